@@ -1,11 +1,14 @@
-"""A training step and a sampled chunk of `pi05` against LeRobot's own PI05 as shipped, at reduced width.
+r"""A training step and a sampled chunk of `pi05` against LeRobot's own PI05 as shipped, at reduced
+width.
 
-    python benchmarks/against_lerobot.py [--threads 1] [--batch 1] [--rounds 10] [--compile] [--cpu-time]
+    python benchmarks/against_lerobot.py [--threads 1] [--batch 1] [--rounds 10] [--compile] \
+        [--cpu-time]
 
-Both have two cameras at 224 pixels, 200 prompt tokens of which 60 are used, a chunk of 20, a frozen vision tower and
-the same dimensions; they take turns in one process. Ours runs twice: on the 200 tokens as they are, and as its own
-pipeline makes batches, without the padding that no prompt of the batch uses (the answer is the same). LeRobot's is as
-shipped (eager). Needs the extra `vlm` (LeRobot's policy is built on transformers).
+Both have two cameras at 224 pixels, 200 prompt tokens of which 60 are used, a chunk of 20, a frozen
+vision tower and the same dimensions; they take turns in one process. Ours runs twice: on the 200
+tokens as they are, and as its own pipeline makes batches, without the padding that no prompt of the
+batch uses (the answer is the same). LeRobot's is as shipped (eager). Needs the extra `vlm`
+(LeRobot's policy is built on transformers).
 """
 
 import argparse
@@ -21,7 +24,14 @@ from mme_vla import build_policy
 from mme_vla.types import Batch
 
 SIZES = {
-    "vision": {"image_size": 224, "patch_size": 14, "width": 192, "depth": 4, "mlp_dim": 768, "num_heads": 4},
+    "vision": {
+        "image_size": 224,
+        "patch_size": 14,
+        "width": 192,
+        "depth": 4,
+        "mlp_dim": 768,
+        "num_heads": 4,
+    },
     "vlm": {"width": 256, "mlp_dim": 1024},
     "action": {"width": 128, "mlp_dim": 512},
     "depth": 4,
@@ -34,12 +44,18 @@ PROMPT_LENGTH, PROMPT_USED, HORIZON = 200, 60, 20
 
 
 def lerobot_pi05(dtype: str, reduced: bool = True) -> nn.Module:
-    """LeRobot's PI05 network, reduced by its size functions answering `SIZES`; how it computes is not touched."""
+    """LeRobot's PI05 network, reduced by its size functions answering `SIZES`; how it computes is
+    not touched.
+    """
     from lerobot.policies.pi05 import modeling_pi05 as source_module
     from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
     config = PI05Config(
-        dtype=dtype, chunk_size=HORIZON, n_action_steps=HORIZON, freeze_vision_encoder=True, device="cpu"
+        dtype=dtype,
+        chunk_size=HORIZON,
+        n_action_steps=HORIZON,
+        freeze_vision_encoder=True,
+        device="cpu",
     )
     if not reduced:
         return source_module.PI05Pytorch(config)
@@ -80,14 +96,18 @@ def lerobot_pi05(dtype: str, reduced: bool = True) -> nn.Module:
 
 def our_pi05(dtype: str) -> nn.Module:
     """Our policy at the same sizes, vision frozen."""
-    policy = build_policy("pi05", backbone=SIZES, policy={"augment": "false", "compute_dtype": dtype})
+    policy = build_policy(
+        "pi05", backbone=SIZES, policy={"augment": "false", "compute_dtype": dtype}
+    )
     policy.backbone.vision.requires_grad_(False)
     return policy
 
 
 def trainer(model: nn.Module, loss: Callable[[], Tensor]) -> Callable[[], None]:
     """One optimisation step: forward, backward, AdamW."""
-    optimizer = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=1e-5, fused=True)
+    optimizer = torch.optim.AdamW(
+        [p for p in model.parameters() if p.requires_grad], lr=1e-5, fused=True
+    )
 
     def step() -> None:
         model.train()
@@ -99,13 +119,17 @@ def trainer(model: nn.Module, loss: Callable[[], Tensor]) -> Callable[[], None]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--batch", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--compile", action="store_true", help="compile ours, layer by layer")
     parser.add_argument("--dtype", default="float32", choices=["float32", "bfloat16"])
-    parser.add_argument("--cpu-time", action="store_true", help="CPU time, where others use the machine too")
+    parser.add_argument(
+        "--cpu-time", action="store_true", help="CPU time, where others use the machine too"
+    )
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
@@ -134,7 +158,9 @@ def main() -> None:
     if args.compile:
         target.backbone.compile(dynamic=False)
     cut = batch.without_prompt_padding()
-    assert (target.sample_actions(batch, noise) - target.sample_actions(cut, noise)).abs().max() < 1e-4
+    assert (
+        target.sample_actions(batch, noise) - target.sample_actions(cut, noise)
+    ).abs().max() < 1e-4
 
     def our_chunk(inputs: Batch) -> Callable[[], Tensor]:
         return lambda: target.eval().sample_actions(inputs, noise)
@@ -156,7 +182,9 @@ def main() -> None:
     for what, contest in (("training step", steps), ("sample_actions", chunks)):
         clock = time_of.process_time if args.cpu_time else time_of.perf_counter
         for name, seconds in (result := alternate(contest, args.rounds, clock=clock)).items():
-            print(f"{what:15} {name:22} {1e3 * seconds:7.1f} ms   {seconds / result['LeRobot']:.2f}x")
+            print(
+                f"{what:15} {name:22} {1e3 * seconds:7.1f} ms   {seconds / result['LeRobot']:.2f}x"
+            )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """What every model costs: FLOPs counted at full size, time and peak memory measured at tiny size.
 
-    python benchmarks/cost.py [--count] [--budgets] [--time] [--memory] [--models …]     (all four without a choice)
+    # all four without a choice
+    python benchmarks/cost.py [--count] [--budgets] [--time] [--memory] [--models …]
 
-FLOPs are counted by `mme_vla.evaluation.analyses.cost`, which says what counts; `python -m mme_vla.analyse cost` prints
-them as well.
+FLOPs are counted by `mme_vla.evaluation.analyses.cost`, which says what counts;
+`python -m mme_vla.analyse cost` prints them as well.
 """
 
 import argparse
@@ -37,18 +38,23 @@ def full_batch(policy: MMEPolicy, batch: int, prompt: int) -> Batch:
 
 def count(models: list[str]) -> None:
     """Parameters and FLOPs of the models at full size."""
-    print("| model | prompt | parameters | forward pass | sampled chunk | over `pi05` | memory, of these | streamed "
-          "| past frames |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|")  # fmt: skip
+    print(
+        "| model | prompt | parameters | forward pass | sampled chunk | over `pi05` | memory, of"
+        " these | streamed | past frames |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|"
+    )
     reference = count_model("pi05").chunk
     for model in models:
         model_cost = count_model(model)
         cells = [
-            str(model_cost.prompt), f"{model_cost.parameters / 1e6:,.1f} M", f"{model_cost.forward / TERA:.3f} T",
-            f"{model_cost.chunk / TERA:.3f} T", f"{model_cost.chunk / reference:.2f}x",
+            str(model_cost.prompt),
+            f"{model_cost.parameters / 1e6:,.1f} M",
+            f"{model_cost.forward / TERA:.3f} T",
+            f"{model_cost.chunk / TERA:.3f} T",
+            f"{model_cost.chunk / reference:.2f}x",
             f"{model_cost.memory / TERA:.4f} T" if model_cost.memory else "",
             "" if model_cost.streamed is None else f"{model_cost.streamed / TERA:.4f} T",
             f"{model_cost.frames / TERA:.3f} T" if model in (*NEURAL, *ALL_BEYOND) else "",
-        ]  # fmt: skip
+        ]
         print(f"| `{model}` | {' | '.join(cells)} |")
 
 
@@ -58,9 +64,15 @@ def budgets() -> None:
     print(f"| model | | {head} |\n|---|---|{'---:|' * len(BUDGETS)}")
     for model in OF_BUDGETS:
         costs = [count_model(model, budget) for budget in BUDGETS]
-        rows = {"forward pass": [cost.forward for cost in costs], "sampled chunk": [cost.chunk for cost in costs]}
+        rows = {
+            "forward pass": [cost.forward for cost in costs],
+            "sampled chunk": [cost.chunk for cost in costs],
+        }
         for what, values in rows.items():
-            print(f"| `{model}` | {what} | {' | '.join(f'{value / TERA:.3f} T' for value in values)} |")
+            print(
+                f"| `{model}` | {what} |"
+                f" {' | '.join(f'{value / TERA:.3f} T' for value in values)} |"
+            )
 
 
 def prompt_length(model: str) -> int:
@@ -75,12 +87,19 @@ def tiny(model: str, batch: int) -> tuple[MMEPolicy, Batch]:
 
 
 def measure_time(models: list[str], batch: int, rounds: int) -> None:
-    """Median times of the models at tiny size, taking turns; those over `pi05` where it takes part."""
+    """Median times of the models at tiny size, taking turns; those over `pi05` where
+    it takes part.
+    """
     made = {model: tiny(model, batch) for model in models}
-    steps = alternate({model: training_step(*parts) for model, parts in made.items()}, rounds, warmup=1)
+    steps = alternate(
+        {model: training_step(*parts) for model, parts in made.items()}, rounds, warmup=1
+    )
     chunks = alternate({model: chunk(*parts) for model, parts in made.items()}, rounds, warmup=1)
     print(f"{machine()}; tiny, batch {batch}, median of {rounds}")
-    print("| model | training step | over `pi05` | sampled chunk | over `pi05` |\n|---|---:|---:|---:|---:|")
+    print(
+        "| model | training step | over `pi05` | sampled chunk | over `pi05`"
+        " |\n|---|---:|---:|---:|---:|"
+    )
     for model in models:
         cells = [
             f"{1e3 * t[model]:,.0f} ms | " + (f"{t[model] / t['pi05']:.2f}x" if "pi05" in t else "")
@@ -95,7 +114,9 @@ def peak_mib() -> float:
 
 
 def peaks_of(model: str, batch: int) -> None:
-    """In a process of its own: print the peak with the model built, after a chunk, and after two training steps."""
+    """In a process of its own: print the peak with the model built, after a chunk, and after two
+    training steps.
+    """
     policy, made = tiny(model, batch)
     peaks = [peak_mib()]
     chunk(policy, made)()
@@ -107,11 +128,25 @@ def peaks_of(model: str, batch: int) -> None:
 
 
 def measure_memory(models: list[str], batch: int, threads: int) -> None:
-    """Peak resident memory at tiny size, a process for each model, and what of it came after the model was built."""
-    print("| model | sampled chunk | of this working memory | training step | of this working memory |")
+    """Peak resident memory at tiny size, a process for each model, and what of it came after the
+    model was built.
+    """
+    print(
+        "| model | sampled chunk | of this working memory | training step | of this working"
+        " memory |"
+    )
     print("|---|---:|---:|---:|---:|")
     for model in models:
-        command = [sys.executable, __file__, "--child", model, "--batch", str(batch), "--threads", str(threads)]
+        command = [
+            sys.executable,
+            __file__,
+            "--child",
+            model,
+            "--batch",
+            str(batch),
+            "--threads",
+            str(threads),
+        ]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         built, *peaks = map(float, done.stdout.split())
         cells = [f"{peak:,.0f} MiB | {peak - built:,.0f} MiB" for peak in peaks]
@@ -119,15 +154,25 @@ def measure_memory(models: list[str], batch: int, threads: int) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", action="store_true", help="FLOPs of every model at full size")
-    parser.add_argument("--budgets", action="store_true", help="FLOPs over the memory budget at full size")
+    parser.add_argument(
+        "--budgets", action="store_true", help="FLOPs over the memory budget at full size"
+    )
     parser.add_argument("--time", action="store_true", help="times at tiny size")
     parser.add_argument("--memory", action="store_true", help="peak memory at tiny size")
     parser.add_argument("--batch", type=int, default=4, help="of what is measured")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--models", nargs="+", default=ALL_MODELS, choices=[*ALL_MODELS, *ALL_BEYOND], metavar="NAME")
+    parser.add_argument(
+        "--models",
+        nargs="+",
+        default=ALL_MODELS,
+        choices=[*ALL_MODELS, *ALL_BEYOND],
+        metavar="NAME",
+    )
     parser.add_argument("--child", help=argparse.SUPPRESS)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)

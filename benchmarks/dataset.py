@@ -1,8 +1,10 @@
-"""Samples per second of the training dataset with its cache, and resident memory as the dataset grows.
+"""Samples per second of the training dataset with its cache, and resident memory as the dataset
+grows.
 
     python benchmarks/dataset.py [--model tokendrop_expert] [--copies 1 4 16] [--items 600]
 
-The embedded sample is copied side by side into one larger LeRobot dataset; each size has a process of its own.
+The embedded sample is copied side by side into one larger LeRobot dataset; each size has a process
+of its own.
 """
 
 import argparse
@@ -40,7 +42,9 @@ def resident_mib() -> tuple[float, float]:
 
 
 def measure(root: Path, model: str, items: int, caches: Path) -> tuple[int, float, float, float]:
-    """Frames, samples per second, anonymous and file-backed MiB after reading `items` random samples."""
+    """Frames, samples per second, anonymous and file-backed MiB after reading `items` random
+    samples.
+    """
     import torch
 
     from mme_vla import build_policy
@@ -53,7 +57,12 @@ def measure(root: Path, model: str, items: int, caches: Path) -> tuple[int, floa
     policy, source = build_policy(model), EpisodeSource(root)
     policy.processor.stats = compute_norm_stats([source])
     cache = ensure_cache(
-        source, policy.memory, policy.encode_frames, policy.vision_fingerprint(), root=caches, max_build_frames=10**6
+        source,
+        policy.memory,
+        policy.encode_frames,
+        policy.vision_fingerprint(),
+        root=caches,
+        max_build_frames=10**6,
     )
     data = TrainingDataset([source], policy.processor, policy.memory, [cache])
     order = np.random.default_rng(0).permutation(len(data))[:items]
@@ -66,7 +75,9 @@ def measure(root: Path, model: str, items: int, caches: Path) -> tuple[int, floa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--model", default="tokendrop_expert")
     parser.add_argument("--copies", type=int, nargs="+", default=[1, 4, 16])
     parser.add_argument("--items", type=int, default=400)
@@ -76,9 +87,19 @@ def main() -> None:
         for copies in args.copies:
             root = grow(copies, Path(folder))
             with multiprocessing.get_context("spawn").Pool(1) as pool:
-                rows.append((copies, *pool.apply(measure, (root, args.model, args.items, Path(folder) / "caches"))))
+                rows.append(
+                    (
+                        copies,
+                        *pool.apply(
+                            measure, (root, args.model, args.items, Path(folder) / "caches")
+                        ),
+                    )
+                )
     print(f"{machine()}; {args.model}, in the main process, {args.items} random samples")
-    print("| dataset | frames | samples/s | anonymous memory | file-backed, shared |\n|---|---:|---:|---:|---:|")
+    print(
+        "| dataset | frames | samples/s | anonymous memory | file-backed, shared"
+        " |\n|---|---:|---:|---:|---:|"
+    )
     for copies, frames, rate, anonymous, mapped in rows:
         print(f"| {copies}x | {frames:,} | {rate:.0f} | {anonymous:.0f} MiB | {mapped:.0f} MiB |")
 

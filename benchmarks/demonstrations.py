@@ -1,9 +1,11 @@
-"""The demonstrator on fresh seeds of every task and difficulty: does it succeed, and how long are its episodes?
+"""The demonstrator on fresh seeds of every task and difficulty: does it succeed, and how long are
+its episodes?
 
     python benchmarks/demonstrations.py [TASK ...] [--seeds 5] [--first 9000000]
 
-Unrendered. Prints a Markdown table; lengths are stored steps (with the conditioning video, without steps that belong to
-no sub-task), averaged with the benchmark's weights of 50 % easy, 25 % medium and 25 % hard, beside the paper's.
+Unrendered. Prints a Markdown table; lengths are stored steps (with the conditioning video, without
+steps that belong to no sub-task), averaged with the benchmark's weights of 50 % easy, 25 % medium
+and 25 % hard, beside the paper's.
 """
 
 import argparse
@@ -41,10 +43,14 @@ def seeds_with_scenes(task: str, difficulty: str, first: int, count: int) -> lis
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("tasks", nargs="*", default=list(TASK_NAMES))
     parser.add_argument("--seeds", type=int, default=5, help="seeds a difficulty")
-    parser.add_argument("--first", type=int, default=9_000_000, help="first seed; the benchmark's own are lower")
+    parser.add_argument(
+        "--first", type=int, default=9_000_000, help="first seed; the benchmark's own are lower"
+    )
     args = parser.parse_args()
     paper = {name: task_facts(name).steps for name in TASK_NAMES}
     print("| task | easy | medium | hard | mean length | paper | ratio | seconds an episode |")
@@ -59,10 +65,15 @@ def main() -> None:
             good = [stored for success, stored, _ in results if success]
             cells.append(f"{len(good)}/{len(results)}")
             mean += weight * sum(good) / max(len(good), 1)
-            failed = [(seed, error) for seed, (ok, _, error) in zip(seeds, results, strict=True) if not ok]
+            failed = [
+                (seed, error) for seed, (ok, _, error) in zip(seeds, results, strict=True) if not ok
+            ]
             problems += [f"{difficulty} {seed}: {error}" for seed, error in failed]
         ratio = mean / paper[name]
-        print(f"| {name} | {' | '.join(cells)} | {mean:.0f} | {paper[name]:.0f} | {ratio:.2f} | {seconds / runs:.1f} |")
+        print(
+            f"| {name} | {' | '.join(cells)} | {mean:.0f} | {paper[name]:.0f} | {ratio:.2f} |"
+            f" {seconds / runs:.1f} |"
+        )
         for problem in problems:
             print(f"<!-- {problem} -->", flush=True)
 

@@ -1,10 +1,13 @@
-"""What images on demand save: evaluation episodes and demonstrations, rendered where read, against rendered in full.
+r"""What images on demand save: evaluation episodes and demonstrations, rendered where read, against
+rendered in full.
 
-    python benchmarks/drawing.py [MODEL ...] [--task VideoUnmask] [--steps 128] [--no-record] [--no-episodes]
+    python benchmarks/drawing.py [MODEL ...] [--task VideoUnmask] [--steps 128] [--no-record] \
+        [--no-episodes]
 
-Both ways do the same episode in one process, one after the other; the command checks that actions and outcomes are
-equal to the last bit. The policy is tiny and untrained; its part is counted, and given apart. CPU seconds are those of
-this process and all its threads, so that other work on the machine does not count.
+Both ways do the same episode in one process, one after the other; the command checks that actions
+and outcomes are equal to the last bit. The policy is tiny and untrained; its part is counted, and
+given apart. CPU seconds are those of this process and all its threads, so that other work on the
+machine does not count.
 """
 
 import argparse
@@ -58,7 +61,10 @@ class InProcess:
         self._job = job
         self._env = make_rollout_env(job.task, job.split, job.episode, **self._options)
         sensors = self._env._env.task.scene.sensors
-        for camera, sensor in (("front", sensors["base_camera"]), ("wrist", sensors["hand_camera"])):
+        for camera, sensor in (
+            ("front", sensors["base_camera"]),
+            ("wrist", sensors["hand_camera"]),
+        ):
             sensor.capture = self._counted(camera, sensor.capture)
         self._replies.append(Reply.of_outcome(worker, job, True, self._env.reset(**how)))
         self.cpu_s += time.process_time() - begun
@@ -101,7 +107,9 @@ def episode(policy: MMEPolicy, name: str, job: Job, steps: int, draw: str) -> Me
     """Run an episode of so many steps."""
     settings = RolloutSettings(max_steps=steps, max_batch=1, draw=draw)
     envs, records = InProcess(max_steps=steps), []  # type: ignore[var-annotated]
-    subgoals = Oracle("grounded") if policy.require_processor().prompt_format.reads_subgoal else None
+    subgoals = (
+        Oracle("grounded") if policy.require_processor().prompt_format.reads_subgoal else None
+    )
     facts = RunFacts(name, "untrained", settings.seed, max_steps=steps)
     begun = time.process_time(), time.perf_counter()
     Rollout(policy, envs, facts, settings, records.append, subgoals).run([job])
@@ -112,16 +120,30 @@ def episode(policy: MMEPolicy, name: str, job: Job, steps: int, draw: str) -> Me
 
 def episodes(models: list[str], task: str, steps: int) -> None:
     """Print a row for every model."""
-    columns = ("model", "images (front + wrist): all", "needed", "environment, CPU: all", "needed", "gain",
-               "with the policy, CPU: all", "needed", "gain", "wall, gain")  # fmt: skip
+    columns = (
+        "model",
+        "images (front + wrist): all",
+        "needed",
+        "environment, CPU: all",
+        "needed",
+        "gain",
+        "with the policy, CPU: all",
+        "needed",
+        "gain",
+        "wall, gain",
+    )
     print("| " + " | ".join(columns) + " |\n|---|" + "---:|" * (len(columns) - 1), flush=True)
     job = Job(task, "test", 0)
     for name in models:
         policy = small_policy(name)
         full, needed = (episode(policy, name, job, steps, draw) for draw in ("all", "needed"))
-        assert needed.record.steps == full.record.steps > steps, "the episode ended before its limit"
+        assert needed.record.steps == full.record.steps > steps, (
+            "the episode ended before its limit"
+        )
         assert full.record.outcome == needed.record.outcome
-        assert full.record.extra["actions_sha256"] == needed.record.extra["actions_sha256"], "other actions"
+        assert full.record.extra["actions_sha256"] == needed.record.extra["actions_sha256"], (
+            "other actions"
+        )
         cells = [name, *(f"{m.images['front']} + {m.images['wrist']}" for m in (full, needed))]
         for a, b in ((full.env_s, needed.env_s), (full.cpu_s, needed.cpu_s)):
             cells += [f"{a:.1f} s", f"{b:.1f} s", f"{a / b:.1f}x"]
@@ -138,13 +160,17 @@ def demonstrations(task: str) -> None:
             record_episode(Demonstration(task, 7, 3000, "easy", None, 5, choice), Path(folder))
             spent = [time.process_time() - begun[0], time.perf_counter() - begun[1]]
         full = full or spent
-        cells = " | ".join(f"{now:.1f} s | {before / now:.1f}x" for before, now in zip(full, spent, strict=True))
+        cells = " | ".join(
+            f"{now:.1f} s | {before / now:.1f}x" for before, now in zip(full, spent, strict=True)
+        )
         print(f"| {name} | {cells} |", flush=True)
 
 
 def main() -> None:
     """Measure and print Markdown tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("models", nargs="*", default=list(MODELS))
     parser.add_argument("--task", default="VideoUnmask", help="of the evaluation episodes")
     parser.add_argument("--demonstrated", default="PickXtimes", help="task of the demonstrations")
@@ -153,7 +179,9 @@ def main() -> None:
     parser.add_argument("--no-record", action="store_true")
     args = parser.parse_args()
     print(f"{args.task} · {args.steps + 1} steps · {machine()}\n")
-    episode(small_policy("pi05"), "pi05", Job(args.task, "test", 1), 2, "needed")  # shaders and imports: once a process
+    episode(
+        small_policy("pi05"), "pi05", Job(args.task, "test", 1), 2, "needed"
+    )  # shaders and imports: once a process
     if not args.no_episodes:
         episodes(args.models, args.task, args.steps)
     if not args.no_record:

@@ -1,9 +1,10 @@
-"""Steps per second of the rendering environments, beside ManiSkill's PickCube-v1 with the same two cameras.
+"""Steps per second of the rendering environments, beside ManiSkill's PickCube-v1 with the same two
+cameras.
 
     python benchmarks/env_speed.py [TASK ...] [--steps 40] [--workers 1 2]
 
-Each task and PickCube take turns in one process, so that both see the same machine; the ratio is what counts. Then
-where the time of a step goes, and episodes in worker processes.
+Each task and PickCube take turns in one process, so that both see the same machine; the ratio is
+what counts. Then where the time of a step goes, and episodes in worker processes.
 """
 
 import argparse
@@ -27,14 +28,26 @@ HOLD = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4, 1], np.float32)
 def pick_cube() -> Callable[[], object]:
     """One step of PickCube-v1 with a 256 × 256 front and wrist camera."""
     front = CameraConfig(
-        "base_camera", sapien_utils.look_at([0.3, 0, 0.4], [0, 0, -0.2]), 256, 256, np.pi / 2, 0.01, 100
+        "base_camera",
+        sapien_utils.look_at([0.3, 0, 0.4], [0, 0, -0.2]),
+        256,
+        256,
+        np.pi / 2,
+        0.01,
+        100,
     )
     env = gymnasium.make(
-        "PickCube-v1", obs_mode="rgb", render_backend=render_backend(), sim_backend="physx_cpu",
-        robot_uids="panda_wristcam", control_mode="pd_joint_pos",
-        sensor_configs={"base_camera": {"width": 256, "height": 256, "pose": front.pose, "fov": front.fov},
-                        "hand_camera": {"width": 256, "height": 256}},
-    )  # fmt: skip
+        "PickCube-v1",
+        obs_mode="rgb",
+        render_backend=render_backend(),
+        sim_backend="physx_cpu",
+        robot_uids="panda_wristcam",
+        control_mode="pd_joint_pos",
+        sensor_configs={
+            "base_camera": {"width": 256, "height": 256, "pose": front.pose, "fov": front.fov},
+            "hand_camera": {"width": 256, "height": 256},
+        },
+    )
     env.reset(seed=0)
     return lambda: env.step(HOLD)
 
@@ -57,7 +70,8 @@ class Parts:
         scene.update_render = self._timed("rendering", scene.update_render)
         for sensor in scene.sensors.values():
             sensor.capture = self._timed("rendering", sensor.capture)
-        # Rendering continues in the background until an image is read: this is the other part of its time.
+        # Rendering continues in the background until an image is read: this is the other part of
+        # its time.
         observations._read_texture = self._timed("waiting for images", observations._read_texture)
 
     def _timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
@@ -80,9 +94,13 @@ def rate(step: Callable[[], object], steps: int) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("tasks", nargs="*", default=list(TASK_NAMES))
-    parser.add_argument("--steps", type=int, default=40, help="steps of each before the other has its turn")
+    parser.add_argument(
+        "--steps", type=int, default=40, help="steps of each before the other has its turn"
+    )
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2])
     args = parser.parse_args()
@@ -95,10 +113,17 @@ def main() -> None:
         pairs = [(rate(step, args.steps), rate(reference, args.steps)) for _ in range(args.rounds)]
         target, source = (float(np.median(values)) for values in zip(*pairs, strict=True))
         env.close()
-        print(f"| {task} | {target:.2f} | {source:.2f} | {np.median([a / b for a, b in pairs]):.2f} |", flush=True)
+        print(
+            f"| {task} | {target:.2f} | {source:.2f} |"
+            f" {np.median([a / b for a, b in pairs]):.2f} |",
+            flush=True,
+        )
     where(args.tasks[0], args.steps)
     for workers in args.workers:
-        print(f"{workers} workers: {workers_rate(workers, args.steps):.2f} steps/s together", flush=True)
+        print(
+            f"{workers} workers: {workers_rate(workers, args.steps):.2f} steps/s together",
+            flush=True,
+        )
 
 
 def where(task: str, steps: int) -> None:
@@ -110,13 +135,18 @@ def where(task: str, steps: int) -> None:
     milliseconds = {name: 1000 * seconds / steps for name, seconds in parts.seconds.items()}
     milliseconds["all else"] = total - sum(milliseconds.values())
     env.close()
-    shares = ", ".join(f"{name} {value:.1f} ms ({100 * value / total:.0f} %)" for name, value in milliseconds.items())
+    shares = ", ".join(
+        f"{name} {value:.1f} ms ({100 * value / total:.0f} %)"
+        for name, value in milliseconds.items()
+    )
     print(f"\na step of {task}: {total:.1f} ms: {shares}", flush=True)
 
 
 def workers_rate(workers: int, steps: int) -> float:
     """Steps per second of PickXtimes in worker processes, each stepped as soon as it is ready."""
-    with make_vec_env("PickXtimes", episodes=range(workers), workers=workers, max_steps=100_000) as envs:
+    with make_vec_env(
+        "PickXtimes", episodes=range(workers), workers=workers, max_steps=100_000
+    ) as envs:
         for worker in range(envs.workers):
             envs.start_next(worker)
         ready = 0

@@ -1,8 +1,9 @@
 """Damage every kind of file that the library reads: `python benchmarks/fuzz.py [KIND…]`.
 
-For each kind a small valid artefact is made. Each of `--mutations` copies of it is damaged in one way and read by the
-library's own reader in a process with limits on time and memory. The same seed damages in the same ways. Exit code 1 if
-damage was accepted without a message, or met with a traceback, a hang or a message of more than 2,000 characters.
+For each kind a small valid artefact is made. Each of `--mutations` copies of it is damaged in one
+way and read by the library's own reader in a process with limits on time and memory. The same seed
+damages in the same ways. Exit code 1 if damage was accepted without a message, or met with a
+traceback, a hang or a message of more than 2,000 characters.
 """
 
 import argparse
@@ -26,7 +27,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))  # small files as the tests have them
+sys.path.insert(
+    0, str(Path(__file__).resolve().parent.parent / "tests")
+)  # small files as the tests have them
 _CACHE = tempfile.TemporaryDirectory(prefix="fuzz-cache-")
 os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": _CACHE.name, "OMP_NUM_THREADS": "1"}
 
@@ -46,7 +49,13 @@ from mme_vla.evaluation.store import RECORDS, read_records, read_run
 from mme_vla.play.game import Option
 from mme_vla.play.vlm_players import parse_choice
 from mme_vla.policy.tensor_files import WEIGHTS, save_tensors
-from mme_vla.subgoal.text import MalformedReply, parse_gemini, parse_memer, parse_subgoal, pixels_of_pairs
+from mme_vla.subgoal.text import (
+    MalformedReply,
+    parse_gemini,
+    parse_memer,
+    parse_subgoal,
+    pixels_of_pairs,
+)
 from mme_vla.testing.small import SMALL_VISION, small_policy
 from mme_vla.training.checkpoint import read_state, restore, save_checkpoint, trainable
 from mme_vla.training.optim import EMA
@@ -55,8 +64,10 @@ from mme_vla.utils import SUMS, read_text, write_sums
 from mme_vla.weights import load_weights, read_stats
 
 OUTCOMES = ("refused", "warned", "harmless", "untellable", "silent", "traceback", "hang", "long")
-"""Refused in words · read otherwise, with a warning · read equal · read otherwise, and no reader of this format could
-know · read otherwise without a word · another exception, or the process died · no end in time · too long a message."""
+"""Refused in words · read otherwise, with a warning · read equal · read otherwise, and no reader of
+this format could know · read otherwise without a word · another exception, or the process died · no
+end in time · too long a message.
+"""
 BAD = ("silent", "traceback", "hang", "long")
 LONGEST = 2000  # characters of a message
 
@@ -65,9 +76,9 @@ LONGEST = 2000  # characters of a message
 class Target:
     """One kind of artefact.
 
-    make: writes a small valid artefact into an empty folder. read: reads all of it with the library's own reader, and
-    returns a value that is equal for equal content. untellable: the format has no checksum, so that no reader can know
-    whether another result is damage.
+    make: writes a small valid artefact into an empty folder. read: reads all of it with the
+    library's own reader, and returns a value that is equal for equal content. untellable: the
+    format has no checksum, so that no reader can know whether another result is damage.
     """
 
     make: Callable[[Path], None]
@@ -92,7 +103,9 @@ class Case:
     said: str
 
 
-def fuzz(name: str, target: Target, mutations: int, seed: int, seconds: float = 60, gib: float = 2) -> list[Case]:
+def fuzz(
+    name: str, target: Target, mutations: int, seed: int, seconds: float = 60, gib: float = 2
+) -> list[Case]:
     """Damage one kind this often.
 
     Raises:
@@ -101,14 +114,23 @@ def fuzz(name: str, target: Target, mutations: int, seed: int, seconds: float = 
     with tempfile.TemporaryDirectory(prefix="fuzz-") as base:
         root = Path(base)
         (root / "valid").mkdir()
-        maker = multiprocessing.get_context("fork").Process(target=_make, args=(target, root / "valid"))
+        maker = multiprocessing.get_context("fork").Process(
+            target=_make, args=(target, root / "valid")
+        )
         maker.start()
         maker.join()
         files = [path.relative_to(root / "valid") for path in files_of(root / "valid")]
-        (kind, valid, message), again = (_apart(target, root / "valid", seconds, gib) for _ in range(2))
+        (kind, valid, message), again = (
+            _apart(target, root / "valid", seconds, gib) for _ in range(2)
+        )
         if kind != "read" or again[1] != valid:
-            raise RuntimeError(f"The undamaged {name} cannot be read: {message or 'it reads differently twice'}")
-        return [_case(name, target, root, files, valid, number, seed, seconds, gib) for number in range(mutations)]
+            raise RuntimeError(
+                f"The undamaged {name} cannot be read: {message or 'it reads differently twice'}"
+            )
+        return [
+            _case(name, target, root, files, valid, number, seed, seconds, gib)
+            for number in range(mutations)
+        ]
 
 
 def _case(
@@ -128,22 +150,32 @@ def _case(
     before = {path: (work / path).read_bytes() for path in files}
     path = rng.choice(files)
     mutation = mutate(rng, work / path)
-    if (work / path).is_file() and not (work / path).is_symlink() and (work / path).read_bytes() == before[path]:
+    if (
+        (work / path).is_file()
+        and not (work / path).is_symlink()
+        and (work / path).read_bytes() == before[path]
+    ):
         mutation += " (nothing changed)"
     kind, result, message = _apart(target, work, seconds, gib)
     outcome = kind
     if kind == "read" and result == valid:
         outcome = "harmless"
     elif kind == "read":
-        outcome = "warned" if message else "untellable" if target.untellable(valid, result) else "silent"
+        outcome = (
+            "warned" if message else "untellable" if target.untellable(valid, result) else "silent"
+        )
     elif kind == "refused" and len(message) > LONGEST:
         outcome = "long"
     _remove(work)
-    return Case(name, number, path.as_posix(), mutation, outcome, message.replace(str(work), "<folder>"))
+    return Case(
+        name, number, path.as_posix(), mutation, outcome, message.replace(str(work), "<folder>")
+    )
 
 
 def _apart(target: Target, folder: Path, seconds: float, gib: float) -> tuple[str, object, str]:
-    """Read in a child process: (`read`, `refused`, `traceback` or `hang`; the result; what was said)."""
+    """Read in a child process: (`read`, `refused`, `traceback` or `hang`; the result; what was
+    said).
+    """
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
     child = context.Process(target=_read, args=(target, folder, gib, there))
@@ -189,7 +221,9 @@ def _read(target: Target, folder: Path, gib: float, answers: Connection) -> None
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             result = target.read(folder)
-        warning_texts = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
+        warning_texts = [
+            str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)
+        ]
         answers.send(("read", result, "\n".join([*warning_texts, log.getvalue()]).strip()))
     except UserError as error:
         answers.send(("refused", None, str(error)))
@@ -211,7 +245,9 @@ def table(cases: Sequence[Case]) -> str:
     lines = [f"| kind | tries | {' | '.join(OUTCOMES)} |", f"|---|---:|{'---:|' * len(OUTCOMES)}"]
     for kind in kinds:
         counts = Counter(case.outcome for case in cases if case.kind == kind)
-        lines.append(f"| {kind} | {counts.total()} | {' | '.join(str(counts[name]) for name in OUTCOMES)} |")
+        lines.append(
+            f"| {kind} | {counts.total()} | {' | '.join(str(counts[name]) for name in OUTCOMES)} |"
+        )
     return "\n".join(lines)
 
 
@@ -284,18 +320,40 @@ def _remove_file(rng: random.Random, path: Path) -> None:
 
 def _change_value(rng: random.Random, path: Path) -> None:
     """Replace or delete one value of one JSON text, however deep."""
-    lines = path.read_text().rstrip("\n").split("\n") if path.suffix == ".jsonl" else [path.read_text()]
+    lines = (
+        path.read_text().rstrip("\n").split("\n") if path.suffix == ".jsonl" else [path.read_text()]
+    )
     line = rng.randrange(len(lines))
     root = json.loads(lines[line])
     places: list[tuple[Any, Any]] = []
 
     def collect(value: Any) -> None:
-        for key in list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+        for key in (
+            list(value)
+            if isinstance(value, dict)
+            else range(len(value))
+            if isinstance(value, list)
+            else ()
+        ):
             places.append((value, key))
             collect(value[key])
 
     collect(root)
-    text = rng.choice(["null", "true", "-1", '""', "{}", '["a"]', "9" * 5001, "1e999", "NaN", "[" * 10**6, '"\\ud800"'])
+    text = rng.choice(
+        [
+            "null",
+            "true",
+            "-1",
+            '""',
+            "{}",
+            '["a"]',
+            "9" * 5001,
+            "1e999",
+            "NaN",
+            "[" * 10**6,
+            '"\\ud800"',
+        ]
+    )
     if places:
         box, key = rng.choice(places)
         if rng.random() < 0.2:
@@ -326,7 +384,13 @@ def _of_policy(policy: MMEPolicy) -> list[object]:
     stats = None if processor.stats is None else processor.stats.to_dict()
     decisive = {key: value for key, value in policy.config.items() if key != "card"}
     tokens = processor.prompt("pick up the red cube", state=np.zeros(8, np.float32))
-    return [*_arrays(policy.state_dict()), decisive, processor.embodiment.to_dict(), stats, *map(_array, tokens)]
+    return [
+        *_arrays(policy.state_dict()),
+        decisive,
+        processor.embodiment.to_dict(),
+        stats,
+        *map(_array, tokens),
+    ]
 
 
 def write_sharded(folder: Path) -> None:
@@ -372,10 +436,19 @@ def read_training(folder: Path) -> object:
     opened = MMEPolicy.from_pretrained(checkpoint)
     policy, ema, optimizer = _training()
     restore(checkpoint, policy, ema, optimizer)
-    moments = [_array(value) for entry in optimizer.state_dict()["state"].values() for value in entry.values()]
+    moments = [
+        _array(value)
+        for entry in optimizer.state_dict()["state"].values()
+        for value in entry.values()
+    ]
     averages = _arrays(ema.tensors())
     return artefacts.digest(
-        state["step"], state["config"], *_of_policy(opened), *_arrays(policy.state_dict()), *averages, *moments
+        state["step"],
+        state["config"],
+        *_of_policy(opened),
+        *_arrays(policy.state_dict()),
+        *averages,
+        *moments,
     )
 
 
@@ -390,7 +463,9 @@ def read_released(folder: Path) -> object:
     """Weights and statistics."""
     policy = load_weights(_policy("pi05"), folder / "released")
     stats = read_stats(folder / "released" / "0")
-    return artefacts.digest(*_arrays(policy.state_dict()), None if stats is None else stats.to_dict())
+    return artefacts.digest(
+        *_arrays(policy.state_dict()), None if stats is None else stats.to_dict()
+    )
 
 
 def read_recording(folder: Path) -> object:
@@ -398,7 +473,14 @@ def read_recording(folder: Path) -> object:
     read: list[object] = []
     for ref in list_episodes(find_files([folder / artefacts.H5])):
         with open_episode(ref) as episode:
-            read += [ref.index, ref.task, episode.goals, episode.seed, episode.difficulty, episode.exec_start]
+            read += [
+                ref.index,
+                ref.task,
+                episode.goals,
+                episode.seed,
+                episode.difficulty,
+                episode.exec_start,
+            ]
             for frame in episode:
                 read += [
                     frame.front,
@@ -439,18 +521,26 @@ def read_cache(folder: Path) -> object:
         history = cache.history(episode)
         stored = cache.spec.stored_frames(len(history))
         every = np.stack([np.repeat(stored, 4), np.tile(np.arange(4), len(stored))], axis=1)
-        read += [history.gather(every).view(torch.int16).numpy(), history.scores.frames, history.scores.values]
+        read += [
+            history.gather(every).view(torch.int16).numpy(),
+            history.scores.frames,
+            history.scores.values,
+        ]
     return artefacts.digest(*read)
 
 
 def read_logs(folder: Path) -> object:
     """The settings and notes, and every record."""
     run = read_run(folder)
-    return artefacts.digest(sorted(map(repr, run.items()))), tuple(map(repr, read_records(folder / RECORDS)))
+    return artefacts.digest(sorted(map(repr, run.items()))), tuple(
+        map(repr, read_records(folder / RECORDS))
+    )
 
 
 def is_shorter(valid: Any, result: Any) -> bool:
-    """A log cut after a whole line is that of a run that was stopped there: it continues with the missing episodes."""
+    """A log cut after a whole line is that of a run that was stopped there: it continues with the
+    missing episodes.
+    """
     return result[0] == valid[0] and result[1] == valid[1][: len(result[1])]
 
 
@@ -469,7 +559,9 @@ def write_replies(folder: Path) -> None:
 
 
 def read_replies(folder: Path) -> object:
-    """What the predictors and players understand of it; they count what they cannot, and continue."""
+    """What the predictors and players understand of it; they count what they cannot,
+    and continue.
+    """
     replies = {name: read_text(folder / name, "an answer") for name in ANSWERS}
     try:
         return (
@@ -511,8 +603,12 @@ TARGETS = {
 def main(words: Sequence[str] | None = None) -> int:
     """Run from the command line; return the exit code."""
     known = TARGETS
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"default: all of {', '.join(known)}")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "kinds", nargs="*", metavar="KIND", help=f"default: all of {', '.join(known)}"
+    )
     parser.add_argument("--mutations", type=int, default=200, help="of each kind (default 200)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=60, help="for one reading (default 60)")
@@ -529,9 +625,16 @@ def main(words: Sequence[str] | None = None) -> int:
     print(table(cases))
     bad = [case for case in cases if case.outcome in BAD]
     for case in bad:
-        print(f"\n{case.outcome}: {case.kind} {case.number}, {case.file}, {case.mutation}\n{case.said[:LONGEST]}")
+        print(
+            f"\n{case.outcome}: {case.kind} {case.number}, {case.file},"
+            f" {case.mutation}\n{case.said[:LONGEST]}"
+        )
     if args.json:
-        content: dict[str, Any] = {"seed": args.seed, "mutations": args.mutations, "cases": [vars(c) for c in cases]}
+        content: dict[str, Any] = {
+            "seed": args.seed,
+            "mutations": args.mutations,
+            "cases": [vars(c) for c in cases],
+        }
         args.json.write_text(json.dumps(content, indent=1) + "\n")
     return int(bool(bad))
 

@@ -1,15 +1,20 @@
-"""What this GPU does with the library: a table, a JSON file, and exit code 1 where it is below the goals.
+r"""What this GPU does with the library: a table, a JSON file, and exit code 1 where it is below the
+goals.
 
-    python benchmarks/gpu.py [--models pi05 tokendrop_expert] [--batch 8] [--attention auto] [--output gpu.json]
-    torchrun --nproc-per-node 8 benchmarks/gpu.py --output gpu.json     # adds what many processes take to that file
-    python benchmarks/gpu.py --backbone tiny --device cpu --rounds 2     # tries the program out; judges nothing
+    python benchmarks/gpu.py [--models pi05 tokendrop_expert] [--batch 8] [--attention auto] \
+        [--output gpu.json]
+    # adds what many processes take to that file
+    torchrun --nproc-per-node 8 benchmarks/gpu.py --output gpu.json
+    # tries the program out; judges nothing
+    python benchmarks/gpu.py --backbone tiny --device cpu --rounds 2
 
-For each model: an update (forward, backward, clipping, AdamW, EMA; layers compiled unless --eager) with its model and
-hardware FLOP utilisation, samples/s and peak memory, and the share of time that updates wait for the embedded
-demonstrations; a chunk eager, with compiled layers, and as one CUDA graph of these (p50, p99), and how far they lie
-apart. LeRobot's PI05 beside it, where it is installed. For attention alone: every backend's time and error against
-float32, and a sweep over lengths for numbers that are none. Under a launcher: an update over all processes, weights
-whole (ddp) and shared (fsdp), one line each. Goals: 50 % of the peak in training, 15 ms a chunk.
+For each model: an update (forward, backward, clipping, AdamW, EMA; layers compiled unless --eager)
+with its model and hardware FLOP utilisation, samples/s and peak memory, and the share of time that
+updates wait for the embedded demonstrations; a chunk eager, with compiled layers, and as one CUDA
+graph of these (p50, p99), and how far they lie apart. LeRobot's PI05 beside it, where it is
+installed. For attention alone: every backend's time and error against float32, and a sweep over
+lengths for numbers that are none. Under a launcher: an update over all processes, weights whole
+(ddp) and shared (fsdp), one line each. Goals: 50 % of the peak in training, 15 ms a chunk.
 """
 
 import argparse
@@ -40,7 +45,9 @@ Projections = tuple[Tensor, Tensor, Tensor]  # queries, keys, values
 
 
 def chunks(model: str, setup: Setup) -> dict[str, Any]:
-    """A chunk of one episode each way: p50 and p99, and the largest difference from the eager one."""
+    """A chunk of one episode each way: p50 and p99, and the largest difference from
+    the eager one.
+    """
     device = setup.device
     policy = built(model, setup.backbone, device).to(setup.dtype).eval().requires_grad_(False)
     batch = replace(batch_of(policy, 1, device), actions=None)
@@ -52,7 +59,9 @@ def chunks(model: str, setup: Setup) -> dict[str, Any]:
 
     def measure(way: str) -> None:
         nonlocal reference
-        took = milliseconds(lambda: policy.sample_actions(batch, noise, memory=memory), setup.rounds, 3, device)
+        took = milliseconds(
+            lambda: policy.sample_actions(batch, noise, memory=memory), setup.rounds, 3, device
+        )
         chunk = policy.sample_actions(batch, noise, memory=memory).float()
         reference = chunk if reference is None else reference
         rows[way] = {
@@ -77,8 +86,12 @@ def chunks(model: str, setup: Setup) -> dict[str, Any]:
     return rows
 
 
-def attention_rows(setup: Setup, lengths: Sequence[int] = (512, 512, 64, 20), width: int = 256) -> dict[str, Any]:
-    """Attention alone, with memory, images, prompt and actions so long: each backend's time and error."""
+def attention_rows(
+    setup: Setup, lengths: Sequence[int] = (512, 512, 64, 20), width: int = 256
+) -> dict[str, Any]:
+    """Attention alone, with memory, images, prompt and actions so long: each backend's time and
+    error.
+    """
     spans = [Span(name, length) for name, length in zip(MEMORY_VISIBILITY, lengths, strict=True)]
     rows: dict[str, Any] = {}
     for backend in ("sdpa", "flex", "varlen"):
@@ -111,13 +124,17 @@ def attention_rows(setup: Setup, lengths: Sequence[int] = (512, 512, 64, 20), wi
 def _attention_case(
     spans: Sequence[Span], setup: Setup, width: int
 ) -> tuple[MaskLayout, Projections, Tensor, list[Tensor]]:
-    """Rows that attend, their queries, keys and values, and in float32 the answers and the gradients of their sum."""
+    """Rows that attend, their queries, keys and values, and in float32 the answers and the
+    gradients of their sum.
+    """
     n = sum(span.length for span in spans)
     generator = torch.Generator().manual_seed(n)
     valid = (torch.rand(setup.batch, n, generator=generator) < 0.8).to(setup.device)
     mask_layout = MaskLayout.of(spans, spans, valid, MEMORY_VISIBILITY)
     sizes = [(setup.batch, n, heads, width) for heads in (8, 1, 1)]
-    first, second, third = (torch.randn(size, generator=generator).to(setup.device, setup.dtype) for size in sizes)
+    first, second, third = (
+        torch.randn(size, generator=generator).to(setup.device, setup.dtype) for size in sizes
+    )
     leaves = [x.float().requires_grad_() for x in (first, second, third)]
     q, k, v = (x.transpose(1, 2) for x in leaves)
     logits = (q @ k.transpose(-1, -2) * width**-0.5).masked_fill(
@@ -133,12 +150,22 @@ def nan_sweep(setup: Setup, lengths: Sequence[int], width: int = 256) -> list[st
     """Where an answer or a gradient is no number: backend and number of keys."""
     broken = []
     for n_images in lengths:
-        spans = [Span("memory", 64), Span("images", n_images), Span("prompt", 48), Span("action", 16)]
-        for backend in ("sdpa", "varlen") if setup.device.type != "cuda" else ("sdpa", "flex", "varlen"):
+        spans = [
+            Span("memory", 64),
+            Span("images", n_images),
+            Span("prompt", 48),
+            Span("action", 16),
+        ]
+        for backend in (
+            ("sdpa", "varlen") if setup.device.type != "cuda" else ("sdpa", "flex", "varlen")
+        ):
             mask_layout, tensors, *_ = _attention_case(spans, setup, width)
             output = attend(*tensors, build_mask(mask_layout, setup.dtype, backend, compiled=False))
             functional.mse_loss(output, torch.zeros_like(output)).backward()
-            if not all(torch.isfinite(x).all() for x in (output, *(x.grad for x in tensors if x.grad is not None))):
+            if not all(
+                torch.isfinite(x).all()
+                for x in (output, *(x.grad for x in tensors if x.grad is not None))
+            ):
                 broken.append(f"{backend} at {64 + n_images + 48 + 16} keys")
     return broken
 
@@ -164,11 +191,16 @@ def show_model(model: str, row: dict[str, Any]) -> None:
         print(_of_update(model, row["training"]))
     if "feeding" in row:
         fed = row["feeding"]
-        print(f"{model}: from {fed['workers']} reading processes {fed['samples_per_s']:.1f} samples/s, "
-              f"{fed['waiting']:.0%} of the time waiting for data")  # fmt: skip
+        print(
+            f"{model}: from {fed['workers']} reading processes {fed['samples_per_s']:.1f}"
+            f" samples/s, {fed['waiting']:.0%} of the time waiting for data"
+        )
     for way, took in row.get("chunk", {}).items():
         apart = f", differs by {took['difference']:.1e}" if "difference" in took else ""
-        print(f"{model}: chunk, {way}: p50 {took['p50_ms']:.1f} ms, p99 {took['p99_ms']:.1f}{apart}", flush=True)
+        print(
+            f"{model}: chunk, {way}: p50 {took['p50_ms']:.1f} ms, p99 {took['p99_ms']:.1f}{apart}",
+            flush=True,
+        )
 
 
 def show_attention(result: dict[str, Any]) -> None:
@@ -183,16 +215,27 @@ def show_attention(result: dict[str, Any]) -> None:
 
 
 def _of_update(who: str, update: dict[str, Any]) -> str:
-    mfu = NOT_MEASURED if update.get("mfu") is None else f"{update['mfu']:.1%} (HFU {update['hfu']:.1%})"
+    mfu = (
+        NOT_MEASURED
+        if update.get("mfu") is None
+        else f"{update['mfu']:.1%} (HFU {update['hfu']:.1%})"
+    )
     gib = NOT_MEASURED if update["peak_gib"] is None else f"{update['peak_gib']:.1f} GiB"
-    return f"{who}: update {update['ms']:.1f} ms, {update['samples_per_s']:.1f} samples/s, MFU {mfu}, peak {gib}"
+    return (
+        f"{who}: update {update['ms']:.1f} ms, {update['samples_per_s']:.1f} samples/s, MFU {mfu},"
+        f" peak {gib}"
+    )
 
 
 def alone(
     result: dict[str, Any], models: Sequence[str], parts: Sequence[str], setup: Setup, workers: int
 ) -> Iterator[None]:
     """Add to `result` what one process measures, one row at a time."""
-    result |= {"machine": machine(), "device": setup.device.type, "cudnn": torch.backends.cudnn.version()}
+    result |= {
+        "machine": machine(),
+        "device": setup.device.type,
+        "cudnn": torch.backends.cudnn.version(),
+    }
     rows: dict[str, dict[str, Any]] = result.setdefault("models", {})
     print(f"{result['machine']}; cuDNN {result['cudnn']}", flush=True)
     measures: dict[str, Callable[[str], dict[str, Any]]] = {
@@ -207,7 +250,10 @@ def alone(
             show_model(model, {part: rows[model][part]})
             yield
     if "lerobot" in parts and not find_spec("transformers"):
-        print("LeRobot's PI05: not measured, since transformers is not installed (the extra `vlm` has it)")
+        print(
+            "LeRobot's PI05: not measured, since transformers is not installed (the extra `vlm`"
+            " has it)"
+        )
     elif "lerobot" in parts:
         from gpu_lerobot import lerobot_row
 
@@ -217,8 +263,12 @@ def alone(
         yield
     if "attention" in parts:
         small = setup.device.type != "cuda"
-        result["attention"] = attention_rows(setup, (32, 32, 8, 4), 32) if small else attention_rows(setup)
-        result["nan"] = nan_sweep(setup, range(8, 24, 8) if small else range(256, 640, 4), 32 if small else 256)
+        result["attention"] = (
+            attention_rows(setup, (32, 32, 8, 4), 32) if small else attention_rows(setup)
+        )
+        result["nan"] = nan_sweep(
+            setup, range(8, 24, 8) if small else range(256, 640, 4), 32 if small else 256
+        )
         show_attention(result)
         yield
 
@@ -241,20 +291,30 @@ def write(output: Path | None, result: dict[str, Any]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print, write; 1 where a goal is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--models", nargs="+", default=["pi05", "tokendrop_expert"])
     parser.add_argument("--backbone", default="pi05", help="a file of configs/backbone")
     parser.add_argument("--batch", type=int, default=8, help="samples a process")
     parser.add_argument("--rounds", type=int, default=50)
-    parser.add_argument("--workers", type=int, default=8, help="processes that read the demonstrations")
+    parser.add_argument(
+        "--workers", type=int, default=8, help="processes that read the demonstrations"
+    )
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--attention", default="auto", help="backend in training: auto, sdpa, flex or varlen")
+    parser.add_argument(
+        "--attention", default="auto", help="backend in training: auto, sdpa, flex or varlen"
+    )
     parser.add_argument("--eager", action="store_true", help="compile no layers")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what is measured")
-    parser.add_argument("--output", type=Path, help="a JSON file, written after each row; rows that it has are kept")
+    parser.add_argument(
+        "--output", type=Path, help="a JSON file, written after each row; rows that it has are kept"
+    )
     args = parser.parse_args(arguments)
     device, rank, processes = join_processes(args.device)
-    setup = Setup(args.backbone, args.batch, args.rounds, device, not args.eager, args.attention, processes)
+    setup = Setup(
+        args.backbone, args.batch, args.rounds, device, not args.eager, args.attention, processes
+    )
     result: dict[str, Any] = {}
     if args.output is not None and args.output.exists():
         result = json.loads(args.output.read_text())

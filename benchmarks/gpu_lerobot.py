@@ -1,4 +1,6 @@
-"""The row of `gpu.py` about LeRobot's PI05 as shipped: the same images, prompt and chunk, its own code."""
+"""The row of `gpu.py` about LeRobot's PI05 as shipped: the same images, prompt and chunk, its own
+code.
+"""
 
 import statistics
 from typing import Any
@@ -14,15 +16,17 @@ STEPS = 10
 def lerobot_row(setup: Setup) -> dict[str, Any]:
     """An update (forward, backward, AdamW; no EMA, vision frozen) and a chunk, eager.
 
-    On a GPU at full size with bfloat16 weights and moments, as its own configuration offers; elsewhere reduced, in
-    float32.
+    On a GPU at full size with bfloat16 weights and moments, as its own configuration offers;
+    elsewhere reduced, in float32.
 
     Raises:
         ImportError: LeRobot or its transformers are not installed.
     """
     device, b = setup.device, setup.batch
     full = setup.backbone == "pi05"
-    source: Any = lerobot_pi05("bfloat16" if device.type == "cuda" else "float32", reduced=not full).to(device)
+    source: Any = lerobot_pi05(
+        "bfloat16" if device.type == "cuda" else "float32", reduced=not full
+    ).to(device)
     time = torch.full((b,), 0.5, device=device)
 
     def inputs(rows: int) -> tuple[Any, ...]:
@@ -41,6 +45,12 @@ def lerobot_row(setup: Setup) -> dict[str, Any]:
     source.eval()
     with torch.no_grad():
         chunk = milliseconds(
-            lambda: source.sample_actions(*alone, noise=noise, num_steps=STEPS), setup.rounds, 2, device
+            lambda: source.sample_actions(*alone, noise=noise, num_steps=STEPS),
+            setup.rounds,
+            2,
+            device,
         )
-    return {"training": row, "chunk": {"eager": {"p50_ms": statistics.median(chunk), "p99_ms": chunk[-1]}}}
+    return {
+        "training": row,
+        "chunk": {"eager": {"p50_ms": statistics.median(chunk), "p99_ms": chunk[-1]}},
+    }

@@ -1,13 +1,17 @@
-"""Memory that a full-size policy takes on a GPU, as PyTorch's allocator counts it: the tables of the pages on hardware.
+"""Memory that a full-size policy takes on a GPU, as PyTorch's allocator counts it: the tables of
+the pages on hardware.
 
     python benchmarks/gpu_memory.py chunk pi05
     python benchmarks/gpu_memory.py update pi05:8
-    python benchmarks/gpu_memory.py shared tokendrop_expert:8:8            # model:processes:samples a process
-    python benchmarks/gpu_memory.py shared pi05:4:16:all                   # … :recomputation (all, selective)
+    # model:processes:samples a process
+    python benchmarks/gpu_memory.py shared tokendrop_expert:8:8
+    # … :recomputation (all, selective)
+    python benchmarks/gpu_memory.py shared pi05:4:16:all
 
-One process a figure, one line of JSON. Weights hold whatever was in memory: nothing is learned, only counted. It asks
-for one GPU, or (with --no-cudnn) for a stand-in that computes nothing, as docs/evidence has it; `shared` is one of
-so many processes of one machine, and communicates with none.
+One process a figure, one line of JSON. Weights hold whatever was in memory: nothing is learned,
+only counted. It asks for one GPU, or (with --no-cudnn) for a stand-in that computes nothing, as
+docs/evidence has it; `shared` is one of so many processes of one machine, and communicates with
+none.
 """
 
 import argparse
@@ -46,19 +50,33 @@ def batch_of(policy: MMEPolicy, size: int) -> Batch:
     """A batch at its fullest, with vision tokens as a cache stores them."""
     full = policy.full_batch(DEVICE)
     if full.history is not None:
-        full = replace(full, history=replace(full.history, features=full.history.features.to(policy.history_dtype)))
+        full = replace(
+            full,
+            history=replace(full.history, features=full.history.features.to(policy.history_dtype)),
+        )
     return full.rows(torch.zeros(size, dtype=torch.int64, device=DEVICE))
 
 
 def chunk(model: str, backbone: str = "pi05") -> dict[str, float]:
     """A chunk of one episode, bfloat16 weights, captured as one graph and played again."""
-    policy = on_meta(model, backbone).to(torch.bfloat16).to_empty(device=DEVICE).eval().requires_grad_(False)
+    policy = (
+        on_meta(model, backbone)
+        .to(torch.bfloat16)
+        .to_empty(device=DEVICE)
+        .eval()
+        .requires_grad_(False)
+    )
     weights = torch.cuda.memory_allocated()
     policy.compile_sampling()
-    batch, noise = batch_of(policy, 1), torch.zeros(1, policy.horizon, policy.action_dim, device=DEVICE)
+    batch, noise = (
+        batch_of(policy, 1),
+        torch.zeros(1, policy.horizon, policy.action_dim, device=DEVICE),
+    )
     with torch.no_grad(), policy.autocast():
         memory = policy.encode_memory(batch.history)
-    batch = replace(batch, history=None, actions=None)  # an episode's tokens are counted where episodes are
+    batch = replace(
+        batch, history=None, actions=None
+    )  # an episode's tokens are counted where episodes are
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
     for _ in range(2):
@@ -74,9 +92,14 @@ def update(model: str, samples: int, backbone: str = "pi05") -> dict[str, float]
 
 
 def shared(
-    model: str, processes: int, samples: int, recompute: str = "", backbone: str = "pi05", mode: str = "full",
+    model: str,
+    processes: int,
+    samples: int,
+    recompute: str = "",
+    backbone: str = "pi05",
+    mode: str = "full",
     frozen_dtype: str | None = None,
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     """The same in one of so many processes that share weights, gradients, moments and averages."""
     from torch.testing._internal.distributed.fake_pg import FakeStore
 
@@ -98,10 +121,15 @@ def shared(
 
 def _updates(policy: MMEPolicy, samples: int, reshard: Callable[[], None]) -> dict[str, float]:
     learning = trainable(policy)
-    optimizer = make_optimizer(learning.values(), TrainSettings(steps=10, batch_size=samples, lr=1e-4))
+    optimizer = make_optimizer(
+        learning.values(), TrainSettings(steps=10, batch_size=samples, lr=1e-4)
+    )
     ema = EMA(learning, 0.999, reshard=reshard)
     batch = batch_of(policy, samples)
-    draws = {name: value.to(DEVICE) for name, value in policy.training_noise(samples, torch.Generator()).items()}
+    draws = {
+        name: value.to(DEVICE)
+        for name, value in policy.training_noise(samples, torch.Generator()).items()
+    }
     allocated = torch.cuda.memory_allocated()
     for _ in range(3):  # moments come with the first
         torch.cuda.reset_peak_memory_stats()
@@ -114,18 +142,27 @@ def _updates(policy: MMEPolicy, samples: int, reshard: Callable[[], None]) -> di
 
 
 def _peaks() -> dict[str, float]:
-    return {"peak": torch.cuda.max_memory_allocated() / GIB, "reserved": torch.cuda.max_memory_reserved() / GIB}
+    return {
+        "peak": torch.cuda.max_memory_allocated() / GIB,
+        "reserved": torch.cuda.max_memory_reserved() / GIB,
+    }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Count and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("chunk", "update", "shared"))
     parser.add_argument("of", help="the model and its numbers, as above")
     parser.add_argument("--backbone", default="pi05", help="a file of configs/backbone")
-    parser.add_argument("--mode", default="full", help="of `shared`: finetune (full, expert_only, lora)")
+    parser.add_argument(
+        "--mode", default="full", help="of `shared`: finetune (full, expert_only, lora)"
+    )
     parser.add_argument("--frozen-dtype", help="of `shared`: finetune.frozen_dtype")
-    parser.add_argument("--no-cudnn", action="store_true", help="leave cuDNN out: a stand-in has none")
+    parser.add_argument(
+        "--no-cudnn", action="store_true", help="leave cuDNN out: a stand-in has none"
+    )
     args = parser.parse_args(arguments)
     if not torch.cuda.is_available():
         parser.error("there is no GPU, nor one that computes nothing")
@@ -137,10 +174,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         peaks = update(model, int(numbers[0]), args.backbone)
     else:
         peaks = shared(
-            model, int(numbers[0]), int(numbers[1]), *numbers[2:3], backbone=args.backbone, mode=args.mode,
+            model,
+            int(numbers[0]),
+            int(numbers[1]),
+            *numbers[2:3],
+            backbone=args.backbone,
+            mode=args.mode,
             frozen_dtype=args.frozen_dtype,
-        )  # fmt: skip
-    print(json.dumps({"what": args.what, "of": args.of, **{name: round(gib, 2) for name, gib in peaks.items()}}))
+        )
+    print(
+        json.dumps(
+            {
+                "what": args.what,
+                "of": args.of,
+                **{name: round(gib, 2) for name, gib in peaks.items()},
+            }
+        )
+    )
     return 0
 
 

@@ -1,4 +1,6 @@
-"""What the parts of `gpu.py` share: what is measured and how, and policies, batches and FLOPs for it."""
+"""What the parts of `gpu.py` share: what is measured and how, and policies, batches and FLOPs for
+it.
+"""
 
 import os
 import time
@@ -16,16 +18,29 @@ from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.speed import HasAttentionBackends
 from mme_vla.types import Batch
 
-PEAKS = {"H100 PCIe": 756, "H100": 989, "H200": 989, "GH200": 989, "B200": 2250, "A100": 312, "A40": 150, "L40S": 362,
-         "RTX 4090": 165, "RTX 3090": 71}  # fmt: skip
-"""Dense bfloat16 TFLOP/s by a part of the device's name, the first that fits; vendors' data sheets."""
+PEAKS = {
+    "H100 PCIe": 756,
+    "H100": 989,
+    "H200": 989,
+    "GH200": 989,
+    "B200": 2250,
+    "A100": 312,
+    "A40": 150,
+    "L40S": 362,
+    "RTX 4090": 165,
+    "RTX 3090": 71,
+}
+"""Dense bfloat16 TFLOP/s by a part of the device's name, the first that fits; vendors'
+data sheets.
+"""
 
 
 @dataclass
 class Setup:
     """What is measured: sizes, device and how often.
 
-    backbone: a file of configs/backbone. batch: samples a process. processes: how many share an update.
+    backbone: a file of configs/backbone. batch: samples a process. processes: how many share an
+    update.
     """
 
     backbone: str
@@ -42,8 +57,12 @@ class Setup:
 
 
 def join_processes(device: str) -> tuple[torch.device, int, int]:
-    """This process's device, its rank and how many there are; a process that a launcher started joins the others."""
-    rank, processes = (int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("WORLD_SIZE", 1)))
+    """This process's device, its rank and how many there are; a process that a launcher started
+    joins the others.
+    """
+    rank, processes = (
+        int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("WORLD_SIZE", 1))
+    )
     place = torch.device(device)
     if place.type == "cuda":
         place = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
@@ -66,8 +85,12 @@ def peak_gib(device: torch.device) -> float | None:
     return torch.cuda.max_memory_allocated(device) / 2**30 if device.type == "cuda" else None
 
 
-def milliseconds(work: Callable[[], object], rounds: int, warmup: int, device: torch.device) -> list[float]:
-    """How long each round takes, the device's work included; ascending. A CPU is warmed up once at most."""
+def milliseconds(
+    work: Callable[[], object], rounds: int, warmup: int, device: torch.device
+) -> list[float]:
+    """How long each round takes, the device's work included; ascending. A CPU is warmed up once at
+    most.
+    """
     times = []
     warmup = warmup if device.type == "cuda" else min(warmup, 1)
     for index in range(warmup + rounds):
@@ -87,7 +110,8 @@ def wait(device: torch.device) -> None:
 
 
 def sample_flops(model: str, backbone: str) -> tuple[int, int]:
-    """FLOPs of a sample's forward and backward pass with a frozen tower, counted on the meta device.
+    """FLOPs of a sample's forward and backward pass with a frozen tower, counted on the meta
+    device.
 
     Returns:
         What the model needs, and what is computed: recurrent memories compute their window twice.

@@ -1,4 +1,6 @@
-"""The rows of `gpu.py` about training: an update by one process or by many, and how long it waits for data."""
+"""The rows of `gpu.py` about training: an update by one process or by many, and how long it waits
+for data.
+"""
 
 import statistics
 import tempfile
@@ -9,7 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gpu_setup import Setup, batch_of, built, draws_of, milliseconds, peak_flops, peak_gib, sample_flops, wait
+from gpu_setup import (
+    Setup,
+    batch_of,
+    built,
+    draws_of,
+    milliseconds,
+    peak_flops,
+    peak_gib,
+    sample_flops,
+    wait,
+)
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
@@ -24,20 +36,29 @@ from mme_vla.types import Batch
 def updating(
     policy: MMEPolicy, setup: Setup, strategy: str | None = None
 ) -> tuple[Callable[[Batch, dict[str, Tensor]], None], list[Tensor]]:
-    """An update of one model as the trainer makes it (forward, backward, clipping, AdamW, EMA), and its losses so far.
+    """An update of one model as the trainer makes it (forward, backward, clipping, AdamW, EMA), and
+    its losses so far.
 
     Args:
-        strategy: how processes share it: `ddp` (each has all weights) or `fsdp` (each a part); None for one process.
+        strategy: how processes share it: `ddp` (each has all weights) or `fsdp` (each a part); None
+            for one process.
     """
     if setup.compiled:
         policy.compile()
     model: nn.Module = policy
     if strategy == "fsdp":
-        shard(policy, ParallelSettings("fsdp").mesh(setup.device.type), policy.compute_dtype, setup.compiled)
+        shard(
+            policy,
+            ParallelSettings("fsdp").mesh(setup.device.type),
+            policy.compute_dtype,
+            setup.compiled,
+        )
     elif strategy == "ddp":
         model = DistributedDataParallel(policy, gradient_as_bucket_view=True)
     learning = {name: p for name, p in policy.named_parameters() if p.requires_grad}
-    optimizer = make_optimizer(learning.values(), TrainSettings(steps=1, batch_size=setup.batch, lr=1e-5))
+    optimizer = make_optimizer(
+        learning.values(), TrainSettings(steps=1, batch_size=setup.batch, lr=1e-5)
+    )
     ema = EMA(learning, 0.999, reshard=partial(reshard, policy))
     losses: list[Tensor] = []
 
@@ -76,7 +97,9 @@ def training(model: str, setup: Setup, strategy: str | None = None) -> dict[str,
 
 
 def feeding(model: str, setup: Setup, workers: int) -> dict[str, float]:
-    """Updates from the embedded demonstrations, read by `workers` processes: the share of time that waits for them."""
+    """Updates from the embedded demonstrations, read by `workers` processes: the share of time that
+    waits for them.
+    """
     policy, device = built(model, setup.backbone, setup.device, setup.attention), setup.device
     with tempfile.TemporaryDirectory() as folder:
         batches = _batches(policy, setup, workers, Path(folder))
@@ -94,10 +117,16 @@ def feeding(model: str, setup: Setup, workers: int) -> dict[str, float]:
         wait(device)
         took = time.perf_counter() - begun
         batches.close()
-    return {"workers": workers, "waiting": waited / took, "samples_per_s": setup.rounds * setup.batch / took}
+    return {
+        "workers": workers,
+        "waiting": waited / took,
+        "samples_per_s": setup.rounds * setup.batch / took,
+    }
 
 
-def _batches(policy: MMEPolicy, setup: Setup, workers: int, caches: Path) -> Generator[Batch, None, None]:
+def _batches(
+    policy: MMEPolicy, setup: Setup, workers: int, caches: Path
+) -> Generator[Batch, None, None]:
     """Batches of the embedded demonstrations in random order, without end."""
     from mme_vla.data.cache_building import ensure_cache
     from mme_vla.data.dataset import TrainingDataset
@@ -110,11 +139,21 @@ def _batches(policy: MMEPolicy, setup: Setup, workers: int, caches: Path) -> Gen
     cache = None
     if policy.memory is not None:
         fingerprint = policy.vision_fingerprint()
-        cache = [ensure_cache(source, policy.memory, policy.encode_frames, fingerprint, root=caches)]
+        cache = [
+            ensure_cache(source, policy.memory, policy.encode_frames, fingerprint, root=caches)
+        ]
     data = TrainingDataset([source], processor, policy.memory, cache)
-    endless = torch.utils.data.RandomSampler(data, replacement=True, num_samples=setup.batch * (setup.rounds + 64))
+    endless = torch.utils.data.RandomSampler(
+        data, replacement=True, num_samples=setup.batch * (setup.rounds + 64)
+    )
     loader = DataLoader(
-        data, setup.batch, sampler=endless, collate_fn=processor.collate, num_workers=workers, drop_last=True,
-        pin_memory=setup.device.type == "cuda", prefetch_factor=4 if workers else None,
-    )  # fmt: skip
+        data,
+        setup.batch,
+        sampler=endless,
+        collate_fn=processor.collate,
+        num_workers=workers,
+        drop_last=True,
+        pin_memory=setup.device.type == "cuda",
+        prefetch_factor=4 if workers else None,
+    )
     yield from loader

@@ -1,9 +1,11 @@
-"""How far a freshly added memory moves a memoryless π0.5: relative distance of the predicted velocity.
+"""How far a freshly added memory moves a memoryless π0.5: relative distance of the predicted
+velocity.
 
     python benchmarks/initial_distance.py
 
-Every variant gets the same weights as a `pi05` whose adaptive gates are open (a fresh π0.5 has them shut, which would
-hide everything); only the memory's own parameters are as initialised. Mean over eight random batches.
+Every variant gets the same weights as a `pi05` whose adaptive gates are open (a fresh π0.5 has them
+shut, which would hide everything); only the memory's own parameters are as initialised. Mean over
+eight random batches.
 """
 
 import argparse
@@ -31,7 +33,9 @@ def distance(name: str, **overrides: object) -> float:
 
 
 def main() -> None:
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     print("| model | relative distance at initialisation |\n|---|---:|")
     for name in NEURAL:
         print(f"| `{name}` | {distance(name):.1e} |")

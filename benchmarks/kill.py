@@ -2,9 +2,10 @@
 
     python benchmarks/kill.py [train cache convert evaluate record] [--every 1] [--times 5]
 
-The results must equal those of an undisturbed run bit by bit, apart from times. Each run is a fresh process. Python's
-audit events tell when it opens a file for writing, renames, removes or makes a folder: it is killed before every
-`--every`-th of these, and `--times` times after a random part of its duration, while libraries write their files.
+The results must equal those of an undisturbed run bit by bit, apart from times. Each run is a fresh
+process. Python's audit events tell when it opens a file for writing, renames, removes or makes a
+folder: it is killed before every `--every`-th of these, and `--times` times after a random part of
+its duration, while libraries write their files.
 """
 
 import argparse
@@ -30,24 +31,34 @@ SMALL = (
     "backbone.vision.patch_size=2 memory.budget=64"
 )
 RECIPE = (
-    "train.steps=3 train.save_every=1 train.log_every=1 train.val_every=2 train.val_samples=1 train.batch_size=1 "
-    "train.open_loop_chunks=1 train.device=cpu train.workers=0 train.keep.last=1 logger=none"
+    "train.steps=3 train.save_every=1 train.log_every=1 train.val_every=2 train.val_samples=1"
+    " train.batch_size=1 train.open_loop_chunks=1 train.device=cpu train.workers=0"
+    " train.keep.last=1 logger=none"
 )
 COMMANDS = {
     "train": f"train {SMALL} {RECIPE} data.cache.root=cache output=out/run resume=auto",
     "cache": f"cache {SMALL} data.cache.root=out device=cpu",
     "convert": "convert input=recordings output=out/dataset",
-    "evaluate": "evaluate model=pi05 backbone=tiny tasks=[StopCube] episodes=2 max_steps=2 workers=1 render=false "
-                "flow_steps=1 seed=7 output=out/run",
-    "record": "record task=[StopCube,PickXtimes] episodes=1 frames=[0] workers=1 output=out/dataset hdf5=out/files",
-}  # fmt: skip
-"""Words after `mme-vla`, run in a folder with the inputs `cache` and `recordings`. Results are below `out`."""
+    "evaluate": (
+        "evaluate model=pi05 backbone=tiny tasks=[StopCube] episodes=2 max_steps=2 workers=1"
+        " render=false flow_steps=1 seed=7 output=out/run"
+    ),
+    "record": (
+        "record task=[StopCube,PickXtimes] episodes=1 frames=[0] workers=1 output=out/dataset"
+        " hdf5=out/files"
+    ),
+}
+"""Words after `mme-vla`, run in a folder with the inputs `cache` and `recordings`. Results are
+below `out`.
+"""
 
 RUN = """
 import os, runpy, signal, sys
-below, kill_at, log = os.path.join(os.getcwd(), "out"), int(sys.argv[1]), os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT)
+below, kill_at = os.path.join(os.getcwd(), "out"), int(sys.argv[1])
+log = os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT)
 main, count = os.getpid(), 0
-CHANGES = {"os.rename": 1, "os.remove": 0, "os.mkdir": 0, "os.rmdir": 0, "os.link": 1, "os.symlink": 1}
+CHANGES = {"os.rename": 1, "os.remove": 0, "os.mkdir": 0, "os.rmdir": 0}
+CHANGES |= {"os.link": 1, "os.symlink": 1}
 def watch(event, args):
     global count
     if event == "open":
@@ -66,12 +77,16 @@ sys.argv = ["mme_vla", *sys.argv[3:]]
 runpy.run_module("mme_vla", run_name="__main__", alter_sys=True)
 """
 # What only tells when and how fast, and the checksums of lines that do.
-TIMES = re.compile(r'"(?:seconds|when|begun|speed/\w+|memory/gib|crc32)": ?(?:"[^"]*"|\{[^}]*\}|[-+.\w]+)')
+TIMES = re.compile(
+    r'"(?:seconds|when|begun|speed/\w+|memory/gib|crc32)": ?(?:"[^"]*"|\{[^}]*\}|[-+.\w]+)'
+)
 
 
 @dataclass
 class Outcome:
-    """Kills of one command: after how many it failed, ended with other results, or left other files behind."""
+    """Kills of one command: after how many it failed, ended with other results, or left other files
+    behind.
+    """
 
     command: str
     changes: int = 0
@@ -94,16 +109,31 @@ def results(folder: Path) -> dict[str, str]:
     return sums
 
 
-def run(words: str, base: Path, kill_at: int = 0, after: float | None = None) -> tuple[int, list[str], str]:
-    """Exit code, changes and errors of a command; it is killed before a change, or after so many seconds."""
+def run(
+    words: str, base: Path, kill_at: int = 0, after: float | None = None
+) -> tuple[int, list[str], str]:
+    """Exit code, changes and errors of a command; it is killed before a change, or after so many
+    seconds.
+    """
     log = base / "changes.log"
     log.unlink(missing_ok=True)
     path = os.pathsep.join([str(REPOSITORY), *sys.path[:1]])
-    variables = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "PYTHONHASHSEED": "0"}
+    variables = {
+        **os.environ,
+        "PYTHONPATH": path,
+        "OMP_NUM_THREADS": "1",
+        "HF_HUB_OFFLINE": "1",
+        "PYTHONHASHSEED": "0",
+    }
     process = subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", RUN, str(kill_at), str(log), *words.split()], cwd=base, env=variables,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
+        [sys.executable, "-W", "ignore", "-c", RUN, str(kill_at), str(log), *words.split()],
+        cwd=base,
+        env=variables,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
     try:
         _, errors = process.communicate(timeout=600 if after is None else after)
     except subprocess.TimeoutExpired:
@@ -113,7 +143,9 @@ def run(words: str, base: Path, kill_at: int = 0, after: float | None = None) ->
 
 
 def attack(name: str, every: int, times: int, base: Path) -> Outcome:
-    """Kill a command in each way, and compare what its repetition writes with an undisturbed run."""
+    """Kill a command in each way, and compare what its repetition writes with an
+    undisturbed run.
+    """
     words, outcome, out = COMMANDS[name], Outcome(name), base / "out"
     begun = time.monotonic()
     code, changes, errors = run(words, base)
@@ -138,7 +170,8 @@ def attack(name: str, every: int, times: int, base: Path) -> Outcome:
         if again or wrong or left:
             last = observed[-1] if observed else "no change"
             outcome.places.append(
-                f"{way} at {last}: exit {again}, {wrong[:4]}, {left[:4]} {errors[-300:] * bool(again)}"
+                f"{way} at {last}: exit {again}, {wrong[:4]}, {left[:4]}"
+                f" {errors[-300:] * bool(again)}"
             )
     shutil.rmtree(out, ignore_errors=True)
     return outcome
@@ -146,10 +179,24 @@ def attack(name: str, every: int, times: int, base: Path) -> Outcome:
 
 def main() -> None:
     """Run the attacks and print their table."""
-    parser = argparse.ArgumentParser("python benchmarks/kill.py", description=__doc__.splitlines()[0])
-    parser.add_argument("commands", nargs="*", default=list(COMMANDS), help=f"of {', '.join(COMMANDS)}; default: all")
-    parser.add_argument("--every", type=int, default=1, help="kill before every so manieth change (default: each)")
-    parser.add_argument("--times", type=int, default=5, help="kills after a random part of the duration (default: 5)")
+    parser = argparse.ArgumentParser(
+        "python benchmarks/kill.py", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument(
+        "commands",
+        nargs="*",
+        default=list(COMMANDS),
+        help=f"of {', '.join(COMMANDS)}; default: all",
+    )
+    parser.add_argument(
+        "--every", type=int, default=1, help="kill before every so manieth change (default: each)"
+    )
+    parser.add_argument(
+        "--times",
+        type=int,
+        default=5,
+        help="kills after a random part of the duration (default: 5)",
+    )
     parser.add_argument("--json", type=Path, help="write the outcomes here")
     args = parser.parse_args()
     if unknown := set(args.commands) - set(COMMANDS):
@@ -166,7 +213,10 @@ def main() -> None:
         for name in args.commands:
             o = attack(name, args.every, args.times, base)
             outcomes.append(o)
-            print(f"| {name} | {o.changes} | {o.kills} | {o.refused} | {o.wrong} | {o.left} |", flush=True)
+            print(
+                f"| {name} | {o.changes} | {o.kills} | {o.refused} | {o.wrong} | {o.left} |",
+                flush=True,
+            )
     print("\n".join(f"{o.command}: {place}" for o in outcomes for place in o.places))
     if args.json:
         args.json.write_text(json.dumps([asdict(o) for o in outcomes], indent=2) + "\n")

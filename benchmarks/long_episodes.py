@@ -1,10 +1,12 @@
-"""What a decision costs as an episode grows: after so many frames, with one replan every 16.
+r"""What a decision costs as an episode grows: after so many frames, with one replan every 16.
 
-    OMP_NUM_THREADS=1 python benchmarks/long_episodes.py [--models ttt_modul rmt_modul] [--frames 80 560 1300]
+    OMP_NUM_THREADS=1 python benchmarks/long_episodes.py [--models ttt_modul rmt_modul] \
+        [--frames 80 560 1300]
 
-Tiny and untrained. Median of the last decisions before each length: taking the new frames (`observe`), the decision
-itself (`act`), and what is prepared for the next one while the robot moves (`prepare`); `--no-prepare` leaves that
-out, so that a decision does it all. CPU time, since other work disturbs it less.
+Tiny and untrained. Median of the last decisions before each length: taking the new frames
+(`observe`), the decision itself (`act`), and what is prepared for the next one while the robot
+moves (`prepare`); `--no-prepare` leaves that out, so that a decision does it all. CPU time, since
+other work disturbs it less.
 """
 
 import argparse
@@ -43,13 +45,24 @@ def decisions(policy: MMEPolicy, frames: int, prepare: bool) -> list[tuple[float
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print a Markdown table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--models", nargs="+", default=["tokendrop_modul", "ttt_modul", "rmt_modul"])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--models", nargs="+", default=["tokendrop_modul", "ttt_modul", "rmt_modul"]
+    )
     parser.add_argument("--frames", nargs="+", type=int, default=[80, 560, 1064, 1300])
-    parser.add_argument("--no-prepare", action="store_true", help="leave everything to the decision itself")
+    parser.add_argument(
+        "--no-prepare", action="store_true", help="leave everything to the decision itself"
+    )
     args = parser.parse_args(arguments)
     print(f"{machine()}; ms of CPU time: frames taken / decision / prepared for the next\n")
-    print("| model | " + " | ".join(f"{n:,} frames" for n in args.frames) + " |\n|---|" + "---:|" * len(args.frames))
+    print(
+        "| model | "
+        + " | ".join(f"{n:,} frames" for n in args.frames)
+        + " |\n|---|"
+        + "---:|" * len(args.frames)
+    )
     for model in args.models:
         rows = decisions(small_policy(model), max(args.frames), not args.no_prepare)
         cells = []

@@ -1,11 +1,14 @@
-"""SimpleMemVLA at nano size, with its video or without, on one task by choices: demonstrations, then training.
+"""SimpleMemVLA at nano size, with its video or without, on one task by choices: demonstrations,
+then training.
 
 python benchmarks/nano_simplememvla.py record --folder data/pick
 python benchmarks/nano_simplememvla.py train --folder data/pick --output outputs/video
 python benchmarks/nano_simplememvla.py train --folder data/pick --output outputs/no_video --no-video
-python benchmarks/nano_simplememvla.py measure --folder data/pick --output outputs/video/checkpoints/step_000900
+python benchmarks/nano_simplememvla.py measure --folder data/pick --output
+outputs/video/checkpoints/step_000900
 
-Frames are rendered only at decisions and where the video shows them. `mme-vla evaluate checkpoint=…` evaluates.
+Frames are rendered only at decisions and where the video shows them.
+`mme-vla evaluate checkpoint=…` evaluates.
 """
 
 import argparse
@@ -39,11 +42,20 @@ from mme_vla.types import stack_noise
 LEVEL, FIRST_SEED = "easy", 3_000_000
 HELD_OUT = 10  # one demonstration in so many only measures the loss
 WORDS = (
-    "model=simplememvla", "backbone=simplememvla_nano", "embodiment=robomme_choice_front",
-    "embodiment.action.horizon=4", "embodiment.action.execute=1", "policy.augment=false", "train=nano",
-    "+train.schedule=cosine", "train.lr=1e-3", "train.log_every=25", "train.val_every=100", "train.val_samples=48",
+    "model=simplememvla",
+    "backbone=simplememvla_nano",
+    "embodiment=robomme_choice_front",
+    "embodiment.action.horizon=4",
+    "embodiment.action.execute=1",
+    "policy.augment=false",
+    "train=nano",
+    "+train.schedule=cosine",
+    "train.lr=1e-3",
+    "train.log_every=25",
+    "train.val_every=100",
+    "train.val_samples=48",
     "train.save_every=100",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -55,7 +67,9 @@ class VideoFrames:
 
     def read(self, frames: np.ndarray, exec_start: int) -> frozenset[int]:
         """Those shown at any of these frames [n]."""
-        return frozenset(np.concatenate([self.window.frames(int(frame)) for frame in frames]).tolist())
+        return frozenset(
+            np.concatenate([self.window.frames(int(frame)) for frame in frames]).tolist()
+        )
 
 
 def composed(*words: str) -> dict[str, Any]:
@@ -70,8 +84,12 @@ def record(task: str, folder: Path, count: int) -> list[Path]:
     window = Window(window_section["seconds"], window_section["fps"], window_section["native_fps"])
     choices: Any = (VideoFrames(window),)
     folder.mkdir(parents=True, exist_ok=True)
-    scene = Scene(task, FIRST_SEED, LEVEL, folder, tuple(robot.camera_names), choices, False, robot.action)
-    return demonstrate([Group((replace(scene, seed=seed) for seed in itertools.count(FIRST_SEED)), count)])
+    scene = Scene(
+        task, FIRST_SEED, LEVEL, folder, tuple(robot.camera_names), choices, False, robot.action
+    )
+    return demonstrate(
+        [Group((replace(scene, seed=seed) for seed in itertools.count(FIRST_SEED)), count)]
+    )
 
 
 def decisions(policy: SimpleMemVlaPolicy, files: Sequence[Path]) -> list[dict[str, Any]]:
@@ -83,7 +101,9 @@ def decisions(policy: SimpleMemVlaPolicy, files: Sequence[Path]) -> list[dict[st
             chunk, recorded = made.motions.chunk(frame, action.horizon)
             video = np.stack([made.images[camera][i] for i in processor.frames(frame).tolist()])
             subtask, none = made.subgoals["simple"][place], np.zeros((0, action.width), np.float32)
-            sample = Sample({camera: video}, made.states[frame : frame + 1], made.goal, subtask, none, chunk)
+            sample = Sample(
+                {camera: video}, made.states[frame : frame + 1], made.goal, subtask, none, chunk
+            )
             items.append({**processor.item(sample), "action_mask": torch.from_numpy(recorded)})
     return items
 
@@ -97,11 +117,27 @@ def train(files: Sequence[Path], output: Path, words: Sequence[str]) -> None:
         policy: Any = build_from_config(compose("train", [*WORDS, *words]))
         learnt = [file for number, file in enumerate(files, 1) if number % HELD_OUT]
         processor = policy.require_processor()
-        processor.stats = statistics((Demonstration.load(file, images=False) for file in learnt), policy)
-        samples, held_out = decisions(policy, learnt), decisions(policy, files[HELD_OUT - 1 :: HELD_OUT])
+        processor.stats = statistics(
+            (Demonstration.load(file, images=False) for file in learnt), policy
+        )
+        samples, held_out = (
+            decisions(policy, learnt),
+            decisions(policy, files[HELD_OUT - 1 :: HELD_OUT]),
+        )
         settings = TrainSettings.from_dict(config["train"], int(config["seed"]))
-        validation = Validation(held_out, processor.collate, settings.val_samples, settings.batch_size, settings.seed)
-        trainer = Trainer(policy, samples, processor.collate, validation, settings, run, config, Accelerator(cpu=True))
+        validation = Validation(
+            held_out, processor.collate, settings.val_samples, settings.batch_size, settings.seed
+        )
+        trainer = Trainer(
+            policy,
+            samples,
+            processor.collate,
+            validation,
+            settings,
+            run,
+            config,
+            Accelerator(cpu=True),
+        )
         line, loggers = ProgressLine(settings.steps, run.step), open_loggers(output, {}, run.step)
         line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(learnt)} demonstrations")
         with line:
@@ -137,7 +173,9 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--task", default="PickXtimes")
     parser.add_argument("--count", type=int, default=110)
-    parser.add_argument("--output", type=Path, help="of train: a run folder; of measure: a checkpoint")
+    parser.add_argument(
+        "--output", type=Path, help="of train: a run folder; of measure: a checkpoint"
+    )
     parser.add_argument("--no-video", action="store_true")
     parser.add_argument("overrides", nargs="*", help="train.steps=300 …")
     args = parser.parse_intermixed_args()
@@ -146,7 +184,9 @@ def main() -> None:
         measure(files, args.output)
     elif args.command == "train":
         video = f"processor.video={'false' if args.no_video else 'true'}"
-        train(files, args.output, [video, "train.steps=900", "train.batch_size=16", *args.overrides])
+        train(
+            files, args.output, [video, "train.steps=900", "train.batch_size=16", *args.overrides]
+        )
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python benchmarks/opening.py [--episodes 1600] [--frames 480]
 
-The embedded sample, then a dataset of that many episodes with two cameras, ten episodes a video file. Each is opened
-three times: the first time its tables are copied into the cache folder.
+The embedded sample, then a dataset of that many episodes with two cameras, ten episodes a video
+file. Each is opened three times: the first time its tables are copied into the cache folder.
 """
 
 import argparse
@@ -50,22 +50,32 @@ def write(root: Path, episodes: int, frames: int) -> None:
             numbers = rng.normal(size=(len(episode), 8)).astype(np.float32)
             values[name] = pa.FixedSizeListArray.from_arrays(pa.array(numbers.ravel()), 8)
         columns = {
-            **values, "is_demo": np.zeros(len(episode), bool), "timestamp": (frame / FPS).astype(np.float32),
-            "frame_index": frame, "episode_index": episode, "index": episode * frames + frame,
+            **values,
+            "is_demo": np.zeros(len(episode), bool),
+            "timestamp": (frame / FPS).astype(np.float32),
+            "frame_index": frame,
+            "episode_index": episode,
+            "index": episode * frames + frame,
             "task_index": episode % TASKS,
-        }  # fmt: skip
+        }
         pq.write_table(pa.table(columns), root / f"data/chunk-000/file-{number:03d}.parquet")
     number = np.arange(episodes)
     tasks = [f"do thing {i}" for i in range(TASKS)]
     about = {
-        "episode_index": number, "length": np.full(episodes, frames), "dataset_from_index": number * frames,
-        "dataset_to_index": (number + 1) * frames, "tasks": [[tasks[i % TASKS]] for i in number],
-    }  # fmt: skip
+        "episode_index": number,
+        "length": np.full(episodes, frames),
+        "dataset_from_index": number * frames,
+        "dataset_to_index": (number + 1) * frames,
+        "tasks": [[tasks[i % TASKS]] for i in number],
+    }
     for camera in CAMERAS:
         begin = number % IN_VIDEO * frames / FPS
         about |= {f"videos/{camera}/chunk_index": np.zeros(episodes, int)}
         about |= {f"videos/{camera}/file_index": number // IN_VIDEO}
-        about |= {f"videos/{camera}/from_timestamp": begin, f"videos/{camera}/to_timestamp": begin + frames / FPS}
+        about |= {
+            f"videos/{camera}/from_timestamp": begin,
+            f"videos/{camera}/to_timestamp": begin + frames / FPS,
+        }
         folder = root / "videos" / camera / "chunk-000"
         folder.mkdir(parents=True)
         write_video(folder / "file-000.mp4", IN_VIDEO * frames)
@@ -76,17 +86,24 @@ def write(root: Path, episodes: int, frames: int) -> None:
     table = pd.DataFrame({"task_index": range(TASKS)}, index=pd.Index(tasks, name="task"))
     table.to_parquet(root / "meta/tasks.parquet")
     shapes = {
-        **dict.fromkeys(CAMERAS, ("video", [SIDE, SIDE, 3])), **dict.fromkeys(("state", "actions"), ("float32", [8])),
-        "is_demo": ("bool", [1]), "timestamp": ("float32", [1]),
+        **dict.fromkeys(CAMERAS, ("video", [SIDE, SIDE, 3])),
+        **dict.fromkeys(("state", "actions"), ("float32", [8])),
+        "is_demo": ("bool", [1]),
+        "timestamp": ("float32", [1]),
         **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), ("int64", [1])),
-    }  # fmt: skip
-    features = {name: {"dtype": kind, "shape": shape, "names": None} for name, (kind, shape) in shapes.items()}
+    }
+    features = {
+        name: {"dtype": kind, "shape": shape, "names": None}
+        for name, (kind, shape) in shapes.items()
+    }
     info = {"codebase_version": "v3.0", "fps": FPS, "features": features}
     (root / "meta/info.json").write_text(json.dumps(info))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--episodes", type=int, default=1600, help="a multiple of ten")
     parser.add_argument("--frames", type=int, default=480, help="of an episode")
     args = parser.parse_args()
@@ -101,7 +118,10 @@ def main() -> None:
                 begin, cpu = time.perf_counter(), time.process_time()
                 source = EpisodeSource(name)
                 seconds, busy = time.perf_counter() - begin, time.process_time() - cpu
-                print(f"{source.name}, {len(source)} episodes, {opening} opening: {seconds:.2f} s ({busy:.2f} s CPU)")
+                print(
+                    f"{source.name}, {len(source)} episodes, {opening} opening: {seconds:.2f} s"
+                    f" ({busy:.2f} s CPU)"
+                )
 
 
 if __name__ == "__main__":

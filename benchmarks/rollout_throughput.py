@@ -1,10 +1,13 @@
-"""Episodes a minute: one environment and no batches, against several workers without and with a batching policy.
+r"""Episodes a minute: one environment and no batches, against several workers without and with a
+batching policy.
 
-    python benchmarks/rollout_throughput.py [--model framesamp_modul] [--workers 2] [--steps 64] [--no-render]
+    python benchmarks/rollout_throughput.py [--model framesamp_modul] [--workers 2] [--steps 64] \
+        [--no-render]
 
-All do the same episodes with the same noise, one contestant after the other in one run, on workers that are warm: the
-first episode of every worker, which imports the simulator, is not timed. The policy is tiny and untrained; its episodes
-run until the step limit, so that the work is the same whatever it does.
+All do the same episodes with the same noise, one contestant after the other in one run, on workers
+that are warm: the first episode of every worker, which imports the simulator, is not timed. The
+policy is tiny and untrained; its episodes run until the step limit, so that the work is the same
+whatever it does.
 """
 
 import argparse
@@ -21,7 +24,12 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import small_policy
 
-TASKS = ("PickXtimes", "StopCube", "BinFill", "SwingXtimes")  # none with a video: all steps are the policy's
+TASKS = (
+    "PickXtimes",
+    "StopCube",
+    "BinFill",
+    "SwingXtimes",
+)  # none with a video: all steps are the policy's
 
 
 @dataclass
@@ -35,7 +43,8 @@ class Measured:
 
     def row(self) -> list[str]:
         sim, render, policy = (
-            sum(getattr(r.seconds, part) for r in self.records) for part in ("sim", "render", "policy")
+            sum(getattr(r.seconds, part) for r in self.records)
+            for part in ("sim", "render", "policy")
         )
         steps = sum(record.steps for record in self.records)
         return [
@@ -53,10 +62,17 @@ class Measured:
 
 
 def measure(
-    policy: MMEPolicy, name: str, jobs: list[Job], workers: int, max_batch: int, args: argparse.Namespace
+    policy: MMEPolicy,
+    name: str,
+    jobs: list[Job],
+    workers: int,
+    max_batch: int,
+    args: argparse.Namespace,
 ) -> Measured:
     """Run these episodes on warm workers."""
-    settings = RolloutSettings(max_steps=args.steps, workers=workers, max_batch=max_batch, render=not args.no_render)
+    settings = RolloutSettings(
+        max_steps=args.steps, workers=workers, max_batch=max_batch, render=not args.no_render
+    )
     options = {"max_steps": args.steps, "render": not args.no_render}
     facts = RunFacts(args.model, "untrained", settings.seed, max_steps=args.steps)
     records: list[EpisodeRecord] = []
@@ -72,17 +88,32 @@ def measure(
 
 def main() -> None:
     """Measure and print a Markdown table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--model", default="framesamp_modul")
     parser.add_argument("--workers", type=int, default=2, help="of the batched contestant")
     parser.add_argument("--steps", type=int, default=64, help="step limit of an episode")
     parser.add_argument("--episodes", type=int, default=1, help="of each of the four tasks")
-    parser.add_argument("--no-render", action="store_true", help="black images: the simulation alone")
+    parser.add_argument(
+        "--no-render", action="store_true", help="black images: the simulation alone"
+    )
     args = parser.parse_args()
     policy = small_policy(args.model)
     jobs = [Job(task, "test", episode) for episode in range(args.episodes) for task in TASKS]
-    print(f"{args.model}, tiny · {len(jobs)} episodes of at most {args.steps + 1} steps · {machine()}\n")
-    columns = ["", "episodes/min", "steps/s", "simulation", "rendering", "policy", "policy over both"]
+    print(
+        f"{args.model}, tiny · {len(jobs)} episodes of at most {args.steps + 1} steps ·"
+        f" {machine()}\n"
+    )
+    columns = [
+        "",
+        "episodes/min",
+        "steps/s",
+        "simulation",
+        "rendering",
+        "policy",
+        "policy over both",
+    ]
     columns += ["policy a chunk", "batch", "wall"]
     print("| " + " | ".join(columns) + " |\n|---|" + "---:|" * (len(columns) - 1))
     results = [

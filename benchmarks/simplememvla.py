@@ -1,9 +1,10 @@
-"""What SimpleMemVLA costs: seconds of a decision over a long episode, FLOPs at full size, peak memory of a GPU.
+"""What SimpleMemVLA costs: seconds of a decision over a long episode, FLOPs at full size, peak
+memory of a GPU.
 
-python benchmarks/simplememvla.py time                  # tiny; a window of 20 s, an episode of 100 s
-python benchmarks/simplememvla.py count                 # on the meta device, beside framesamp_modul
-python benchmarks/simplememvla.py memory chunk          # of one GPU, or of a stand-in that computes nothing
-python benchmarks/simplememvla.py memory update
+python benchmarks/simplememvla.py time                  # tiny; a window of 20 s, an episode of 100
+s python benchmarks/simplememvla.py count                 # on the meta device, beside
+framesamp_modul python benchmarks/simplememvla.py memory chunk          # of one GPU, or of a
+stand-in that computes nothing python benchmarks/simplememvla.py memory update
 """
 
 import argparse
@@ -26,7 +27,9 @@ COMPARED = ("simplememvla", "framesamp_modul")
 
 
 def measure_time(steps: int, every: int) -> None:
-    """Seconds of decisions along one episode, without and with reading ahead; the latter is not in them."""
+    """Seconds of decisions along one episode, without and with reading ahead; the latter is not in
+    them.
+    """
     options: dict[str, Any] = {"processor": {"seconds": SECONDS, "max_words": 4}}
     policy: Any = build_policy("simplememvla", **options)
     policy.require_processor().stats = unit_stats(policy.embodiment)
@@ -37,20 +40,36 @@ def measure_time(steps: int, every: int) -> None:
         rows = []
         for step in range(0, steps, 16):
             count = 1 if step == 0 else 16
-            views = {name: rng.integers(0, 255, (count, side, side, 3), np.uint8) for name in ("front", "wrist")}
+            views = {
+                name: rng.integers(0, 255, (count, side, side, 3), np.uint8)
+                for name in ("front", "wrist")
+            }
             episode.observe(views, np.full((count, 8), 0.1, np.float32))
             begun = time.process_time()
             policy.act(episode)
-            rows.append((step, time.process_time() - begun, len(episode.video.frames), len(episode.video.patches)))
+            rows.append(
+                (
+                    step,
+                    time.process_time() - begun,
+                    len(episode.video.frames),
+                    len(episode.video.patches),
+                )
+            )
             while ahead and policy.prepare(episode):
                 pass
         seconds[ahead] = rows
     print(
-        "| frame | decision | after reading ahead | frames kept | temporal patches kept |\n|---:|---:|---:|---:|---:|"
+        "| frame | decision | after reading ahead | frames kept | temporal patches kept"
+        " |\n|---:|---:|---:|---:|---:|"
     )
-    for (step, base, frames, patches), (_, prepared, _, _) in zip(seconds[False], seconds[True], strict=True):
+    for (step, base, frames, patches), (_, prepared, _, _) in zip(
+        seconds[False], seconds[True], strict=True
+    ):
         if step % every == 0:
-            print(f"| {step} | {1e3 * base:,.0f} ms | {1e3 * prepared:,.0f} ms | {frames} | {patches} |")
+            print(
+                f"| {step} | {1e3 * base:,.0f} ms | {1e3 * prepared:,.0f} ms | {frames} |"
+                f" {patches} |"
+            )
 
 
 def count() -> None:
@@ -61,7 +80,10 @@ def count() -> None:
         policy: Any = on_meta(model)
         batch = policy.full_batch("meta")
         work = (lambda: policy(batch), lambda: policy.sample_actions(batch))  # noqa: B023
-        numbers = [*map(flops, work), *(update_flops(policy, batch, frozen) for frozen in (False, True))]
+        numbers = [
+            *map(flops, work),
+            *(update_flops(policy, batch, frozen) for frozen in (False, True)),
+        ]
         parameters = sum(p.numel() for p in policy.parameters())
         cells = [f"{number / TERA:.2f} T" for number in numbers]
         print(f"| `{model}` | {parameters:,} | {' | '.join(cells)} |", flush=True)
@@ -78,13 +100,17 @@ def update_flops(policy: Any, batch: Any, freeze_vision: bool) -> int:
 
 
 def _conv_gradients(made: Any, x: Any, weight: Any, *options: Any, **_: Any) -> int:
-    """FLOPs of a convolution's gradients, from shapes. PyTorch's own count of a grouped one is for a dense one."""
+    """FLOPs of a convolution's gradients, from shapes. PyTorch's own count of a grouped one is for
+    a dense one.
+    """
     transposed, needed = options[4], options[-1]
     return sum(needed[:2]) * conv_flop_count(x, weight, made, transposed)
 
 
 def memory(what: str, recompute: bool, cudnn: bool) -> None:
-    """Peak memory of a chunk (bfloat16 weights), or of two updates of one sample (AdamW over float32 weights)."""
+    """Peak memory of a chunk (bfloat16 weights), or of two updates of one sample (AdamW over
+    float32 weights).
+    """
     device = torch.device("cuda")
     torch.backends.cudnn.enabled = cudnn
     torch.backends.cuda.enable_cudnn_sdp(cudnn)
@@ -112,9 +138,13 @@ def memory(what: str, recompute: bool, cudnn: bool) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("figure", choices=("time", "count", "memory"))
-    parser.add_argument("what", nargs="?", default="chunk", choices=("chunk", "update"), help="of `memory`")
+    parser.add_argument(
+        "what", nargs="?", default="chunk", choices=("chunk", "update"), help="of `memory`"
+    )
     parser.add_argument("--steps", type=int, default=2000, help="frames of the episode")
     parser.add_argument("--every", type=int, default=160, help="frames between two rows")
     parser.add_argument("--keep", action="store_true", help="of an update: keep all activations")

@@ -2,9 +2,10 @@
 
     python benchmarks/sizes.py [--backbone pi05 | --prior]
 
-Training memory is weights, gradients, AdamW's two moments and the EMA in float32 for what is trained, plus the frozen
-tower; activations come on top. `--prior` counts the prior methods as their recipes (`configs/experiment`) train them:
-without an EMA where they have none, and frozen weights in the dtype that they are held in.
+Training memory is weights, gradients, AdamW's two moments and the EMA in float32 for what is
+trained, plus the frozen tower; activations come on top. `--prior` counts the prior methods as their
+recipes (`configs/experiment`) train them: without an EMA where they have none, and frozen weights
+in the dtype that they are held in.
 """
 
 import argparse
@@ -40,11 +41,15 @@ def of_model(name: str, backbone: str = "pi05") -> str:
     policy = build_policy(name, backbone=backbone, device="meta")
     total = sum(p.numel() for p in policy.parameters())
     frozen = sum(p.numel() for p in policy.backbone.vision.parameters())
-    return line(f"`{name}`", total, frozen, (total - frozen) * 5 * FULL_PRECISION + frozen * FULL_PRECISION)
+    return line(
+        f"`{name}`", total, frozen, (total - frozen) * 5 * FULL_PRECISION + frozen * FULL_PRECISION
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--backbone", default="pi05")
     parser.add_argument("--prior", action="store_true", help="the prior methods, by their recipes")
     args = parser.parse_args()
@@ -59,7 +64,9 @@ def main() -> None:
 
 
 def of_recipe(words: Sequence[str]) -> str:
-    """The line of a recipe: parameters without its adapters, and what its own fine-tuning keeps while training."""
+    """The line of a recipe: parameters without its adapters, and what its own fine-tuning keeps
+    while training.
+    """
     cfg = compose("train", list(words))
     options: Any = OmegaConf.to_container(cfg.finetune, resolve=True)
     policy = build_from_config(cfg, device="meta")
@@ -69,7 +76,9 @@ def of_recipe(words: Sequence[str]) -> str:
     copies = 4 + (cfg.train.ema > 0)
     learning = [p.numel() for p in policy.parameters() if p.requires_grad]
     still = [p for p in policy.parameters() if not p.requires_grad]
-    training = sum(learning) * copies * FULL_PRECISION + sum(p.numel() * p.element_size() for p in still)
+    training = sum(learning) * copies * FULL_PRECISION + sum(
+        p.numel() * p.element_size() for p in still
+    )
     name = f"`{cfg.name}`" + (f", stage `{cfg.policy.stage}`" if "stage" in cfg.policy else "")
     return line(name, total, sum(p.numel() for p in still), training)
 

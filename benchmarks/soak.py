@@ -1,10 +1,11 @@
 """Eight clients, well-behaved and not, against one server: `python benchmarks/soak.py [seconds]`.
 
-Starts `python -m mme_vla.serve` in a process of its own and lets eight clients loose on it for two minutes. Each does
-one thing after the other at random: an episode in either schema or by HTTP, a first message of 1,000 small frames, a
-disconnect in the middle of a request, malformed messages, garbage on the wire, a message over the limit. Four episodes
-are known beforehand, each served alone: every chunk of theirs is compared, and must differ from the other episodes'.
-Reads memory from /proc (Linux).
+Starts `python -m mme_vla.serve` in a process of its own and lets eight clients loose on it for two
+minutes. Each does one thing after the other at random: an episode in either schema or by HTTP, a
+first message of 1,000 small frames, a disconnect in the middle of a request, malformed messages,
+garbage on the wire, a message over the limit. Four episodes are known beforehand, each served
+alone: every chunk of theirs is compared, and must differ from the other episodes'. Reads memory
+from /proc (Linux).
 """
 
 import argparse
@@ -39,8 +40,22 @@ MALFORMED = 20  # malformed messages a client sends before something else
 TOLERANCE = 1e-4  # between batches of different sizes
 
 ODD: list[Any] = [
-    None, True, -1, 2**63, 1e400, float("nan"), "", "\u202e", "x" * 5000, b"", [], {}, [[]] * 50, {"a": {}}, [None],
-]  # fmt: skip
+    None,
+    True,
+    -1,
+    2**63,
+    1e400,
+    float("nan"),
+    "",
+    "\u202e",
+    "x" * 5000,
+    b"",
+    [],
+    {},
+    [[]] * 50,
+    {"a": {}},
+    [None],
+]
 
 
 class Mutations:
@@ -50,18 +65,42 @@ class Mutations:
         self._rng = random.Random(seed)
         frames, states = moving_frames(8, size=8), np.zeros((8, 8), np.float32)
         first, later = (
-            challenge(frames[part], states[part], first=i == 0) for i, part in enumerate((slice(4), slice(4, 8)))
+            challenge(frames[part], states[part], first=i == 0)
+            for i, part in enumerate((slice(4), slice(4, 8)))
         )
         image = np.zeros((8, 8, 3), np.uint8)
         state = np.zeros(8, np.float32)
-        view = {"observation/image": image, "observation/wrist_image": image, "observation/state": state}
-        buffer = {"add_buffer": True, "images": image[None, None], "state": state[None], "exec_start_idx": 0}
-        self._messages: list[dict[str, Any]] = [first, later, {**view, "prompt": "go"}, buffer, {"reset": True}]
+        view = {
+            "observation/image": image,
+            "observation/wrist_image": image,
+            "observation/state": state,
+        }
+        buffer = {
+            "add_buffer": True,
+            "images": image[None, None],
+            "state": state[None],
+            "exec_start_idx": 0,
+        }
+        self._messages: list[dict[str, Any]] = [
+            first,
+            later,
+            {**view, "prompt": "go"},
+            buffer,
+            {"reset": True},
+        ]
         self._packed = [pack(message) for message in self._messages]
 
     def next(self) -> bytes:
         """The next message."""
-        kinds = (self._noise, self._bytes, self._cut, self._splice, self._values, self._values, self._claims)
+        kinds = (
+            self._noise,
+            self._bytes,
+            self._cut,
+            self._splice,
+            self._values,
+            self._values,
+            self._claims,
+        )
         return self._rng.choice(kinds)()
 
     def _noise(self) -> bytes:
@@ -70,7 +109,9 @@ class Mutations:
     def _bytes(self) -> bytes:
         data = bytearray(self._rng.choice(self._packed))
         for _ in range(self._rng.randrange(1, 8)):
-            data[min(self._rng.randrange(len(data)), self._rng.randrange(len(data)))] = self._rng.randrange(256)
+            data[min(self._rng.randrange(len(data)), self._rng.randrange(len(data)))] = (
+                self._rng.randrange(256)
+            )
         return bytes(data)
 
     def _cut(self) -> bytes:
@@ -92,7 +133,9 @@ class Mutations:
             del message[key]
             message[str(key)[:-1]] = odd
         elif how == 2 and isinstance(message[key], np.ndarray):
-            message[key] = message[key][..., :-1].astype(self._rng.choice(["<f8", "|b1", "<U1", ">i2"]))
+            message[key] = message[key][..., :-1].astype(
+                self._rng.choice(["<f8", "|b1", "<U1", ">i2"])
+            )
         else:
             message[key] = odd
         return pack(message)
@@ -100,7 +143,9 @@ class Mutations:
     def _claims(self) -> bytes:
         size = self._rng.choice([0, 1, 17, 2**16, 2**31, 2**32 - 1])
         tag = self._rng.choice([0xC6, 0xC9, 0xDB, 0xDD, 0xDF])
-        inner = self._rng.choice([b"\x80", b"\x90", b"\x91" * 600, b"\xc0", b"\xdd\x00\x01\x00\x00"])
+        inner = self._rng.choice(
+            [b"\x80", b"\x90", b"\x91" * 600, b"\xc0", b"\xdd\x00\x01\x00\x00"]
+        )
         return bytes([tag]) + struct.pack(">I", size) + inner * self._rng.randrange(1, 200)
 
 
@@ -117,9 +162,12 @@ class Soak:
         small = np.repeat(moving_frames(20, size=32), LONG // 20, 0)
         self.long = challenge(small, np.zeros((LONG, 8), np.float32), first=True)
         self.expected = [self._alone(messages) for messages in self.episodes]
-        # Joint deltas, so that the states, which the answer is relative to, do not make the difference.
+        # Joint deltas, so that the states, which the answer is relative to, do not make the
+        # difference.
         deltas = [chunks[0][1] - chunks[0][0] for chunks in self.expected]
-        self.apart = min(float(np.abs(a - b).max()) for i, a in enumerate(deltas) for b in deltas[:i])
+        self.apart = min(
+            float(np.abs(a - b).max()) for i, a in enumerate(deltas) for b in deltas[:i]
+        )
 
     def _messages(self, seed: int) -> list[dict[str, Any]]:
         frames = moving_frames(10 + 16 * ROUNDS, seed=seed)
@@ -157,11 +205,20 @@ class Soak:
             client.reset()
             for step, message in enumerate(self.episodes[which]):
                 front = np.stack(message["front_rgb_list"])
-                state = np.array([[*j, g[0]] for j, g in zip(message["joint_state_list"], message["gripper_state_list"],
-                                                             strict=True)], np.float32)  # fmt: skip
+                state = np.array(
+                    [
+                        [*j, g[0]]
+                        for j, g in zip(
+                            message["joint_state_list"], message["gripper_state_list"], strict=True
+                        )
+                    ],
+                    np.float32,
+                )
                 client.add_buffer(front, state, exec_start=len(front) - 1 if step == 0 else 0)
                 view = {"observation/image": front[-1], "observation/wrist_image": front[-1]}
-                reply = client.infer({**view, "observation/state": state[-1], "prompt": message["task_goal"][0]})
+                reply = client.infer(
+                    {**view, "observation/state": state[-1], "prompt": message["task_goal"][0]}
+                )
                 self.compare(which, step, reply["actions"][:16])
 
     def http_episode(self, rng: random.Random) -> None:
@@ -200,7 +257,9 @@ class Soak:
         client.close()
 
     def garbage(self, rng: random.Random) -> None:
-        """Malformed messages by websocket and HTTP: each gets an error message, or happens to be well-formed."""
+        """Malformed messages by websocket and HTTP: each gets an error message, or happens to be
+        well-formed.
+        """
         mutations = Mutations(rng.randrange(2**32))
         for _ in range(MALFORMED):
             data = mutations.next()
@@ -208,9 +267,15 @@ class Soak:
                 client._socket.send(data)
                 reply = client._socket.recv(60)
             status, body = self.post(data, "garbage")
-            if status >= 500 or "Traceback" in str(reply) or b"Traceback" in body or not (reply and body):
+            if (
+                status >= 500
+                or "Traceback" in str(reply)
+                or b"Traceback" in body
+                or not (reply and body)
+            ):
                 raise AssertionError(
-                    f"{data[:100]!r} was answered with {reply[:100]!r} and HTTP {status} {body[:100]!r}"
+                    f"{data[:100]!r} was answered with {reply[:100]!r} and HTTP {status}"
+                    f" {body[:100]!r}"
                 )
             self.counts["malformed messages"] += 2
 
@@ -233,8 +298,16 @@ class Soak:
             return
         raise AssertionError("an oversized message was answered")
 
-    KINDS = ("episode", "buffered_episode", "http_episode", "long_first_message", "vanish", "garbage",
-             "garbage_on_the_wire", "oversized")  # fmt: skip
+    KINDS = (
+        "episode",
+        "buffered_episode",
+        "http_episode",
+        "long_first_message",
+        "vanish",
+        "garbage",
+        "garbage_on_the_wire",
+        "oversized",
+    )
 
     def client(self, number: int) -> None:
         rng = random.Random(number)
@@ -284,7 +357,9 @@ def resident_mib(process: int) -> float:
 def main(seconds: float) -> int:
     """Soak, print the figures; 1 if anything was not as it must be."""
     with tempfile.TemporaryDirectory() as folder:
-        small_policy("framesamp_modul").save_pretrained(folder)  # open gates: memory changes actions
+        small_policy("framesamp_modul").save_pretrained(
+            folder
+        )  # open gates: memory changes actions
         return soak_server(folder, seconds)
 
 
@@ -324,11 +399,19 @@ def soak_server(checkpoint: str, seconds: float) -> int:
     health = np.percentile(soak.health, [50, 95, 100]) * 1e3
     print(machine())
     print(f"{CLIENTS} clients, {seconds:g} s:", dict(sorted(soak.counts.items())))
-    print(f"difference from the same episode alone {soak.worst:.1e}, between episodes at least {soak.apart:.1e}")
+    print(
+        f"difference from the same episode alone {soak.worst:.1e}, between episodes at least"
+        f" {soak.apart:.1e}"
+    )
     print("server:", json.dumps(stats))
     print("memory MiB, every 10 s:", " ".join(f"{mib:.0f}" for mib in memory[::10]))
-    print(f"memory MiB: start {memory[0]:.0f}, median of middle third {early:.0f}, of last third {late:.0f}")
-    print(f"/healthz while serving, ms: p50 {health[0]:.1f}, p95 {health[1]:.1f}, max {health[2]:.1f}")
+    print(
+        f"memory MiB: start {memory[0]:.0f}, median of middle third {early:.0f}, of last third"
+        f" {late:.0f}"
+    )
+    print(
+        f"/healthz while serving, ms: p50 {health[0]:.1f}, p95 {health[1]:.1f}, max {health[2]:.1f}"
+    )
     print(f"exit code {code}; last words: {log[-1].strip()}")
     tracebacks = sum("Traceback" in line for line in log)
     problems = [*soak.wrong, *(["the server logged a traceback"] * tracebacks)]
@@ -337,12 +420,19 @@ def soak_server(checkpoint: str, seconds: float) -> int:
     if late > early * 1.05:
         problems.append(f"memory grew from {early:.0f} to {late:.0f} MiB")
     if code != 0 or stats["connections"] != 1 or stats["counts"].get("failed"):
-        problems.append(f"exit code {code}, {stats['connections'] - 1} connections left, counts {stats['counts']}")
+        problems.append(
+            f"exit code {code}, {stats['connections'] - 1} connections left, counts"
+            f" {stats['counts']}"
+        )
     print("\n".join(["PROBLEMS", *problems[:20], *log[-20:]]) if problems else "no problem")
     return bool(problems)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("seconds", nargs="?", type=float, default=120, help="how long the clients are at it")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "seconds", nargs="?", type=float, default=120, help="how long the clients are at it"
+    )
     raise SystemExit(main(parser.parse_args().seconds))

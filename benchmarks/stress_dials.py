@@ -1,9 +1,12 @@
-"""How far each dial of `split=stress` goes: who knows everything, does it still solve the test scenes?
+"""How far each dial of `split=stress` goes: who knows everything, does it still solve the test
+scenes?
 
-`python benchmarks/stress_dials.py --output benchmarks/stress_dials.csv` (continues where it was stopped)
+`python benchmarks/stress_dials.py --output benchmarks/stress_dials.csv` (continues where it was
+stopped)
 
-Two know everything. The demonstrator moves the arm as it records. The oracle planner is `mme_vla.play`'s: it acts from
-outside, as a policy in an evaluation does, by choices and pixels, and has so many control steps after the video.
+Two know everything. The demonstrator moves the arm as it records. The oracle planner is
+`mme_vla.play`'s: it acts from outside, as a policy in an evaluation does, by choices and pixels,
+and has so many control steps after the video.
 """
 
 import argparse
@@ -22,9 +25,13 @@ from mme_vla.play.players import play
 from mme_vla.play.run import make_session
 
 VALUES = {
-    "count": (0, 2, 5, 10), "containers": (0, 2, 5, 10), "swaps": (0, 2, 5, 10), "delay": (0, 100, 400),
-    "path": (0, 1, 2, 4), "distractors": (0, 2, 4, 8),
-}  # fmt: skip
+    "count": (0, 2, 5, 10),
+    "containers": (0, 2, 5, 10),
+    "swaps": (0, 2, 5, 10),
+    "delay": (0, 100, 400),
+    "path": (0, 1, 2, 4),
+    "distractors": (0, 2, 4, 8),
+}
 EPISODES = {"count": 4}
 """The first so many of `test`; of the other dials three."""
 KEY = ("actor", "dial", "task", "value", "episode")
@@ -37,7 +44,9 @@ type Ended = tuple[str, int, int]
 def demonstrator(dial: str, task: str, value: int, episode: int) -> Ended:
     """A demonstration without images."""
     spec = metadata.episode(task, "test", episode)
-    env = make_task(task, render=False, seed=spec.seed, difficulty=spec.difficulty, stress={dial: value})
+    env = make_task(
+        task, render=False, seed=spec.seed, difficulty=spec.difficulty, stress={dial: value}
+    )
     try:
         done = Recorder(env, render=False).record()
     finally:
@@ -57,7 +66,10 @@ def oracle(dial: str, task: str, value: int, episode: int) -> Ended:
     return "failure" if session.status == "fail" else session.status, video + session.steps, video
 
 
-ACTORS: dict[str, Callable[[str, str, int, int], Ended]] = {"demonstrator": demonstrator, "oracle": oracle}
+ACTORS: dict[str, Callable[[str, str, int, int], Ended]] = {
+    "demonstrator": demonstrator,
+    "oracle": oracle,
+}
 
 
 def measure(actor: str, dial: str, task: str, value: int, episode: int) -> tuple[str | int, ...]:
@@ -71,7 +83,9 @@ def measure(actor: str, dial: str, task: str, value: int, episode: int) -> tuple
 
 def main() -> None:
     """Measure what the table does not hold yet."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--actors", nargs="+", default=list(ACTORS), choices=list(ACTORS))
     parser.add_argument("--dials", nargs="+", default=list(DIALS), choices=list(DIALS))
     parser.add_argument("--output", type=Path, required=True)

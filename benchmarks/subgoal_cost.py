@@ -1,14 +1,16 @@
-"""What a subgoal predictor costs in an episode, beside the policy that reads it: calls, tokens and FLOPs.
+"""What a subgoal predictor costs in an episode, beside the policy that reads it: calls, tokens and
+FLOPs.
 
     python benchmarks/subgoal_cost.py [--episodes 0 1 2 3]
 
-Plays the execution of demonstrations of the embedded sample through the real predictors, 16 steps at a time, with
-stand-ins for the models: they give the recorded subgoals (and MemER's keyframes) as answers, and count. Qwen3-VL-4B's
-FLOPs are those of PyTorch's `FlopCounterMode` over the real code on the meta device: vision tower, one pass over the
-question with keys and values kept, one pass for each token of the answer. Tokens of images are exact; words are
-counted with a small tokenizer of RoboMME's language, where Qwen's own would take about as many. Gemini's FLOPs are not
-known; its tokens of images are what its documentation says (258 an image and 258 a second of video), its thoughts
-are left out, and its price is that of configs/subgoal/gemini.yaml.
+Plays the execution of demonstrations of the embedded sample through the real predictors, 16 steps
+at a time, with stand-ins for the models: they give the recorded subgoals (and MemER's keyframes) as
+answers, and count. Qwen3-VL-4B's FLOPs are those of PyTorch's `FlopCounterMode` over the real code
+on the meta device: vision tower, one pass over the question with keys and values kept, one pass for
+each token of the answer. Tokens of images are exact; words are counted with a small tokenizer of
+RoboMME's language, where Qwen's own would take about as many. Gemini's FLOPs are not known; its
+tokens of images are what its documentation says (258 an image and 258 a second of video), its
+thoughts are left out, and its price is that of configs/subgoal/gemini.yaml.
 """
 
 import argparse
@@ -32,18 +34,32 @@ RUN = 16  # actions executed of a chunk
 IMAGE_TOKENS, SECOND = 258, 258  # Gemini's tokens of an image, and of a second of video
 QWEN3_VL_4B = {
     "text_config": {
-        "vocab_size": 151936, "hidden_size": 2560, "intermediate_size": 9728, "num_hidden_layers": 36,
-        "num_attention_heads": 32, "num_key_value_heads": 8, "head_dim": 128, "max_position_embeddings": 262144,
+        "vocab_size": 151936,
+        "hidden_size": 2560,
+        "intermediate_size": 9728,
+        "num_hidden_layers": 36,
+        "num_attention_heads": 32,
+        "num_key_value_heads": 8,
+        "head_dim": 128,
+        "max_position_embeddings": 262144,
         "rope_parameters": {
-            "rope_type": "default", "rope_theta": 5e6, "mrope_section": [24, 20, 20], "mrope_interleaved": True,
+            "rope_type": "default",
+            "rope_theta": 5e6,
+            "mrope_section": [24, 20, 20],
+            "mrope_interleaved": True,
         },
     },
     "vision_config": {
-        "depth": 24, "hidden_size": 1024, "intermediate_size": 4096, "num_heads": 16, "out_hidden_size": 2560,
-        "num_position_embeddings": 2304, "deepstack_visual_indexes": [5, 11, 17],
+        "depth": 24,
+        "hidden_size": 1024,
+        "intermediate_size": 4096,
+        "num_heads": 16,
+        "out_hidden_size": 2560,
+        "num_position_embeddings": 2304,
+        "deepstack_visual_indexes": [5, 11, 17],
     },
     "tie_word_embeddings": True,
-}  # fmt: skip
+}
 
 
 @cache
@@ -58,12 +74,16 @@ def qwen() -> Any:
 
 @cache
 def vision_flops(patches: int, n_images: int) -> int:
-    """The vision tower and its mergers on images of this many patches each, attention within each."""
+    """The vision tower and its mergers on images of this many patches each, attention
+    within each.
+    """
     tower = qwen().model.visual
     total = patches * n_images
     pixels = torch.empty(total, 3 * 2 * 16 * 16, device="meta")
     angles = torch.empty(total, 64, device="meta")
-    bounds = torch.arange(n_images + 1) * patches  # on the CPU: the attention splits by their values
+    bounds = (
+        torch.arange(n_images + 1) * patches
+    )  # on the CPU: the attention splits by their values
 
     def run() -> None:
         hidden = tower.patch_embed(pixels)
@@ -98,11 +118,15 @@ def language_flops(read: int, n_output: int) -> int:
 
         return flops(run)
 
-    return step(read, 0) + max(n_output - 1, 0) * step(1, read)  # the pass over the question gives the first token
+    return step(read, 0) + max(n_output - 1, 0) * step(
+        1, read
+    )  # the pass over the question gives the first token
 
 
 class CountingVLM:
-    """A fake `VLM`: returns the given answers, and counts FLOPs of Qwen3-VL-4B for each question."""
+    """A fake `VLM`: returns the given answers, and counts FLOPs of Qwen3-VL-4B for
+    each question.
+    """
 
     def __init__(self, tiny: VLM) -> None:
         self.tiny, self.next_reply, self.flops = tiny, "", 0
@@ -113,7 +137,9 @@ class CountingVLM:
         read = batch["input_ids"].shape[1]
         n_output = len(self.tiny.processor.tokenizer.encode(self.next_reply)) + 1
         for grid in ("image_grid_thw", "video_grid_thw"):
-            for time, height, width in batch.get(grid, torch.zeros(0, 3, dtype=torch.long)).tolist():
+            for time, height, width in batch.get(
+                grid, torch.zeros(0, 3, dtype=torch.long)
+            ).tolist():
                 self.flops += vision_flops(height * width, time)
         self.flops += language_flops(-(-read // 16) * 16, n_output)
         return [Completion(self.next_reply, read, n_output)]
@@ -133,11 +159,17 @@ class CountingClient:
                 read += len(self.tokenizer.encode(part["text"]))
             else:
                 video = part["inline_data"]["mime_type"] == "video/mp4"
-                read += SECOND * max(1, round(seconds(part["inline_data"]["data"]))) if video else IMAGE_TOKENS
+                read += (
+                    SECOND * max(1, round(seconds(part["inline_data"]["data"])))
+                    if video
+                    else IMAGE_TOKENS
+                )
         n_output = len(self.tokenizer.encode(self.next_reply))
         return SimpleNamespace(
             text=self.next_reply,
-            usage_metadata=SimpleNamespace(prompt_token_count=read, candidates_token_count=n_output),
+            usage_metadata=SimpleNamespace(
+                prompt_token_count=read, candidates_token_count=n_output
+            ),
             candidates=[],
         )
 
@@ -177,17 +209,29 @@ def expected_reply(name: str, kind: str, labels: Labels, step: int) -> str:
         return text
     displayed = [step] if step == labels.exec_start else list(range(step - 14, step + 1, 2))
     targets = keyframes(labels)
-    return memer_reply(text, [i for i, t in enumerate(displayed, 1) if any(0 <= t - k <= 1 for k in targets)])
+    return memer_reply(
+        text, [i for i, t in enumerate(displayed, 1) if any(0 <= t - k <= 1 for k in targets)]
+    )
 
 
 def measure(
-    name: str, kind: str, policy: str, predictor: Any, model: Any, episodes: Sequence[Labels], baseline: int
+    name: str,
+    kind: str,
+    policy: str,
+    predictor: Any,
+    model: Any,
+    episodes: Sequence[Labels],
+    baseline: int,
 ) -> list[str]:
     """Play these episodes; the cells of one row, means over them."""
     chunks = 0
     for labels in episodes:
         reply_at = partial(expected_reply, name, kind, labels)
-        chunks += play(predictor, labels, lambda step, reply_at=reply_at: setattr(model, "next_reply", reply_at(step)))
+        chunks += play(
+            predictor,
+            labels,
+            lambda step, reply_at=reply_at: setattr(model, "next_reply", reply_at(step)),
+        )
     n, usage = len(episodes), predictor.usage
     acting, reference = chunks * count_model(policy).chunk, chunks * baseline
     counted = isinstance(model, CountingVLM)
@@ -217,15 +261,25 @@ def count(demonstrations: Sequence[Demonstration]) -> None:
         ("qwenvl", "simple", "simplesg", QwenVL("simple", vlm=cast(VLM, simple)), simple),
         ("qwenvl", "grounded", "groundsg", QwenVL("grounded", vlm=cast(VLM, grounded)), grounded),
         ("memer", "grounded", "groundsg", Memer("grounded", vlm=cast(VLM, memer)), memer),
-        ("gemini", "grounded", "groundsg", Gemini("grounded", client=client, requests_per_minute=None), client),
+        (
+            "gemini",
+            "grounded",
+            "groundsg",
+            Gemini("grounded", client=client, requests_per_minute=None),
+            client,
+        ),
     ]
     for case in cases:
         print(f"| {' | '.join(measure(*case, episodes, baseline))} |", flush=True)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episodes", nargs="+", type=int, default=[0, 1, 2, 3], help="of the embedded sample")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--episodes", nargs="+", type=int, default=[0, 1, 2, 3], help="of the embedded sample"
+    )
     args = parser.parse_args()
     sample = open_input("sample")
     count([sample[index] for index in args.episodes])

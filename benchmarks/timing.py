@@ -1,4 +1,6 @@
-"""Shared by the benchmarks: timing that alternates between contestants, and a line about the machine."""
+"""Shared by the benchmarks: timing that alternates between contestants, and a line about the
+machine.
+"""
 
 import platform
 import statistics
@@ -22,9 +24,11 @@ def alternate(
     warmup: int = 2,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
-    """Median seconds of each, one call of each per round, so that a slow moment of the machine meets all alike.
+    """Median seconds of each, one call of each per round, so that a slow moment of the machine
+    meets all alike.
 
-    Where others use the machine too, `clock=time.process_time` counts this process's CPU time, of all its threads.
+    Where others use the machine too, `clock=time.process_time` counts this process's CPU time, of
+    all its threads.
     """
     seconds: dict[str, list[float]] = {name: [] for name in contestants}
     for index in range(warmup + rounds):
@@ -41,12 +45,17 @@ def alternate(
 def machine() -> str:
     """What the figures were measured on."""
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else f"CPU ({_cpu()})"
-    return f"{device}, {torch.get_num_threads()} threads, torch {version('torch')}, Python {platform.python_version()}"
+    return (
+        f"{device}, {torch.get_num_threads()} threads, torch {version('torch')}, Python"
+        f" {platform.python_version()}"
+    )
 
 
 def _cpu() -> str:
     try:
         with Path("/proc/cpuinfo").open() as info:
-            return next(line.split(":")[1].strip() for line in info if line.startswith("model name"))
+            return next(
+                line.split(":")[1].strip() for line in info if line.startswith("model name")
+            )
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()

@@ -1,4 +1,5 @@
-"""Does the demonstrator solve every twin of `split=twin` as it solves the test scene, to the last joint angle?
+"""Does the demonstrator solve every twin of `split=twin` as it solves the test scene, to the last
+joint angle?
 
 `python benchmarks/twins.py --episodes 3`
 """
@@ -32,7 +33,10 @@ def main() -> None:
     args = parser.parse_args()
     print("| task | scene | twin | the same joint states |\n|---|---|---|---|")
     for task in args.tasks:
-        pairs = [[demonstrate(task, episode, twin) for twin in (False, True)] for episode in range(args.episodes)]
+        pairs = [
+            [demonstrate(task, episode, twin) for twin in (False, True)]
+            for episode in range(args.episodes)
+        ]
         scene, twin = (f"{sum(pair[i][0] for pair in pairs)}/{args.episodes}" for i in (0, 1))
         same = sum(np.array_equal(one[1], other[1]) for one, other in pairs)
         print(f"| {task} | {scene} | {twin} | {same}/{args.episodes} |", flush=True)

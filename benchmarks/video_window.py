@@ -1,4 +1,6 @@
-"""A memory that only names frames: those of SimpleMemVLA's window, for `mme-vla record memory=… frames=choices`."""
+"""A memory that only names frames: those of SimpleMemVLA's window, for
+`mme-vla record memory=… frames=choices`.
+"""
 
 from collections.abc import Sequence
 
@@ -16,7 +18,9 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 class VideoWindow(MemoryModule):
     """Reads the frames that a `Window` shows; it makes no tokens."""
 
-    def __init__(self, d_vision: int, width: int, seconds: float = 60, fps: float = 2, native_fps: float = 20) -> None:
+    def __init__(
+        self, d_vision: int, width: int, seconds: float = 60, fps: float = 2, native_fps: float = 20
+    ) -> None:
         """Take the window's settings; `d_vision` and `width` are not used."""
         super().__init__()
         self.window = Window(seconds, fps, native_fps)
@@ -25,7 +29,9 @@ class VideoWindow(MemoryModule):
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return union_frames([np.unique(self.window.frames(int(step))) for step in steps])
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         return np.array([[step, 0]])
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:

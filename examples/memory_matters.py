@@ -1,22 +1,25 @@
 """Does the memory work? A stream whose target was visible only in the conditioning video.
 
-    python examples/memory_matters.py                         # every neural variant and pi05, two at a time
+    # every neural variant and pi05, two at a time
+    python examples/memory_matters.py
     python examples/memory_matters.py framesamp_modul --seconds 60
-    python examples/memory_matters.py my_model --config-dir configs    # a memory of your own, with its own options
+    # a memory of your own, with its own options
+    python examples/memory_matters.py my_model --config-dir configs
 
-In the video a square of one of four colours passes over the scene; when execution begins it is gone, and the right
-action depends on its colour alone. The current view, the goal and the state say nothing, so a policy without memory can
-only guess: `pi05` is always trained beside what is named. Prints the open-loop error of each policy on episodes it has
-not seen, and draws it.
+In the video a square of one of four colours passes over the scene; when execution begins it is
+gone, and the right action depends on its colour alone. The current view, the goal and the state say
+nothing, so a policy without memory can only guess: `pi05` is always trained beside what is named.
+Prints the open-loop error of each policy on episodes it has not seen, and draws it.
 
-The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; all but FrameSamp read every 4th
-frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At first a slot reads every token and
-every slot alike, and slots begin at random: with many slots and few tokens the frame is a small part of what a slot
-takes in, and what all slots have in common is learned late.
+The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; all but FrameSamp
+read every 4th frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At
+first a slot reads every token and every slot alike, and slots begin at random: with many slots and
+few tokens the frame is a small part of what a slot takes in, and what all slots have in common is
+learned late.
 
-The memories beyond the paper can be named too (`retrieval_modul`); what they change is in `OF_KIND`. In the video
-the arm leans aside, for each colour its own way: that is all that the memory `actions` is told, and `spacetime` beside
-its images.
+The memories beyond the paper can be named too (`retrieval_modul`); what they change is in
+`OF_KIND`. In the video the arm leans aside, for each colour its own way: that is all that the
+memory `actions` is told, and `spacetime` beside its images.
 """
 
 import argparse
@@ -42,8 +45,15 @@ from mme_vla.testing.small import ALL_BEYOND, NEURAL, cached_history
 from mme_vla.types import Batch, PastViews
 
 COLOURS = np.array([[220, 40, 40], [40, 200, 60], [50, 70, 230], [230, 210, 40]], np.uint8)
-ANSWERS = np.array([[1, 1, 1, 1, -1, -1, -1, -1], [1, -1, 1, -1, 1, -1, 1, -1],
-                    [-1, -1, 1, 1, 1, 1, -1, -1], [-1, 1, 1, -1, -1, 1, 1, -1]], np.float32)  # fmt: skip
+ANSWERS = np.array(
+    [
+        [1, 1, 1, 1, -1, -1, -1, -1],
+        [1, -1, 1, -1, 1, -1, 1, -1],
+        [-1, -1, 1, 1, 1, 1, -1, -1],
+        [-1, 1, 1, -1, -1, 1, 1, -1],
+    ],
+    np.float32,
+)
 SIZE, SQUARE = 64, 40  # pixels
 VIDEO, LENGTH = 8, 12  # frames of conditioning video, and of the whole episode
 MEMORYLESS = "pi05"
@@ -61,14 +71,23 @@ OF_KIND: dict[str, dict[str, Any]] = {
     "events": {"stride": 1, "gripper": 0.15},
     "pyramid": {"strides": [1, 4], "budget": 96},
     "keyframes": {"every": 2, "pool": LENGTH // 2 + 1, "budget": 96},
-    "actions": {"stride": 1, "max_steps": LENGTH, "max_video": VIDEO, "chunk": 4, "budget": 4, "grid": None},
+    "actions": {
+        "stride": 1,
+        "max_steps": LENGTH,
+        "max_video": VIDEO,
+        "chunk": 4,
+        "budget": 4,
+        "grid": None,
+    },
     "spacetime": {"frames": 6, "stride": 2, "every": 1, "budget": None, "grid": None},
 }
 
 
 @dataclass
 class Stream:
-    """One synthetic episode: its colour, its frames [t, h, w, 3], what the arm felt and did [t, 17], and its tokens."""
+    """One synthetic episode: its colour, its frames [t, h, w, 3], what the arm felt and did [t,
+    17], and its tokens.
+    """
 
     colour: int
     frames: np.ndarray
@@ -85,12 +104,16 @@ def memory_options(model: str) -> dict[str, Any]:
 
 
 def models_of(named: Sequence[str]) -> list[str]:
-    """What is trained: the models that are named, and the one without memory to hold them against."""
+    """What is trained: the models that are named, and the one without memory to hold
+    them against.
+    """
     return list(dict.fromkeys([*named, MEMORYLESS]))
 
 
 def make_stream(rng: np.random.Generator) -> Stream:
-    """A grey scene; in all but the first and the last frame of the video a coloured square wanders over it."""
+    """A grey scene; in all but the first and the last frame of the video a coloured square wanders
+    over it.
+    """
     frames = np.full((LENGTH, SIZE, SIZE, 3), 110, np.uint8)
     colour = int(rng.integers(len(COLOURS)))
     y, x = rng.integers(0, SIZE - SQUARE, 2)
@@ -98,7 +121,9 @@ def make_stream(rng: np.random.Generator) -> Stream:
         top, left = (y + 2 * t) % (SIZE - SQUARE), (x + t) % (SIZE - SQUARE)
         frames[t, top : top + SQUARE, left : left + SQUARE] = COLOURS[colour]
     motion = torch.zeros(LENGTH, 17)
-    motion[1 : VIDEO - 1, :8] = torch.from_numpy(ANSWERS[colour]) * torch.linspace(0, 1, VIDEO - 2)[:, None]
+    motion[1 : VIDEO - 1, :8] = (
+        torch.from_numpy(ANSWERS[colour]) * torch.linspace(0, 1, VIDEO - 2)[:, None]
+    )
     return Stream(colour, frames, motion)
 
 
@@ -113,7 +138,9 @@ def make_streams(policy: MMEPolicy, count: int, seed: int) -> list[Stream]:
     return streams
 
 
-def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generator, size: int) -> Batch:
+def make_batch(
+    policy: MMEPolicy, streams: list[Stream], rng: np.random.Generator, size: int
+) -> Batch:
     """Random execution steps of random episodes, with the action of their colour."""
     processor, config = policy.require_processor(), policy.backbone.config
     selected = [streams[i] for i in rng.integers(len(streams), size=size)]
@@ -126,7 +153,9 @@ def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generato
     if policy.memory is not None:
         memory = policy.memory
         recalled = [
-            memory.gather_selection(s.history, int(t)) for s, t in zip(selected, steps, strict=True) if s.history
+            memory.gather_selection(s.history, int(t))
+            for s, t in zip(selected, steps, strict=True)
+            if s.history
         ]
         history = stack_history(recalled)
     return Batch(
@@ -155,7 +184,9 @@ def past_of(policy: MMEPolicy, selected: Sequence[Stream], steps: np.ndarray) ->
 
 
 def open_loop_error(policy: MMEPolicy, streams: list[Stream], chunks: int = 48) -> float:
-    """Mean absolute error of sampled chunks on unseen episodes; guessing a colour gives about 0.75."""
+    """Mean absolute error of sampled chunks on unseen episodes; guessing a colour
+    gives about 0.75.
+    """
     policy.eval()
     batch = make_batch(policy, streams, np.random.default_rng(7), chunks)
     sampled = policy.sample_actions(batch, generator=torch.Generator().manual_seed(0))
@@ -176,19 +207,26 @@ def learn(
     every: int = 100,
     enough: float = 0.08,
 ) -> dict[str, Any]:
-    """Train one policy until it fits the episodes it trains on; its error on others, and what it took.
+    """Train one policy until it fits the episodes it trains on; its error on others, and what it
+    took.
 
     Args:
         seconds: most CPU time, encoding included. steps: most updates. episodes: to learn from.
         backbone: keys of the tiny backbone to change. config_dir: YAML files of your own.
-        every: updates between two measurements of the error on what it trains on. enough: error that it stops at.
+        every: updates between two measurements of the error on what it trains on. enough: error
+            that it stops at.
     """
     wall, start = time.perf_counter(), time.process_time()
     torch.manual_seed(seed)
     changed = memory_options(model)
     options = {"memory": changed} if changed else {}
     policy = build_policy(
-        model, seed=seed, config_dir=config_dir, policy={"augment": False}, backbone=backbone or {}, **options
+        model,
+        seed=seed,
+        config_dir=config_dir,
+        policy={"augment": False},
+        backbone=backbone or {},
+        **options,
     )
     policy.backbone.vision.requires_grad_(False)
     train_streams, unseen = make_streams(policy, episodes, seed), make_streams(policy, 32, seed + 1)
@@ -207,11 +245,20 @@ def learn(
         done += 1
         if done % every == 0 and policy.memory is not None:
             error = open_loop_error(policy, train_streams, 24)
-            print(f"  {model}: {error:.2f} on the episodes it learns from after {done} steps", flush=True)
+            print(
+                f"  {model}: {error:.2f} on the episodes it learns from after {done} steps",
+                flush=True,
+            )
             if error < enough:
                 break
     cpu, wall = time.process_time() - start, time.perf_counter() - wall
-    return {"model": model, "error": open_loop_error(policy, unseen), "steps": done, "cpu": cpu, "wall": wall}
+    return {
+        "model": model,
+        "error": open_loop_error(policy, unseen),
+        "steps": done,
+        "cpu": cpu,
+        "wall": wall,
+    }
 
 
 def plot(results: list[dict], path: Path) -> None:
@@ -224,7 +271,9 @@ def plot(results: list[dict], path: Path) -> None:
     figure, axes = pyplot.subplots(figsize=(7, 0.4 * len(results) + 1.4), layout="constrained")
     names = [r["model"] for r in results]
     bars = axes.barh(
-        names, [r["error"] for r in results], color=["#9a9a9a" if n == MEMORYLESS else "#2b6cb0" for n in names]
+        names,
+        [r["error"] for r in results],
+        color=["#9a9a9a" if n == MEMORYLESS else "#2b6cb0" for n in names],
     )
     axes.bar_label(bars, fmt="%.2f", padding=3)
     axes.axvline(0.75, color="#c05621", linestyle="--", linewidth=1, label="guessing a colour")
@@ -243,15 +292,26 @@ def one_of_several(job: tuple[str, float, Path | None]) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="*", default=list(NEURAL), help="variants to train, beside pi05")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "models", nargs="*", default=list(NEURAL), help="variants to train, beside pi05"
+    )
     parser.add_argument("--config-dir", type=Path, help="a folder of your own YAML files")
     parser.add_argument(
-        "--seconds", type=float, default=240, help="most CPU time of one variant: two minutes of two cores"
+        "--seconds",
+        type=float,
+        default=240,
+        help="most CPU time of one variant: two minutes of two cores",
     )
-    parser.add_argument("--processes", type=int, default=2, help="variants that train side by side, one core each")
+    parser.add_argument(
+        "--processes", type=int, default=2, help="variants that train side by side, one core each"
+    )
     parser.add_argument("--plot", type=Path, default=Path("memory_matters.png"))
-    parser.add_argument("--results", type=Path, help="JSON lines to add to; what stands there is not trained again")
+    parser.add_argument(
+        "--results", type=Path, help="JSON lines to add to; what stands there is not trained again"
+    )
     args = parser.parse_args()
     with print_user_errors():
         compare(args)
@@ -265,7 +325,9 @@ def compare(args: argparse.Namespace) -> None:
     """
     models, results = models_of(args.models), read_results(args.results)
     for model in models:
-        compose("policy", [f"model={model}"], extra_dirs=[args.config_dir] if args.config_dir else [])
+        compose(
+            "policy", [f"model={model}"], extra_dirs=[args.config_dir] if args.config_dir else []
+        )
     jobs = [(model, args.seconds, args.config_dir) for model in models if model not in results]
     with multiprocessing.get_context("spawn").Pool(args.processes, maxtasksperchild=1) as pool:
         for result in pool.imap_unordered(one_of_several, jobs):
@@ -273,7 +335,10 @@ def compare(args: argparse.Namespace) -> None:
             if args.results is not None:
                 with args.results.open("a") as file:
                     file.write(json.dumps(result) + "\n")
-    line = "{model:20} error {error:.3f} after {steps} steps, {cpu:.0f} s of CPU time, {wall:.0f} s of wall time"
+    line = (
+        "{model:20} error {error:.3f} after {steps} steps, {cpu:.0f} s of CPU time, {wall:.0f} s of"
+        " wall time"
+    )
     displayed = [results[model] for model in models]
     print("\n".join(line.format(**result) for result in displayed))
     plot(displayed, args.plot)

@@ -1,4 +1,5 @@
-"""Memory-augmented vision-language-action policies: one backbone, one memory interface, three integrations.
+"""Memory-augmented vision-language-action policies: one backbone, one memory interface, three
+integrations.
 
 >>> from mme_vla import build_policy
 >>> policy = build_policy("tokendrop_expert", backbone="tiny")
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 
     __version__: str
 
-# Names are loaded on first use, so that importing the package costs nothing and needs no optional dependency.
+# Names are loaded on first use, so that importing the package costs nothing and needs no optional
+# dependency.
 _MODULES = {
     "backbone.base": ["Backbone"],
     "embodiment": ["Embodiment"],
@@ -61,12 +63,41 @@ _MODULES = {
 _HOME = {name: f"mme_vla.{module}" for module, names in _MODULES.items() for name in names}
 
 __all__ = [
-    "BACKBONES", "INTEGRATIONS", "MEMORIES", "SUBGOALS", "TASKS", "Backbone", "Batch", "CachedHistory", "Embodiment",
-    "Environment", "Episode", "History", "HistoryTokens", "HistoryTransform", "Integration", "MMEPolicy", "Memory",
-    "MemoryTokens", "OnlineHistory", "PerceptualMemory", "Policy", "RecurrentMemory", "StorageSpec", "SubgoalPredictor",
-    "Task", "UserError", "__version__", "build_policy", "evaluate", "load_weights", "make_env", "make_vec_env", "probe",
+    "BACKBONES",
+    "INTEGRATIONS",
+    "MEMORIES",
+    "SUBGOALS",
+    "TASKS",
+    "Backbone",
+    "Batch",
+    "CachedHistory",
+    "Embodiment",
+    "Environment",
+    "Episode",
+    "History",
+    "HistoryTokens",
+    "HistoryTransform",
+    "Integration",
+    "MMEPolicy",
+    "Memory",
+    "MemoryTokens",
+    "OnlineHistory",
+    "PerceptualMemory",
+    "Policy",
+    "RecurrentMemory",
+    "StorageSpec",
+    "SubgoalPredictor",
+    "Task",
+    "UserError",
+    "__version__",
+    "build_policy",
+    "evaluate",
+    "load_weights",
+    "make_env",
+    "make_vec_env",
+    "probe",
     "register",
-]  # fmt: skip
+]
 
 
 def __getattr__(name: str) -> Any:

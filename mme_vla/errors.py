@@ -5,13 +5,16 @@ from difflib import get_close_matches
 
 
 class UserError(ValueError):
-    """Something the user gave cannot work: the message names the value, what was expected, and what to do."""
+    """Something the user gave cannot work: the message names the value, what was expected, and what
+    to do.
+    """
 
 
 def require(holds: object, message: str, error: type[Exception] = UserError) -> None:
     """Raise an error with this message unless something holds.
 
-    The message is made in either case: for checks in a hot loop, or of a value it cannot name, write `if` and `raise`.
+    The message is made in either case: for checks in a hot loop, or of a value it cannot name,
+    write `if` and `raise`.
     """
     if not holds:
         raise error(message)
@@ -28,11 +31,16 @@ def check_sizes(section: str, **sizes: int) -> None:
     """Make sure that numbers of a section are whole and at least 1."""
     for key, value in sizes.items():
         whole = isinstance(value, int) and not isinstance(value, bool)
-        require(whole and value >= 1, f"{section}.{key}={brief(value)} must be at least 1, a whole number.")
+        require(
+            whole and value >= 1,
+            f"{section}.{key}={brief(value)} must be at least 1, a whole number.",
+        )
 
 
 LARGEST = 2**16
-"""Of any size of a robot or a processor: what is larger is a damaged file, and would take memory."""
+"""Of any size of a robot or a processor: what is larger is a damaged file, and would
+take memory.
+"""
 
 
 def check_integer(key: str, value: object, most: int = LARGEST) -> int:
@@ -60,42 +68,57 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
     "Did you mean 'tokendrop'? Known: framesamp, tokendrop."
     """
     known = sorted(options)
-    near = get_close_matches(name[:200], known, n=3, cutoff=0.6)  # the time it takes grows with the square
+    near = get_close_matches(
+        name[:200], known, n=3, cutoff=0.6
+    )  # the time it takes grows with the square
     hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
     return f"{hint}Known: {', '.join(known) or 'none'}."
 
 
 def missing_extra(what: str, extra: str) -> UserError:
-    """The error to raise where the packages of an extra are not installed: what needs them, and what installs them.
+    """The error to raise where the packages of an extra are not installed: what needs them, and
+    what installs them.
 
     `--inexact` keeps the extras that are there already; a plain `uv sync` would take them away.
     """
-    with_uv, with_pip = f"uv sync --inexact --extra {extra}", f"pip install -c constraints.txt -e '.[{extra}]'"
-    return UserError(f"{what} needs the extra `{extra}`. In the clone: {with_uv} (without uv: {with_pip}).")
+    with_uv, with_pip = (
+        f"uv sync --inexact --extra {extra}",
+        f"pip install -c constraints.txt -e '.[{extra}]'",
+    )
+    return UserError(
+        f"{what} needs the extra `{extra}`. In the clone: {with_uv} (without uv: {with_pip})."
+    )
 
 
 def brief(value: object, most: int = 80, quote: bool = True) -> str:
-    """A value as it is in a message: its repr, cut in the middle where it is longer than `most` characters.
+    """A value as it is in a message: its repr, cut in the middle where it is longer than `most`
+    characters.
 
     >>> brief("x" * 1000, 9)
     "'xxx…xxx'"
     """
     try:
         text = repr(value) if quote or not isinstance(value, str) else value
-    except (ValueError, RecursionError):  # an integer of thousands of digits, a value nested too deeply
+    except (
+        ValueError,
+        RecursionError,
+    ):  # an integer of thousands of digits, a value nested too deeply
         text = f"a value of type {type(value).__name__}"
     half = (most - 1) // 2
     return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"
 
 
 def printable(text: str) -> str:
-    r"""Text for a terminal: escape sequences and other characters that cannot be seen, spelled out. Lines stay lines.
+    r"""Text for a terminal: escape sequences and other characters that cannot be seen, spelled out.
+    Lines stay lines.
 
     >>> print(printable("\x1b[2J"))
     \x1b[2J
     """
     return "".join(
-        letter if letter.isprintable() or letter in "\n\N{NO-BREAK SPACE}" else letter.encode("unicode_escape").decode()
+        letter
+        if letter.isprintable() or letter in "\n\N{NO-BREAK SPACE}"
+        else letter.encode("unicode_escape").decode()
         for letter in text
     )
 

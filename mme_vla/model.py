@@ -4,16 +4,18 @@
     history ───────── memory ──────────► tokens ─┴─► integration.inject ──► Injection
     Injection, noise ─ backbone.loss or backbone.sample ──► loss [b, h] or chunk [b, h, a]
 
-Data flows down once. The backbone does not call the integration, and neither knows which memory made the tokens. It
-needs torch, numpy and timm; configuration, datasets and simulation are in other packages.
+Data flows down once. The backbone does not call the integration, and neither knows which memory
+made the tokens. It needs torch, numpy and timm; configuration, datasets and simulation are in other
+packages.
 
-    backbone/   base.py (interface) · layers.py (visibility, attention, norms) · gemma.py (joint experts,
-                KV cache) · siglip.py · flow.py · pi05.py
-    memory/     base.py (interface, encoder) · history.py (stored tokens of an episode) · framesamp.py · …
+    backbone/   base.py (interface) · layers.py (visibility, attention, norms) · gemma.py (joint
+                experts, KV cache) · siglip.py · flow.py · pi05.py
+    memory/     base.py (interface, encoder) · history.py (stored tokens of an episode) ·
+                framesamp.py · …
     integration/ base.py (interface) · context.py (context, expert) · modulator.py
 
-A memory works in two steps. `MemoryModule.gather_selection` chooses stored tokens, in a dataset or in an episode, and
-makes `Batch.history`. `MemoryModule.forward`, called here, encodes them.
+A memory works in two steps. `MemoryModule.gather_selection` chooses stored tokens, in a dataset or
+in an episode, and makes `Batch.history`. `MemoryModule.forward`, called here, encodes them.
 
 Shapes: b batch · n tokens · d width · v views · h action horizon · a action width (types.py).
 """
@@ -39,7 +41,8 @@ class MMEModel(nn.Module):
 
     Args:
         backbone: constructed with `integration.extra_experts()`.
-        memory: None for the policy without memory. integration: the base class `Integration` adds nothing.
+        memory: None for the policy without memory. integration: the base class `Integration` adds
+            nothing.
         compute_dtype: bfloat16 runs matrix products under autocast over float32 weights.
 
     >>> sizes = BackboneConfig()  # doctest: +SKIP
@@ -70,12 +73,15 @@ class MMEModel(nn.Module):
         memory: MemoryTokens | None = None,
         augmentation: Tensor | None = None,
     ) -> Tensor:
-        """The mean loss of a batch: that of the actions, and in training the weighted auxiliary ones.
+        """The mean loss of a batch: that of the actions, and in training the weighted auxiliary
+        ones.
 
         Args:
-            batch: with `actions`, on the model's device. noise: as `training_noise` makes it, on that device.
+            batch: with `actions`, on the model's device. noise: as `training_noise` makes it, on
+                that device.
             memory: memory tokens; by default those of `batch.history`.
-            augmentation: random numbers [b, …] of the image augmentation; None leaves images as they are.
+            augmentation: random numbers [b, …] of the image augmentation; None leaves images as
+                they are.
         """
         return self.total_loss(self.losses(batch, noise, memory, augmentation))
 
@@ -86,7 +92,9 @@ class MMEModel(nn.Module):
         memory: MemoryTokens | None = None,
         augmentation: Tensor | None = None,
     ) -> Tensor:
-        """The `loss`. What wraps a module (DDP, FSDP, `torch.compile`) acts when the module itself is called."""
+        """The `loss`. What wraps a module (DDP, FSDP, `torch.compile`) acts when the module itself
+        is called.
+        """
         return self.loss(batch, noise, memory, augmentation)
 
     def losses(
@@ -96,21 +104,30 @@ class MMEModel(nn.Module):
         memory: MemoryTokens | None = None,
         augmentation: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """The mean losses of a batch by name: `action`, and in training those of memory, integration and backbone.
+        """The mean losses of a batch by name: `action`, and in training those of memory,
+        integration and backbone.
 
         The arguments are those of `loss`.
         """
         batch = self.prepare_images(batch, augmentation)
         with self.autocast():
-            memory = self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
+            memory = (
+                self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
+            )
             injection = self.inject(batch, memory)
             losses = self.backbone.loss(batch, injection, noise)  # b h
             auxiliary = self.auxiliary_losses(batch, injection, memory) if self.training else {}
-        means = {name: weighted_mean(rows.float(), batch.weight) for name, rows in auxiliary.items()}
+        means = {
+            name: weighted_mean(rows.float(), batch.weight) for name, rows in auxiliary.items()
+        }
         return {"action": masked_mean(losses, batch.action_mask, batch.weight), **means}
 
-    def auxiliary_losses(self, batch: Batch, injection: Injection, memory: MemoryTokens | None) -> dict[str, Tensor]:
-        """Losses [b] by name that memory, integration and backbone return beside that of the actions."""
+    def auxiliary_losses(
+        self, batch: Batch, injection: Injection, memory: MemoryTokens | None
+    ) -> dict[str, Tensor]:
+        """Losses [b] by name that memory, integration and backbone return beside that of the
+        actions.
+        """
         rows = {} if memory is None else dict(memory.losses)
         for part in (self.integration, self.backbone):
             if isinstance(part, AuxiliaryLosses):
@@ -118,44 +135,63 @@ class MMEModel(nn.Module):
         for name, values in rows.items():
             require(
                 name != "action" and values.shape == (len(batch.prompt),),
-                f"The auxiliary loss {name!r} has shape {list(values.shape)}: return one number a sample, "
-                f"[{len(batch.prompt)}], under another name than 'action'.",
+                f"The auxiliary loss {name!r} has shape {list(values.shape)}: return one number a"
+                f" sample, [{len(batch.prompt)}], under another name than 'action'.",
                 ValueError,
             )
         return rows
 
     def total_loss(self, losses: Mapping[str, Tensor]) -> Tensor:
-        """The loss that training minimises: `action`, and the others times their weights. Weight 0 leaves one out."""
+        """The loss that training minimises: `action`, and the others times their weights. Weight 0
+        leaves one out.
+        """
         total = losses["action"]
         for name, value in losses.items():
             if name != "action" and (weight := self.loss_weights.get(name, 1.0)):
                 total = total + weight * value
         if self.training:
             for name in self.loss_weights:
-                check_known("auxiliary loss in train.losses:", name, [key for key in losses if key != "action"])
+                check_known(
+                    "auxiliary loss in train.losses:",
+                    name,
+                    [key for key in losses if key != "action"],
+                )
         return total
 
     @torch.no_grad()
     def sample(
-        self, batch: Batch, noise: Mapping[str, Tensor], steps: int | None = None, memory: MemoryTokens | None = None
+        self,
+        batch: Batch,
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
+        memory: MemoryTokens | None = None,
     ) -> Tensor:
         """A normalised chunk [b, h, a].
 
         Args:
             noise: as `sampling_noise` makes it, with a batch axis, on the batch's device.
-            steps: of an iterative sampler, such as Euler steps of a flow; None is the backbone's default.
+            steps: of an iterative sampler, such as Euler steps of a flow; None is the backbone's
+                default.
             memory: memory tokens; by default those of `batch.history`.
         """
         with self.autocast():
-            memory = self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
+            memory = (
+                self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
+            )
             batch = self.prepare_images(batch)
             return self.backbone.sample(batch, self.inject(batch, memory), noise, steps)
 
     @torch.no_grad()
     def sample_and_keep(
-        self, batch: Batch, noise: Mapping[str, Tensor], steps: int | None = None, memory: MemoryTokens | None = None
+        self,
+        batch: Batch,
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
+        memory: MemoryTokens | None = None,
     ) -> tuple[Tensor, KeysValues]:
-        """A chunk as `sample` returns it, and the keys and values that the backbone made of its prefix."""
+        """A chunk as `sample` returns it, and the keys and values that the backbone made of its
+        prefix.
+        """
         assert isinstance(self.backbone, KeepsKeysValues)
         with self.autocast():
             batch = self.prepare_images(batch)
@@ -167,7 +203,9 @@ class MMEModel(nn.Module):
         """The batch's selection as the backbone reads it with the prompt."""
         if self.memory is None or batch.history is None:
             return None
-        condition = partial(self.backbone.condition_on_prompt, prompt=batch.prompt, prompt_mask=batch.prompt_mask)
+        condition = partial(
+            self.backbone.condition_on_prompt, prompt=batch.prompt, prompt_mask=batch.prompt_mask
+        )
         return self.memory.condition_on_prompt(batch.history, condition)
 
     def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
@@ -175,7 +213,8 @@ class MMEModel(nn.Module):
         return None if self.memory is None or history is None else self.memory(history)
 
     def prepare_images(self, batch: Batch, augmentation: Tensor | None = None) -> Batch:
-        """The batch with its views, past ones included, in [−1, 1] float32. Past views change as the current ones do.
+        """The batch with its views, past ones included, in [−1, 1] float32. Past views change as
+        the current ones do.
 
         Args:
             batch: images uint8. augmentation: random numbers [b, …] of the image augmentation.
@@ -184,7 +223,9 @@ class MMEModel(nn.Module):
         if past is not None:
             count = past.images.shape[1]
             repeated = None if augmentation is None else augmentation.repeat_interleave(count, 0)
-            images = self.transform_images(past.images.flatten(0, 1), repeated).unflatten(0, past.images.shape[:2])
+            images = self.transform_images(past.images.flatten(0, 1), repeated).unflatten(
+                0, past.images.shape[:2]
+            )
             past = replace(past, images=images)
         return replace(batch, images=self.transform_images(batch.images, augmentation), past=past)
 
@@ -203,11 +244,15 @@ class MMEModel(nn.Module):
     # Noise, device, precision
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
-        """The random numbers for the losses of `count` samples, on the CPU; of π0.5 `noise` [n, h, a], `time` [n]."""
+        """The random numbers for the losses of `count` samples, on the CPU; of π0.5 `noise` [n, h,
+        a], `time` [n].
+        """
         return self.backbone.training_noise(count, generator)
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
-        """The random numbers for one chunk, on the CPU, without a batch axis; of π0.5 the starting `noise` [h, a]."""
+        """The random numbers for one chunk, on the CPU, without a batch axis; of π0.5 the starting
+        `noise` [h, a].
+        """
         return self.backbone.sampling_noise(generator)
 
     @property
@@ -225,17 +270,20 @@ def check_uncounted(block: Block, backbone: Backbone) -> None:
     if block.positions is not None:
         count = block.positions.shape[-1] if block.positions.ndim > 2 else 1
         raise UserError(
-            f"The block {block.name!r} has positions of {count} number{'s'[: count > 1]} a token, and "
-            f"{type(backbone).__name__} counts tokens in causal order. Allowed here is Block.positions=None. "
-            "A backbone whose `supports` has 'positions', such as backbone=pi05, takes others."
+            f"The block {block.name!r} has positions of {count} number{'s'[: count > 1]} a token,"
+            f" and {type(backbone).__name__} counts tokens in causal order. Allowed here is"
+            " Block.positions=None. A backbone whose `supports` has 'positions', such as"
+            " backbone=pi05, takes others."
         )
 
 
 def masked_mean(losses: Tensor, counted: Tensor | None, weight: Tensor | None = None) -> Tensor:
-    """The mean of losses [b, h], over the counted steps of each sample first, so that it is independent of the batch.
+    """The mean of losses [b, h], over the counted steps of each sample first, so that it is
+    independent of the batch.
 
     Args:
-        counted: [b, h] bool; None counts all (`data.mask_padding`). weight: of each sample, [b] (`data.weights`).
+        counted: [b, h] bool; None counts all (`data.mask_padding`). weight: of each sample, [b]
+            (`data.weights`).
     """
     if counted is None:
         return losses.mean() if weight is None else weighted_mean(losses.mean(1), weight)
@@ -244,5 +292,7 @@ def masked_mean(losses: Tensor, counted: Tensor | None, weight: Tensor | None = 
 
 
 def weighted_mean(losses: Tensor, weight: Tensor | None) -> Tensor:
-    """The mean over a batch of each sample's loss [b] times its weight [b]; None weighs all with 1."""
+    """The mean over a batch of each sample's loss [b] times its weight [b]; None
+    weighs all with 1.
+    """
     return losses.mean() if weight is None else (losses * weight).mean()

@@ -2,7 +2,8 @@
 
 One legend for shapes, used in the whole library:
 
-b batch · n tokens · d width · t frames · v views (cameras) · h action horizon · a action width · l prompt length
+b batch · n tokens · d width · t frames · v views (cameras) · h action horizon · a action width · l
+prompt length
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,12 +16,20 @@ from torch import Tensor
 
 
 def send(x: Tensor, device: torch.device) -> Tensor:
-    """A tensor on a device; from the CPU to a GPU through page-locked memory, without waiting for the copy."""
-    return x.pin_memory().to(device, non_blocking=True) if device.type == "cuda" and not x.is_cuda else x.to(device)
+    """A tensor on a device; from the CPU to a GPU through page-locked memory, without waiting for
+    the copy.
+    """
+    return (
+        x.pin_memory().to(device, non_blocking=True)
+        if device.type == "cuda" and not x.is_cuda
+        else x.to(device)
+    )
 
 
 Noise = dict[str, Tensor]
-"""Random numbers by name, one row a sample. The caller makes them, so that batching and sharding cannot change them."""
+"""Random numbers by name, one row a sample. The caller makes them, so that batching and sharding
+cannot change them.
+"""
 
 
 def named_noise(noise: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> Noise:
@@ -31,7 +40,10 @@ def named_noise(noise: Mapping[str, Tensor] | Tensor | None, **more: Tensor | No
 
 def stack_noise(rows: Sequence[Mapping[str, Tensor]], device: torch.device | None = None) -> Noise:
     """Noise of single samples (`sampling_noise`) as that of a batch."""
-    return {name: torch.stack([row[name] for row in rows]).to(device) for name in (rows[0] if rows else {})}
+    return {
+        name: torch.stack([row[name] for row in rows]).to(device)
+        for name in (rows[0] if rows else {})
+    }
 
 
 def map_noise(noise: Mapping[str, Tensor], change: Callable[[Tensor], Tensor]) -> Noise:
@@ -44,7 +56,9 @@ class Labels(dict[str, Tensor]):
 
 
 class TensorStruct:
-    """A dataclass of tensors (or nested structs, labels, or None) that moves between devices as one."""
+    """A dataclass of tensors (or nested structs, labels, or None) that moves between devices as
+    one.
+    """
 
     def _map(self, fn: Any) -> Self:
         values = {}
@@ -100,10 +114,14 @@ class FrameBatch:
     length: int
 
     @classmethod
-    def of(cls, images: np.ndarray, index: np.ndarray | None = None, length: int | None = None) -> Self:
+    def of(
+        cls, images: np.ndarray, index: np.ndarray | None = None, length: int | None = None
+    ) -> Self:
         """A batch; by default every frame has an image."""
         length = len(images) if length is None else length
-        return cls(images, np.arange(length) if index is None else np.asarray(index, np.int64), length)
+        return cls(
+            images, np.arange(length) if index is None else np.asarray(index, np.int64), length
+        )
 
     def select(self, frames: np.ndarray) -> np.ndarray:
         """Images of frames that have one."""
@@ -120,11 +138,13 @@ class HistoryTokens(TensorStruct):
     """Selected past vision tokens, zero-padded.
 
     features: [b, n, d_vision]; pooled vision tokens.
-    positions: [b, n, 3]; (frame, row, column) of each token: the frame counted from the episode's first,
+    positions: [b, n, 3]; (frame, row, column) of each token: the frame counted from the episode's
+    first,
         video included, the rest patch centres in sixteenths of a view's side.
     mask: [b, n] bool; False on padding.
     step: [b] int64; the current frame, counted like the others. None where it is not needed.
-    labels: in training, the labels of each token's frame that the memory reads (`ReadsLabels`), each [b, n] or
+    labels: in training, the labels of each token's frame that the memory reads (`ReadsLabels`),
+    each [b, n] or
         [b, n, k] float32, 0 on padding. Empty in episodes.
     """
 
@@ -136,7 +156,9 @@ class HistoryTokens(TensorStruct):
 
     @property
     def ages(self) -> Tensor | None:
-        """How many frames before the current one each token's frame lies, [b, n] float32; 0 on padding."""
+        """How many frames before the current one each token's frame lies, [b, n] float32; 0 on
+        padding.
+        """
         if self.step is None:
             return None
         return (self.step[:, None] - self.positions[..., 0]).float() * self.mask
@@ -158,7 +180,9 @@ class KeysValues(TensorStruct):
 
     @classmethod
     def stack(cls, samples: Sequence[Sequence[Tensor]]) -> Self | None:
-        """The entries of each of b samples, one after the other, padded to one length; None if there is none."""
+        """The entries of each of b samples, one after the other, padded to one length; None if
+        there is none.
+        """
         if not (every := [entry for entries in samples for entry in entries]):
             return None
         lengths = [sum(entry.shape[2] for entry in entries) for entries in samples]
@@ -175,12 +199,14 @@ class KeysValues(TensorStruct):
 class MemoryTokens(TensorStruct):
     """What every neural memory hands over: at most `budget` valid tokens.
 
-    tokens: [b, budget, d]; mask: [b, budget] bool. Where the mask is False the token's value is undefined.
-    metrics: scalars a memory reports of how it came to these tokens, detached.
-    ages: [b, budget] float32; frames between the frame of a token and the current one. None where tokens belong to
+    tokens: [b, budget, d]; mask: [b, budget] bool. Where the mask is False the token's value is
+    undefined. metrics: scalars a memory reports of how it came to these tokens, detached.
+    ages: [b, budget] float32; frames between the frame of a token and the current one. None where
+    tokens belong to
         no frame, or the selection has no number of the current frame.
-    losses: auxiliary losses by name, each [b], with gradients. Only training reads them (`train.losses`).
-    cache: stored keys and values of earlier chunks (`CacheMemory`); None in training, and before the first chunk.
+    losses: auxiliary losses by name, each [b], with gradients. Only training reads them
+    (`train.losses`). cache: stored keys and values of earlier chunks (`CacheMemory`); None in
+    training, and before the first chunk.
     """
 
     tokens: Tensor
@@ -193,9 +219,11 @@ class MemoryTokens(TensorStruct):
 
 @dataclass
 class Overlap(TensorStruct):
-    """Actions of the chunk before that are still to be executed; the sampling of a new chunk is pulled towards them.
+    """Actions of the chunk before that are still to be executed; the sampling of a new chunk is
+    pulled towards them.
 
-    actions: [b, h, a]; normalised as the network predicts. weight: [b, h, a] in [0, 1]: how strongly the chunk is
+    actions: [b, h, a]; normalised as the network predicts. weight: [b, h, a] in [0, 1]: how
+    strongly the chunk is
         pulled towards each number; 0 where the chunk before has none.
     """
 
@@ -207,7 +235,8 @@ class Overlap(TensorStruct):
 class PastViews(TensorStruct):
     """Views of past frames, for a vision tower that reads them along with the current ones.
 
-    images: [b, k, v, 3, s, s] uint8, oldest first, the current frame not among them; float in [−1, 1] once they are as
+    images: [b, k, v, 3, s, s] uint8, oldest first, the current frame not among them; float in [−1,
+    1] once they are as
         the tower takes them. mask: [b, k] bool; False on frames before the episode's first.
     every: each so-many-th layer of the tower looks through time, and at least its last.
     """
@@ -221,8 +250,8 @@ class PastViews(TensorStruct):
 class Batch(TensorStruct):
     """What the network reads, and for training what it should answer.
 
-    images: [b, v, 3, s, s] uint8; the views at the vision tower's resolution, in the embodiment's order.
-    image_mask: [b, v] bool; False hides a view.
+    images: [b, v, 3, s, s] uint8; the views at the vision tower's resolution, in the embodiment's
+    order. image_mask: [b, v] bool; False hides a view.
     prompt: [b, l] int64 token ids; prompt_mask: [b, l] bool.
     history: the memory's selection, None for a policy without memory.
     actions: [b, h, a]; normalised, padded chunk. None when sampling.
@@ -232,9 +261,10 @@ class Batch(TensorStruct):
     view_tokens: [b, v, n, d]; a frozen tower's tokens of `images`, where they were made beforehand.
     overlap: what a sampled chunk is to agree with; None where it is free.
     past: past views that a memory gives along with the current ones; None for all others.
-    options: [b, letters] bool; the letters offered to a policy that chooses among options. None means all.
-    weight: [b] float32; multiplies each sample's loss (`data.weights`). None counts all alike.
-    labels: in training, labels of the current frame (`ReadsLabels` of integration and backbone).
+    options: [b, letters] bool; the letters offered to a policy that chooses among options. None
+    means all. weight: [b] float32; multiplies each sample's loss (`data.weights`). None counts all
+    alike. labels: in training, labels of the current frame (`ReadsLabels` of integration and
+    backbone).
     """
 
     images: Tensor
@@ -254,22 +284,27 @@ class Batch(TensorStruct):
     labels: Labels = field(default_factory=Labels)
 
     def without_prompt_padding(self, multiple: int = 16) -> "Batch":
-        """Drop the columns on the right that no prompt of the batch uses, keeping a multiple of `multiple`.
+        """Drop the columns on the right that no prompt of the batch uses, keeping a multiple of
+        `multiple`.
 
-        Nothing attends to padding and nothing counts it, so the answer is the same and cheaper. Done where batches
-        are made, on the CPU: the network itself never reads content.
+        Nothing attends to padding and nothing counts it, so the answer is the same and cheaper.
+        Done where batches are made, on the CPU: the network itself never reads content.
         """
         longest = int(self.prompt_mask.sum(1).max())
         length = min(-(-longest // multiple) * multiple, self.prompt.shape[1])
-        return replace(self, prompt=self.prompt[:, :length], prompt_mask=self.prompt_mask[:, :length])
+        return replace(
+            self, prompt=self.prompt[:, :length], prompt_mask=self.prompt_mask[:, :length]
+        )
 
 
 class ReadsLabels:
     """Capability of a memory, an integration or a backbone: it learns from labels of the dataset.
 
-    reads_labels: columns of numbers in the dataset, `subtask_boundary` (1 where a sub-task begins, else 0), or
+    reads_labels: columns of numbers in the dataset, `subtask_boundary` (1 where a sub-task begins,
+    else 0), or
         `subtask_index` (how many sub-tasks have begun).
-        A memory has them by frame in `HistoryTokens.labels`, the others of the current frame in `Batch.labels`.
+        A memory has them by frame in `HistoryTokens.labels`, the others of the current frame in
+        `Batch.labels`.
     """
 
     reads_labels: Sequence[str] = ()

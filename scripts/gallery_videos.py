@@ -1,10 +1,11 @@
-"""Render one demonstrated episode of each task as a small animated WebP: the videos of docs/benchmark/gallery.md.
+"""Render one demonstrated episode of each task as a small animated WebP: the videos of
+docs/benchmark/gallery.md.
 
     python scripts/gallery_videos.py                       # all sixteen, half an hour of one core
     python scripts/gallery_videos.py StopCube --output /tmp/gallery
 
-Episode 2 of the `test` split, front camera. A red border marks frames of the conditioning video. Existing files are
-kept.
+Episode 2 of the `test` split, front camera. A red border marks frames of the conditioning video.
+Existing files are kept.
 """
 
 import argparse
@@ -26,7 +27,9 @@ DURATION, LAST = 120, 1500  # milliseconds of a frame, and of the last one
 def encode(snapshots: list[Snapshot]) -> bytes:
     """Return the snapshots as a looping WebP of at most `LIMIT` bytes."""
     chosen = [snapshots[i] for i in evenly_spaced(len(snapshots), min(FRAMES, len(snapshots)))]
-    images = [Image.fromarray(bordered(shot.image) if shot.video else shot.image) for shot in chosen]
+    images = [
+        Image.fromarray(bordered(shot.image) if shot.video else shot.image) for shot in chosen
+    ]
     images = [image.resize((SIDE, SIDE), Image.Resampling.LANCZOS) for image in images]
     durations = [DURATION] * (len(images) - 1) + [LAST]
     for quality in range(70, 0, -10):
@@ -47,7 +50,9 @@ def encode(snapshots: list[Snapshot]) -> bytes:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("tasks", nargs="*", help="tasks to render, by default all")
     parser.add_argument("--output", type=Path, default=FOLDER)
     options = parser.parse_args()

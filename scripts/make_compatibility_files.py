@@ -1,17 +1,18 @@
-r"""Write `tests/data/compatibility`: files of every published format, and what they mean, as this version has them.
+r"""Write `tests/data/compatibility`: files of every published format, and what they mean, as this
+version has them.
 
     python scripts/make_compatibility_files.py tests/data/compatibility
 
-Run it at the version whose files later versions have to read, from the root of a clone with the extras `dev`, `sim`,
-`vlm`, `baselines` and `orbax`, on a CPU. `tests/end_to_end/test_compatibility.py` opens the files and compares what it
-gets with
-`expected.json`. Floating-point figures agree to 1e-5 between CPUs, not bitwise. Never regenerate the folder to make
-that test pass: a failure means that files of users can no longer be read.
+Run it at the version whose files later versions have to read, from the root of a clone with the
+extras `dev`, `sim`, `vlm`, `baselines` and `orbax`, on a CPU.
+`tests/end_to_end/test_compatibility.py` opens the files and compares what it gets with
+`expected.json`. Floating-point figures agree to 1e-5 between CPUs, not bitwise. Never regenerate
+the folder to make that test pass: a failure means that files of users can no longer be read.
 
-Sizes are far below those of `backbone=tiny`, so that the whole folder has less than 3 MB. Where a network has parts of
-a fixed size (Diffusion Policy's ResNet-18, the shipped vision tower of nano) or is still too large (SAM2Act+,
-MemoryVLA, OpenVLA-OFT), only the names and shapes of its tensors are kept, in `tensors.json`, and `fill_tensors` makes
-the same values again.
+Sizes are far below those of `backbone=tiny`, so that the whole folder has less than 3 MB. Where a
+network has parts of a fixed size (Diffusion Policy's ResNet-18, the shipped vision tower of nano)
+or is still too large (SAM2Act+, MemoryVLA, OpenVLA-OFT), only the names and shapes of its tensors
+are kept, in `tensors.json`, and `fill_tensors` makes the same values again.
 """
 
 import csv
@@ -43,7 +44,14 @@ import mme_vla
 REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path.append(str(REPOSITORY / "tests"))
 TINY = {
-    "backbone.vision": {"image_size": 16, "patch_size": 1, "depth": 1, "width": 8, "mlp_dim": 8, "num_heads": 1},
+    "backbone.vision": {
+        "image_size": 16,
+        "patch_size": 1,
+        "depth": 1,
+        "width": 8,
+        "mlp_dim": 8,
+        "num_heads": 1,
+    },
     "backbone.vlm": {"width": 8, "mlp_dim": 8},
     "backbone.action": {"width": 8, "mlp_dim": 8},
     "backbone.depth": 1,
@@ -54,7 +62,9 @@ TINY = {
 }
 SHORT = {"budget": 32, "grid": 2}
 RECURRENT = {"budget": 32, "position_dim": 48, "max_steps": 3, "max_video": 2, "chunk": 2}
-TOWERS = {name: {"width": 8, "depth": 2, "mlp_dim": 16, "num_heads": 1} for name in ("dino", "siglip")}
+TOWERS = {
+    name: {"width": 8, "depth": 2, "mlp_dim": 16, "num_heads": 1} for name in ("dino", "siglip")
+}
 TWO_TOWERS = {
     "backbone.vision": {"image_size": 56, "patch_size": 7, **TOWERS},
     "backbone.vlm": {"depth": 1, "width": 16, "mlp_dim": 16, "num_heads": 1},
@@ -69,7 +79,9 @@ PRETRAINED: dict[str, tuple[str, dict[str, Any]]] = {
     "joined": ("framesamp_ttt_modul", {**TINY, "memory": {"budget": 64}}),
     "hybrid": ("hybrid", {**TINY, "memory": {"budget": 64}}),
 }  # fmt: skip
-"""Folder → model and settings. One of each kind of policy and of each kind of memory that has tensors of its own."""
+"""Folder → model and settings. One of each kind of policy and of each kind of memory that has
+tensors of its own.
+"""
 NAMES_ONLY: dict[str, tuple[str, dict[str, Any]]] = {
     "diffusion_policy": ("diffusion_policy", {}),
     "sam2act_plus": ("sam2act_plus", {}),
@@ -85,16 +97,34 @@ NAMES_ONLY: dict[str, tuple[str, dict[str, Any]]] = {
 }  # fmt: skip
 """As `PRETRAINED`, without the values of the weights."""
 TRAIN = [
-    "data=lerobot", "data.val_episodes=[1]", "logger=none", "train.batch_size=2", "train.workers=0", "train.device=cpu",
-    "train.log_every=1", "train.save_every=2", "train.warmup=1", "train.ema=0.5", "train.val_samples=2",
-    "train.val_every=2", "train.open_loop_chunks=0",
-]  # fmt: skip
+    "data=lerobot",
+    "data.val_episodes=[1]",
+    "logger=none",
+    "train.batch_size=2",
+    "train.workers=0",
+    "train.device=cpu",
+    "train.log_every=1",
+    "train.save_every=2",
+    "train.warmup=1",
+    "train.ema=0.5",
+    "train.val_samples=2",
+    "train.val_every=2",
+    "train.open_loop_chunks=0",
+]
 RUNS = {
     "framesamp": ["model=framesamp_modul", "memory.budget=32", "memory.grid=2"],
-    "lora": ["model=tokendrop_expert", "memory.budget=80", "finetune=lora", "finetune.rank=2", "backbone.depth=2"],
+    "lora": [
+        "model=tokendrop_expert",
+        "memory.budget=80",
+        "finetune=lora",
+        "finetune.rank=2",
+        "backbone.depth=2",
+    ],
     "sharded": ["model=framesamp_modul", "memory.budget=32", "memory.grid=2"],
 }
-"""Run folder → its words: averages and optimizer in one file each, adapters, and the shards of two processes."""
+"""Run folder → its words: averages and optimizer in one file each, adapters, and the shards of two
+processes.
+"""
 ROLLOUT = [
     "episodes=1",
     "tasks=[PickXtimes,VideoUnmask]",
@@ -113,7 +143,11 @@ def words(settings: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Settings as words of a command line."""
     found: list[str] = []
     for key, value in settings.items():
-        found += words(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [f"{prefix}{key}={value}"]
+        found += (
+            words(value, f"{prefix}{key}.")
+            if isinstance(value, Mapping)
+            else [f"{prefix}{key}={value}"]
+        )
     return found
 
 
@@ -138,7 +172,9 @@ def command(name: str, *arguments: str | Path) -> str:
             runpy.run_module("mme_vla", run_name="__main__")
     except SystemExit as end:
         if end.code not in (None, 0):
-            raise RuntimeError(f"{name} {' '.join(map(str, arguments))} ended with {end.code}") from end
+            raise RuntimeError(
+                f"{name} {' '.join(map(str, arguments))} ended with {end.code}"
+            ) from end
     finally:
         sys.argv = before
     return printed.getvalue()
@@ -168,21 +204,34 @@ def actions(policy: Any, width: int = 8, depth: bool = False) -> list[Any]:
         for camera in ("front", "wrist"):
             frames[camera] = rng.integers(0, 256, (count, 64, 64, 3), dtype=np.uint8)
             if depth:
-                frames[f"{camera}_depth"] = rng.integers(400, 1000, (count, 64, 64, 1)).astype(np.int16)
+                frames[f"{camera}_depth"] = rng.integers(400, 1000, (count, 64, 64, 1)).astype(
+                    np.int16
+                )
                 frames[f"{camera}_camera_extrinsic"] = np.tile(down, (count, 1, 1))
         state = rng.normal(size=(count, width)).astype(np.float32) * (0.1 if depth else 1)
-        episode.observe(frames, state, is_demo=np.arange(count) < count - 1 if count == 9 else False)
+        episode.observe(
+            frames, state, is_demo=np.arange(count) < count - 1 if count == 9 else False
+        )
         chunks.append(np.round(np.asarray(policy.act([episode])[0], np.float64), 7).tolist())
     return chunks
 
 
 def make_dataset(folder: Path, scratch: Path) -> None:
-    """Two synthetic episodes as a dataset of images and as one of videos, and the side file of first frames."""
+    """Two synthetic episodes as a dataset of images and as one of videos, and the side file of
+    first frames.
+    """
     from helpers.h5_files import write_file
 
     recordings = scratch / "h5"
     recordings.mkdir()
-    write_file(recordings / "record_dataset_PickXtimes.h5", [22, 20], [6, 0], poses=True, depth=True, choices=True)
+    write_file(
+        recordings / "record_dataset_PickXtimes.h5",
+        [22, 20],
+        [6, 0],
+        poses=True,
+        depth=True,
+        choices=True,
+    )
     command("convert", f"input={recordings}", f"output={folder / 'dataset'}", "images=png")
     command("convert", f"input={recordings}", f"output={folder / 'dataset_video'}", "names=lerobot",
             "keyframes=true")  # fmt: skip
@@ -210,7 +259,10 @@ def make_policies(folder: Path) -> None:
 def keep_names(folder: Path) -> None:
     """Replace the weights of a saved policy by the names, dtypes and shapes of its tensors."""
     tensors = load_file(folder / "model.safetensors")
-    shapes = {name: [str(value.dtype).removeprefix("torch."), list(value.shape)] for name, value in tensors.items()}
+    shapes = {
+        name: [str(value.dtype).removeprefix("torch."), list(value.shape)]
+        for name, value in tensors.items()
+    }
     (folder / "tensors.json").write_text(json.dumps(shapes) + "\n")
     (folder / "model.safetensors").unlink()
     (folder / "SHA256SUMS").unlink()
@@ -228,7 +280,10 @@ def load_named(folder: Path, scratch: Path) -> Any:
 def policy_figures(folder: Path, scratch: Path) -> dict[str, Any]:
     """The chunks of every checkpoint: saved policies, exports, and what runs left."""
     figures: dict[str, Any] = {}
-    for path in [*sorted((folder / "pretrained").iterdir()), *sorted((folder / "training").iterdir())]:
+    for path in [
+        *sorted((folder / "pretrained").iterdir()),
+        *sorted((folder / "training").iterdir()),
+    ]:
         figures[str(path.relative_to(folder))] = actions(mme_vla.Policy.from_pretrained(path))
     for path in sorted((folder / "names").iterdir()):
         depth = path.name == "sam2act_plus"
@@ -251,16 +306,35 @@ def train(folder: Path) -> None:
     """The run folders, each as its second update left it, and the vision caches that they share."""
     for name, chosen in RUNS.items():
         output = f"output={folder / 'training' / name}"
-        arguments = [*words(TINY), *chosen, *TRAIN, *places(folder, folder / "cache"), "train.steps=2", output]
+        arguments = [
+            *words(TINY),
+            *chosen,
+            *TRAIN,
+            *places(folder, folder / "cache"),
+            "train.steps=2",
+            output,
+        ]
         if name == "sharded":
-            launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-            subprocess.run([*launcher, "-m", "mme_vla.train", *arguments, "train.parallel.strategy=fsdp"], check=True)
+            launcher = [
+                sys.executable,
+                "-m",
+                "torch.distributed.run",
+                "--standalone",
+                "--nproc-per-node",
+                "2",
+            ]
+            subprocess.run(
+                [*launcher, "-m", "mme_vla.train", *arguments, "train.parallel.strategy=fsdp"],
+                check=True,
+            )
         else:
             command("train", *arguments)
 
 
 def resumed_losses(folder: Path, name: str, chosen: Sequence[str], scratch: Path) -> list[float]:
-    """Resume a copy of a run with a copy of the cache: two losses, and the validation losses after them."""
+    """Resume a copy of a run with a copy of the cache: two losses, and the validation losses after
+    them.
+    """
     run, cache = scratch / "training" / name, scratch / "cache"
     shutil.copytree(folder / "training" / name, run)
     if not cache.exists():
@@ -273,8 +347,13 @@ def resumed_losses(folder: Path, name: str, chosen: Sequence[str], scratch: Path
 
 
 def evaluations(folder: Path) -> dict[str, list[str]]:
-    """The words of the finished runs of the benchmark's episodes: a sweep over seeds, and two shards with subgoals."""
-    trained, symbolic = f"checkpoint={folder}/training/framesamp", f"checkpoint={folder}/pretrained/groundsg"
+    """The words of the finished runs of the benchmark's episodes: a sweep over seeds, and two
+    shards with subgoals.
+    """
+    trained, symbolic = (
+        f"checkpoint={folder}/training/framesamp",
+        f"checkpoint={folder}/pretrained/groundsg",
+    )
     return {
         "sweep/7": [trained, *ROLLOUT, "seed=7"],
         "sweep/42": [trained, *ROLLOUT, "seed=42"],
@@ -283,17 +362,27 @@ def evaluations(folder: Path) -> dict[str, list[str]]:
 
 
 def evaluate(folder: Path) -> None:
-    """Run `evaluations` in the simulator, and episodes in the tests' own environment whose outcomes are successes."""
+    """Run `evaluations` in the simulator, and episodes in the tests' own environment whose outcomes
+    are successes.
+    """
     chosen, output = evaluations(folder), folder / "evaluation"
     seeds = [*chosen["sweep/7"][:-1], "seed=7,42"]
-    command("evaluate", "--multirun", *seeds, f"output={output}/sweep/${{seed}}", f"hydra.sweep.dir={output}/launcher")
+    command(
+        "evaluate",
+        "--multirun",
+        *seeds,
+        f"output={output}/sweep/${{seed}}",
+        f"hydra.sweep.dir={output}/launcher",
+    )
     for shard in ("shard=0/2", "shard=1/2"):
         command("evaluate", *chosen["shared"][:-1], shard, f"output={output}/shared")
     evaluate_scripted(folder, output / "scripted")
 
 
 def evaluate_scripted(folder: Path, output: Path) -> Any:
-    """Run, or continue with, four episodes in the tests' own environment, which needs no simulator."""
+    """Run, or continue with, four episodes in the tests' own environment, which needs
+    no simulator.
+    """
     from helpers.scripted_env import make_moving_env
 
     return mme_vla.evaluate(
@@ -306,7 +395,17 @@ def evaluate_scripted(folder: Path, output: Path) -> Any:
 def result_rows(folder: Path, episodes: int, scratch: Path) -> list[dict[str, str]]:
     """The figures that `results` writes of all runs in `folder`."""
     table = scratch / "figures.csv"
-    command("results", folder, "--tasks", "PickXtimes", "VideoUnmask", "--episodes", str(episodes), "--csv", table)
+    command(
+        "results",
+        folder,
+        "--tasks",
+        "PickXtimes",
+        "VideoUnmask",
+        "--episodes",
+        str(episodes),
+        "--csv",
+        table,
+    )
     with table.open(newline="") as file:
         return list(csv.DictReader(file))
 
@@ -314,10 +413,19 @@ def result_rows(folder: Path, episodes: int, scratch: Path) -> list[dict[str, st
 def probe(folder: Path, output: Path, *more: str) -> str:
     """Probe a checkpoint on the dataset, or continue with it; the table that is printed."""
     return command(
-        "probe", f"checkpoint={folder / 'training' / 'framesamp'}", f"recordings={folder / 'dataset'}", "draws=2",
-        "moments=2", "flow_steps=2", "recorded=1", "with=[shuffle,drop:1]", "scan=true", "device=cpu",
-        f"output={output}", *more,
-    )  # fmt: skip
+        "probe",
+        f"checkpoint={folder / 'training' / 'framesamp'}",
+        f"recordings={folder / 'dataset'}",
+        "draws=2",
+        "moments=2",
+        "flow_steps=2",
+        "recorded=1",
+        "with=[shuffle,drop:1]",
+        "scan=true",
+        "device=cpu",
+        f"output={output}",
+        *more,
+    )
 
 
 def numbers(text: str) -> list[str]:
@@ -331,10 +439,18 @@ def probe_figures(folder: Path) -> list[str]:
 
 
 def dataset_figures(folder: Path, name: str) -> list[str]:
-    """What `inspect` counts in a dataset, whose checksums it compares, with the side file of first frames."""
-    printed = command("inspect", f"dataset={folder / name}", f"exec_starts={folder / 'exec_starts.json'}")
+    """What `inspect` counts in a dataset, whose checksums it compares, with the side file of first
+    frames.
+    """
+    printed = command(
+        "inspect", f"dataset={folder / name}", f"exec_starts={folder / 'exec_starts.json'}"
+    )
     # Names of the numbers of states and actions are printed by later versions.
-    return numbers("\n".join(line for line in printed.splitlines() if not line.startswith(("state: ", "action: "))))
+    return numbers(
+        "\n".join(
+            line for line in printed.splitlines() if not line.startswith(("state: ", "action: "))
+        )
+    )
 
 
 def nano_tower() -> str:
@@ -343,7 +459,9 @@ def nano_tower() -> str:
 
 
 def tidy(folder: Path) -> None:
-    """Remove what people look at and no command reads, and the names of this machine and its folders."""
+    """Remove what people look at and no command reads, and the names of this machine and its
+    folders.
+    """
     for place in ("evaluation/launcher", "probe/remembered"):
         shutil.rmtree(folder / place)
     (folder / "probe" / "page.html").unlink()
@@ -367,15 +485,20 @@ def figures(folder: Path, scratch: Path) -> dict[str, Any]:
         "nano_tower": nano_tower(),
         "probe": probe_figures(folder / "probe"),
         "words": chosen,
-        "losses": {name: resumed_losses(folder, name, run, scratch) for name, run in chosen.items()},
+        "losses": {
+            name: resumed_losses(folder, name, run, scratch) for name, run in chosen.items()
+        },
         "results": {
-            name: result_rows(folder / "evaluation" / name, count, scratch) for name, count in FINISHED.items()
+            name: result_rows(folder / "evaluation" / name, count, scratch)
+            for name, count in FINISHED.items()
         },
     }
 
 
 def main(folder: Path) -> None:
-    """Write everything below `folder`, a path relative to the repository, that does not exist yet."""
+    """Write everything below `folder`, a path relative to the repository, that does
+    not exist yet.
+    """
     os.chdir(REPOSITORY)
     folder.mkdir(parents=True)
     with tempfile.TemporaryDirectory() as place:

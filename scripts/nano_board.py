@@ -1,7 +1,8 @@
 """Write the table, the figure and the evidence page of nanoMME from the rows in benchmarks/nano16.
 
-python scripts/nano_board.py                                # pages, from the rows that are committed
-python scripts/nano_board.py --add outputs/nano16/reserved  # copy the rows of a run first, records compressed
+python scripts/nano_board.py                                # pages, from the rows that are
+committed python scripts/nano_board.py --add outputs/nano16/reserved  # copy the rows of a run
+first, records compressed
 """
 
 import argparse
@@ -22,7 +23,8 @@ from mme_vla.utils import read_json, with_checksum, write_json
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = ROOT / "benchmarks" / "nano16"
 PAGE, EVIDENCE, FIGURE = (
-    ROOT / "docs" / name for name in ("train/nano.md", "evidence/nano-board.md", "images/nano16.svg")
+    ROOT / "docs" / name
+    for name in ("train/nano.md", "evidence/nano-board.md", "images/nano16.svg")
 )
 BLOCK = re.compile(r"(?<=<!-- board -->\n).*?(?=<!-- /board -->)", re.DOTALL)
 VARIANTS = [
@@ -34,7 +36,9 @@ EXPECTED = ["demonstrator", "oracle_frames", *VARIANTS, "pi05", MATCHED, "freque
 
 
 def add(folder: Path) -> None:
-    """Copy the rows of a run's split into the folder of their table, checked, with compressed records."""
+    """Copy the rows of a run's split into the folder of their table, checked, with compressed
+    records.
+    """
     for place in sorted(path.parent for path in folder.rglob("trained.json")):
         training = read_training(place)
         table = ROWS / training.table
@@ -43,7 +47,9 @@ def add(folder: Path) -> None:
         for name in FILES:
             shutil.copyfile(place / name, target / name)
         files = sorted(place.glob("episodes*.jsonl*"))
-        lines = b"".join(lzma.decompress(f.read_bytes()) if f.suffix == ".xz" else f.read_bytes() for f in files)
+        lines = b"".join(
+            lzma.decompress(f.read_bytes()) if f.suffix == ".xz" else f.read_bytes() for f in files
+        )
         (target / f"{RECORDS}.xz").write_bytes(lzma.compress(lines, preset=9))
         (target / "receipt.json").unlink(missing_ok=True)
         if (receipt := place / "receipt.json").is_file():
@@ -55,12 +61,20 @@ def add(folder: Path) -> None:
 
 def add_scenes(file: Path, target: Path) -> None:
     """Add the scenes that a run tried to those of its table."""
-    scenes, listed = (read_json(path, "the scenes of a split") if path.is_file() else {} for path in (file, target))
-    write_json(target, {**scenes, "tried": dict(sorted((scenes["tried"] | listed.get("tried", {})).items()))})
+    scenes, listed = (
+        read_json(path, "the scenes of a split") if path.is_file() else {}
+        for path in (file, target)
+    )
+    write_json(
+        target,
+        {**scenes, "tried": dict(sorted((scenes["tried"] | listed.get("tried", {})).items()))},
+    )
 
 
 def copy_receipt(receipt: Path, target: Path) -> None:
-    """Copy the receipt of records, with the checkpoint's folder in its run in place of that on this machine."""
+    """Copy the receipt of records, with the checkpoint's folder in its run in place of that on this
+    machine.
+    """
     content = read_receipt(receipt)
     for part in content["conditions"]:
         part["checkpoint"]["folder"] = content["settings"].get("source")
@@ -68,7 +82,9 @@ def copy_receipt(receipt: Path, target: Path) -> None:
 
 
 def boards() -> list[Board]:
-    """A board for each split and action space that has rows: those of choices first, then those with most rows."""
+    """A board for each split and action space that has rows: those of choices first, then those
+    with most rows.
+    """
     tables = sorted({path.parents[2] for path in ROWS.rglob("trained.json")})
     made = [Board(read_rows([table])) for table in tables]
     return sorted(made, key=lambda board: (board.action_space != CHOICES, -len(board.rows)))
@@ -99,7 +115,11 @@ def evidence(made: list[Board]) -> str:
     for board in made:
         listed = [*board_page.notes(board), *board_page.separating(board)]
         actions = "" if board.action_space == CHOICES else f", `{board.action_space}`"
-        parts.append("\n".join([f"## Split `{board.split}`{actions}", "", *(f"- {line}" for line in listed), ""]))
+        parts.append(
+            "\n".join(
+                [f"## Split `{board.split}`{actions}", "", *(f"- {line}" for line in listed), ""]
+            )
+        )
         parts += [to_markdown(table) for table in board_page.all_tables(board)]
     return "\n".join(parts)
 
@@ -120,7 +140,9 @@ def _names(names: list[str]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     how = "folders <output>/<split> of runs, or rows in them, to copy first"
     parser.add_argument("--add", type=Path, nargs="+", default=[], help=how)
     for folder in parser.parse_args().add:

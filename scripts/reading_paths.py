@@ -1,7 +1,8 @@
-"""Files and lines that a reader needs for five questions about the library (docs/extend/architecture.md).
+"""Files and lines that a reader needs for five questions about the library
+(docs/extend/architecture.md).
 
-(a) and (e) follow imports from a starting point; (b) to (d) list the files on the way. Every file is checked to exist,
-and every call of (d) to be defined where it is listed.
+(a) and (e) follow imports from a starting point; (b) to (d) list the files on the way. Every file
+is checked to exist, and every call of (d) to be defined where it is listed.
 
     python scripts/reading_paths.py
 """
@@ -14,10 +15,17 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "mme_vla"
 
-MODEL = ["mme_vla.model", "mme_vla.backbone.pi05", "mme_vla.memory.framesamp", "mme_vla.integration.modulator"]
+MODEL = [
+    "mme_vla.model",
+    "mme_vla.backbone.pi05",
+    "mme_vla.memory.framesamp",
+    "mme_vla.integration.modulator",
+]
 """FrameSamp + Modulator, from image to loss."""
 NOT_READ = {"mme_vla", "mme_vla.errors", "mme_vla.registry", "mme_vla.speed"}
-"""Of no concern to the mathematics: messages, tables of names, and marks of what can be made faster."""
+"""Of no concern to the mathematics: messages, tables of names, and marks of what can be made
+faster.
+"""
 SELECTION = ["memory/tokendrop.py", "memory/history.py"]
 HEAD = ["backbone/flow.py"]
 SAMPLING = [
@@ -69,7 +77,11 @@ def sampling() -> list[Path]:
     """The files of (d), each of which must define its call."""
     files = check([PACKAGE / name for name, _ in SAMPLING])
     for file, (_, call) in zip(files, SAMPLING, strict=True):
-        functions = {node.name for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.FunctionDef)}
+        functions = {
+            node.name
+            for node in ast.walk(ast.parse(file.read_text()))
+            if isinstance(node, ast.FunctionDef)
+        }
         if call not in functions:
             sys.exit(f"{file} defines no {call}(); update the lists in {Path(__file__).name}")
     return list(dict.fromkeys(files))
@@ -83,11 +95,18 @@ def block(page: str) -> str:
 
 
 def example() -> tuple[int, int]:
-    """Lines of the README's example of the model alone, and the modules of the library that the full one imports."""
-    count = "\nimport sys\nprint(len([name for name in sys.modules if name.split('.')[0] == 'mme_vla']))"
+    """Lines of the README's example of the model alone, and the modules of the library that the
+    full one imports.
+    """
+    count = (
+        "\nimport sys\nprint(len([name for name in sys.modules if name.split('.')[0] =="
+        " 'mme_vla']))"
+    )
     command = [sys.executable, "-c", block("docs/start/python.md") + count]
     result = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
-    return len([line for line in block(ALONE).splitlines() if line.strip()]), int(result.stdout.split()[-1])
+    return len([line for line in block(ALONE).splitlines() if line.strip()]), int(
+        result.stdout.split()[-1]
+    )
 
 
 def row(question: str, files: list[Path], note: str = "") -> str:
@@ -101,10 +120,17 @@ def main() -> None:
     lines, modules = example()
     print("| question | to read | files |\n|---|---|---|")
     print(row("(a) FrameSamp + Modulator, image to loss", closure(MODEL)))
-    print(row("(b) another selection rule of TokenDrop", check([PACKAGE / name for name in SELECTION])))
+    print(
+        row(
+            "(b) another selection rule of TokenDrop", check([PACKAGE / name for name in SELECTION])
+        )
+    )
     print(row("(c) another flow head", check([PACKAGE / name for name in HEAD])))
     print(row("(d) where a chunk is sampled", sampling(), f"{len(SAMPLING)} calls, "))
-    print(f"| (e) the model in your own loop | {lines} lines, {modules} modules imported | `{ALONE}` |")
+    print(
+        f"| (e) the model in your own loop | {lines} lines, {modules} modules imported |"
+        f" `{ALONE}` |"
+    )
 
 
 if __name__ == "__main__":

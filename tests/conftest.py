@@ -14,7 +14,10 @@ from helpers import REPOSITORY
 def _folder(variable: str, default: Path, what: str) -> Path:
     folder = Path(os.environ.get(variable, default))
     if not folder.is_dir():
-        pytest.skip(f"{what} not found at {folder}; set {variable} to a folder of that layout to run this test")
+        pytest.skip(
+            f"{what} not found at {folder}; set {variable} to a folder of that layout to run this"
+            " test"
+        )
     return folder
 
 
@@ -27,7 +30,9 @@ def _isolated_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """With `MME_VLA_PARITY_TABLE=1`, print the largest error of every parity test as the table of docs/evidence."""
+    """With `MME_VLA_PARITY_TABLE=1`, print the largest error of every parity test as the table of
+    docs/evidence.
+    """
     if os.environ.get("MME_VLA_PARITY_TABLE"):
         from helpers import golden
 
@@ -51,7 +56,9 @@ def renderer() -> str:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder with specifications and reference data that developers have beside the repository."""
+    """The folder with specifications and reference data that developers have beside
+    the repository.
+    """
     return _folder("MME_VLA_SHARED", REPOSITORY.parent / "shared", "reference data")
 
 
@@ -64,4 +71,6 @@ def parity() -> Path:
 @pytest.fixture(scope="session")
 def h5_folder() -> Path:
     """Official demonstration files, record_dataset_<Task>.h5."""
-    return _folder("MME_VLA_ROBOMME_H5", REPOSITORY.parent / "shared" / "robomme_h5", "RoboMME HDF5 episodes")
+    return _folder(
+        "MME_VLA_ROBOMME_H5", REPOSITORY.parent / "shared" / "robomme_h5", "RoboMME HDF5 episodes"
+    )

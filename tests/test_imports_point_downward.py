@@ -1,4 +1,6 @@
-"""Imports of the library point downward: the order of its packages, without exemption, and no cycle at run time."""
+"""Imports of the library point downward: the order of its packages, without exemption, and no cycle
+at run time.
+"""
 
 import ast
 from collections.abc import Iterator
@@ -11,12 +13,37 @@ PACKAGE = REPOSITORY / "mme_vla"
 
 # From the top: a package or top-level module imports only itself and what is below it.
 ORDER = [
-    "cli", "nano", "testing", "play", "probing", "evaluation", "serving", "training", "subgoal", "envs", "data",
-    "methods", "weights", "policy", "model", "processing", "integration", "memory", "backbone", "speed", "embodiment",
-    "config", "types", "registry", "utils", "errors",
-]  # fmt: skip
+    "cli",
+    "nano",
+    "testing",
+    "play",
+    "probing",
+    "evaluation",
+    "serving",
+    "training",
+    "subgoal",
+    "envs",
+    "data",
+    "methods",
+    "weights",
+    "policy",
+    "model",
+    "processing",
+    "integration",
+    "memory",
+    "backbone",
+    "speed",
+    "embodiment",
+    "config",
+    "types",
+    "registry",
+    "utils",
+    "errors",
+]
 ENTRIES = {"train", "evaluate", "results", "analyse", "probe", "inspect", "serve", "__main__"}
-"""Top-level modules that only run a command, as `__main__.py` of `nano` and `play` does: they belong to `cli`."""
+"""Top-level modules that only run a command, as `__main__.py` of `nano` and `play` does: they
+belong to `cli`.
+"""
 APART = ("memory", "backbone")
 """Packages that do not import each other in either direction."""
 
@@ -31,17 +58,25 @@ def modules() -> dict[str, Path]:
 
 
 def level_of(module: str) -> str:
-    """The entry of `ORDER` that a module belongs to; `mme_vla` itself, which loads lazily, is at the top."""
+    """The entry of `ORDER` that a module belongs to; `mme_vla` itself, which loads lazily, is at
+    the top.
+    """
     parts = module.split(".")
     return "cli" if parts[-1] == "__main__" or len(parts) == 1 or parts[1] in ENTRIES else parts[1]
 
 
 @cache
 def imports(module: str, for_types: bool = True) -> set[str]:
-    """Modules of the library that a module imports anywhere: at run time, lazily, or for type checkers alone."""
+    """Modules of the library that a module imports anywhere: at run time, lazily, or for type
+    checkers alone.
+    """
     tree = ast.parse(modules()[module].read_text())
     if not for_types:
-        tree.body = [node for node in tree.body if "TYPE_CHECKING" not in ast.unparse(getattr(node, "test", node))[:13]]
+        tree.body = [
+            node
+            for node in tree.body
+            if "TYPE_CHECKING" not in ast.unparse(getattr(node, "test", node))[:13]
+        ]
     return set(_imports(tree)) - {module}
 
 
@@ -53,7 +88,9 @@ def _imports(tree: ast.Module) -> Iterator[str]:
             for alias in node.names:
                 name = f"{node.module}.{alias.name}"
                 yield from (
-                    target for target in (name, node.module)[name not in modules() :][:1] if target in modules()
+                    target
+                    for target in (name, node.module)[name not in modules() :][:1]
+                    if target in modules()
                 )
 
 
@@ -97,4 +134,8 @@ def test_the_core_imports_without_transformers() -> None:
     for module, file in modules().items():
         if level_of(module) != "subgoal" and file.parent.name != "sam2act":
             lines = file.read_text().splitlines()  # methods import it where they build their towers
-            assert not [line for line in lines if line.startswith(("import transformers", "from transformers"))], file
+            assert not [
+                line
+                for line in lines
+                if line.startswith(("import transformers", "from transformers"))
+            ], file

@@ -12,7 +12,10 @@ class Blink(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.side, self.time, self.arm = int(self.np_random.integers(2)) * 2 - 1, 0, 0.0
-        return self.observe(), {"goal": "move to where the light was", "video": [self.observe(light=True)] * 4}
+        return self.observe(), {
+            "goal": "move to where the light was",
+            "video": [self.observe(light=True)] * 4,
+        }
 
     def observe(self, light=False):
         image = np.full((64, 64, 3), 40, np.uint8)
@@ -22,7 +25,10 @@ class Blink(gymnasium.Env):
         return {"top": image, "state": np.array([self.arm], np.float32)}
 
     def step(self, action):
-        self.time, self.arm = self.time + 1, float(np.clip(self.arm + 0.25 * np.clip(action[0], -1, 1), -1, 1))
+        self.time, self.arm = (
+            self.time + 1,
+            float(np.clip(self.arm + 0.25 * np.clip(action[0], -1, 1), -1, 1)),
+        )
         success, over = self.arm * self.side >= 1, abs(self.arm) >= 1
         return self.observe(), float(success), over, self.time >= 20, {"success": success}
 
@@ -31,8 +37,13 @@ class Blink(gymnasium.Env):
 class BlinkEnvironment(Environment):
     tasks = ("Blink",)
     suites = {"Recall": ("Blink",)}
-    embodiment = dict(name="blink", cameras={"top": {"augment": "none"}}, state={"width": 1},
-                      conditioning_video=True, action={"width": 1, "horizon": 4, "execute": 4})  # fmt: skip
+    embodiment = dict(
+        name="blink",
+        cameras={"top": {"augment": "none"}},
+        state={"width": 1},
+        conditioning_video=True,
+        action={"width": 1, "horizon": 4, "execute": 4},
+    )
 
     def make(self, spec, render=True):
         return Blink()

@@ -1,4 +1,6 @@
-"""A memory without training: keys and values of the last prefixes, which the actions read beside the current ones."""
+"""A memory without training: keys and values of the last prefixes, which the actions read beside
+the current ones.
+"""
 
 from collections.abc import Sequence
 
@@ -24,7 +26,9 @@ class Fifo(CacheMemory):
 
 @register("integration", "beside_prefix")
 class BesidePrefix(Integration):
-    """The actions attend to stored keys and values as they do to the prefix. The prefix does not."""
+    """The actions attend to stored keys and values as they do to the prefix. The
+    prefix does not.
+    """
 
     visibility = VISIBILITY
 

@@ -20,7 +20,9 @@ class VideoFrames(PerceptualMemory):
         last = min(step, max(exec_start - 1, 0))
         return np.unique(np.linspace(0, last, self.frames).astype(np.int64))
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         return all_patches(self.frames_at(step, history.exec_start), self.storage.grid)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:

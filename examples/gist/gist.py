@@ -1,4 +1,6 @@
-"""An integration of one's own: the memory's gist joins the time condition, its tokens stand beside the actions."""
+"""An integration of one's own: the memory's gist joins the time condition, its tokens stand beside
+the actions.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,7 +14,9 @@ from mme_vla.integration.base import required
 
 @register("integration", "gist")
 class Gist(Integration):
-    """Mean of the memory → condition of every action norm; all of it → tokens that the actions attend to."""
+    """Mean of the memory → condition of every action norm; all of it → tokens that the actions
+    attend to.
+    """
 
     def __init__(self, backbone: Any) -> None:
         super().__init__(backbone)

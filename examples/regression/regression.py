@@ -1,4 +1,6 @@
-"""An own backbone: a small transformer that predicts a chunk in one pass, trained on the absolute error."""
+"""An own backbone: a small transformer that predicts a chunk in one pass, trained on the absolute
+error.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -32,13 +34,18 @@ class Layer(nn.Module):
 
 @register("backbone", "regression")
 class Regression(Backbone, HasLoraTargets, Recomputes):
-    """Patches, words and memory in one sequence; a learned query for each step of the chunk reads it."""
+    """Patches, words and memory in one sequence; a learned query for each step of the chunk reads
+    it.
+    """
 
-    Config = BackboneConfig  # one's own dataclass will do; integrations read `vlm.width` and the like from it
+    # one's own dataclass will do; integrations read `vlm.width` and the like from it
+    Config = BackboneConfig
     supports = frozenset({"blocks"})
     lora_targets, heads = ("qkv", "out"), ("head",)
 
-    def __init__(self, config: BackboneConfig, extra_experts: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, config: BackboneConfig, extra_experts: Mapping[str, Any] | None = None
+    ) -> None:
         super().__init__(config, extra_experts)
         width, vision = config.vlm.width, config.vision
         self.vision_width = width
@@ -48,7 +55,9 @@ class Regression(Backbone, HasLoraTargets, Recomputes):
         self.words, self.order = nn.Embedding(config.vocab_size, width), nn.Embedding(1024, width)
         self.places = nn.Parameter(torch.randn(self.grid**2, width) * 0.02)
         self.queries = nn.Parameter(torch.randn(config.horizon, width))
-        self.layers = nn.ModuleList(Layer(width, config.num_heads, config.vlm.mlp_dim) for _ in range(config.depth))
+        self.layers = nn.ModuleList(
+            Layer(width, config.num_heads, config.vlm.mlp_dim) for _ in range(config.depth)
+        )
         self.head = nn.Linear(width, config.action_dim)
         self._recompute = False
 
@@ -56,10 +65,15 @@ class Regression(Backbone, HasLoraTargets, Recomputes):
         return self.vision(images).flatten(2).transpose(1, 2) + self.places
 
     def embed(self, batch: Batch) -> list[Block]:
-        tokens = self.encode_images(batch.images.flatten(0, 1)).unflatten(0, batch.images.shape[:2])  # b v n d
+        tokens = self.encode_images(batch.images.flatten(0, 1)).unflatten(
+            0, batch.images.shape[:2]
+        )  # b v n d
         mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
         words = self.words(batch.prompt) + self.order.weight[: batch.prompt.shape[1]]
-        return [Block("images", tokens.flatten(1, 2), mask, "vlm"), Block("prompt", words, batch.prompt_mask, "vlm")]
+        return [
+            Block("images", tokens.flatten(1, 2), mask, "vlm"),
+            Block("prompt", words, batch.prompt_mask, "vlm"),
+        ]
 
     def predict(self, injection: Injection) -> Tensor:
         """The chunk [b, h, a]."""
@@ -68,7 +82,9 @@ class Regression(Backbone, HasLoraTargets, Recomputes):
         blocks = [*injection.blocks, Block("action", queries, everywhere, "action")]
         x, valid = torch.cat([b.tokens for b in blocks], 1), torch.cat([b.mask for b in blocks], 1)
         spans = [Span(block.name, len(block)) for block in blocks]
-        mask = additive_mask(attention_mask(spans, spans, valid, valid, injection.visibility), x.dtype)
+        mask = additive_mask(
+            attention_mask(spans, spans, valid, valid, injection.visibility), x.dtype
+        )
         for layer in self.layers:
             keep_nothing = self._recompute and torch.is_grad_enabled()
             x = checkpoint(layer, x, mask, use_reentrant=False) if keep_nothing else layer(x, mask)
@@ -80,7 +96,11 @@ class Regression(Backbone, HasLoraTargets, Recomputes):
 
     @torch.no_grad()
     def sample(
-        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Batch,
+        injection: Injection,
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
         return self.predict(injection)
 

@@ -1,4 +1,6 @@
-"""Text that the policy writes: a line at each decision, which its next prompt has as the note `scratchpad`."""
+"""Text that the policy writes: a line at each decision, which its next prompt has as the note
+`scratchpad`.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -26,7 +28,9 @@ class Scratchpad(PromptFormat):
 
 @register("backbone", "pi05_writer")
 class Writer(Pi05Backbone, AuxiliaryLosses, HasLanguageHead):
-    """π0.5 with a small language head: all tokens of a line at once, from the mean of images and prompt."""
+    """π0.5 with a small language head: all tokens of a line at once, from the mean of images and
+    prompt.
+    """
 
     note = NOTE
 
@@ -34,16 +38,27 @@ class Writer(Pi05Backbone, AuxiliaryLosses, HasLanguageHead):
         super().__init__(config, extra_experts)
         width = config.vlm.width
         self.slots = nn.Parameter(torch.randn(Scratchpad.note_length, width))
-        self.line = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+        self.line = nn.Sequential(
+            nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
+        )
 
     def logits(self, injection: Injection) -> Tensor:
         """Of a line's tokens, [b, l, vocabulary]."""
-        means = [(b.tokens * b.mask[..., None]).sum(1) / b.mask.sum(1, keepdim=True) for b in injection.blocks]
+        means = [
+            (b.tokens * b.mask[..., None]).sum(1) / b.mask.sum(1, keepdim=True)
+            for b in injection.blocks
+        ]
         return self.line(sum(means)[:, None] + self.slots) @ self.embedding.weight.T
 
-    def losses(self, batch: Batch, injection: Injection, memory: MemoryTokens | None) -> dict[str, Tensor]:
+    def losses(
+        self, batch: Batch, injection: Injection, memory: MemoryTokens | None
+    ) -> dict[str, Tensor]:
         logits = self.logits(injection).float()
-        return {"line": nn.functional.cross_entropy(logits.mT, batch.labels[NOTE], reduction="none").mean(1)}
+        return {
+            "line": nn.functional.cross_entropy(
+                logits.mT, batch.labels[NOTE], reduction="none"
+            ).mean(1)
+        }
 
     def write(self, batch: Batch, injection: Injection) -> Tensor:
         return self.logits(injection).argmax(-1)

@@ -1,4 +1,6 @@
-"""DAgger: the policy acts, the oracle says what it would have chosen, and the policy learns from all of that so far."""
+"""DAgger: the policy acts, the oracle says what it would have chosen, and the policy learns from
+all of that so far.
+"""
 
 from dataclasses import replace
 
@@ -17,7 +19,9 @@ NOISE = 0.2  # on remembered tokens, so that few demonstrations are learned by h
 
 def make_easy_env(task: str, split: str, episode: int, **options):
     """An easy scene of a task, by choices; `episode` is its seed."""
-    return make_env(task, seed=FIRST_SEED + episode, difficulty="easy", action_space="multi_choice", **options)
+    return make_env(
+        task, seed=FIRST_SEED + episode, difficulty="easy", action_space="multi_choice", **options
+    )
 
 
 def learn(policy: MMEPolicy, optimizer: torch.optim.Optimizer, rows: Batch, updates: int) -> None:
@@ -34,8 +38,12 @@ def learn(policy: MMEPolicy, optimizer: torch.optim.Optimizer, rows: Batch, upda
     policy.eval()
 
 
-def main(output: str = "outputs/dagger", scenes: tuple[int, ...] = (180, 40, 24), updates: int = 900) -> None:
-    """Print success in new scenes and the loss after each round; in the first round the oracle acts."""
+def main(
+    output: str = "outputs/dagger", scenes: tuple[int, ...] = (180, 40, 24), updates: int = 900
+) -> None:
+    """Print success in new scenes and the loss after each round; in the first round the oracle
+    acts.
+    """
     policy = build_policy(
         "framesamp_modul", backbone="nano_choice", embodiment="robomme_choice_front", seed=0,
         memory={"budget": 4, "grid": 1, "every": 8}, policy={"augment": False},
@@ -48,7 +56,9 @@ def main(output: str = "outputs/dagger", scenes: tuple[int, ...] = (180, 40, 24)
     data: list[Batch] = []
     for step, count in enumerate(scenes):
         jobs = [Job("VideoUnmask", "train", sum(scenes[:step]) + i) for i in range(count)]
-        trajectories = list(rollouts(policy, make_easy_env, jobs, ["oracle"], oracle_share=step == 0, max_steps=400))
+        trajectories = list(
+            rollouts(policy, make_easy_env, jobs, ["oracle"], oracle_share=step == 0, max_steps=400)
+        )
         print(f"round {step}: success {sum(t.success for t in trajectories) / count:.2f}")
         data += [t.oracle for t in trajectories if t.oracle is not None]
         if step < len(scenes) - 1:

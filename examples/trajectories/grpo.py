@@ -1,4 +1,6 @@
-"""GRPO: each episode is played several times, and what did better than its group becomes more probable."""
+"""GRPO: each episode is played several times, and what did better than its group becomes more
+probable.
+"""
 
 import torch
 from two_choices import make_two_choices
@@ -15,7 +17,9 @@ CLIP = 0.2  # of the probability ratio, either way
 
 def play(policy: MMEPolicy, seed: int) -> list[Trajectory]:
     keep = ("observations", "rewards", "log_probs")
-    return sorted(rollouts(policy, make_two_choices, JOBS, keep, seed=seed), key=lambda t: t.job.episode)
+    return sorted(
+        rollouts(policy, make_two_choices, JOBS, keep, seed=seed), key=lambda t: t.job.episode
+    )
 
 
 def tower_free(policy: MMEPolicy) -> list[torch.nn.Parameter]:
@@ -24,11 +28,15 @@ def tower_free(policy: MMEPolicy) -> list[torch.nn.Parameter]:
     return [parameter for parameter in policy.parameters() if parameter.requires_grad]
 
 
-def update(policy: MMEPolicy, optimizer: torch.optim.Optimizer, groups: list[list[Trajectory]], epochs: int) -> None:
+def update(
+    policy: MMEPolicy, optimizer: torch.optim.Optimizer, groups: list[list[Trajectory]], epochs: int
+) -> None:
     returns = torch.tensor([[t.total_reward for t in group] for group in groups])
     advantages = (returns - returns.mean(0)) / (returns.std(0) + 1e-6)  # in the group of an episode
     trajectories = [t for group in groups for t in group]
-    advantages = advantages.flatten().repeat_interleave(torch.tensor([len(t.chunks) for t in trajectories]))
+    advantages = advantages.flatten().repeat_interleave(
+        torch.tensor([len(t.chunks) for t in trajectories])
+    )
     rows = with_view_tokens(policy, join([t.observations for t in trajectories]))
     chunks = torch.cat([t.chunks for t in trajectories])
     before = torch.cat([t.log_probs for t in trajectories])

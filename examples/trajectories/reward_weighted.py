@@ -1,4 +1,6 @@
-"""Reward-weighted regression: what the policy did is imitated, weighted by the exponential of its return."""
+"""Reward-weighted regression: what the policy did is imitated, weighted by the exponential of its
+return.
+"""
 
 import torch
 from grpo import JOBS, tower_free
@@ -12,7 +14,9 @@ from mme_vla.processing.normalise import NormStats
 TEMPERATURE = 0.25  # of the returns: smaller imitates the best alone
 
 
-def update(policy: MMEPolicy, optimizer: torch.optim.Optimizer, trajectories: list[Trajectory], epochs: int) -> None:
+def update(
+    policy: MMEPolicy, optimizer: torch.optim.Optimizer, trajectories: list[Trajectory], epochs: int
+) -> None:
     returns = torch.tensor([t.total_reward for t in trajectories])
     counts = torch.tensor([len(t.chunks) for t in trajectories])
     weights = ((returns - returns.max()) / TEMPERATURE).exp().repeat_interleave(counts)
@@ -33,7 +37,9 @@ def main(rounds: int = 12, group: int = 6, epochs: int = 4) -> tuple[float, floa
     rates = []
     for step in range(rounds):
         seeds = range(step * group, (step + 1) * group)
-        trajectories = [t for seed in seeds for t in rollouts(policy, make_two_choices, JOBS, seed=seed)]
+        trajectories = [
+            t for seed in seeds for t in rollouts(policy, make_two_choices, JOBS, seed=seed)
+        ]
         rates.append(sum(t.success for t in trajectories) / len(trajectories))
         print(f"round {step}: success {rates[-1]:.2f}")
         update(policy, optimizer, trajectories, epochs)

@@ -16,7 +16,9 @@ class TwoButtons(Task):
 
     def build(self, draws: Draws) -> None:
         spots = [draw_button(draws, place, (0.1, 0.1)) for place in PLACES]
-        self.buttons = [self.add(build_button(self, at, name)) for name, at in zip(NAMES, spots, strict=True)]
+        self.buttons = [
+            self.add(build_button(self, at, name)) for name, at in zip(NAMES, spots, strict=True)
+        ]
         self.order = [int(i) for i in draws.permutation(2)]
 
     def subtasks(self) -> list[SubTask]:
@@ -38,10 +40,17 @@ class TwoButtons(Task):
 
     def choices(self) -> list[Choice]:
         return [
-            Choice("ab"[i], f"press the {NAMES[i]} button", lambda demo, _, i=i: demo.press(self.buttons[i]))
+            Choice(
+                "ab"[i],
+                f"press the {NAMES[i]} button",
+                lambda demo, _, i=i: demo.press(self.buttons[i]),
+            )
             for i in range(2)
         ]
 
     def goals(self) -> list[str]:
         first, second = (NAMES[i] for i in self.order)
-        return [f"press the {first} button, then the {second} one", f"the {first} button first, then the {second}"]
+        return [
+            f"press the {first} button, then the {second} one",
+            f"the {first} button first, then the {second}",
+        ]

@@ -1,4 +1,6 @@
-"""A memory with a learned write head: it learns which frames begin a sub-task, and weighs their tokens by it."""
+"""A memory with a learned write head: it learns which frames begin a sub-task, and weighs their
+tokens by it.
+"""
 
 from dataclasses import replace
 
@@ -19,12 +21,16 @@ class WriteHead(PerceptualMemory, ReadsLabels):
 
     reads_labels = (LABEL,)
 
-    def __init__(self, d_vision: int, width: int, budget: int = 256, grid: int = 4, spacing: int = 4) -> None:
+    def __init__(
+        self, d_vision: int, width: int, budget: int = 256, grid: int = 4, spacing: int = 4
+    ) -> None:
         super().__init__(d_vision, width, budget, StorageSpec(grid))
         self.frames, self.spacing = budget // grid**2, spacing
         self.write = nn.Linear(d_vision, 1)
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         frames = np.arange(step, -1, -self.spacing)[: self.frames][::-1]
         return all_patches(frames, self.storage.grid)
 
@@ -38,6 +44,8 @@ class WriteHead(PerceptualMemory, ReadsLabels):
     def write_loss(self, scores: Tensor, history: HistoryTokens) -> Tensor:
         """Binary cross-entropy [b] of the scores [b, n], the mean over valid tokens."""
         labels = history.labels[LABEL]
-        losses = nn.functional.binary_cross_entropy_with_logits(scores.float(), labels, reduction="none")
+        losses = nn.functional.binary_cross_entropy_with_logits(
+            scores.float(), labels, reduction="none"
+        )
         counted = history.mask.float()
         return (losses * counted).sum(1) / torch.clamp(counted.sum(1), min=1)

@@ -1,1 +1,3 @@
-"""The π0.5 backbone: without memory, with two extension points for it (blocks and the per-layer hook)."""
+"""The π0.5 backbone: without memory, with two extension points for it (blocks and the per-layer
+hook).
+"""

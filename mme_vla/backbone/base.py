@@ -1,4 +1,6 @@
-"""`Backbone`: a network that turns images, prompt and memory into actions, and what an integration injects into it."""
+"""`Backbone`: a network that turns images, prompt and memory into actions, and what an integration
+injects into it.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,11 +14,14 @@ from mme_vla.backbone.layers import Block, Visibility
 from mme_vla.types import Batch, KeysValues, MemoryTokens, Noise, ReadsLabels
 
 Hook = Callable[[int, Tensor], Tensor]
-"""`hook(layer, x)`: the input of the action expert's MLP in a layer, made from its residual stream x [b, h, d]."""
+"""`hook(layer, x)`: the input of the action expert's MLP in a layer, made from its residual stream
+x [b, h, d].
+"""
 
 
 class LayerHooks:
-    """A hook made of one callable a layer. Compiled layers share one code; any other hook makes each compile its own.
+    """A hook made of one callable a layer. Compiled layers share one code; any other hook makes
+    each compile its own.
 
     layers: `layers[i](x)` is the input of layer i's MLP.
     """
@@ -30,7 +35,13 @@ class LayerHooks:
 
 def bind_hook(hook: Hook | None, layer: int) -> Callable[[Tensor], Tensor] | None:
     """The hook of one layer."""
-    return hook.layers[layer] if isinstance(hook, LayerHooks) else None if hook is None else partial(hook, layer)
+    return (
+        hook.layers[layer]
+        if isinstance(hook, LayerHooks)
+        else None
+        if hook is None
+        else partial(hook, layer)
+    )
 
 
 @dataclass(frozen=True)
@@ -38,10 +49,11 @@ class Injection:
     """All that an integration adds for one chunk (`Integration.inject`).
 
     blocks: the prefix in sequence order, the observation's own blocks among them.
-    visibility: which block attends to which; rows for these blocks, for those beside the actions and for `action`.
-    hook: see `Hook`. condition: maps the condition [b, c] of the action expert's norms to a changed one.
-    beside: blocks that run with the actions, before them, in every step.
-    past: stored keys and values, read beside the prefix as the block `cache`. They take no positions.
+    visibility: which block attends to which; rows for these blocks, for those beside the actions
+    and for `action`. hook: see `Hook`. condition: maps the condition [b, c] of the action expert's
+    norms to a changed one. beside: blocks that run with the actions, before them, in every step.
+    past: stored keys and values, read beside the prefix as the block `cache`. They take no
+    positions.
     """
 
     blocks: Sequence[Block]
@@ -55,15 +67,16 @@ class Injection:
 class Backbone(nn.Module):
     """A vision tower, a language model and an action head. It has no dependency on memory.
 
-    The model calls `embed`, lets the integration add memory to the blocks, and passes the result to `loss` or `sample`.
-    Optional capabilities are classes to inherit from as well: `HasFlowHead` (backbone/flow.py), `HasExtraExperts`,
-    `HasLoraTargets`, and those of mme_vla/speed.
+    The model calls `embed`, lets the integration add memory to the blocks, and passes the result to
+    `loss` or `sample`. Optional capabilities are classes to inherit from as well: `HasFlowHead`
+    (backbone/flow.py), `HasExtraExperts`, `HasLoraTargets`, and those of mme_vla/speed.
 
     A subclass is constructed from its sizes and the extra experts of an integration, and sets:
-        Config: the dataclass of its sizes, read from the section `backbone`; integrations are built from it.
-        supports: what an integration may use, of `blocks`, `expert`, `hook`, `condition`, `beside`, `positions` (blocks
-            at rotary positions of their own) and `cache` (`Injection.past`, which needs `KeepsKeysValues`); and a
-            memory, `past` (`Batch.past`).
+        Config: the dataclass of its sizes, read from the section `backbone`; integrations are built
+            from it.
+        supports: what an integration may use, of `blocks`, `expert`, `hook`, `condition`, `beside`,
+            `positions` (blocks at rotary positions of their own) and `cache` (`Injection.past`,
+            which needs `KeepsKeysValues`); and a memory, `past` (`Batch.past`).
         vision: the vision tower; its weights decide what a cache of its tokens holds.
         image_size: side of the square images, in pixels. grid: side of a view's token grid.
         vision_width: width d_vision of the tokens that a memory stores.
@@ -87,15 +100,21 @@ class Backbone(nn.Module):
         raise NotImplementedError
 
     def condition_on_prompt(self, tokens: Tensor, prompt: Tensor, prompt_mask: Tensor) -> Tensor:
-        """Stored tokens [b, n, d_vision] as the network reads them with a prompt [b, l]; by default unchanged."""
+        """Stored tokens [b, n, d_vision] as the network reads them with a prompt [b, l]; by default
+        unchanged.
+        """
         return tokens
 
     def embed(self, batch: Batch) -> list[Block]:
-        """Blocks of the current views, in [−1, 1] (`MMEModel.prepare_images`), and of the prompt."""
+        """Blocks of the current views, in [−1, 1] (`MMEModel.prepare_images`), and of
+        the prompt.
+        """
         raise NotImplementedError
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
-        """The random numbers for the losses of `count` samples, on the CPU: each value [count, …]."""
+        """The random numbers for the losses of `count` samples, on the CPU: each value
+        [count, …].
+        """
         return {}
 
     def loss(self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor]) -> Tensor:
@@ -112,7 +131,11 @@ class Backbone(nn.Module):
         return {}
 
     def sample(
-        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Batch,
+        injection: Injection,
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
         """A normalised chunk [b, h, a], under the caller's autocast.
 
@@ -123,15 +146,19 @@ class Backbone(nn.Module):
         raise NotImplementedError
 
     def parts(self) -> Mapping[str, str]:
-        """Part → pattern of its parameters' names inside this module, in order; the first match decides.
+        """Part → pattern of its parameters' names inside this module, in order; the first match
+        decides.
 
-        Fine-tuning uses the names `vision`, `vlm`, `action`, and `memory` for the extra experts of an integration.
+        Fine-tuning uses the names `vision`, `vlm`, `action`, and `memory` for the extra experts of
+        an integration.
         """
         raise NotImplementedError
 
 
 class HasLanguageHead:
-    """Capability of a backbone: it writes a line of text at each decision, the note `note` of its next prompt."""
+    """Capability of a backbone: it writes a line of text at each decision, the note `note` of its
+    next prompt.
+    """
 
     note: str = "note"
 
@@ -150,11 +177,14 @@ class AuxiliaryLosses(ReadsLabels):
     A memory returns its own with its tokens (`MemoryTokens.losses`).
     """
 
-    def losses(self, batch: Batch, injection: Injection, memory: MemoryTokens | None) -> dict[str, Tensor]:
+    def losses(
+        self, batch: Batch, injection: Injection, memory: MemoryTokens | None
+    ) -> dict[str, Tensor]:
         """Losses by name, each [b], with gradients; called in training alone.
 
         Args:
-            batch: its images are prepared. injection: what the backbone's own loss reads. memory: the memory tokens.
+            batch: its images are prepared. injection: what the backbone's own loss reads. memory:
+                the memory tokens.
         """
         raise NotImplementedError
 
@@ -163,26 +193,37 @@ class KeepsKeysValues:
     """Capability of a backbone: it returns the keys and values that it made of a chunk's prefix."""
 
     def sample_and_keep(
-        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Batch,
+        injection: Injection,
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> tuple[Tensor, KeysValues]:
-        """A chunk as `Backbone.sample` returns it, and the keys and values of `injection.blocks`."""
+        """A chunk as `Backbone.sample` returns it, and the keys and values of
+        `injection.blocks`.
+        """
         raise NotImplementedError
 
 
 class HasExtraExperts:
-    """Capability of a backbone: it runs extra experts, or has parts that a released checkpoint does not contain."""
+    """Capability of a backbone: it runs extra experts, or has parts that a released checkpoint does
+    not contain.
+    """
 
     def init_experts(self, names: Sequence[str]) -> None:
-        """Initialise these experts, and own heads that a checkpoint to start from lacks. All other weights wait."""
+        """Initialise these experts, and own heads that a checkpoint to start from lacks. All other
+        weights wait.
+        """
         raise NotImplementedError
 
 
 class HasLoraTargets:
     """Capability of a backbone: it names the layers that LoRA adapts.
 
-    lora_targets: linear layers that LoRA wraps by default. heads: modules that are trained in full beside the adapters.
-    Both name modules by the end of their name.
-    lora_exclude: pattern of linear layers whose weight is read without calling them, so that no adapter can wrap them.
+    lora_targets: linear layers that LoRA wraps by default. heads: modules that are trained in full
+    beside the adapters. Both name modules by the end of their name.
+    lora_exclude: pattern of linear layers whose weight is read without calling them, so that no
+    adapter can wrap them.
     """
 
     lora_targets: Sequence[str] = ()

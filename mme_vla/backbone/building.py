@@ -17,7 +17,9 @@ _INITIALISERS = {Tensor.normal_, Tensor.uniform_}
 
 @contextmanager
 def shapes_only() -> Iterator[None]:
-    """Build on `meta`, and leave out initialisation, a third of the time that building takes there."""
+    """Build on `meta`, and leave out initialisation, a third of the time that building
+    takes there.
+    """
     with torch.device("meta"), _WithoutInit():
         yield
 
@@ -43,7 +45,9 @@ def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
     from mme_vla.config.sections import read_section
 
     kind: type[Backbone] = BACKBONES[str(section.get("name"))]
-    return kind, read_section(kind.Config, {key: value for key, value in section.items() if key != "name"}, "backbone")
+    return kind, read_section(
+        kind.Config, {key: value for key, value in section.items() if key != "name"}, "backbone"
+    )
 
 
 def shape_of(section: Mapping[str, Any]) -> Backbone:

@@ -1,4 +1,6 @@
-"""A categorical head: letters of the options by cross-entropy, all other numbers by regression, in one pass."""
+"""A categorical head: letters of the options by cross-entropy, all other numbers by regression, in
+one pass.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -19,18 +21,20 @@ WEIGHT = 0.5  # of a mixture's negative log-likelihood, beside the letter's cros
 class ChoiceHead(FlowHead):
     """Reads the network's output as logits of letters and means of the other numbers.
 
-    The network sees no noise: its noisy chunk is 0 and its flow time 1. A sampled letter is the best score among those
-    offered (`ActionSpace.decide`), and a score is a logit with Gumbel noise, so that the choice is an exact sample of
-    the softmax over the offered letters.
+    The network sees no noise: its noisy chunk is 0 and its flow time 1. A sampled letter is the
+    best score among those offered (`ActionSpace.decide`), and a score is a logit with Gumbel noise,
+    so that the choice is an exact sample of the softmax over the offered letters.
 
-    A network may give more than a numbers: the logits of m components and their points, 3·m numbers (`Pointer`). Then
-    the point is a mixture of normal distributions about them, and the mean of the most probable component is taken.
+    A network may give more than a numbers: the logits of m components and their points, 3·m numbers
+    (`Pointer`). Then the point is a mixture of normal distributions about them, and the mean of the
+    most probable component is taken.
 
     Args:
         horizon, action_dim: of a chunk [h, a]. time_distribution: has no effect.
         choice: the columns of the letters, `embodiment.action.choice`.
         temperature: of the letters' softmax while sampling; 0 takes the best letter.
-        deviation: standard deviation of the other numbers while sampling, in normalised units; 0 takes the mean.
+        deviation: standard deviation of the other numbers while sampling, in normalised units; 0
+            takes the mean.
     """
 
     supports_rtc = False
@@ -47,8 +51,9 @@ class ChoiceHead(FlowHead):
         super().__init__(horizon, action_dim, time_distribution, steps=1, deviation=deviation)
         require(
             len(choice) and all(0 <= place < action_dim for place in choice),
-            f"backbone.head.choice={list(choice)} must list the columns of the letters, 0 to {action_dim - 1}. Set "
-            "embodiment=robomme_choice and head.choice=${embodiment.action.choice}.",
+            f"backbone.head.choice={list(choice)} must list the columns of the letters, 0 to"
+            f" {action_dim - 1}. Set embodiment=robomme_choice and"
+            " head.choice=${embodiment.action.choice}.",
         )
         require(temperature >= 0, f"backbone.head.temperature={temperature} must not be negative.")
         self.choice, self.temperature = list(choice), temperature
@@ -56,23 +61,31 @@ class ChoiceHead(FlowHead):
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """`noise` [n, h, a] of zeros and `time` [n] of ones: the loss has no noise."""
-        return {"noise": torch.zeros(count, self.horizon, self.action_dim), "time": torch.ones(count)}
+        return {
+            "noise": torch.zeros(count, self.horizon, self.action_dim),
+            "time": torch.ones(count),
+        }
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
-        """`noise` [h, a] on the CPU: standard Gumbel for letters, standard normal for the other numbers."""
+        """`noise` [h, a] on the CPU: standard Gumbel for letters, standard normal for the other
+        numbers.
+        """
         uniform = torch.rand(self.horizon, len(self.choice), generator=generator).clamp(min=1e-20)
         noise = torch.randn(self.horizon, self.action_dim, generator=generator)
         noise[:, self.choice] = -(-uniform.log()).log()
         return {"noise": noise}
 
     def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
-        """The loss [b, h]: cross-entropy of the letter, plus the mean squared error of the other numbers.
+        """The loss [b, h]: cross-entropy of the letter, plus the mean squared error of the other
+        numbers.
 
         Of a mixture it is plus half the negative log-likelihood, up to a constant, instead.
         """
         output = predict(noise["noise"], noise["time"]).float()
         letters = actions[..., self.choice].argmax(-1)
-        loss = nn.functional.cross_entropy(output[..., self.choice].movedim(-1, 1), letters, reduction="none")
+        loss = nn.functional.cross_entropy(
+            output[..., self.choice].movedim(-1, 1), letters, reduction="none"
+        )
         if not self.numbers:
             return loss
         numbers = actions[..., self.numbers].float()
@@ -84,7 +97,9 @@ class ChoiceHead(FlowHead):
 
     def _mixture(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Logits [b, h, m] and points [b, h, m, 2]."""
-        logits, points = output[..., self.action_dim :].tensor_split([(output.shape[-1] - self.action_dim) // 3], -1)
+        logits, points = output[..., self.action_dim :].tensor_split(
+            [(output.shape[-1] - self.action_dim) // 3], -1
+        )
         return logits, points.unflatten(-1, (-1, 2))
 
     def _means(self, output: Tensor) -> Tensor:
@@ -116,23 +131,32 @@ class ChoiceHead(FlowHead):
         return output + scale * noise
 
     def log_prob(self, predict: PredictAt, chunk: Tensor, options: Tensor | None) -> Tensor:
-        """Log-probability [b, h] of the choices that `ActionSpace.decide` makes of sampled chunks [b, h, a].
+        """Log-probability [b, h] of the choices that `ActionSpace.decide` makes of sampled chunks
+        [b, h, a].
 
         Args:
             chunk: what `sample` returned, or the executed actions as the network predicts them.
             options: [b, letters] bool; the letters offered. None means all.
 
         Returns:
-            Log-probability of the letter, plus the log-density of the other numbers if `deviation` is positive.
+            Log-probability of the letter, plus the log-density of the other numbers if `deviation`
+            is positive.
         """
-        require(self.temperature > 0, "backbone.head.temperature=0 has no log-probability: set a positive temperature.")
+        require(
+            self.temperature > 0,
+            "backbone.head.temperature=0 has no log-probability: set a positive temperature.",
+        )
         output = self._means(predict(torch.zeros_like(chunk), 0).float())
         logits, scores = output[..., self.choice] / self.temperature, chunk[..., self.choice]
         if options is not None:
-            logits, scores = (x.masked_fill(~options[:, None], -torch.inf) for x in (logits, scores))
+            logits, scores = (
+                x.masked_fill(~options[:, None], -torch.inf) for x in (logits, scores)
+            )
         log_prob = logits.log_softmax(-1).gather(-1, scores.argmax(-1, keepdim=True))[..., 0]
         if self.deviation and self.numbers:
             error = (chunk - output)[..., self.numbers]
-            density = normal_log_density(error.flatten(0, 1), self.deviation).unflatten(0, error.shape[:2])
+            density = normal_log_density(error.flatten(0, 1), self.deviation).unflatten(
+                0, error.shape[:2]
+            )
             log_prob = log_prob + density
         return log_prob

@@ -12,11 +12,13 @@ PERIOD = 10_000.0
 
 
 def through_time(layers: Sequence[Any], x: Tensor, visible: Tensor, every: int) -> Tensor:
-    """Features of the last frame of clips, with attention over past frames in some of a transformer's layers.
+    """Features of the last frame of clips, with attention over past frames in some of a
+    transformer's layers.
 
     Args:
         layers: timm's `Block`s. x: [n, t, p, d]. visible: [n, t] bool, False on padding.
-        every: interval of the layers that attend over time, at least the last one; the past is dropped above them.
+        every: interval of the layers that attend over time, at least the last one; the past is
+            dropped above them.
 
     Returns:
         [n, p, d].
@@ -24,7 +26,9 @@ def through_time(layers: Sequence[Any], x: Tensor, visible: Tensor, every: int) 
     n, t = x.shape[:2]
     temporal = {i for i in range(len(layers)) if (i + 1) % every == 0} or {len(layers) - 1}
     times = encode_time(t, x.shape[-1], x.device).to(x.dtype)[:, None]
-    before = (torch.ones(t, t, dtype=torch.bool, device=x.device).tril() & visible[:, None]) | torch.eye(
+    before = (
+        torch.ones(t, t, dtype=torch.bool, device=x.device).tril() & visible[:, None]
+    ) | torch.eye(
         t, dtype=torch.bool, device=x.device
     )  # padding attends to itself, so that no row is empty
     for i, layer in enumerate(layers):
@@ -45,10 +49,14 @@ def space_time(attention: Any, x: Tensor, before: Tensor) -> Tensor:
         attention: timm's `Attention`. before: [n, t, t] bool, which frames a frame attends to.
     """
     n, t, p = x.shape[:3]
-    q, k, v = attention.qkv(x).unflatten(-1, (3, attention.num_heads, -1)).permute(3, 0, 4, 1, 2, 5)  # n h t p c
+    q, k, v = (
+        attention.qkv(x).unflatten(-1, (3, attention.num_heads, -1)).permute(3, 0, 4, 1, 2, 5)
+    )  # n h t p c
     of_patch = [part.permute(0, 3, 1, 2, 4).flatten(0, 1) for part in (q, k, v)]  # n·p h t c
     mask = before.repeat_interleave(p, 0)[:, None]
-    mixed = functional.scaled_dot_product_attention(of_patch[0], of_patch[1], of_patch[2], attn_mask=mask)
+    mixed = functional.scaled_dot_product_attention(
+        of_patch[0], of_patch[1], of_patch[2], attn_mask=mask
+    )
     mixed = mixed.unflatten(0, (n, p)).permute(0, 3, 2, 1, 4)  # n t h p c
     q, k = (part.transpose(1, 2).flatten(0, 1) for part in (q, k))
     output = functional.scaled_dot_product_attention(q, k, mixed.flatten(0, 1))
@@ -56,8 +64,12 @@ def space_time(attention: Any, x: Tensor, before: Tensor) -> Tensor:
 
 
 def encode_time(count: int, width: int, device: torch.device) -> Tensor:
-    """Sinusoidal encoding [count, width] float32 of the frames' times, exactly 0 at the last frame."""
+    """Sinusoidal encoding [count, width] float32 of the frames' times, exactly 0 at
+    the last frame.
+    """
     ages = torch.arange(1 - count, 1, device=device, dtype=torch.float32)
-    rates = torch.exp(torch.arange(0, width, 2, device=device, dtype=torch.float32) * (-math.log(PERIOD) / width))
+    rates = torch.exp(
+        torch.arange(0, width, 2, device=device, dtype=torch.float32) * (-math.log(PERIOD) / width)
+    )
     angles = ages[:, None] * rates
     return torch.stack([angles.sin(), angles.cos() - 1], -1).flatten(1)

@@ -1,4 +1,6 @@
-"""Sizes of π0.5 (`pi05`) and of its small twin (`tiny`), and the class that the section `backbone` names."""
+"""Sizes of π0.5 (`pi05`) and of its small twin (`tiny`), and the class that the section `backbone`
+names.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,7 +9,9 @@ from typing import Any
 from mme_vla.errors import brief, check_choice, check_multiple, require
 
 LARGEST, DEEPEST = 2**24, 2**10
-"""Bounds of every size and of layers, far above any network here: a number of a damaged file exceeds them."""
+"""Bounds of every size and of layers, far above any network here: a number of a damaged file
+exceeds them.
+"""
 
 
 def check_positive(config: Any, prefix: str) -> None:
@@ -17,7 +21,10 @@ def check_positive(config: Any, prefix: str) -> None:
             require(0 < value < 1, f"{prefix}{name}={brief(value)} must lie between 0 and 1.")
         if isinstance(value, int) and not isinstance(value, bool):
             most = DEEPEST if name in ("depth", "horizon") else LARGEST
-            require(1 <= value <= most, f"{prefix}{name}={brief(value)} must be at least 1 and at most {most}.")
+            require(
+                1 <= value <= most,
+                f"{prefix}{name}={brief(value)} must be at least 1 and at most {most}.",
+            )
 
 
 @dataclass(frozen=True)
@@ -33,12 +40,16 @@ class VisionConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.vision.")
-        check_multiple("backbone.vision.", "image_size", self.image_size, "patch_size", self.patch_size)
+        check_multiple(
+            "backbone.vision.", "image_size", self.image_size, "patch_size", self.patch_size
+        )
 
 
 @dataclass(frozen=True)
 class ExpertConfig:
-    """One Gemma expert's own sizes; depth, heads and head width are shared by all (paper, section 4.1)."""
+    """One Gemma expert's own sizes; depth, heads and head width are shared by all (paper, section
+    4.1).
+    """
 
     width: int
     mlp_dim: int
@@ -58,8 +69,12 @@ class BackboneConfig:
     vocab_size: int = 257_152
     action_dim: int = 32
     horizon: int = 20
-    time_distribution: str = "beta"  # `beta`: 0.001 + 0.999·Beta(1.5, 1), as released; `uniform`: the paper's text
-    head: Mapping[str, Any] = field(default_factory=lambda: {"name": "flow"}, hash=False)  # a key of HEADS, its options
+    time_distribution: str = (
+        "beta"  # `beta`: 0.001 + 0.999·Beta(1.5, 1), as released; `uniform`: the paper's text
+    )
+    head: Mapping[str, Any] = field(
+        default_factory=lambda: {"name": "flow"}, hash=False
+    )  # a key of HEADS, its options
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
@@ -67,5 +82,7 @@ class BackboneConfig:
         check_positive(self.action, "backbone.action.")
         check_multiple("backbone.", "num_heads", self.num_heads, "num_kv_heads", self.num_kv_heads)
         check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)  # of a rotation
-        check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)  # sin and cos of the flow time
+        check_multiple(
+            "backbone.", "action.width", self.action.width, "pairs", 2
+        )  # sin and cos of the flow time
         check_choice("backbone.time_distribution", self.time_distribution, ("beta", "uniform"))

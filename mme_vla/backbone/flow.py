@@ -23,7 +23,9 @@ MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0
 def sample_time(
     count: int, distribution: str, device: torch.device, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Sample τ [count]: `beta` gives 0.001 + 0.999·Beta(1.5, 1), as released; `uniform` U(0, 1), as in the paper."""
+    """Sample τ [count]: `beta` gives 0.001 + 0.999·Beta(1.5, 1), as released; `uniform` U(0, 1), as
+    in the paper.
+    """
     uniform = torch.rand(count, device=device, generator=generator)
     if distribution == "uniform":
         return uniform
@@ -37,7 +39,9 @@ def interpolate(actions: Tensor, noise: Tensor, time: Tensor) -> tuple[Tensor, T
 
 
 def step_loss(velocity: Tensor, target: Tensor) -> Tensor:
-    """Squared error averaged over action dimensions: [b, h, a] → [b, h]. Padded dimensions count, as released."""
+    """Squared error averaged over action dimensions: [b, h, a] → [b, h]. Padded dimensions count,
+    as released.
+    """
     return (velocity.float() - target.float()).square().mean(-1)
 
 
@@ -52,7 +56,8 @@ def time_embedding(time: Tensor, width: int) -> Tensor:
 
 def euler_times(steps: int, device: torch.device) -> Tensor:
     """The times 1, 1 − 1/steps, … of Euler steps [steps], added up in float32 as released."""
-    # Computed on the device: a copy from the CPU would wait for the GPU, and could not be in a CUDA graph.
+    # Computed on the device: a copy from the CPU would wait for the GPU, and could not be in a CUDA
+    # graph.
     times, time = [], torch.ones((), device=device)
     for _ in range(steps):
         times.append(time)
@@ -61,7 +66,9 @@ def euler_times(steps: int, device: torch.device) -> Tensor:
 
 
 def euler(noise: Tensor, steps: int, velocity: Callable[[Tensor, int], Tensor]) -> Tensor:
-    """Integrate from noise to actions: x ← x − v/steps, with `velocity(x, index)` at `euler_times`."""
+    """Integrate from noise to actions: x ← x − v/steps, with `velocity(x, index)` at
+    `euler_times`.
+    """
     x = noise
     for index in range(steps):
         x = x - velocity(x, index).to(x.dtype) / steps
@@ -69,37 +76,48 @@ def euler(noise: Tensor, steps: int, velocity: Callable[[Tensor, int], Tensor]) 
 
 
 def normal_log_density(x: Tensor, deviation: float) -> Tensor:
-    """Log-density [b] of x [b, …] under independent normal distributions of this standard deviation."""
+    """Log-density [b] of x [b, …] under independent normal distributions of this standard
+    deviation.
+    """
     x = x.flatten(1)
-    return -0.5 * (x / deviation).square().sum(1) - x.shape[1] * (math.log(deviation) + 0.5 * math.log(2 * math.pi))
+    return -0.5 * (x / deviation).square().sum(1) - x.shape[1] * (
+        math.log(deviation) + 0.5 * math.log(2 * math.pi)
+    )
 
 
 def _check_increments(increments: Tensor, steps: int, overlap: Overlap | None) -> None:
     require(
         increments.shape[1] == steps,
-        f"flow_steps={steps}: backbone.head.deviation has noise for {increments.shape[1]}; set backbone.head.steps.",
+        f"flow_steps={steps}: backbone.head.deviation has noise for {increments.shape[1]}; set"
+        " backbone.head.steps.",
     )
     require(overlap is None, "backbone.head.deviation must be 0 for real-time chunking.")
 
 
 Predict = Callable[[Tensor, Tensor], Tensor]
-"""`predict(x_t, time)`: the network's output [b, h, a] at noisy chunks [b, h, a] and flow times [b]."""
+"""`predict(x_t, time)`: the network's output [b, h, a] at noisy chunks [b, h, a] and flow times
+[b].
+"""
 PredictAt = Callable[[Tensor, int], Tensor]
-"""`predict(x, index)`: the same while sampling, at the flow time with this index in `FlowHead.times`."""
+"""`predict(x, index)`: the same while sampling, at the flow time with this index in
+`FlowHead.times`.
+"""
 
 
 @HEADS.register("flow")
 class FlowHead:
-    """Flow matching as π0.5 has it: time distribution, loss and Euler sampler of a network that predicts the velocity.
+    """Flow matching as π0.5 has it: time distribution, loss and Euler sampler of a network that
+    predicts the velocity.
 
-    A head of your own overrides what differs, registers under a name and is chosen with `backbone.head.name`.
+    A head of your own overrides what differs, registers under a name and is chosen with
+    `backbone.head.name`.
 
     Args:
         horizon, action_dim: of a chunk [h, a].
         time_distribution: `beta` or `uniform`, see `sample_time`.
         steps: Euler steps unless the caller says otherwise.
-        deviation: σ of Gaussian noise in each Euler step while sampling, in units of normalised actions (policy
-            gradients, `mme_vla.policy.log_prob`); 0 samples without it.
+        deviation: σ of Gaussian noise in each Euler step while sampling, in units of normalised
+            actions (policy gradients, `mme_vla.policy.log_prob`); 0 samples without it.
     """
 
     supports_rtc: ClassVar[bool] = True
@@ -122,13 +140,22 @@ class FlowHead:
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """`noise` [n, h, a] and flow times `time` [n], on the CPU."""
         noise = torch.randn(count, self.horizon, self.action_dim, generator=generator)
-        return {"noise": noise, "time": sample_time(count, self.time_distribution, noise.device, generator)}
+        return {
+            "noise": noise,
+            "time": sample_time(count, self.time_distribution, noise.device, generator),
+        }
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
-        """The starting `noise` [h, a], on the CPU; with `deviation` also `increments` [steps, h, a]."""
+        """The starting `noise` [h, a], on the CPU; with `deviation` also `increments` [steps, h,
+        a].
+        """
         shape = self.horizon, self.action_dim
         noise = {"noise": torch.randn(*shape, generator=generator)}
-        return noise | ({"increments": torch.randn(self.steps, *shape, generator=generator)} if self.deviation else {})
+        return noise | (
+            {"increments": torch.randn(self.steps, *shape, generator=generator)}
+            if self.deviation
+            else {}
+        )
 
     def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
         """The loss [b, h] of chunks [b, h, a]: squared error of the velocity."""
@@ -151,7 +178,8 @@ class FlowHead:
         overlap: Overlap | None = None,
         increments: Tensor | None = None,
     ) -> Tensor:
-        """Integrate from noise [b, h, a] to chunks; `overlap` guides them to actions that are already fixed.
+        """Integrate from noise [b, h, a] to chunks; `overlap` guides them to actions that are
+        already fixed.
 
         increments: [b, steps, h, a], standard normal; `deviation` times them is added in each step.
         """
@@ -167,11 +195,15 @@ class FlowHead:
 
     # Gaussian steps, whose density is known
 
-    def sample_path(self, predict: PredictAt, noise: Tensor, increments: Tensor, deviation: float) -> Tensor:
-        """Every state x_0 … x_k [b, k + 1, h, a] of k Euler steps with noise: x_{i+1} = x_i − v(x_i)/k + σ·ε_i.
+    def sample_path(
+        self, predict: PredictAt, noise: Tensor, increments: Tensor, deviation: float
+    ) -> Tensor:
+        """Every state x_0 … x_k [b, k + 1, h, a] of k Euler steps with noise: x_{i+1} = x_i −
+        v(x_i)/k + σ·ε_i.
 
         Args:
-            noise: x_0 [b, h, a]. increments: ε [b, k, h, a], standard normal. deviation: σ; 0 is `sample` itself.
+            noise: x_0 [b, h, a]. increments: ε [b, k, h, a], standard normal. deviation: σ; 0 is
+                `sample` itself.
         """
         steps = increments.shape[1]
         velocity, states = self.velocity(predict, steps, noise.device), [noise]
@@ -181,7 +213,8 @@ class FlowHead:
         return torch.stack(states, 1)
 
     def path_log_prob(self, predict: PredictAt, path: Tensor, deviation: float) -> Tensor:
-        """Log-density [b] of the states [b, k + 1, h, a] that `sample_path` made: log N(x_0) + Σ log N(x_{i+1} | x_i).
+        """Log-density [b] of the states [b, k + 1, h, a] that `sample_path` made: log N(x_0) + Σ
+        log N(x_{i+1} | x_i).
 
         Gradients reach the network's parameters, and not the states.
         """
@@ -196,7 +229,9 @@ class FlowHead:
 
 @HEADS.register("clean_flow")
 class CleanFlowHead(FlowHead):
-    """Flow matching of a network that predicts the chunk without its noise; the velocity follows."""
+    """Flow matching of a network that predicts the chunk without its noise; the
+    velocity follows.
+    """
 
     def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
         """Squared error [b, h] of the chunk without its noise."""
@@ -222,7 +257,9 @@ class HasFlowHead:
     head: FlowHead
 
     def predictor(self, batch: Batch, injection: Injection) -> Predict:
-        """The network's output at noisy chunks [b, h, a] and flow times [b], with gradient, for one observation."""
+        """The network's output at noisy chunks [b, h, a] and flow times [b], with gradient, for one
+        observation.
+        """
         raise NotImplementedError
 
     def sample_chunk(
@@ -233,8 +270,16 @@ class HasFlowHead:
         return self.head.sample(predict, noise["noise"], steps, overlap, **more)
 
     def make_head(self, config: Any) -> None:
-        """Build the head that `config.head` names, for the sizes and the time distribution of `config`."""
+        """Build the head that `config.head` names, for the sizes and the time distribution of
+        `config`.
+        """
         self.head = HEADS.build(
-            config.head, horizon=config.horizon, action_dim=config.action_dim,
-            **({} if "time_distribution" in config.head else {"time_distribution": config.time_distribution}),
-        )  # fmt: skip
+            config.head,
+            horizon=config.horizon,
+            action_dim=config.action_dim,
+            **(
+                {}
+                if "time_distribution" in config.head
+                else {"time_distribution": config.time_distribution}
+            ),
+        )

@@ -38,7 +38,9 @@ KeyValue = tuple[Tensor, Tensor]
 
 
 class StaticKV(NamedTuple):
-    """Keys and values of one layer [b, past + n, K, h]: those of the past, and space for a pass of n tokens."""
+    """Keys and values of one layer [b, past + n, K, h]: those of the past, and space for a pass of
+    n tokens.
+    """
 
     k: Tensor
     v: Tensor
@@ -80,23 +82,39 @@ class GatedMLP(nn.Module):
         gate, up = self.gate_up(x).chunk(2, dim=-1)
         if torch.is_grad_enabled():
             return self.down(nn.functional.gelu(gate, approximate="tanh") * up)
-        return self.down(torch.ops.aten.gelu_(gate, approximate="tanh").mul_(up))  # in place: a chunk's largest tensors
+        return self.down(
+            torch.ops.aten.gelu_(gate, approximate="tanh").mul_(up)
+        )  # in place: a chunk's largest tensors
 
 
 class ExpertLayer(nn.Module):
     """One expert's weights in one layer.
 
-    In the last layer only the answering expert is read further: of the others that layer needs keys and values
-    alone (`keys_only`), and has no other weights.
+    In the last layer only the answering expert is read further: of the others that layer needs keys
+    and values alone (`keys_only`), and has no other weights.
     """
 
-    def __init__(self, config: BackboneConfig, expert: ExpertConfig, condition_width: int | None, keys_only: bool):
+    def __init__(
+        self,
+        config: BackboneConfig,
+        expert: ExpertConfig,
+        condition_width: int | None,
+        keys_only: bool,
+    ):
         super().__init__()
-        self.heads, self.kv_heads, self.head_dim = config.num_heads, config.num_kv_heads, config.head_dim
+        self.heads, self.kv_heads, self.head_dim = (
+            config.num_heads,
+            config.num_kv_heads,
+            config.head_dim,
+        )
         self.keys_only = keys_only
 
         def norm() -> nn.Module:
-            return AdaRMSNorm(expert.width, condition_width) if condition_width else RMSNorm(expert.width)
+            return (
+                AdaRMSNorm(expert.width, condition_width)
+                if condition_width
+                else RMSNorm(expert.width)
+            )
 
         self.attention_norm = norm()
         kv_width = 2 * self.kv_heads * self.head_dim
@@ -112,7 +130,8 @@ class ExpertLayer(nn.Module):
     def project(
         self, x: Tensor, rope: Rotation, condition: Tensor | Modulation | None
     ) -> tuple[Tensor | None, Tensor, Tensor, Tensor | None]:
-        """Normalise [b, n, d] and return q [b, n, N, h] (None if `keys_only`), k, v [b, n, K, h] and the gate.
+        """Normalise [b, n, d] and return q [b, n, N, h] (None if `keys_only`), k, v [b, n, K, h]
+        and the gate.
 
         Queries and keys come back rotated, by `rope` at their positions.
         """
@@ -142,19 +161,30 @@ def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
 
 
 class JointBlock(nn.Module):
-    """One layer of all experts: a real module, so that sharding, checkpointing and compilation wrap it whole."""
+    """One layer of all experts: a real module, so that sharding, checkpointing and compilation wrap
+    it whole.
+    """
 
     def __init__(
-        self, config: BackboneConfig, experts: dict[str, ExpertConfig], action_expert: str, last: bool
+        self,
+        config: BackboneConfig,
+        experts: dict[str, ExpertConfig],
+        action_expert: str,
+        last: bool,
     ) -> None:
         super().__init__()
         self.action_expert = action_expert
-        self.experts = nn.ModuleDict({
-            name: ExpertLayer(
-                config, expert, expert.width if name == action_expert else None, last and name != action_expert
-            )
-            for name, expert in experts.items()
-        })  # fmt: skip
+        self.experts = nn.ModuleDict(
+            {
+                name: ExpertLayer(
+                    config,
+                    expert,
+                    expert.width if name == action_expert else None,
+                    last and name != action_expert,
+                )
+                for name, expert in experts.items()
+            }
+        )
 
     def forward(
         self,
@@ -170,24 +200,39 @@ class JointBlock(nn.Module):
         Args:
             segments: this pass's tokens in sequence order. rope: their rotation.
             mask: additive [b, 1, n, past + n], or what another backend of attention reads.
-            condition: what the answering expert's norms are conditioned on: the time embedding [b, c] or a modulation.
+            condition: what the answering expert's norms are conditioned on: the time embedding [b,
+                c] or a modulation.
             hook: see `Hook`, layer already bound.
-            past: keys and values [b, past, K, h] of earlier passes, rotated; or these with space for this pass's own.
+            past: keys and values [b, past, K, h] of earlier passes, rotated; or these with space
+                for this pass's own.
 
         Returns:
             The updated segments (of those that asked), and this pass's keys (rotated) and values.
         """
-        of_attention, of_mlp = condition if isinstance(condition, LayerModulation) else (condition, condition)
+        of_attention, of_mlp = (
+            condition if isinstance(condition, LayerModulation) else (condition, condition)
+        )
         querying, queries, keys, values, row = [], [], [], [], 0
         for segment in segments:
             layer: ExpertLayer = self.experts[segment.expert]  # type: ignore[assignment]
             adaptive = segment.expert == self.action_expert
             rows = slice(row, row + segment.tokens.shape[1])
-            q, k, v, gate = layer.project(segment.tokens, rope.rows(rows), of_attention if adaptive else None)
+            q, k, v, gate = layer.project(
+                segment.tokens, rope.rows(rows), of_attention if adaptive else None
+            )
             keys.append(k)
             values.append(v)
             if q is not None:
-                querying.append((segment, layer, gate, of_mlp if adaptive else None, hook if adaptive else None, rows))
+                querying.append(
+                    (
+                        segment,
+                        layer,
+                        gate,
+                        of_mlp if adaptive else None,
+                        hook if adaptive else None,
+                        rows,
+                    )
+                )
                 queries.append(q)
             row = rows.stop
         k, v = _join(keys), _join(values)
@@ -195,7 +240,9 @@ class JointBlock(nn.Module):
             return [], (k, v)
         all_k, all_v = _after(past, k, v)
         query_mask = (
-            mask if len(querying) == len(segments) else select_rows(mask, [rows for *_, rows in querying], k.dtype)
+            mask
+            if len(querying) == len(segments)
+            else select_rows(mask, [rows for *_, rows in querying], k.dtype)
         )
         attended = attend(_join(queries), all_k, all_v, query_mask)
         pieces = attended.split([rows.stop - rows.start for *_, rows in querying], dim=1)
@@ -208,7 +255,9 @@ class JointBlock(nn.Module):
 
 @dataclass
 class KVCache:
-    """Keys and values of every layer, and what is needed to see them: their blocks and which tokens are valid."""
+    """Keys and values of every layer, and what is needed to see them: their blocks and which tokens
+    are valid.
+    """
 
     layers: Sequence[KeyValue | StaticKV]
     spans: list[Span]
@@ -230,19 +279,25 @@ class KVCache:
         return KeysValues(torch.stack(pairs, 1), self.mask[:, self.stored :])
 
     def preallocate(self, tokens: int) -> "KVCache":
-        """The same with space behind it, in which every one of many passes of so many tokens writes its own.
+        """The same with space behind it, in which every one of many passes of so many tokens writes
+        its own.
 
-        It is theirs alone: no pass can be kept (`JointTransformer.forward`), and each overwrites the last.
+        It is theirs alone: no pass can be kept (`JointTransformer.forward`), and each overwrites
+        the last.
         """
         static = [
-            StaticKV(*(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, tokens)) for x in (layer[0], layer[1])))
+            StaticKV(
+                *(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, tokens)) for x in (layer[0], layer[1]))
+            )
             for layer in self.layers
         ]
         return KVCache(static, self.spans, self.mask, self.stored)
 
 
 class Layout(NamedTuple):
-    """What attention needs to know of a pass beside its tokens; the same for every Euler step of a chunk."""
+    """What attention needs to know of a pass beside its tokens; the same for every Euler step of a
+    chunk.
+    """
 
     spans: list[Span]  # of this pass and the cached ones before it
     valid: Tensor  # [b, past + n] bool
@@ -254,36 +309,50 @@ class Layout(NamedTuple):
 
 @dataclass
 class Conditioning:
-    """Time modulations of all layers, made once for the fixed times of a sampler (`JointTransformer.conditioning`)."""
+    """Time modulations of all layers, made once for the fixed times of a sampler
+    (`JointTransformer.conditioning`).
+    """
 
     layers: list[LayerModulation]
     final: Modulation
 
     def at(self, index: int, rows: int = 1) -> "Conditioning":
-        """Return the modulations of one time, which has `rows`: one for the whole batch, or one a sample."""
+        """Return the modulations of one time, which has `rows`: one for the whole batch, or one a
+        sample.
+        """
 
         def pick(m: Modulation) -> Modulation:
             return Modulation(*(x[index * rows : (index + 1) * rows] for x in m))
 
-        return Conditioning([LayerModulation(pick(a), pick(m)) for a, m in self.layers], pick(self.final))
+        return Conditioning(
+            [LayerModulation(pick(a), pick(m)) for a, m in self.layers], pick(self.final)
+        )
 
 
 class JointTransformer(nn.Module):
     """All layers and the final norm of the action expert, and nothing that no action reads."""
 
-    def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], action_expert: str = "action") -> None:
+    def __init__(
+        self,
+        config: BackboneConfig,
+        experts: dict[str, ExpertConfig],
+        action_expert: str = "action",
+    ) -> None:
         super().__init__()
         self.head_dim, self.action_expert, self.experts = config.head_dim, action_expert, experts
         self.gradient_checkpointing: Recompute = False
         self.attention = "auto"
         self.layers = nn.ModuleList(
-            JointBlock(config, experts, action_expert, last=i == config.depth - 1) for i in range(config.depth)
+            JointBlock(config, experts, action_expert, last=i == config.depth - 1)
+            for i in range(config.depth)
         )
         width = experts[action_expert].width
         self.final_norm = AdaRMSNorm(width, width)
 
     def conditioning(self, condition: Tensor) -> Conditioning:
-        """Compute every layer's modulation for conditions [m, c] at once: the weights are read once, not m times."""
+        """Compute every layer's modulation for conditions [m, c] at once: the weights are read
+        once, not m times.
+        """
         *of_layers, final = (norm.modulation(condition) for norm in self.modulating())
         pairs = zip(of_layers[::2], of_layers[1::2], strict=True)
         return Conditioning([LayerModulation(*pair) for pair in pairs], final)
@@ -291,22 +360,35 @@ class JointTransformer(nn.Module):
     def modulating(self) -> list[AdaRMSNorm]:
         """The norms that a condition modulates: two of every layer, and the final one."""
         experts: list[Any] = [block.experts[self.action_expert] for block in self.layers]  # type: ignore[index]
-        return [norm for expert in experts for norm in (expert.attention_norm, expert.mlp_norm)] + [self.final_norm]
+        return [norm for expert in experts for norm in (expert.attention_norm, expert.mlp_norm)] + [
+            self.final_norm
+        ]
 
     @property
     def _compiled(self) -> bool:
         return self.layers[0]._compiled_call_impl is not None
 
-    def layout(self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None) -> Layout:
-        """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a visibility table."""
+    def layout(
+        self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None
+    ) -> Layout:
+        """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a
+        visibility table.
+        """
         spans = [Span(block.name, len(block)) for block in blocks]
         asking = torch.cat([block.mask for block in blocks], 1)
         before = past.mask[:, past.stored :] if past else None
         positions = apply_custom_positions(token_positions(asking, before), blocks)
-        all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
-        mask_layout, dtype = MaskLayout.of(spans, all_spans, valid, table), compute_dtype(blocks[0].tokens)
+        all_spans, valid = (
+            (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
+        )
+        mask_layout, dtype = (
+            MaskLayout.of(spans, all_spans, valid, table),
+            compute_dtype(blocks[0].tokens),
+        )
         mask = build_mask(mask_layout, dtype, self.attention, self._compiled)
-        return Layout(all_spans, valid, mask, rotation(positions, self.head_dim), mask_layout, dtype)
+        return Layout(
+            all_spans, valid, mask, rotation(positions, self.head_dim), mask_layout, dtype
+        )
 
     def forward(
         self,
@@ -321,18 +403,27 @@ class JointTransformer(nn.Module):
 
         Args:
             blocks: in sequence order. layout: of these blocks after this past.
-            condition: time condition [b, c] of the answering expert, or its modulations; unread without that expert.
+            condition: time condition [b, c] of the answering expert, or its modulations; unread
+                without that expert.
             hook: the per-layer hook. past: an earlier pass's cache.
             keep: whether to return a cache of `past` and this pass.
 
         Returns:
-            The answering block's output [b, n, d] (None if it is not among `blocks`) and the cache (None unless kept).
+            The answering block's output [b, n, d] (None if it is not among `blocks`) and the cache
+            (None unless kept).
         """
         segments = _segments(blocks, layout.dtype, self._compiled)
         cached: list[KeyValue] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
-            args = (segments, layout.rope, layout.mask, of_layer, bind_hook(hook, i), past.layers[i] if past else None)
+            args = (
+                segments,
+                layout.rope,
+                layout.mask,
+                of_layer,
+                bind_hook(hook, i),
+                past.layers[i] if past else None,
+            )
             segments, kv = run_layer(block, *args, how=self.gradient_checkpointing)
             if keep:
                 # Copies where they are views: a view would keep all queries of its layer alive.
@@ -361,11 +452,14 @@ def _join(parts: list[Tensor]) -> Tensor:
 
 
 def _segments(blocks: Sequence[Block], dtype: torch.dtype, compiled: bool) -> list[Segment]:
-    """Join neighbouring blocks of one expert, in the compute dtype, for layers that are compiled or are not."""
+    """Join neighbouring blocks of one expert, in the compute dtype, for layers that are compiled or
+    are not.
+    """
     runs: list[tuple[str, list[Tensor]]] = []
     for block in blocks:
         if not runs or runs[-1][0] != block.expert:
             runs.append((block.expert, []))
-        # Not a view of something else, as no later layer's tokens are: the first layer then shares their compiled code.
+        # Not a view of something else, as no later layer's tokens are: the first layer then shares
+        # their compiled code.
         runs[-1][1].append(block.tokens.to(dtype, copy=compiled and block.tokens._is_view()))
     return [Segment(expert, _join(tokens)) for expert, tokens in runs]

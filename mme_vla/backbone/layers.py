@@ -1,4 +1,6 @@
-"""Layers that all experts share: float32 layers, rotary embedding, RMS norms, and attention by a visibility table."""
+"""Layers that all experts share: float32 layers, rotary embedding, RMS norms, and attention by a
+visibility table.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,13 +21,19 @@ PI05_VISIBILITY: Visibility = {
     "prompt": {"images", "prompt"},
     "action": {"images", "prompt", "action"},
 }
-"""Images and prompt are one bidirectional block. Actions attend to everything and nothing attends to them."""
+"""Images and prompt are one bidirectional block. Actions attend to everything and nothing attends
+to them.
+"""
 
 
 def compute_dtype(x: Tensor) -> torch.dtype:
     """The dtype matmuls run in where `x` lives: autocast's when it is on, else the tensor's own."""
     kind = x.device.type
-    return torch.get_autocast_dtype(kind) if kind != "meta" and torch.is_autocast_enabled(kind) else x.dtype
+    return (
+        torch.get_autocast_dtype(kind)
+        if kind != "meta" and torch.is_autocast_enabled(kind)
+        else x.dtype
+    )
 
 
 def float32_linear(layer: nn.Linear, x: Tensor) -> Tensor:
@@ -39,7 +47,9 @@ BASE = 10_000.0
 
 
 class Rotation(NamedTuple):
-    """cos and sin of every position's angles, float32 [b, n, 1, h]: both halves turn by the same angles."""
+    """cos and sin of every position's angles, float32 [b, n, 1, h]: both halves turn by the same
+    angles.
+    """
 
     cos: Tensor
     sin: Tensor
@@ -86,7 +96,9 @@ class RMSNorm(nn.Module):
         self.scale = nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor, condition: None = None) -> tuple[Tensor, None]:
-        """Normalise [b, n, d]; the second value is the missing gate, so that both norms read alike."""
+        """Normalise [b, n, d]; the second value is the missing gate, so that both
+        norms read alike.
+        """
         return (rms_normalise(x) * (1 + self.scale.float())).to(x.dtype), None
 
 
@@ -99,7 +111,9 @@ class Modulation(NamedTuple):
 
 
 class AdaRMSNorm(nn.Module):
-    """rms(x)·(1 + scale(c)) + shift(c), and a gate(c) for the sublayer's output. Starts as identity with gate 0."""
+    """rms(x)·(1 + scale(c)) + shift(c), and a gate(c) for the sublayer's output. Starts as identity
+    with gate 0.
+    """
 
     keeps_float32 = True
     """Its weights are never gathered in bfloat16 (`shard_groups`)."""
@@ -115,18 +129,23 @@ class AdaRMSNorm(nn.Module):
         return Modulation(*float32_linear(self.dense, condition).unsqueeze(1).chunk(3, dim=-1))
 
     def forward(self, x: Tensor, condition: Tensor | Modulation) -> tuple[Tensor, Tensor]:
-        """Normalise [b, n, d]. `condition` is the raw [b, c] or, when sampling, a modulation made beforehand."""
+        """Normalise [b, n, d]. `condition` is the raw [b, c] or, when sampling, a modulation made
+        beforehand.
+        """
         m = condition if isinstance(condition, Modulation) else self.modulation(condition)
         return torch.addcmul(m.shift, rms_normalise(x), 1 + m.scale).to(x.dtype), m.gate.to(x.dtype)
 
 
 @dataclass
 class Block:
-    """A run of tokens that share a name, hence a row of the table, and an expert whose weights process them.
+    """A run of tokens that share a name, hence a row of the table, and an expert whose weights
+    process them.
 
     tokens: [b, n, d] at the expert's width. mask: [b, n] bool, False on padding.
-    positions: [b, n] custom rotary positions, on the same axis as those of the other blocks; [b, n, k] where a token
-        has k coordinates (time, row, column), which rotate interleaved angles; None counts its tokens.
+    positions: [b, n] custom rotary positions, on the same axis as those of the other blocks; [b, n,
+    k] where a token
+        has k coordinates (time, row, column), which rotate interleaved angles; None counts its
+        tokens.
     """
 
     name: str
@@ -148,12 +167,19 @@ class Span(NamedTuple):
 
 def visible_blocks(name: str, table: Visibility) -> frozenset[str] | set[str]:
     """The blocks that a block of this name attends to."""
-    require(name in table, f"Block {name!r} has no row in the visibility table; it has rows {sorted(table)}.")
+    require(
+        name in table,
+        f"Block {name!r} has no row in the visibility table; it has rows {sorted(table)}.",
+    )
     return table[name]
 
 
 def attention_mask(
-    queries: Sequence[Span], keys: Sequence[Span], query_mask: Tensor, key_mask: Tensor, table: Visibility
+    queries: Sequence[Span],
+    keys: Sequence[Span],
+    query_mask: Tensor,
+    key_mask: Tensor,
+    table: Visibility,
 ) -> Tensor:
     """Query q attends to key k iff q's row of the table names k's block and both tokens are valid.
 
@@ -175,13 +201,16 @@ def attention_mask(
 
 
 def token_positions(mask: Tensor, past_mask: Tensor | None = None) -> Tensor:
-    """Rotary positions [b, n]: valid tokens are counted, padding repeats the number before it (−1 first)."""
+    """Rotary positions [b, n]: valid tokens are counted, padding repeats the number before it (−1
+    first).
+    """
     positions = mask.long().cumsum(1) - 1
     return positions if past_mask is None else positions + past_mask.long().sum(1, keepdim=True)
 
 
 def apply_custom_positions(numbered: Tensor, blocks: Sequence[Block]) -> Tensor:
-    """Rotary positions [b, n] of blocks in sequence order, with the custom positions of blocks that have them.
+    """Rotary positions [b, n] of blocks in sequence order, with the custom positions of blocks that
+    have them.
 
     [b, n, k] if a block has k coordinates: those of tokens with one number are equal.
     """
@@ -189,21 +218,27 @@ def apply_custom_positions(numbered: Tensor, blocks: Sequence[Block]) -> Tensor:
         return numbered
     parts = numbered.float().split([len(block) for block in blocks], 1)
     positions = [
-        part if block.positions is None else block.positions for part, block in zip(parts, blocks, strict=True)
+        part if block.positions is None else block.positions
+        for part, block in zip(parts, blocks, strict=True)
     ]
     counts = {part.shape[-1] for part in positions if part.ndim == 3}
     if len(counts) > 1:
-        raise ValueError(f"Blocks have positions of {sorted(counts)} coordinates: all need as many, or one number.")
+        raise ValueError(
+            f"Blocks have positions of {sorted(counts)} coordinates: all need as many, or one"
+            " number."
+        )
     for count in counts:
-        positions = [part if part.ndim == 3 else part[..., None].expand(-1, -1, count) for part in positions]
+        positions = [
+            part if part.ndim == 3 else part[..., None].expand(-1, -1, count) for part in positions
+        ]
     return torch.cat(positions, 1)
 
 
 class MaskLayout(NamedTuple):
     """The visibility table applied to the valid keys of a batch.
 
-    Padding queries get the same mask as valid ones of their block; their output is ignored. This avoids fully masked
-    rows, which produce NaN.
+    Padding queries get the same mask as valid ones of their block; their output is ignored. This
+    avoids fully masked rows, which produce NaN.
 
     lengths: of the runs of queries, in sequence order. visible: [b, runs, k] bool.
     """
@@ -212,11 +247,14 @@ class MaskLayout(NamedTuple):
     visible: Tensor
 
     @classmethod
-    def of(cls, queries: Sequence[Span], keys: Sequence[Span], valid: Tensor, table: Visibility) -> Self:
+    def of(
+        cls, queries: Sequence[Span], keys: Sequence[Span], valid: Tensor, table: Visibility
+    ) -> Self:
         """The layout of blocks; neighbours with equal rows are one run.
 
         Args:
-            queries, keys: blocks in sequence order. valid: [b, k] bool, of the keys. table: the visibility table.
+            queries, keys: blocks in sequence order. valid: [b, k] bool, of the keys. table: the
+                visibility table.
         """
         runs: list[tuple[int, list[bool]]] = []
         for query in queries:
@@ -228,7 +266,9 @@ class MaskLayout(NamedTuple):
         parts = valid.split([key.length for key in keys], 1)
         hidden = [torch.zeros_like(part) for part in parts]
         rows = [
-            valid if all(sees) else torch.cat([p if s else h for p, h, s in zip(parts, hidden, sees, strict=True)], 1)
+            valid
+            if all(sees)
+            else torch.cat([p if s else h for p, h, s in zip(parts, hidden, sees, strict=True)], 1)
             for _, sees in runs
         ]
         return cls(tuple(length for length, _ in runs), torch.stack(rows, 1))
@@ -243,19 +283,25 @@ class MaskLayout(NamedTuple):
                 runs.append(run)
             start += length
         visible = (
-            self.visible if len(runs) == len(self.lengths) else torch.stack([self.visible[:, run] for run in runs], 1)
+            self.visible
+            if len(runs) == len(self.lengths)
+            else torch.stack([self.visible[:, run] for run in runs], 1)
         )
         return MaskLayout(tuple(lengths), visible)
 
     def expand(self, rows: Tensor) -> Tensor:
         """Values of each run [b, runs, k] for each query [b, n, k]: a view if there is one run."""
-        parts = [rows[:, run, None].expand(-1, length, -1) for run, length in enumerate(self.lengths)]
+        parts = [
+            rows[:, run, None].expand(-1, length, -1) for run, length in enumerate(self.lengths)
+        ]
         return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
 BACKENDS = ("auto", "sdpa", "flex", "varlen")
-"""`sdpa`: fused kernels with an additive mask, the reference. `flex`: compiled from the layout, skips hidden keys.
-`varlen`: flash attention over keys packed for each run of queries. `auto`: see `build_mask`."""
+"""`sdpa`: fused kernels with an additive mask, the reference. `flex`: compiled from the layout,
+skips hidden keys. `varlen`: flash attention over keys packed for each run of queries. `auto`: see
+`build_mask`.
+"""
 
 
 class SparseMask(Protocol):
@@ -270,17 +316,24 @@ class SparseMask(Protocol):
 
 
 AttentionMask = Tensor | SparseMask | None
-"""The mask of `attend`: additive [b, 1, q, k], the form of another backend, or None (all keys are visible)."""
+"""The mask of `attend`: additive [b, 1, q, k], the form of another backend, or None (all keys are
+visible).
+"""
 
 BIG_NEGATIVE = -1e30
-"""Far below any logit, and still finite where kernels count in base 2 (times 1.44): no row becomes NaN."""
+"""Far below any logit, and still finite where kernels count in base 2 (times 1.44): no row becomes
+NaN.
+"""
 
 ALIGNMENT = 8
-"""Keys a row of the mask is padded to, as fused kernels want it: otherwise they copy the mask in every layer."""
+"""Keys a row of the mask is padded to, as fused kernels want it: otherwise they copy the mask in
+every layer.
+"""
 
 
 def additive_mask(mask: Tensor, dtype: torch.dtype) -> Tensor:
-    """[b, q, k] bool → [b, 1, q, k] of 0 and `BIG_NEGATIVE`, made once per forward and shared by all layers.
+    """[b, q, k] bool → [b, 1, q, k] of 0 and `BIG_NEGATIVE`, made once per forward and shared by
+    all layers.
 
     Added to finite logits in float32 it absorbs them, so this equals replacing them.
     """
@@ -289,7 +342,9 @@ def additive_mask(mask: Tensor, dtype: torch.dtype) -> Tensor:
 
 def layout_mask(layout: MaskLayout, dtype: torch.dtype) -> Tensor:
     """The additive mask [b, 1, n, k] of a layout."""
-    return layout.expand(_padded(layout.visible, dtype))[..., : layout.visible.shape[-1]].unsqueeze(1)
+    return layout.expand(_padded(layout.visible, dtype))[..., : layout.visible.shape[-1]].unsqueeze(
+        1
+    )
 
 
 def _padded(visible: Tensor, dtype: torch.dtype) -> Tensor:
@@ -305,13 +360,18 @@ def check_backend(name: str) -> str:
     return name
 
 
-def build_mask(layout: MaskLayout, dtype: torch.dtype, backend: str, compiled: bool) -> AttentionMask:
+def build_mask(
+    layout: MaskLayout, dtype: torch.dtype, backend: str, compiled: bool
+) -> AttentionMask:
     """The mask of one backend, built once per forward and shared by all layers.
 
-    `auto` is `flex` for training on a GPU where layers are `compiled`, so that it is part of their code; else `sdpa`.
+    `auto` is `flex` for training on a GPU where layers are `compiled`, so that it is part of their
+    code; else `sdpa`.
     """
     if backend == "auto":
-        backend = "flex" if compiled and layout.visible.is_cuda and torch.is_grad_enabled() else "sdpa"
+        backend = (
+            "flex" if compiled and layout.visible.is_cuda and torch.is_grad_enabled() else "sdpa"
+        )
     if backend == "sdpa":
         return layout_mask(layout, dtype)
     from mme_vla.speed.sparse_attention import FlexMask, PackedMask
@@ -320,7 +380,9 @@ def build_mask(layout: MaskLayout, dtype: torch.dtype, backend: str, compiled: b
 
 
 def select_rows(mask: AttentionMask, rows: Sequence[slice], dtype: torch.dtype) -> Tensor:
-    """The additive mask of some of the queries, for the last layer: they are few, whatever the backend."""
+    """The additive mask of some of the queries, for the last layer: they are few, whatever the
+    backend.
+    """
     if isinstance(mask, Tensor):
         return torch.cat([mask[:, :, at] for at in rows], 2)
     assert mask is not None
@@ -332,7 +394,8 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: AttentionMask) -> Tensor:
 
     Args:
         q: [b, q, N, h]; k, v: [b, k, K, h].
-        mask: of `build_mask`; or additive [b, 1, q, k] in q's dtype; or bool with a key in every row; or None.
+        mask: of `build_mask`; or additive [b, 1, q, k] in q's dtype; or bool with a key in every
+            row; or None.
 
     Returns:
         [b, q, N·h].
@@ -343,6 +406,13 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: AttentionMask) -> Tensor:
     q, k, v = (x.transpose(1, 2) for x in (q, k, v))
     if groups > 1:
         # One shared key head broadcasts without a copy; several are repeated.
-        k, v = ((x.expand(-1, groups, -1, -1) if x.shape[1] == 1 else x.repeat_interleave(groups, 1)) for x in (k, v))
+        k, v = (
+            (x.expand(-1, groups, -1, -1) if x.shape[1] == 1 else x.repeat_interleave(groups, 1))
+            for x in (k, v)
+        )
     with fused_kernels(q):
-        return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask).transpose(1, 2).flatten(2)
+        return (
+            functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+            .transpose(1, 2)
+            .flatten(2)
+        )

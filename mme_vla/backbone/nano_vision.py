@@ -1,4 +1,6 @@
-"""The vision tower of nano checkpoints from before `tower.PlaceTower`: which of twelve classes each place shows."""
+"""The vision tower of nano checkpoints from before `tower.PlaceTower`: which of twelve classes each
+place shows.
+"""
 
 import math
 from collections.abc import Sequence
@@ -9,9 +11,20 @@ from torch import Tensor, nn
 from mme_vla.backbone.tower import build_stages
 
 CLASSES = (
-    "nothing", "robot", "red cube", "green cube", "blue cube", "other cube", "container", "button", "target", "disc",
-    "box", "obstacle", "peg",
-)  # fmt: skip
+    "nothing",
+    "robot",
+    "red cube",
+    "green cube",
+    "blue cube",
+    "other cube",
+    "container",
+    "button",
+    "target",
+    "disc",
+    "box",
+    "obstacle",
+    "peg",
+)
 """What a place of an image may show; a class's number is its place in here."""
 FINE, COARSE = 8, 4
 """A token means 8×8 places that show a class each, and for 4×4 places that have a colour each."""
@@ -26,20 +39,23 @@ FAINT = 0.02
 class ConvTower(nn.Module):
     """Images [n, 3, s, s] in [−1, 1] → tokens [n, (s/16)², d] that say what is where.
 
-    A token holds, for each class but the first, its presence; its share of all that the image shows of the class, as
-    it is and times the column and the row in the image, each in [−1, 1]; and the colours of its 4×4 places. So a sum
-    of tokens, and pooled ones, say where the things of a class are: their middle.
+    A token holds, for each class but the first, its presence; its share of all that the image shows
+    of the class, as it is and times the column and the row in the image, each in [−1, 1]; and the
+    colours of its 4×4 places. So a sum of tokens, and pooled ones, say where the things of a class
+    are: their middle.
 
     Args:
-        widths: channels of the three stages. blocks: residual blocks of each. out: channels that the outputs are read
-            from.
+        widths: channels of the three stages. blocks: residual blocks of each. out: channels that
+            the outputs are read from.
     """
 
     words: Tensor
 
     def __init__(self, widths: Sequence[int], blocks: Sequence[int], out: int) -> None:
         super().__init__()
-        self.stages = nn.Sequential(*(layer for stage in build_stages(widths, blocks) for layer in stage))
+        self.stages = nn.Sequential(
+            *(layer for stage in build_stages(widths, blocks) for layer in stage)
+        )
         before = widths[-1]
         self.norm = nn.GroupNorm(8, before)
         self.out = nn.Conv2d(before, out, 1)
@@ -54,8 +70,12 @@ class ConvTower(nn.Module):
         return 4 * (len(CLASSES) - 1) + self.colours.out_features
 
     def answers(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Scores of the classes [n, (s/16)², classes, 64] and colours [n, (s/16)², 48] in [−1, 1]."""
-        features = self.out(nn.functional.gelu(self.norm(self.stages(images)))).flatten(2).transpose(1, 2)
+        """Scores of the classes [n, (s/16)², classes, 64] and colours [n, (s/16)², 48]
+        in [−1, 1].
+        """
+        features = (
+            self.out(nn.functional.gelu(self.norm(self.stages(images)))).flatten(2).transpose(1, 2)
+        )
         return self.classes(features).unflatten(-1, (len(CLASSES), -1)), self.colours(features)
 
     def forward(self, images: Tensor) -> Tensor:

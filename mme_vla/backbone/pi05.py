@@ -8,7 +8,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection, KeepsKeysValues
+from mme_vla.backbone.base import (
+    Backbone,
+    HasExtraExperts,
+    HasLoraTargets,
+    Injection,
+    KeepsKeysValues,
+)
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
 from mme_vla.backbone.gemma import Conditioning, JointTransformer, KVCache, Layout
@@ -40,13 +46,21 @@ class Pi05Backbone(
     """
 
     Config = BackboneConfig
-    supports = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions", "cache", "past"})
+    supports = frozenset(
+        {"blocks", "expert", "hook", "condition", "beside", "positions", "cache", "past"}
+    )
     heads = ("action_in", "action_out", "time_in", "time_out")
     # The VLM's last layer has `kv` in place of `qkv`.
     lora_targets = tuple(
         f"experts.{expert}.{layer}"
         for expert in ("vlm", "action")
-        for layer in ("qkv", *(("kv",) if expert == "vlm" else ()), "out", "mlp.gate_up", "mlp.down")
+        for layer in (
+            "qkv",
+            *(("kv",) if expert == "vlm" else ()),
+            "out",
+            "mlp.gate_up",
+            "mlp.down",
+        )
     )
     # These are computed in float32 from their weight, without calling an adapter that wraps them.
     lora_exclude = rf"\.({'|'.join(heads)}|\w*norm\.dense)$"
@@ -57,13 +71,19 @@ class Pi05Backbone(
         "action": "",
     }
 
-    def __init__(self, config: BackboneConfig, extra_experts: Mapping[str, ExpertConfig] | None = None) -> None:
+    def __init__(
+        self, config: BackboneConfig, extra_experts: Mapping[str, ExpertConfig] | None = None
+    ) -> None:
         super().__init__(config, extra_experts)
         self.config = config
         self.vision_width, width = config.vlm.width, config.action.width
-        self.image_size, self.grid = config.vision.image_size, config.vision.image_size // config.vision.patch_size
+        self.image_size, self.grid = (
+            config.vision.image_size,
+            config.vision.image_size // config.vision.patch_size,
+        )
         self.horizon, self.action_dim = config.horizon, config.action_dim
-        # The vision tower comes first: with one seed it is the same in every variant, and so is a cache made by it.
+        # The vision tower comes first: with one seed it is the same in every variant, and so is a
+        # cache made by it.
         self.vision = VisionTower(config.vision, config.vlm.width)
         initialise(self.vision)
         self.embedding = nn.Embedding(config.vocab_size, config.vlm.width)
@@ -76,12 +96,21 @@ class Pi05Backbone(
         self.action_out = nn.Linear(width, config.action_dim)
         self.time_in = nn.Linear(width, width)
         self.time_out = nn.Linear(width, width)
-        for module in (self.embedding, self.transformer, self.action_in, self.action_out, self.time_in, self.time_out):
+        for module in (
+            self.embedding,
+            self.transformer,
+            self.action_in,
+            self.action_out,
+            self.time_in,
+            self.time_out,
+        ):
             initialise(module)
         self.make_head(config)
 
     def encode_images(self, images: Tensor) -> Tensor:
-        """Images [n, 3, s, s] in [−1, 1] → tokens [n, 256, d]; no graph is kept while the tower is frozen."""
+        """Images [n, 3, s, s] in [−1, 1] → tokens [n, 256, d]; no graph is kept while the tower is
+        frozen.
+        """
         return self._through_tower(images)
 
     def _through_tower(self, images: Tensor, *clips: Any) -> Tensor:
@@ -90,14 +119,16 @@ class Pi05Backbone(
             return self.vision(images, *clips)
 
     def view_tokens(self, images: Tensor, past: PastViews | None) -> Tensor:
-        """Tokens [b, v, n, d] of current views [b, v, 3, s, s], which attend to past ones if there are any."""
+        """Tokens [b, v, n, d] of current views [b, v, 3, s, s], which attend to past ones if there
+        are any.
+        """
         if past is None:
             return self.encode_images(images.flatten(0, 1)).unflatten(0, images.shape[:2])
         clips = torch.cat([past.images, images[:, None]], 1).transpose(1, 2)  # b v t 3 s s
         frame_mask = functional.pad(past.mask, (0, 1), value=True)[:, None].expand(clips.shape[:3])
-        return self._through_tower(clips.flatten(0, 1), frame_mask.flatten(0, 1), past.every).unflatten(
-            0, clips.shape[:2]
-        )
+        return self._through_tower(
+            clips.flatten(0, 1), frame_mask.flatten(0, 1), past.every
+        ).unflatten(0, clips.shape[:2])
 
     def embed(self, batch: Batch) -> list[Block]:
         """Blocks `images`, of the current views, and `prompt`."""
@@ -123,7 +154,9 @@ class Pi05Backbone(
         return x
 
     def read_velocity(self, hidden: Tensor) -> Tensor:
-        """The velocity [b, h, a] in float32 from the output [b, n, d], whose last h tokens are the actions."""
+        """The velocity [b, h, a] in float32 from the output [b, n, d], whose last h tokens are the
+        actions.
+        """
         return float32_linear(self.action_out, hidden[:, -self.horizon :])
 
     # Training
@@ -141,7 +174,9 @@ class Pi05Backbone(
         return partial(self.velocity, injection)
 
     def velocity(self, injection: Injection, x_t: Tensor, time: Tensor) -> Tensor:
-        """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint pass."""
+        """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint
+        pass.
+        """
         blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
         past = KVCache.of(injection.past)
         layout = self.transformer.layout(blocks, injection.visibility, past)
@@ -158,24 +193,38 @@ class Pi05Backbone(
 
     @torch.no_grad()
     def sample(
-        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Batch,
+        injection: Injection,
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
         """Integrate the flow from noise to a chunk, in `steps` Euler steps (10 by default).
 
-        All that does not depend on the flow time is computed once: memory, keys and values of the prefix and of the
-        modulator, and every layer's time modulation. A step runs the action block alone.
+        All that does not depend on the flow time is computed once: memory, keys and values of the
+        prefix and of the modulator, and every layer's time modulation. A step runs the action block
+        alone.
         """
         return self._integrate(batch, injection, noise, steps, self.prefill(injection))
 
     @torch.no_grad()
     def sample_and_keep(
-        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Batch,
+        injection: Injection,
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> tuple[Tensor, KeysValues]:
         prefix = self.prefill(injection)
         return self._integrate(batch, injection, noise, steps, prefix), prefix.new()
 
     def _integrate(
-        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None, prefix: KVCache
+        self,
+        batch: Batch,
+        injection: Injection,
+        noise: Mapping[str, Tensor],
+        steps: int | None,
+        prefix: KVCache,
     ) -> Tensor:
         x, steps = noise["noise"], self.head.steps if steps is None else steps
         blocks = [*injection.beside, self.action_block(x)]
@@ -201,7 +250,12 @@ class Pi05Backbone(
         return prefix
 
     def denoise(
-        self, x_t: Tensor, condition: Tensor | Conditioning, layout: Layout, prefix: KVCache, injection: Injection
+        self,
+        x_t: Tensor,
+        condition: Tensor | Conditioning,
+        layout: Layout,
+        prefix: KVCache,
+        injection: Injection,
     ) -> Tensor:
         """The velocity at one flow time, from the cached prefix: the cost of one Euler step."""
         blocks = [*injection.beside, self.action_block(x_t)]
@@ -209,7 +263,9 @@ class Pi05Backbone(
         return self.read_velocity(hidden)
 
     def conditions(self, steps: int) -> Conditioning:
-        """Every layer's time modulations at the times of so many steps; kept for the next chunk while `keep_times`."""
+        """Every layer's time modulations at the times of so many steps; kept for the next chunk
+        while `keep_times`.
+        """
         if not self.keep_times:
             return self._conditions(steps)
         stamp = self.sampling_stamp()
@@ -226,7 +282,9 @@ class Pi05Backbone(
     # Optional capabilities
 
     def parts(self) -> Mapping[str, str]:
-        """Tower and projector; embedding and VLM expert; extra experts of an integration; the rest is `action`."""
+        """Tower and projector; embedding and VLM expert; extra experts of an integration; the rest
+        is `action`.
+        """
         return self.PARTS
 
     def init_experts(self, names: Sequence[str]) -> None:
@@ -236,12 +294,14 @@ class Pi05Backbone(
                 initialise(block.experts[name])  # type: ignore[index, arg-type]
 
     def compile(self, **options: Any) -> None:
-        """Compile the vision tower and every layer in place, each by itself: quick to compile, and shardable still.
+        """Compile the vision tower and every layer in place, each by itself: quick to compile, and
+        shardable still.
 
-        Lengths are symbols, so that prompts and batches of any length share their code. `fullgraph` reports what would
-        fall back to eager. `options` are `torch.compile`'s and override these.
+        Lengths are symbols, so that prompts and batches of any length share their code. `fullgraph`
+        reports what would fall back to eager. `options` are `torch.compile`'s and override these.
         """
-        # Layers share one code: each passes it in training, prefill and denoising, with and without gradients.
+        # Layers share one code: each passes it in training, prefill and denoising, with and without
+        # gradients.
         torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, 64)
         for module in (self.vision, *self.transformer.layers):
             module.compile(**{"fullgraph": True, "dynamic": True, **options})
@@ -264,14 +324,22 @@ class Pi05Backbone(
         self.keep_times = True
 
     def sampling_stamp(self) -> tuple[object, ...]:
-        """Place and version of the weights that time modulations are computed from, and the precision."""
+        """Place and version of the weights that time modulations are computed from, and the
+        precision.
+        """
         layers = self.transformer.modulating()
-        weights = [p for module in (self.time_in, self.time_out, *layers) for p in module.parameters()]
-        return torch.is_autocast_enabled(weights[0].device.type), *((p.data_ptr(), p._version) for p in weights)
+        weights = [
+            p for module in (self.time_in, self.time_out, *layers) for p in module.parameters()
+        ]
+        return torch.is_autocast_enabled(weights[0].device.type), *(
+            (p.data_ptr(), p._version) for p in weights
+        )
 
 
 def initialise(module: nn.Module) -> None:
-    """Fresh weights: LeCun normal matrices, zero biases, unit-variance embeddings; adaptive norms keep their zeros."""
+    """Fresh weights: LeCun normal matrices, zero biases, unit-variance embeddings; adaptive norms
+    keep their zeros.
+    """
     adaptive = {id(m.dense) for m in module.modules() if isinstance(m, AdaRMSNorm)}
     for m in module.modules():
         if isinstance(m, RMSNorm):

@@ -13,7 +13,9 @@ from mme_vla.errors import UserError, require
 
 
 class VisionTower(nn.Module):
-    """Images [n, 3, s, s] in [−1, 1] → tokens [n, patches, d_out], row-major; not pooled, a linear head on each."""
+    """Images [n, 3, s, s] in [−1, 1] → tokens [n, patches, d_out], row-major; not pooled, a linear
+    head on each.
+    """
 
     def __init__(self, config: VisionConfig, output_dim: int) -> None:
         """Build the tower; `output_dim` is the width of the head, the VLM's."""
@@ -26,7 +28,8 @@ class VisionTower(nn.Module):
             embed_dim=config.width,
             depth=config.depth,
             num_heads=config.num_heads,
-            mlp_ratio=(config.mlp_dim + 0.5) / config.width,  # timm truncates the product: aim at the middle
+            mlp_ratio=(config.mlp_dim + 0.5)
+            / config.width,  # timm truncates the product: aim at the middle
             num_classes=output_dim,
             class_token=False,
             global_pool="",
@@ -37,20 +40,26 @@ class VisionTower(nn.Module):
         self.eval()
 
     def train(self, mode: bool = True) -> Self:
-        """Nothing in it differs in training: it stays as it is, and compiled code serves both modes."""
+        """Nothing in it differs in training: it stays as it is, and compiled code serves both
+        modes.
+        """
         return super().train(False)
 
     def forward(self, images: Tensor, frame_mask: Tensor | None = None, every: int = 0) -> Tensor:
-        """Tokens of images [n, 3, s, s]; or of clips [n, t, 3, s, s], of the last of whose frames they are.
+        """Tokens of images [n, 3, s, s]; or of clips [n, t, 3, s, s], of the last of whose frames
+        they are.
 
         Args:
-            frame_mask: [n, t] bool, False on frames of clips that are not there. every: see `PastViews`.
+            frame_mask: [n, t] bool, False on frames of clips that are not there. every: see
+                `PastViews`.
         """
         vit: Any = self.vit
         clips, images = images.shape[:-3], images.flatten(0, -4)
         convolution = vit.patch_embed.proj
         # Patches and positions in float32, as released; then the compute dtype.
-        with torch.autocast(images.device.type if images.device.type != "meta" else "cpu", enabled=False):
+        with torch.autocast(
+            images.device.type if images.device.type != "meta" else "cpu", enabled=False
+        ):
             weight, bias = convolution.weight.float(), convolution.bias.float()
             patches = nn.functional.conv2d(images.float(), weight, bias, stride=convolution.stride)
             x = patches.flatten(2).transpose(1, 2) + vit.pos_embed.float()
@@ -76,7 +85,8 @@ def pool_grid(tokens: Tensor, grid: int, pooling: str = "mean") -> Tensor:
     """
     side = int(tokens.shape[-2] ** 0.5)
     require(
-        side % grid == 0, f"A {side}×{side} token grid cannot be pooled to {grid}×{grid}: {grid} must divide {side}."
+        side % grid == 0,
+        f"A {side}×{side} token grid cannot be pooled to {grid}×{grid}: {grid} must divide {side}.",
     )
     window = side // grid
     cells = tokens.unflatten(-2, (grid, window, grid, window))

@@ -1,4 +1,6 @@
-"""The commands: the only place that reads a command line. `mme-vla NAME` and `python -m mme_vla NAME` run them."""
+"""The commands: the only place that reads a command line. `mme-vla NAME` and
+`python -m mme_vla NAME` run them.
+"""
 
 import os
 import sys
@@ -13,16 +15,31 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "evaluate": ("evaluate", "run a policy on the benchmark"),
     "results": ("results", "tables, comparisons and a report from finished runs"),
     "analyse": ("analyse", "what a memory attends to, selects, modulates and costs"),
-    "probe": ("probe", "what a policy takes from its memory, on recorded episodes and in closed loop"),
-    "inspect": ("inspect", "what is in a checkpoint, a dataset or an episode, and what a memory remembers of it"),
+    "probe": (
+        "probe",
+        "what a policy takes from its memory, on recorded episodes and in closed loop",
+    ),
+    "inspect": (
+        "inspect",
+        "what is in a checkpoint, a dataset or an episode, and what a memory remembers of it",
+    ),
     "serve": ("serve", "put a policy behind a port"),
     "harness": ("harness", "put a policy behind AI2's vla-evaluation-harness"),
     "play": ("play", "play the tasks yourself, or let a model play"),
     "convert": ("convert", "official HDF5 demonstrations to one LeRobot dataset"),
-    "exec-starts": ("exec_starts", "where the conditioning videos of a dataset end, if it has no such column"),
+    "exec-starts": (
+        "exec_starts",
+        "where the conditioning videos of a dataset end, if it has no such column",
+    ),
     "cache": ("cache", "the vision tokens of a dataset, computed once"),
-    "nano": ("nano", "small policies from nothing to results on two cores; `nano board` ranks them"),
-    "vision-pretrain": ("vision_pretrain", "the vision tower of the nano backbone, from renders of the tasks"),
+    "nano": (
+        "nano",
+        "small policies from nothing to results on two cores; `nano board` ranks them",
+    ),
+    "vision-pretrain": (
+        "vision_pretrain",
+        "the vision tower of the nano backbone, from renders of the tasks",
+    ),
     "record": ("record", "demonstrate episodes of the benchmark and keep them as a dataset"),
     "gallery": ("gallery", "the tasks at a glance, one demonstrated episode each, on one page"),
     "weights": ("weights", "a checkpoint from one format to another"),
@@ -44,12 +61,13 @@ _WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}  # Options th
 
 
 def run(module: str) -> None:
-    """Run the command in a module of this package, importing it first: Ctrl-C ends the import with a message, too.
+    """Run the command in a module of this package, importing it first: Ctrl-C ends the import with
+    a message, too.
 
     A terminal gets a line at once, since imports take seconds. Logs and pipes stay as they are.
     """
-    # Threads that wait for each other asleep leave their cores to data workers and environments: busy waiting slows a
-    # step tenfold. It counts only when set before PyTorch is imported.
+    # Threads that wait for each other asleep leave their cores to data workers and environments:
+    # busy waiting slows a step tenfold. It counts only when set before PyTorch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with print_user_errors():
         if _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
@@ -64,8 +82,8 @@ def check_launcher(module: str) -> None:
     """Refuse to start a command in several processes that would each do all of its work.
 
     Raises:
-        UserError: a launcher started this process beside others, and the command does not share its work; or a
-            launcher was asked for several processes and started one.
+        UserError: a launcher started this process beside others, and the command does not share its
+            work; or a launcher was asked for several processes and started one.
     """
     if module in SHARED | READING:
         return
@@ -73,6 +91,6 @@ def check_launcher(module: str) -> None:
     sharing = ", ".join(name for name, (other, _) in COMMANDS.items() if other in SHARED)
     require(
         started == 1,
-        f"{started} processes were started (WORLD_SIZE), and each would do all of this command's work: start it "
-        f"without a launcher. Commands that share their work: {sharing}.",
+        f"{started} processes were started (WORLD_SIZE), and each would do all of this command's"
+        f" work: start it without a launcher. Commands that share their work: {sharing}.",
     )

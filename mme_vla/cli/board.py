@@ -1,6 +1,8 @@
-"""`mme-vla nano board`: the ranking of nanoMME's rows, with rows of your own from folders or from a new training.
+"""`mme-vla nano board`: the ranking of nanoMME's rows, with rows of your own from folders or from a
+new training.
 
-Words of `mme-vla nano` train and evaluate a row first, as far as it is not there: `model=` names it.
+Words of `mme-vla nano` train and evaluate a row first, as far as it is not there: `model=` names
+it.
 """
 
 import argparse
@@ -24,16 +26,29 @@ EXAMPLES = (
 )  # fmt: skip
 
 
-def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable[[Sequence[str]], list[str]]) -> None:
+def main(
+    words: Sequence[str],
+    nano: Callable[[], None],
+    with_settings: Callable[[Sequence[str]], list[str]],
+) -> None:
     """Train where a model is named, read the rows, print and write the board.
 
-    nano: `mme-vla nano`, with the words of `sys.argv`. with_settings: these words with what they imply.
+    nano: `mme-vla nano`, with the words of `sys.argv`. with_settings: these words with what they
+    imply.
     """
     parser = argument_parser("mme-vla nano board", __doc__, EXAMPLES)
-    parser.add_argument("words", nargs="*", metavar="KEY=VALUE",
-                        help="rows=FOLDER: rows of your own, repeatable; others: of mme-vla nano")  # fmt: skip
-    parser.add_argument("--config-dir", type=Path, help="folder of your own models, as of mme-vla nano")
-    parser.add_argument("--html", type=Path, help="write the board as one page with sortable tables and plots")
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="rows=FOLDER: rows of your own, repeatable; others: of mme-vla nano",
+    )
+    parser.add_argument(
+        "--config-dir", type=Path, help="folder of your own models, as of mme-vla nano"
+    )
+    parser.add_argument(
+        "--html", type=Path, help="write the board as one page with sortable tables and plots"
+    )
     parser.add_argument("--samples", type=int, help="of the bootstrap")
     with print_user_errors():
         args = parser.parse_intermixed_args(words)
@@ -44,8 +59,12 @@ def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable
         config = compose("nano", with_settings(words), extra_dirs=trees)
         trained: list[Path] = []
         if any(word.startswith("model=") for word in words):
-            trained = row_folders(resolved(compose("nano", with_settings(alone(words)), extra_dirs=trees)), trees)
-            sys.argv[1:] = alone(words) + [word for tree in trees for word in ("--config-dir", str(tree))]
+            trained = row_folders(
+                resolved(compose("nano", with_settings(alone(words)), extra_dirs=trees)), trees
+            )
+            sys.argv[1:] = alone(words) + [
+                word for tree in trees for word in ("--config-dir", str(tree))
+            ]
             nano()
         run(args, str(config.split), trained)
 
@@ -67,26 +86,33 @@ def row_folders(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
         other = read_training(folder)
         specs = choose_episodes(config["task"], config["episodes"], split)
         compared = {
-            "episodes": tuple(dict(Counter(scene.task for scene in scenes)) for scenes in (specs, other.records)),
+            "episodes": tuple(
+                dict(Counter(scene.task for scene in scenes)) for scenes in (specs, other.records)
+            ),
             "max_steps": (rules.steps, other.records[0].max_steps),
             "rules": (rules_text(actions, rules.max_choices, rules.only_possible), other.rules),
         }
         for name, (value, expected) in compared.items():
             require(
-                value == expected, f"A row with {name} {value} does not fit those of {shipped}: they have {expected}."
+                value == expected,
+                f"A row with {name} {value} does not fit those of {shipped}: they have {expected}.",
             )
     return [Path(config["output"]) / split / row for row in rows.composed]
 
 
 def alone(words: Sequence[str]) -> list[str]:
-    """Words for the models that they name and no other rows, with one training each if they do not say otherwise."""
+    """Words for the models that they name and no other rows, with one training each if they do not
+    say otherwise.
+    """
     typed = {word.partition("=")[0] for word in words}
     others = ("beside=[]", "planner=false", "oracle=null", "floors=false", "trainings=1")
     return [*words, *(word for word in others if word.partition("=")[0] not in typed)]
 
 
 def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
-    """Read the rows, print the board, and write it where a file is named. trained: folders beside those of `rows=`."""
+    """Read the rows, print the board, and write it where a file is named. trained: folders beside
+    those of `rows=`.
+    """
     from mme_vla.evaluation.results.tables import comparison_table, print_table
     from mme_vla.nano import board_page
     from mme_vla.nano.board import SAMPLES, Board
@@ -101,7 +127,11 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
     for table in (board_page.ranking(board, brief=True), board_page.targets(board), pairs):
         if table.rows:
             print_table(table, 120)
-    for line in [*board_page.notes(board), *board_page.separating(board), *board_page.standing(board)]:
+    for line in [
+        *board_page.notes(board),
+        *board_page.separating(board),
+        *board_page.standing(board),
+    ]:
         print(printable(line))
     if args.html:
         args.html.parent.mkdir(parents=True, exist_ok=True)

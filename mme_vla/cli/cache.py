@@ -13,7 +13,9 @@ from mme_vla.utils import FolderLock
 
 @cli("cache")
 def main(cfg: DictConfig) -> None:
-    """Build, or with dry_run only estimate, the caches that configs/cache.yaml and the command line describe."""
+    """Build, or with dry_run only estimate, the caches that configs/cache.yaml and the command line
+    describe.
+    """
     from mme_vla.data.cache import cache_folder, default_cache_root, fingerprint
     from mme_vla.data.cache_building import build_cache, clear_cache, estimate, process_rank
     from mme_vla.data.sources import open_sources
@@ -22,7 +24,10 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.training.runs import start_from, weights_to_start_from
 
     if cfg.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise UserError("rebuild=true removes files that other processes write: run it once without torchrun first.")
+        raise UserError(
+            "rebuild=true removes files that other processes write: run it once without torchrun"
+            " first."
+        )
     init_from = weights_to_start_from(cfg.init_from)
     policy = build_from_config(cfg, fresh_backbone=init_from is None)
     if init_from is not None:
@@ -40,17 +45,23 @@ def main(cfg: DictConfig) -> None:
         if cfg.dry_run:
             plan = estimate(source, memory, encoder.encode_frames, dtype, cfg.data.cache.batch_size)
             print(
-                f"{source.name}: {plan.frames} of {int(source.lengths.sum())} frames to encode, "
-                f"{plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process on {device}"
+                f"{source.name}: {plan.frames} of {int(source.lengths.sum())} frames to encode,"
+                f" {plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process"
+                f" on {device}"
             )
             continue
         rank, world = process_rank()
         if rank == 0:
             source.verify()  # its images are all about to be read, and for the last time
-        # Beside the folder, and one for each share: processes that take other shares, or train, are welcome.
-        with FolderLock(folder.parent, "build of this vision cache", f".{folder.name}.{rank}of{world}.lock"):
+        # Beside the folder, and one for each share: processes that take other shares, or train, are
+        # welcome.
+        with FolderLock(
+            folder.parent, "build of this vision cache", f".{folder.name}.{rank}of{world}.lock"
+        ):
             if cfg.rebuild:
                 clear_cache(folder)
             batch_size = cfg.data.cache.batch_size
-            n_encoded = build_cache(source, memory, encoder.encode_frames, folder, expected, batch_size=batch_size)
+            n_encoded = build_cache(
+                source, memory, encoder.encode_frames, folder, expected, batch_size=batch_size
+            )
         print(f"{source.name}: {n_encoded} episodes encoded, {len(source)} in all, at {folder}")

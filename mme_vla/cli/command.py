@@ -38,22 +38,28 @@ from mme_vla.errors import UserError, printable
 def cli[T](
     config_name: str, directory: Path | None = None
 ) -> Callable[[Callable[[DictConfig], T]], Callable[..., T | None]]:
-    """Make `main(cfg)` a Hydra command: run folder, `--multirun`, `--help`, `--cfg job`, `--config-dir`.
+    """Make `main(cfg)` a Hydra command: run folder, `--multirun`, `--help`, `--cfg job`,
+    `--config-dir`.
 
-    The overrides are checked before the command starts. `print_user_errors` surrounds it: exceptions that are bugs keep
-    their traceback. Called with a config, the decorated function runs `main` directly.
+    The overrides are checked before the command starts. `print_user_errors` surrounds it:
+    exceptions that are bugs keep their traceback. Called with a config, the decorated function runs
+    `main` directly.
     """
 
     def decorate(main: Callable[[DictConfig], T]) -> Callable[..., T | None]:
         @functools.wraps(main)
         def job(cfg: DictConfig) -> T:
-            with print_user_errors():  # here too: Hydra would print a traceback before it gets further
+            with (
+                print_user_errors()
+            ):  # here too: Hydra would print a traceback before it gets further
                 if missing := sorted(OmegaConf.missing_keys(cfg)):
                     words = " ".join(f"{key}=…" for key in missing)
                     raise UserError(f"A value is needed for {', '.join(missing)}: add {words}")
                 join_memories(cfg)
                 hydra_cfg = HydraConfig.get()
-                join_plugins(cfg, str(hydra_cfg.job.config_name), command_trees(), hydra_cfg.overrides.task)
+                join_plugins(
+                    cfg, str(hydra_cfg.job.config_name), command_trees(), hydra_cfg.overrides.task
+                )
                 if {"name", "memory"} <= set(cfg):
                     cfg.name = name_under_hydra(_root_=cfg)
                 import_plugins(cfg)
@@ -68,8 +74,13 @@ def cli[T](
             sys.argv[1:] = options_first(several_memories(plugins.trust_as_override(sys.argv[1:])))
             with print_user_errors():
                 _check_command_line(config_name, tree)
-                start = hydra.main(version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name)
-                # Hydra makes the run folder: what the disk says to that is to come here, not to be printed there.
+                start = hydra.main(
+                    version_base=VERSION_BASE,
+                    config_path=str(tree.resolve()),
+                    config_name=config_name,
+                )
+                # Hydra makes the run folder: what the disk says to that is to come here, not to be
+                # printed there.
                 os.environ.setdefault("HYDRA_FULL_ERROR", "1")
                 try:
                     start(job)()
@@ -103,16 +114,24 @@ def _check_command_line(config_name: str, tree: Path) -> None:
         with local_hydra(tree, []):
             known = list(paths(OmegaConf.to_container(hydra.compose(config_name))))
         raise unknown_option(unknown[0], sys.argv[1:], known)
-    modes = [mode for mode in ("run", "multirun", "cfg", "info", "shell_completion") if getattr(args, mode)]
+    modes = [
+        mode
+        for mode in ("run", "multirun", "cfg", "info", "shell_completion")
+        if getattr(args, mode)
+    ]
     if len(modes) > 1:
-        raise UserError(f"Use one of {' and '.join(f'--{mode}'.replace('_', '-') for mode in modes)}, not both.")
+        raise UserError(
+            f"Use one of {' and '.join(f'--{mode}'.replace('_', '-') for mode in modes)}, not both."
+        )
     extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     if args.help:
         print(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))
         raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
-    check_overrides(args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra)
+    check_overrides(
+        args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra
+    )
 
 
 def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> str:
@@ -122,7 +141,9 @@ def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
     """
 
     def selected_groups(overrides: Sequence[str]) -> dict[str, str]:
-        compose(config_name, overrides, directory=trees[0], extra_dirs=trees[1:])  # says what is misspelt
+        compose(
+            config_name, overrides, directory=trees[0], extra_dirs=trees[1:]
+        )  # says what is misspelt
         with local_hydra(trees[0], trees[1:]):
             cfg = hydra.compose(config_name, list(overrides), return_hydra_config=True)
             taken = cfg.hydra.runtime.choices.items()
@@ -133,14 +154,23 @@ def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
 
 
 def check_overrides(
-    config_name: str, overrides: Sequence[str], *, directory: Path | None = None, extra_dirs: Sequence[Path] = ()
+    config_name: str,
+    overrides: Sequence[str],
+    *,
+    directory: Path | None = None,
+    extra_dirs: Sequence[Path] = (),
 ) -> None:
-    """Compose once to see that the overrides fit, every choice of a sweep (`model=a,b`) included."""
+    """Compose once to see that the overrides fit, every choice of a sweep
+    (`model=a,b`) included.
+    """
     columns = [_choices(override) for override in parse(overrides)]
     for row in zip_longest(*columns) if columns else [()]:
-        # A column shorter than the longest stays at its first choice: every choice is seen once, not their product.
+        # A column shorter than the longest stays at its first choice: every choice is seen once,
+        # not their product.
         combination = [
-            column[0] if value is None else value for value, column in zip(row, columns, strict=True) if column
+            column[0] if value is None else value
+            for value, column in zip(row, columns, strict=True)
+            if column
         ]
         compose(config_name, combination, directory=directory, extra_dirs=extra_dirs)
 
@@ -156,9 +186,13 @@ def _choices(override: Override) -> list[str]:
 
 
 def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:
-    """Write a command's log and warnings to standard error; `clock` puts the time of day before each line."""
+    """Write a command's log and warnings to standard error; `clock` puts the time of day before
+    each line.
+    """
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_Printable("%(asctime)s %(message)s" if clock else "%(message)s", "%H:%M:%S"))
+    handler.setFormatter(
+        _Printable("%(asctime)s %(message)s" if clock else "%(message)s", "%H:%M:%S")
+    )
     logger.setLevel(logging.INFO)
     logger.handlers = [handler]
     logger.propagate = False

@@ -1,4 +1,6 @@
-"""`mme-vla convert input=<files or folders> output=<new folder>`: HDF5 demonstrations to one dataset."""
+"""`mme-vla convert input=<files or folders> output=<new folder>`: HDF5 demonstrations to one
+dataset.
+"""
 
 from pathlib import Path
 
@@ -19,6 +21,10 @@ def main(cfg: DictConfig) -> None:
         episodes = [ref for ref in episodes if ref.index in set(cfg.episodes)]
     output = Path(cfg.output)
     options = {"images": cfg.images, "fps": cfg.fps, "keyframes": cfg.keyframes, "names": cfg.names}
-    n_converted = convert(episodes, output, read_section(ConvertOptions, cfg.video, "video", **options))
+    n_converted = convert(
+        episodes, output, read_section(ConvertOptions, cfg.video, "video", **options)
+    )
     already = len(episodes) - n_converted
-    print(f"{output}: {len(episodes)} episodes ({n_converted} written now, {already} already there).")
+    print(
+        f"{output}: {len(episodes)} episodes ({n_converted} written now, {already} already there)."
+    )

@@ -1,4 +1,6 @@
-"""`mme-vla docs`: build the documentation site of a clone and open it in the browser, without a network."""
+"""`mme-vla docs`: build the documentation site of a clone and open it in the browser, without a
+network.
+"""
 
 import argparse
 import logging
@@ -21,8 +23,9 @@ def build_site(output: Path) -> Path:
     """Build the site into a folder, in place of an earlier site, and return its start page.
 
     Raises:
-        UserError: the folder holds anything but an earlier site, the extra `docs` is missing, this is no clone, or a
-            page has a warning (a broken link, for example). Then the folder is as it was.
+        UserError: the folder holds anything but an earlier site, the extra `docs` is missing, this
+            is no clone, or a page has a warning (a broken link, for example). Then the folder is as
+            it was.
     """
     try:
         from mkdocs.commands.build import build
@@ -31,7 +34,8 @@ def build_site(output: Path) -> Path:
     except ImportError:
         raise missing_extra("The documentation site", "docs") from None
     require(
-        SETTINGS.is_file(), f"The pages are in the repository, not in the installed package ({SETTINGS} is missing)."
+        SETTINGS.is_file(),
+        f"The pages are in the repository, not in the installed package ({SETTINGS} is missing).",
     )
     target = output.resolve()
     check_site(target)
@@ -46,29 +50,38 @@ def build_site(output: Path) -> Path:
         except (Abort, MkDocsException) as error:
             raise UserError(f"The site was not built: {error}") from error
         files = [path for path in draft.rglob("*") if path.is_file()]
-        write_json(draft / FILES, {path.relative_to(draft).as_posix(): file_sum(path) for path in files})
+        write_json(
+            draft / FILES, {path.relative_to(draft).as_posix(): file_sum(path) for path in files}
+        )
         check_site(target)  # building takes a while
         _replace(draft, target)
     return output / "index.html"
 
 
 def check_site(folder: Path) -> None:
-    """Refuse a folder that holds anything but an earlier site, since building removes what is there.
+    """Refuse a folder that holds anything but an earlier site, since building removes what is
+    there.
 
     Raises:
-        UserError: files or folders in it are not of a site that was built here, or were changed since.
+        UserError: files or folders in it are not of a site that was built here, or were changed
+            since.
     """
-    require(not folder.exists() or folder.is_dir(), f"--output {folder} is a file: give a folder for the site.")
+    require(
+        not folder.exists() or folder.is_dir(),
+        f"--output {folder} is a file: give a folder for the site.",
+    )
     record = folder / FILES
     sums = read_json(record, "the files of a site") if record.is_file() else {}
     folders = {parent.as_posix() for name in sums for parent in Path(name).parents}
     # Not all of them: the folder may be somebody's home.
-    foreign = list(islice((path for path in folder.rglob("*") if not _is_ours(path, folder, sums, folders)), 5))
+    foreign = list(
+        islice((path for path in folder.rglob("*") if not _is_ours(path, folder, sums, folders)), 5)
+    )
     require(
         not foreign,
-        f"--output {folder} holds what is no site of this command, or was changed since, such as "
-        f"{listed(sorted(path.name for path in foreign))}. A new site replaces the whole folder: choose another, or "
-        "remove this one yourself.",
+        f"--output {folder} holds what is no site of this command, or was changed since, such as"
+        f" {listed(sorted(path.name for path in foreign))}. A new site replaces the whole folder:"
+        " choose another, or remove this one yourself.",
     )
 
 
@@ -82,7 +95,9 @@ def _is_ours(path: Path, folder: Path, sums: dict[str, str], folders: set[str]) 
 
 
 def _replace(draft: Path, target: Path) -> None:
-    """Move a built site into the folder of an earlier one; at each moment its list names all that is there."""
+    """Move a built site into the folder of an earlier one; at each moment its list names all that
+    is there.
+    """
     target.mkdir(exist_ok=True)
     for path in sorted(target.iterdir(), key=lambda path: path.name == FILES):
         if path.is_dir():
@@ -95,7 +110,9 @@ def _replace(draft: Path, target: Path) -> None:
 
 def main() -> None:
     """Run `mme-vla docs`."""
-    parser = argparse.ArgumentParser(prog="mme-vla docs", description=str(__doc__).partition(": ")[2])
+    parser = argparse.ArgumentParser(
+        prog="mme-vla docs", description=str(__doc__).partition(": ")[2]
+    )
     parser.add_argument(
         "--output",
         type=Path,
@@ -104,7 +121,9 @@ def main() -> None:
     )
     parser.add_argument("--build", action="store_true", help="build only, open no browser")
     arguments = parser.parse_args()
-    logging.getLogger("mkdocs").addHandler(logging.StreamHandler())  # its warnings, which are errors here
+    logging.getLogger("mkdocs").addHandler(
+        logging.StreamHandler()
+    )  # its warnings, which are errors here
     page = build_site(arguments.output).resolve()
     print(f"The site is in {page}")
     if not arguments.build and not webbrowser.open(page.as_uri()):

@@ -24,9 +24,9 @@ class Terminated(KeyboardInterrupt):
 def print_user_errors() -> Iterator[None]:
     """Surround a command: what is not a bug ends the process with a message instead of a traceback.
 
-    A `UserError` ends with code 2, a disk that refuses (full, read-only, too many files) with 1, Ctrl-C with 130 and
-    SIGTERM with 143. Where the reader of standard output closes it, as `| head` does, the command ends quietly. Other
-    exceptions pass.
+    A `UserError` ends with code 2, a disk that refuses (full, read-only, too many files) with 1,
+    Ctrl-C with 130 and SIGTERM with 143. Where the reader of standard output closes it, as `| head`
+    does, the command ends quietly. Other exceptions pass.
     """
     with _terminable():
         try:
@@ -52,7 +52,9 @@ def print_user_errors() -> Iterator[None]:
 
 
 def _interrupted(error: BaseException | None) -> KeyboardInterrupt | None:
-    """The signal that an exception hides: a `finally` that fails on half-made objects replaces it."""
+    """The signal that an exception hides: a `finally` that fails on half-made objects
+    replaces it.
+    """
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__context__
     return error
@@ -61,7 +63,10 @@ def _interrupted(error: BaseException | None) -> KeyboardInterrupt | None:
 def _end_interrupted(stop: KeyboardInterrupt) -> NoReturn:
     number = signal.SIGTERM if isinstance(stop, Terminated) else signal.SIGINT
     name = "SIGTERM" if number == signal.SIGTERM else "Ctrl-C"
-    _print(f"Stopped by {name}. What was finished is kept: the same command continues from there.", "Stopped")
+    _print(
+        f"Stopped by {name}. What was finished is kept: the same command continues from there.",
+        "Stopped",
+    )
     raise SystemExit(128 + number) from None
 
 
@@ -74,7 +79,9 @@ def _has_no_reader(stream: TextIO) -> bool:
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Turn SIGTERM into an exception while this is open, where the process would just have died of it."""
+    """Turn SIGTERM into an exception while this is open, where the process would just have died of
+    it.
+    """
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield

@@ -1,4 +1,6 @@
-"""`python -m mme_vla.evaluate checkpoint=… tasks=all`: run a policy on the benchmark (configs/evaluate.yaml)."""
+"""`python -m mme_vla.evaluate checkpoint=… tasks=all`: run a policy on the benchmark
+(configs/evaluate.yaml).
+"""
 
 import logging
 import multiprocessing
@@ -30,7 +32,9 @@ SUBGOAL_MODES = ("inline", "background")
 
 @cli("evaluate")
 def main(cfg: DictConfig) -> None:
-    """Run the episodes that have no result yet; of a folder of trainings those of one training after the other."""
+    """Run the episodes that have no result yet; of a folder of trainings those of one training
+    after the other.
+    """
     from mme_vla.policy.run_folders import find_run, trainings_in
     from mme_vla.training.runs import check_finished
 
@@ -71,7 +75,9 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     if values["deterministic"]:
         settings = replace(settings, max_batch=1)
         # PyTorch takes kernels whose results repeat; where an operation has none, it warns.
-        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when the GPU is first used
+        os.environ.setdefault(
+            "CUBLAS_WORKSPACE_CONFIG", ":4096:8"
+        )  # read when the GPU is first used
         torch.use_deterministic_algorithms(True, warn_only=True)
         torch.backends.cudnn.benchmark = False
     jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
@@ -82,26 +88,52 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     policy, name, source = load_policy(cfg, "evaluate", logger, device)
     prepare_sampling(policy, cfg.sampling, logger)
     sessions = values["recordings"]
-    recordings = [] if sessions is None else all_recordings(open_sources(sessions, policy.embodiment))
+    recordings = (
+        [] if sessions is None else all_recordings(open_sources(sessions, policy.embodiment))
+    )
     subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
     predictor = None if subgoals is None else str(values["subgoal"]["name"])
     facts = facts_of(policy, name, source, settings, predictor)
     if not settings.render:
-        logger.warning("render=false: the policy sees black images; only the time of the simulation means anything")
-    output = (default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()) / training
+        logger.warning(
+            "render=false: the policy sees black images; only the time of the simulation means"
+            " anything"
+        )
+    output = (
+        default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()
+    ) / training
     count = f"{len(jobs)} episode{'s'[len(jobs) == 1 :]}"
-    logger.info("%s into %s%s", count, output, f", shared as {shard.index}/{shard.count}" if shard.count > 1 else "")
-    notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
+    logger.info(
+        "%s into %s%s",
+        count,
+        output,
+        f", shared as {shard.index}/{shard.count}" if shard.count > 1 else "",
+    )
+    notes: dict[str, Any] = {
+        "device": str(device),
+        "workers": settings.workers,
+        "max_batch": settings.max_batch,
+    }
     notes["deterministic"] = values["deterministic"]
     notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
-    if multiprocessing.get_start_method() == "loky":  # a job of joblib: a worker of ours cannot look that way up
+    if (
+        multiprocessing.get_start_method() == "loky"
+    ):  # a job of joblib: a worker of ours cannot look that way up
         multiprocessing.set_start_method("spawn", force=True)
     try:
         done = evaluate_events(
-            with_sessions(policy, settings.split, recordings), jobs, output, facts, settings, events,
-            subgoals=subgoals, shard=shard, source=source, notes=notes,
+            with_sessions(policy, settings.split, recordings),
+            jobs,
+            output,
+            facts,
+            settings,
+            events,
+            subgoals=subgoals,
+            shard=shard,
+            source=source,
+            notes=notes,
             times_from=None if cfg.times_from is None else Path(str(cfg.times_from)).expanduser(),
-        )  # fmt: skip
+        )
     finally:
         if subgoals is not None:
             report_usage(subgoals.usage)
@@ -110,12 +142,17 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
 
 
 def choose_subgoals(
-    policy: "Policy", section: dict[str, Any] | None, mode: str = "inline", device: "torch.device | None" = None
+    policy: "Policy",
+    section: dict[str, Any] | None,
+    mode: str = "inline",
+    device: "torch.device | None" = None,
 ) -> "SubgoalPredictor | None":
-    """The predictor, saying the kind of subgoal the policy was trained with unless the command line names one.
+    """The predictor, saying the kind of subgoal the policy was trained with unless the command line
+    names one.
 
-    section: the section `subgoal` of the configuration. mode: `inline`, or `background`. device: the policy's; a
-    predictor with `device: auto` runs there too. None leaves the choice to the predictor.
+    section: the section `subgoal` of the configuration. mode: `inline`, or `background`. device:
+    the policy's; a predictor with `device: auto` runs there too. None leaves the choice to the
+    predictor.
     """
     from mme_vla.evaluation.rollout.evaluation import check_subgoals, kind_section
     from mme_vla.subgoal import BackgroundPredictor, build_predictor
@@ -123,7 +160,10 @@ def choose_subgoals(
     check_choice("subgoal_mode", mode, SUBGOAL_MODES)
     if section is None:
         if policy.require_processor().prompt_spec.reads_subgoal:
-            logger.warning("this policy reads a subgoal and subgoal=none: it gets the plain prompt, as released")
+            logger.warning(
+                "this policy reads a subgoal and subgoal=none: it gets the plain prompt, as"
+                " released"
+            )
         return None
     if not words_of("subgoal.kind"):
         section = {**section, **kind_section(policy)}
@@ -131,7 +171,11 @@ def choose_subgoals(
         section = {**section, "device": str(device)}
     predictor = build_predictor(section)
     check_subgoals(policy, predictor)
-    return BackgroundPredictor(predictor) if predictor is not None and mode == "background" else predictor
+    return (
+        BackgroundPredictor(predictor)
+        if predictor is not None and mode == "background"
+        else predictor
+    )
 
 
 def report(done: "Evaluation", output: Path) -> None:
@@ -145,14 +189,22 @@ def report(done: "Evaluation", output: Path) -> None:
     tasks = list(dict.fromkeys(record.task for record in done.records))
     scored = total_score(done.records) is not None
     judged = ("right subgoals", "points off by") if scored else ()
-    table = Table("task", *("episodes", "success", "fail", "timeout", "error", "success rate"), *judged)
+    table = Table(
+        "task", *("episodes", "success", "fail", "timeout", "error", "success rate"), *judged
+    )
     rows = [(task, [r for r in done.records if r.task == task]) for task in tasks]
     for task, records in [*rows, *([("all", done.records)] if len(rows) > 1 else [])]:
         counts = count_outcomes(records)
         outcomes = [str(counts[name]) for name in ("success", "fail", "timeout", "error")]
         score = total_score(records)
         cells = (score.show() if score else ("", "")) if scored else ()
-        table.add_row(task, str(len(records)), *outcomes, f"{100 * counts['success'] / len(records):.1f} %", *cells)
+        table.add_row(
+            task,
+            str(len(records)),
+            *outcomes,
+            f"{100 * counts['success'] / len(records):.1f} %",
+            *cells,
+        )
     # Piped into a file there is no terminal to fit: as wide as the table is.
     console = Console(width=None if sys.stdout.isatty() else 160, soft_wrap=True, highlight=False)
     if done.matched:
@@ -188,6 +240,8 @@ def report_usage(usage: "Usage") -> None:
         **{f"{problem} answers": count for problem, count in usage.problems.items()},
     }  # fmt: skip
     words = [f"{count:,} {what}" for what, count in counts.items() if count]
-    words += [f"${usage.cost:.2f}" if usage.cost >= 0.01 else f"${usage.cost:.4f}"] if usage.cost else []
+    words += (
+        [f"${usage.cost:.2f}" if usage.cost >= 0.01 else f"${usage.cost:.4f}"] if usage.cost else []
+    )
     if words:
         logger.info("subgoals: %s", ", ".join(words))

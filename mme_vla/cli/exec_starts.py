@@ -1,7 +1,8 @@
-"""`mme-vla exec-starts`: where the conditioning videos of a dataset end, as a side file made from recordings that tell.
+"""`mme-vla exec-starts`: where the conditioning videos of a dataset end, as a side file made from
+recordings that tell.
 
-`lerobot/robomme` has neither `is_demo` nor `exec_start_idx`. Its episodes are those of the official HDF5 files, so each
-is found among them by its goal, its length and its joint angles.
+`lerobot/robomme` has neither `is_demo` nor `exec_start_idx`. Its episodes are those of the official
+HDF5 files, so each is found among them by its goal, its length and its joint angles.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,9 @@ from mme_vla.embodiment.robomme import ARM_JOINTS
 from mme_vla.errors import listed, require
 from mme_vla.utils import write_json
 
-NEAR = 0.05  # radians on average: a demonstration that was made anew differs a little, another episode by far more
+# radians on average: a demonstration that was made anew differs a little, another episode by far
+# more
+NEAR = 0.05
 _UNMARKED = replace(ROBOMME_JOINT, conditioning_video=False)
 
 
@@ -36,13 +39,17 @@ class AnnotatedEpisode:
 
 
 def annotated_episodes(inputs: Sequence[str | Path]) -> list[AnnotatedEpisode]:
-    """All episodes, in order, of official HDF5 files or their folders, and of LeRobot datasets that mark the video."""
+    """All episodes, in order, of official HDF5 files or their folders, and of LeRobot datasets that
+    mark the video.
+    """
     episodes: list[AnnotatedEpisode] = []
     for path in inputs:
         if (Path(path) / "meta").is_dir():
             source = EpisodeSource(path)
             for e, start in enumerate(source.exec_starts.tolist()):
-                episodes.append(AnnotatedEpisode((source.goal(e),), source.states(e)[:, :ARM_JOINTS], start))
+                episodes.append(
+                    AnnotatedEpisode((source.goal(e),), source.states(e)[:, :ARM_JOINTS], start)
+                )
             continue
         for ref in list_episodes(find_files([path])):
             with open_episode(ref) as episode:
@@ -60,13 +67,19 @@ def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> 
         alike = [one for one in annotated if len(one.joints) == len(joints) and goal in one.goals]
         apart = [float(np.abs(one.joints - joints).mean()) for one in alike]
         nearest = min(apart, default=np.inf)
-        starts = sorted({one.start for one, distance in zip(alike, apart, strict=True) if distance <= nearest + 1e-6})
+        starts = sorted(
+            {
+                one.start
+                for one, distance in zip(alike, apart, strict=True)
+                if distance <= nearest + 1e-6
+            }
+        )
         near = f"the nearest is {nearest:.2f} rad away" if alike else "none has its goal and length"
         place = f"{source.root}, episode {episode}"
         require(
             nearest <= NEAR,
-            f"{place} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} episodes given: {near}. Give "
-            "the recordings that the dataset was made from, all of them.",
+            f"{place} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} episodes"
+            f" given: {near}. Give the recordings that the dataset was made from, all of them.",
         )
         require(len(starts) <= 1, f"{place}: recordings that fit alike begin at {listed(starts)}.")
         matches.append(starts[0])
@@ -79,7 +92,11 @@ def main(cfg: DictConfig) -> None:
     output = Path(cfg.output)
     require(not output.exists(), f"{output} exists: name a new file, nothing is ever written over.")
     episodes = annotated_episodes([cfg.input] if isinstance(cfg.input, str) else list(cfg.input))
-    starts = [one.start for one in episodes] if cfg.dataset is None else first_frames(cfg.dataset, episodes)
+    starts = (
+        [one.start for one in episodes]
+        if cfg.dataset is None
+        else first_frames(cfg.dataset, episodes)
+    )
     write_json(output, {str(episode): start for episode, start in enumerate(starts)})
     videos = sum(start > 0 for start in starts)
     print(f"{output}: {len(starts)} episodes, {videos} of them with a conditioning video.")

@@ -57,18 +57,23 @@ def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snap
     observer.start()
     task.on_frame = capture
     try:
-        success = demonstrate(task, Demonstrator(task, lambda action: task.step(np.asarray(action, np.float32))))
+        success = demonstrate(
+            task, Demonstrator(task, lambda action: task.step(np.asarray(action, np.float32)))
+        )
     finally:
         task.on_frame = None
     return snapshots, success
 
 
 def strip(snapshots: Sequence[Snapshot], tiles: int) -> "Image":
-    """Some of the snapshots side by side, spread evenly, each with its step; video frames have a red border."""
+    """Some of the snapshots side by side, spread evenly, each with its step; video frames have a
+    red border.
+    """
     selected = [snapshots[i] for i in evenly_spaced(len(snapshots), tiles)]
     labels = [f"{'video, ' if shot.video else ''}step {shot.step}" for shot in selected]
     images = [
-        Tile(shot.image, label, RED if shot.video else None) for shot, label in zip(selected, labels, strict=True)
+        Tile(shot.image, label, RED if shot.video else None)
+        for shot, label in zip(selected, labels, strict=True)
     ]
     return contact_sheet(images, COLUMNS)
 
@@ -78,12 +83,16 @@ def run(cfg: "DictConfig") -> None:
     from mme_vla.data.console import progress
 
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
-    require(isinstance(cfg.tiles, int) and cfg.tiles >= 2, f"tiles={cfg.tiles!r}: expected an integer of at least 2.")
+    require(
+        isinstance(cfg.tiles, int) and cfg.tiles >= 2,
+        f"tiles={cfg.tiles!r}: expected an integer of at least 2.",
+    )
     folder = Path(cfg.output)
     page = folder / "README.md"
     require(
         not page.exists() or MADE in read_text(page),
-        f"{page} exists, and is no gallery: it is not replaced. Choose another output, or remove it yourself.",
+        f"{page} exists, and is no gallery: it is not replaced. Choose another output, or remove it"
+        " yourself.",
     )
     require_simulator()
     folder.mkdir(parents=True, exist_ok=True)
@@ -102,7 +111,9 @@ def run(cfg: "DictConfig") -> None:
 
 
 def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
-    """The first seed from the episode's on whose demonstration succeeds, as the official episodes were found."""
+    """The first seed from the episode's on whose demonstration succeeds, as the official episodes
+    were found.
+    """
     from mme_vla.envs.scene.placement import SceneError
 
     for seed in range(spec.seed, spec.seed + (1 if spec.row else 100)):
@@ -114,7 +125,9 @@ def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
         if success:
             return env, snapshots
         env.close()
-    raise UserError(f"{spec.task}: no demonstration succeeded for seeds {spec.seed} … {spec.seed + 99}.")
+    raise UserError(
+        f"{spec.task}: no demonstration succeeded for seeds {spec.seed} … {spec.seed + 99}."
+    )
 
 
 def main() -> None:

@@ -1,7 +1,9 @@
-"""The text of `--help`: what a command does, examples, and each key with its meaning, from the YAML files.
+"""The text of `--help`: what a command does, examples, and each key with its meaning, from the YAML
+files.
 
-`--help` alone shows the command's own keys and the groups with their choices; `--help memory` the files of a group with
-their keys, `--help model=framesamp_modul` the keys under these choices. Nothing here imports PyTorch.
+`--help` alone shows the command's own keys and the groups with their choices; `--help memory` the
+files of a group with their keys, `--help model=framesamp_modul` the keys under these choices.
+Nothing here imports PyTorch.
 """
 
 import argparse
@@ -38,13 +40,17 @@ COMMANDS = {
     "subgoal_train": "mme-vla subgoal-train",
 }
 """Which command a file of the tree's top level configures."""
-_KEY = re.compile(r"^(?P<indent> *(?:- )?)(?P<key>[\w/]+):(?: +(?P<value>[^#]*?))?(?: +# (?P<comment>.*))?$")
+_KEY = re.compile(
+    r"^(?P<indent> *(?:- )?)(?P<key>[\w/]+):(?: +(?P<value>[^#]*?))?(?: +# (?P<comment>.*))?$"
+)
 _PACKAGE = "# @package"
 
 
 @dataclass(frozen=True)
 class Key:
-    """One key of a file. name: dotted, within the file. default, comment: as they are written; empty where not."""
+    """One key of a file. name: dotted, within the file. default, comment: as they are written;
+    empty where not.
+    """
 
     name: str
     default: str
@@ -70,7 +76,9 @@ def keys(file: Path) -> list[Key]:
         depth = len(match["indent"]) // 2
         path = [*path[:depth], match["key"]]
         if path[0] not in ("defaults", "hydra"):
-            result.append(Key(".".join(path), (match["value"] or "").strip(), match["comment"] or ""))
+            result.append(
+                Key(".".join(path), (match["value"] or "").strip(), match["comment"] or "")
+            )
     return result
 
 
@@ -80,13 +88,20 @@ def explained(file: Path) -> list[Key]:
     if all(key.comment for key in local_keys):
         return local_keys
     comments = {
-        key.name: key.comment for other in sorted(file.parent.glob("*.yaml")) for key in keys(other) if key.comment
+        key.name: key.comment
+        for other in sorted(file.parent.glob("*.yaml"))
+        for key in keys(other)
+        if key.comment
     }
-    return [Key(key.name, key.default, key.comment or comments.get(key.name, "")) for key in local_keys]
+    return [
+        Key(key.name, key.default, key.comment or comments.get(key.name, "")) for key in local_keys
+    ]
 
 
 def heading(file: Path) -> tuple[list[str], str]:
-    """The comment that a file begins with: example commands, and the text after them as one paragraph."""
+    """The comment that a file begins with: example commands, and the text after them as one
+    paragraph.
+    """
     lines: list[str] = []
     for line in file.read_text().splitlines():
         if not line.startswith("#"):
@@ -98,7 +113,9 @@ def heading(file: Path) -> tuple[list[str], str]:
 
 
 def package(file: Path, group: str) -> str:
-    """The section that a group's file fills, with a dot behind it; empty where it fills the top level."""
+    """The section that a group's file fills, with a dot behind it; empty where it fills the top
+    level.
+    """
     for line in file.read_text().splitlines()[:3]:
         if line.startswith(_PACKAGE):
             name = line.removeprefix(_PACKAGE).strip()
@@ -117,17 +134,24 @@ def defaults(file: Path) -> Defaults:
         if isinstance(entry, dict)
         for group, name in entry.items()
     }
-    return Defaults(files, {group: name for group, name in groups.items() if not group.startswith("override ")})
+    return Defaults(
+        files, {group: name for group, name in groups.items() if not group.startswith("override ")}
+    )
 
 
 def choices(trees: Iterable[Path], group: str) -> dict[str, Path]:
-    """The files of a group by name, of all trees; a later tree's file stands before an earlier one's."""
+    """The files of a group by name, of all trees; a later tree's file stands before an earlier
+    one's.
+    """
     files = {file.stem: file for tree in trees for file in sorted((tree / group).glob("*.yaml"))}
     return dict(sorted(files.items()))
 
 
 OPTIONS = (
-    ("--help [GROUP | GROUP=NAME …]", "this text; the files of a group; the keys under these choices"),
+    (
+        "--help [GROUP | GROUP=NAME …]",
+        "this text; the files of a group; the keys under these choices",
+    ),
     ("--cfg job", "print the whole configuration and run nothing"),
     ("--config-dir DIR", "search YAML files of your own too"),
     ("--multirun", "run once for each of several choices: model=framesamp_modul,tokendrop_modul"),
@@ -137,13 +161,17 @@ SelectGroups = Callable[[Sequence[str]], dict[str, str]]
 """From the words of a command line to the file that each group then takes."""
 
 
-def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path], select: SelectGroups) -> str:
+def help_page(
+    config_name: str, words: Sequence[str], trees: Sequence[Path], select: SelectGroups
+) -> str:
     """The text of `--help`.
 
-    config_name: the command's file. words: what stands beside `--help`: names of groups, and overrides. trees: folders
-    of YAML files, the library's first. select: composes.
+    config_name: the command's file. words: what stands beside `--help`: names of groups, and
+    overrides. trees: folders of YAML files, the library's first. select: composes.
     """
-    file = next(tree / f"{config_name}.yaml" for tree in trees if (tree / f"{config_name}.yaml").is_file())
+    file = next(
+        tree / f"{config_name}.yaml" for tree in trees if (tree / f"{config_name}.yaml").is_file()
+    )
     overrides = [word for word in words if "=" in word]
     named = [word for word in words if "=" not in word]
     groups = select(overrides)
@@ -178,20 +206,29 @@ def _included(file: Path, trees: Sequence[Path]) -> list[Path]:
     """The files of the top level that a command's file is built on, theirs included."""
     files: list[Path] = []
     for name in defaults(file).files:
-        part = next((tree / f"{name}.yaml" for tree in trees if (tree / f"{name}.yaml").is_file()), None)
+        part = next(
+            (tree / f"{name}.yaml" for tree in trees if (tree / f"{name}.yaml").is_file()), None
+        )
         if part is not None:
             files += [part, *_included(part, trees)]
     return files
 
 
 def _group_pages(groups: dict[str, str], requested: set[str], trees: Sequence[Path]) -> list[str]:
-    """Each group with its choices; of those that were asked for (a model means its parts) the keys too."""
+    """Each group with its choices; of those that were asked for (a model means its parts) the keys
+    too.
+    """
     if not groups:
         return []
     rows = [
-        (f"{group}={name}", " · ".join(choices(trees, group)) or "(none)") for group, name in sorted(groups.items())
+        (f"{group}={name}", " · ".join(choices(trees, group)) or "(none)")
+        for group, name in sorted(groups.items())
     ]
-    lines = ["Groups: GROUP=NAME takes another file; --help GROUP shows what is in them", *_table(rows), ""]
+    lines = [
+        "Groups: GROUP=NAME takes another file; --help GROUP shows what is in them",
+        *_table(rows),
+        "",
+    ]
     displayed = {"model", "memory", "integration"} if "model" in requested else set()
     for group in sorted((requested | displayed) & groups.keys()):
         lines += _file(group, groups[group], trees)
@@ -222,7 +259,12 @@ def _width() -> int:
 
 def _wrapped(text: str, indent: str = "") -> list[str]:
     return textwrap.wrap(
-        text, _width(), initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False
+        text,
+        _width(),
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_on_hyphens=False,
+        break_long_words=False,
     )
 
 
@@ -245,8 +287,8 @@ def _table(rows: Sequence[tuple[str, str]]) -> list[str]:
 def unknown_option(option: str, words: Sequence[str], paths: Sequence[str]) -> UserError:
     """What to type instead of an option that there is not: settings are `key=value` words here.
 
-    option: as it was typed, `--steps` or `--steps=10`. words: the command line. paths: dotted keys of the
-    configuration.
+    option: as it was typed, `--steps` or `--steps=10`. words: the command line. paths: dotted keys
+    of the configuration.
     """
     name, _, value = option.lstrip("-").partition("=")
     after = words[words.index(option) + 1 :][:1] if option in words else []
@@ -254,27 +296,41 @@ def unknown_option(option: str, words: Sequence[str], paths: Sequence[str]) -> U
     near = near_keys(name.replace("-", "_"), paths)
     words = " or ".join(f"{key}={value or '…'}" for key in near)
     hint = f"write {words}." if near else "--help lists them."
-    return UserError(f"There is no option {option!r}. Settings are words of the form key=value, without dashes: {hint}")
+    return UserError(
+        f"There is no option {option!r}. Settings are words of the form key=value, without dashes:"
+        f" {hint}"
+    )
 
 
 def near_keys(name: str, paths: Sequence[str], most: int = 3) -> list[str]:
-    """The dotted keys that `name` may mean: those that end in it, then those it is a word of, then the like ones."""
+    """The dotted keys that `name` may mean: those that end in it, then those it is a word of, then
+    the like ones.
+    """
     last = {path: path.rpartition(".")[2] for path in paths}
     word = name.rpartition(".")[2]
     equal = [path for path in paths if path == name or last[path] == word]
     parts = [path for path in paths if word in last[path].split("_")]
     like = [
-        path for near in difflib.get_close_matches(word, set(last.values())) for path in paths if last[path] == near
+        path
+        for near in difflib.get_close_matches(word, set(last.values()))
+        for path in paths
+        if last[path] == near
     ]
     return list(dict.fromkeys(equal or parts or like))[:most]
 
 
-def argument_parser(command: str, text: str | None, examples: Sequence[str]) -> argparse.ArgumentParser:
-    """A parser for commands that read options instead of a configuration, with the same kind of `--help`.
+def argument_parser(
+    command: str, text: str | None, examples: Sequence[str]
+) -> argparse.ArgumentParser:
+    """A parser for commands that read options instead of a configuration, with the same kind of
+    `--help`.
 
     command: as it is typed. text: what it does. examples: what is typed after it.
     """
     listed = "\n".join(f"  {command} {example}".rstrip() for example in examples)
     return argparse.ArgumentParser(
-        command, description=text, epilog=f"Examples\n{listed}", formatter_class=argparse.RawDescriptionHelpFormatter
+        command,
+        description=text,
+        epilog=f"Examples\n{listed}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )

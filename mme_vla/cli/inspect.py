@@ -1,4 +1,6 @@
-"""`python -m mme_vla.inspect`: what is in a checkpoint, a dataset or an episode, and what a memory remembers of it."""
+"""`python -m mme_vla.inspect`: what is in a checkpoint, a dataset or an episode, and what a memory
+remembers of it.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,12 +23,17 @@ if TYPE_CHECKING:
 
 @cli("inspect")
 def main(cfg: DictConfig) -> None:
-    """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw its memory."""
+    """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw
+    its memory.
+    """
     from rich.console import Console
 
     console = Console(markup=False)
     if (cfg.checkpoint is None) == (cfg.dataset is None):
-        raise UserError("Name one thing to inspect: checkpoint=<folder>, or dataset=<folder> (`sample` is built in).")
+        raise UserError(
+            "Name one thing to inspect: checkpoint=<folder>, or dataset=<folder> (`sample` is built"
+            " in)."
+        )
     if cfg.checkpoint is not None:
         return show_checkpoint(Path(cfg.checkpoint), console, bool(cfg.trust_plugins))
     from mme_vla.data.episodes import EpisodeSource
@@ -40,7 +47,9 @@ def main(cfg: DictConfig) -> None:
     show_episode(source, episode, step, console)
     if cfg.memory is None:
         return None
-    image = draw_memory(source, episode, step, build_memory(cfg), cfg.memory.name, Path(cfg.output), console)
+    image = draw_memory(
+        source, episode, step, build_memory(cfg), cfg.memory.name, Path(cfg.output), console
+    )
     console.print(f"image: {image}", highlight=False, soft_wrap=True)
     return None
 
@@ -73,7 +82,9 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     settings.add_row("words", printable(policy.require_processor().prompt_spec.encoder))
     if (folder / STATE).is_file():
         state = read_state(folder)
-        settings.add_row("trained for", f"{state['step']} steps; weights here are averages, raw ones beside them")
+        settings.add_row(
+            "trained for", f"{state['step']} steps; weights here are averages, raw ones beside them"
+        )
         settings.add_row("recipe", _summary(state["config"].get("train", {})))
         settings.add_row("data", _summary(state["config"].get("data", {})))
         settings.add_row("versions", _summary(state["versions"]))
@@ -87,7 +98,9 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
             (action, stats.actions, space.names),
         ):
             # Extremes are kept where a policy normalises by them.
-            bounds = [bound for bound in ("min", "q01", "q99", "max") if getattr(of, bound) is not None]
+            bounds = [
+                bound for bound in ("min", "q01", "q99", "max") if getattr(of, bound) is not None
+            ]
             numbers = _table(f"normalisation of the {title}", "number", *bounds)
             for i, name in enumerate(names):
                 numbers.add_row(name, *(f"{getattr(of, bound)[i]:.3f}" for bound in bounds))
@@ -99,25 +112,39 @@ def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) ->
     from mme_vla.data.lerobot_files import SAMPLE
 
     compared = source.verify()
-    table = _table(f"{source.name} ({source.root})", "episode", "task", "frames", "of them video", "seconds", "goal")
+    table = _table(
+        f"{source.name} ({source.root})",
+        "episode",
+        "task",
+        "frames",
+        "of them video",
+        "seconds",
+        "goal",
+    )
     for episode in range(min(len(source), most)):
         frames, video = int(source.lengths[episode]), int(source.exec_starts[episode])
         goal, seconds = printable(" → ".join(source.goals(episode))), f"{frames / source.fps:.1f}"
-        table.add_row(str(episode), printable(source.task(episode)), str(frames), str(video), seconds, goal)
+        table.add_row(
+            str(episode), printable(source.task(episode)), str(frames), str(video), seconds, goal
+        )
     if len(source) > most:
         table.add_row("…", f"{len(source) - most} more")
     frames, video = int(source.lengths.sum()), int(source.exec_starts.sum())
-    table.add_row("all", "", str(frames), str(video), f"{frames / source.fps:.1f}", "", style="bold")
+    table.add_row(
+        "all", "", str(frames), str(video), f"{frames / source.fps:.1f}", "", style="bold"
+    )
     _show(table, console)
     subgoals = printable(", ".join(source.subgoal_names)) or "none"
     console.print(
-        f"{frames - video} execution steps to train on · {source.fps:g} frames per second · images as "
-        f"{'video' if source.video_cameras else 'images'} · subgoals: {subgoals}",
+        f"{frames - video} execution steps to train on · {source.fps:g} frames per second · images"
+        f" as {'video' if source.video_cameras else 'images'} · subgoals: {subgoals}",
         highlight=False,
     )
     for what, names in (("state", source.state_names), ("action", source.robot.action.names)):
         if names:
-            console.print(f"{what}: {len(names)} numbers: {printable(', '.join(names))}", highlight=False)
+            console.print(
+                f"{what}: {len(names)} numbers: {printable(', '.join(names))}", highlight=False
+            )
     if compared:
         checksums = f"all {compared} files are as they were written"
     elif source.root == SAMPLE:
@@ -138,7 +165,9 @@ def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Con
     for name, text in source.subgoals(episode, step).items():
         table.add_row(name, printable(text))
     table.add_row("state", _numbers(source.states(episode, step, step + 1)[0], source.state_names))
-    table.add_row("action", _numbers(source.actions(episode, step, step + 1)[0], source.robot.action.names))
+    table.add_row(
+        "action", _numbers(source.actions(episode, step, step + 1)[0], source.robot.action.names)
+    )
     _show(table, console)
 
 
@@ -150,7 +179,9 @@ def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tupl
     length = int(source.lengths[episode])
     step = length - 1 if step is None else step
     if not isinstance(step, int) or not 0 <= step < length:
-        raise UserError(f"step={step}: episode {episode} of {source.name} has frames 0 … {length - 1}.")
+        raise UserError(
+            f"step={step}: episode {episode} of {source.name} has frames 0 … {length - 1}."
+        )
     return episode, step
 
 
@@ -161,11 +192,19 @@ def build_memory(cfg: DictConfig) -> "Memory":
 
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     backbone = shape_of(config["backbone"])
-    return mme.build_memory(config["memory"], backbone.vision_width, backbone.grid, backbone.vision_width)
+    return mme.build_memory(
+        config["memory"], backbone.vision_width, backbone.grid, backbone.vision_width
+    )
 
 
 def draw_memory(
-    source: "EpisodeSource", episode: int, step: int, memory: "Memory", name: str, folder: Path, console: "Console"
+    source: "EpisodeSource",
+    episode: int,
+    step: int,
+    memory: "Memory",
+    name: str,
+    folder: Path,
+    console: "Console",
 ) -> Path:
     """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
     import torch
@@ -183,13 +222,21 @@ def draw_memory(
     selected = memory.select(history, step)
     remembered = np.unique(selected[:, 0])
     table = _table(f"{name} at step {step}", "", "")
-    table.add_row("remembers", f"{len(selected)} of {memory.budget} tokens, in {len(remembered)} of {step + 1} frames")
+    table.add_row(
+        "remembers",
+        f"{len(selected)} of {memory.budget} tokens, in {len(remembered)} of {step + 1} frames",
+    )
     table.add_row("frames", ", ".join(map(str, remembered)))
-    table.add_row("stored", f"{len(stored)} frames of {memory.storage.grid}×{memory.storage.grid} tokens")
+    table.add_row(
+        "stored", f"{len(stored)} frames of {memory.storage.grid}×{memory.storage.grid} tokens"
+    )
     _show(table, console)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{source.name}_episode{episode}_step{step}_{name}.png"
-    title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode, step)}"
+    title = (
+        f"{name} at step {step}: {len(selected)} of {memory.budget} tokens ·"
+        f" {source.goal(episode, step)}"
+    )
     start = int(source.exec_starts[episode])
     memory_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
     return path
@@ -200,7 +247,10 @@ def _table(title: str, *columns: str) -> "Table":
 
     table = Table(title=printable(title), show_header=any(columns))
     for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 or column in ("goal", "values", "task", "") else "right")
+        table.add_column(
+            column,
+            justify="left" if i == 0 or column in ("goal", "values", "task", "") else "right",
+        )
     return table
 
 
@@ -213,8 +263,11 @@ def _show(table: "Table", console: "Console") -> None:
 
 def _summary(value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{key}={_summary(inner) if not isinstance(inner, dict) else '{' + _summary(inner) + '}'}"
-                         for key, inner in value.items())  # fmt: skip
+        parts = []
+        for key, inner in value.items():
+            text = _summary(inner)
+            parts.append(f"{key}={{{text}}}" if isinstance(inner, dict) else f"{key}={text}")
+        return ", ".join(parts)
     return printable(str(value))
 
 

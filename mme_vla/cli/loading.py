@@ -1,4 +1,6 @@
-"""The policy a command is about: a checkpoint, or a model with fresh weights for trying things out."""
+"""The policy a command is about: a checkpoint, or a model with fresh weights for
+trying things out.
+"""
 
 import logging
 import time
@@ -16,13 +18,23 @@ if TYPE_CHECKING:
 
 # What a checkpoint brings along, so that it cannot be set beside one.
 _MODEL_KEYS = (
-    "name", "model", "embodiment", "backbone", "memory", "integration", "policy", "processor", "subgoal_text",
+    "name",
+    "model",
+    "embodiment",
+    "backbone",
+    "memory",
+    "integration",
+    "policy",
+    "processor",
+    "subgoal_text",
     "token_budget",
-)  # fmt: skip
+)
 
 
 class LoadedPolicy(NamedTuple):
-    """A policy on its device. source: the checkpoint folder or repository it is from; None with fresh weights."""
+    """A policy on its device. source: the checkpoint folder or repository it is from; None with
+    fresh weights.
+    """
 
     policy: "Policy"
     name: str
@@ -34,8 +46,8 @@ def load_policy(
 ) -> LoadedPolicy:
     """Load `checkpoint`, or build `model` with fresh weights and say so.
 
-    cfg: with `checkpoint`, `revision`, `device`, `dtype` and what a model is built from. verb: what the command does
-    with it, for messages. device: instead of the configured one.
+    cfg: with `checkpoint`, `revision`, `device`, `dtype` and what a model is built from. verb: what
+    the command does with it, for messages. device: instead of the configured one.
     """
     from mme_vla.policy.base import Policy
     from mme_vla.policy.build import build_from_config
@@ -49,16 +61,24 @@ def load_policy(
             raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
         where = locate_checkpoint(str(cfg.checkpoint))
         policy = Policy.from_pretrained(
-            where, device=device, dtype=cfg.dtype, revision=cfg.revision, trust_plugins=cfg.trust_plugins
+            where,
+            device=device,
+            dtype=cfg.dtype,
+            revision=cfg.revision,
+            trust_plugins=cfg.trust_plugins,
         )
         name = str(policy.config.get("name", "policy"))
         logger.info("%s from %s, on %s", name, where, device)
         return LoadedPolicy(policy, name, where)
     require(
         any(word.startswith("model=") for word in named),
-        f"Name what to {verb}: checkpoint=<folder>, or model=<model> with fresh weights, to try things out.",
+        f"Name what to {verb}: checkpoint=<folder>, or model=<model> with fresh weights, to try"
+        " things out.",
     )
-    require(cfg.dtype in ("auto", "float32"), f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
+    require(
+        cfg.dtype in ("auto", "float32"),
+        f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.",
+    )
     policy = build_from_config(cfg).to(device)
     robot = policy.embodiment
     policy.require_processor().stats = NormStats.unit(robot.state.width, robot.action.width)
@@ -71,19 +91,29 @@ SAMPLING = ("auto", "eager", "graph", "compiled")
 
 
 def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) -> None:
-    """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where there is a GPU."""
+    """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where
+    there is a GPU.
+    """
     from mme_vla.policy.capabilities import CompilesSampling
 
     check_choice("sampling", sampling, SAMPLING)
     on_gpu = policy.device.type == "cuda"
     if sampling == "graph" and not on_gpu:
-        raise UserError(f"sampling=graph needs a GPU, and the policy is on {policy.device}: leave sampling=auto.")
-    compiles = isinstance(policy, CompilesSampling)
-    if sampling == "eager" or (sampling == "auto" and not (on_gpu and compiles and policy.compiles_sampling)):
-        return
-    if not isinstance(policy, CompilesSampling) or (sampling == "graph" and not policy.compiles_sampling):
         raise UserError(
-            f"sampling={sampling}: {type(policy).__name__} has no sampler that can be compiled. Set sampling=eager."
+            f"sampling=graph needs a GPU, and the policy is on {policy.device}: leave"
+            " sampling=auto."
+        )
+    compiles = isinstance(policy, CompilesSampling)
+    if sampling == "eager" or (
+        sampling == "auto" and not (on_gpu and compiles and policy.compiles_sampling)
+    ):
+        return
+    if not isinstance(policy, CompilesSampling) or (
+        sampling == "graph" and not policy.compiles_sampling
+    ):
+        raise UserError(
+            f"sampling={sampling}: {type(policy).__name__} has no sampler that can be compiled. Set"
+            " sampling=eager."
         )
     begun = time.perf_counter()
     policy.compile_sampling(layers=sampling == "compiled")

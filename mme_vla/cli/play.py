@@ -1,4 +1,6 @@
-"""`python -m mme_vla.play tasks=… episodes=…`: play the tasks yourself, or let a model play (configs/play.yaml)."""
+"""`python -m mme_vla.play tasks=… episodes=…`: play the tasks yourself, or let a model play
+(configs/play.yaml).
+"""
 
 import logging
 import sys
@@ -37,7 +39,9 @@ class PlaySettings:
 
 @cli("play")
 def main(cfg: DictConfig) -> None:
-    """Play the episodes that are not played yet, on the page or by a model, and compare with the paper."""
+    """Play the episodes that are not played yet, on the page or by a model, and compare with the
+    paper.
+    """
     from mme_vla.envs.rendering import render_backend
     from mme_vla.play import build_player
     from mme_vla.play.desk import Desk
@@ -113,13 +117,15 @@ def _play_one(run: PlayRun, which: EpisodeSpec, player: Any) -> EpisodeRecord:
 def line(record: EpisodeRecord) -> str:
     """One episode in one line."""
     choices = " ".join(
-        decision["choice"] + ("" if decision["point"] is None else "({:.0f},{:.0f})".format(*decision["point"]))
+        decision["choice"]
+        + ("" if decision["point"] is None else "({:.0f},{:.0f})".format(*decision["point"]))
         for decision in record.extra["decisions"]
     )
     reason = record.error or record.extra.get("ended_by", "")
     took = f"{record.steps} steps, {record.seconds.total:.0f} s"
-    return f"{record.task} {record.episode}: {record.outcome} · {choices or 'no choice'} · {took}" + (
-        f" · {reason}" if reason else ""
+    return (
+        f"{record.task} {record.episode}: {record.outcome} · {choices or 'no choice'} · {took}"
+        + (f" · {reason}" if reason else "")
     )
 
 
@@ -132,18 +138,29 @@ def print_summary(run: PlayRun) -> None:
     if not rows:
         return
     methods = list(rows[0][3])  # empty for the user's own tasks, which come last
-    table = Table("task", "episodes", run.identity.model, *(f"{method} (paper)" for method in methods))
+    table = Table(
+        "task", "episodes", run.identity.model, *(f"{method} (paper)" for method in methods)
+    )
     for task, successes, count, paper in rows:
         table.add_row(
-            task, str(count), f"{100 * successes / count:.1f}", *(f"{paper[m]:.0f}" if paper else "–" for m in methods)
+            task,
+            str(count),
+            f"{100 * successes / count:.1f}",
+            *(f"{paper[m]:.0f}" if paper else "–" for m in methods),
         )
     rates = [100 * successes / count for _, successes, count, _ in rows]
     if len(rows) > 1:
         reported = [paper for *_, paper in rows if paper]
         means = [sum(paper[m] for paper in reported) / len(reported) for m in methods]
         table.add_section()
-        table.add_row("mean of tasks", str(sum(count for _, _, count, _ in rows)), f"{sum(rates) / len(rates):.2f}",
-                      *(f"{mean:.2f}" for mean in means))  # fmt: skip
+        table.add_row(
+            "mean of tasks",
+            str(sum(count for _, _, count, _ in rows)),
+            f"{sum(rates) / len(rates):.2f}",
+            *(f"{mean:.2f}" for mean in means),
+        )
     console = Console(width=None if sys.stdout.isatty() else 160)
     console.print(table)
-    console.print(f"records: {run.folder / 'episodes.jsonl'}", markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"records: {run.folder / 'episodes.jsonl'}", markup=False, highlight=False, soft_wrap=True
+    )

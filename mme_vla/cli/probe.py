@@ -1,4 +1,6 @@
-"""`python -m mme_vla.probe checkpoint=…`: what a policy takes from its memory (configs/probe.yaml)."""
+"""`python -m mme_vla.probe checkpoint=…`: what a policy takes from its memory
+(configs/probe.yaml).
+"""
 
 import logging
 import sys
@@ -47,7 +49,9 @@ def probe(cfg: DictConfig) -> None:
         return
     card = values["card"]
     if not (values["offline"] or values["online"] or card):
-        raise UserError("offline=false online=false leaves nothing to probe: set one of them to true.")
+        raise UserError(
+            "offline=false online=false leaves nothing to probe: set one of them to true."
+        )
     if values["offline"] and values["recordings"] is None and not card:
         raise UserError(NO_DATA)
     events = event_arms(values["event"])
@@ -56,7 +60,9 @@ def probe(cfg: DictConfig) -> None:
     offline = read_section(OfflineSettings, values, others=True)
     jobs = []
     if values["online"] or card:
-        jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
+        jobs = choose_episodes(
+            named_tasks(values), values["episodes"], settings.split, settings.env
+        )
     shard = choose_shard(values["shard"])
     if jobs:
         environment(settings.env).check_installed()
@@ -65,19 +71,36 @@ def probe(cfg: DictConfig) -> None:
     policy, name, source = load_policy(cfg, "probe", logger, device)
     data = values["recordings"]
     recordings = [] if data is None else all_recordings(open_sources(data, policy.embodiment))
-    numbers = choose_numbers(values["recorded"], len(recordings), "the data") if values["offline"] else []
+    numbers = (
+        choose_numbers(values["recorded"], len(recordings), "the data") if values["offline"] else []
+    )
     probed = [recordings[i] for i in numbers]
-    subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device) if jobs else None
+    subgoals = (
+        choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
+        if jobs
+        else None
+    )
     predictor = None if subgoals is None else str(values["subgoal"]["name"])
     facts = facts_of(policy, name, source, settings, predictor)
-    folder = Path("outputs", "card" if card else "probe", safe_name(name, "the policy's name"), str(facts.checkpoint))
+    folder = Path(
+        "outputs",
+        "card" if card else "probe",
+        safe_name(name, "the policy's name"),
+        str(facts.checkpoint),
+    )
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
     plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source, events)
     try:
         if card:
             graded = run_card(
-                policy.eval(), plan, folder, facts, settings, references=values["references"], subgoals=subgoals
+                policy.eval(),
+                plan,
+                folder,
+                facts,
+                settings,
+                references=values["references"],
+                subgoals=subgoals,
             )
             text, page = card_text(graded), folder / PAGE
         else:

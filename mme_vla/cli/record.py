@@ -34,11 +34,12 @@ FAILED = "the demonstration did not end in success"
 def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict[str, Any]:
     """Demonstrate an episode into `<folder>/<name>.h5`; seeds that fail are skipped.
 
-    Where the rendered frames depend on the demonstration, it is made twice: first without images, to choose the frames,
-    and again with images of them.
+    Where the rendered frames depend on the demonstration, it is made twice: first without images,
+    to choose the frames, and again with images of them.
 
     Returns:
-        Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed seeds with reasons.
+        Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed
+        seeds with reasons.
     """
     from mme_vla.envs.recording.outputs import EpisodeWriter
     from mme_vla.envs.recording.recorder import Recorder
@@ -47,7 +48,11 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
     failures: dict[int, str] = {}
     draft = folder / f"{job.name}.writing"
     for seed in range(job.seed, job.seed + job.retries):
-        scene: dict[str, Any] = {"seed": seed, "difficulty": job.difficulty, "recovery": job.recovery}
+        scene: dict[str, Any] = {
+            "seed": seed,
+            "difficulty": job.difficulty,
+            "recovery": job.recovery,
+        }
         scene |= {} if job.row is None else task_options(job.row)
         blind: Recording | None = None
         try:
@@ -69,7 +74,10 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
             writer.close()
             task.close()
         if blind is not None and (blind.steps, blind.stored) != (result.steps, result.stored):
-            raise RuntimeError(f"{job.name}: seed {seed} took {blind.steps} steps, and {result.steps} when rendered.")
+            raise RuntimeError(
+                f"{job.name}: seed {seed} took {blind.steps} steps, and {result.steps} when"
+                " rendered."
+            )
         if result.success:
             draft.rename(folder / f"{job.name}.h5")
             if previews is not None:
@@ -77,15 +85,23 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
 
                 write_previews(folder / f"{job.name}.h5", job.episode, job.task, previews)
             counts = {"steps": result.steps, "stored": result.stored, "video": result.video}
-            done = {"task": job.task, "episode": job.episode, "seed": seed, **counts, "failed_seeds": failures}
-            write_json(folder / f"{job.name}.json", done, indent=None)  # last: what it tells of is there
+            done = {
+                "task": job.task,
+                "episode": job.episode,
+                "seed": seed,
+                **counts,
+                "failed_seeds": failures,
+            }
+            write_json(
+                folder / f"{job.name}.json", done, indent=None
+            )  # last: what it tells of is there
             return done
         failures[seed] = result.error or FAILED
     draft.unlink(missing_ok=True)
     last = list(failures.items())[-1]
     raise UserError(
-        f"{job.task} episode {job.episode}: none of the seeds {job.seed} … {last[0]} succeeded; the last: {last[1]}. "
-        "Raise retries, or leave this episode out."
+        f"{job.task} episode {job.episode}: none of the seeds {job.seed} … {last[0]} succeeded; the"
+        f" last: {last[1]}. Raise retries, or leave this episode out."
     )
 
 
@@ -100,16 +116,25 @@ def _unseen(task: str, scene: dict[str, Any]) -> "Recording":
         env.close()
 
 
-def record(jobs: Sequence[Job], folder: Path, workers: int, previews: Path | None) -> list[dict[str, Any]]:
-    """Demonstrate all episodes that `folder` does not hold yet, with a progress bar; return what is known of each."""
+def record(
+    jobs: Sequence[Job], folder: Path, workers: int, previews: Path | None
+) -> list[dict[str, Any]]:
+    """Demonstrate all episodes that `folder` does not hold yet, with a progress bar; return what is
+    known of each.
+    """
     from mme_vla.data.console import progress
 
     folder.mkdir(parents=True, exist_ok=True)
     missing = [job for job in jobs if not (folder / f"{job.name}.json").is_file()]
     with progress("record", len(jobs), len(jobs) - len(missing), "episodes") as advance:
-        for _ in carry_out(missing, partial(record_episode, folder=folder, previews=previews), workers):
+        for _ in carry_out(
+            missing, partial(record_episode, folder=folder, previews=previews), workers
+        ):
             advance(1)
-    return [read_json(folder / f"{job.name}.json", "what is known of a recorded episode") for job in jobs]
+    return [
+        read_json(folder / f"{job.name}.json", "what is known of a recorded episode")
+        for job in jobs
+    ]
 
 
 def report_coverage(
@@ -117,7 +142,8 @@ def report_coverage(
 ) -> None:
     """Say which goals of a split the recorded episodes lack, and write it as JSON.
 
-    plan: a recording that is there. workers: processes that build the split's scenes, which tell their goals.
+    plan: a recording that is there. workers: processes that build the split's scenes, which tell
+    their goals.
     """
     from mme_vla.data.console import progress
     from mme_vla.envs.recording.coverage import compare, goal_of, goals_recorded, in_words
@@ -132,7 +158,9 @@ def report_coverage(
             advance(1)
     official = [place for place in plan.places if place != plan.dataset]
     coverage = compare(goals_recorded(plan.dataset, official), zip(specs, goals, strict=True))
-    write_json(file, {task: episode_goals.to_dict() for task, episode_goals in coverage.items()}, indent=1)
+    write_json(
+        file, {task: episode_goals.to_dict() for task, episode_goals in coverage.items()}, indent=1
+    )
     print(f"{in_words(coverage, split)}\n{file}")
 
 
@@ -163,20 +191,28 @@ def plan(cfg: "DictConfig") -> list[Job]:
 
 
 def run(cfg: "DictConfig") -> None:
-    """Record as configs/record.yaml and the command line say; what the same words have recorded stays as it is."""
+    """Record as configs/record.yaml and the command line say; what the same words have recorded
+    stays as it is.
+    """
     from mme_vla.config.sections import read_section
     from mme_vla.data.convert import ConvertOptions
 
     if cfg.env not in ROBOMME:
         record_environment(cfg)
         return
-    require(cfg.env == "mme_vla", f"env={cfg.env} has no demonstrator here: record with env=mme_vla.")
+    require(
+        cfg.env == "mme_vla", f"env={cfg.env} has no demonstrator here: record with env=mme_vla."
+    )
     if not cfg.lerobot and cfg.hdf5 is None:
         raise UserError("lerobot=false leaves nothing to write: name a folder with hdf5=<folder>.")
-    options = read_section(ConvertOptions, cfg.video, "video", images=cfg.images, fps=cfg.fps, names=cfg.names)
+    options = read_section(
+        ConvertOptions, cfg.video, "video", images=cfg.images, fps=cfg.fps, names=cfg.names
+    )
     jobs = plan(cfg)
     recording_plan = RecordingPlan(
-        jobs, Path(cfg.output) if cfg.lerobot else None, None if cfg.hdf5 is None else Path(cfg.hdf5)
+        jobs,
+        Path(cfg.output) if cfg.lerobot else None,
+        None if cfg.hdf5 is None else Path(cfg.hdf5),
     )
     places = ", ".join(map(str, recording_plan.places))
     work = _work_folder(cfg.output)
@@ -189,15 +225,23 @@ def run(cfg: "DictConfig") -> None:
     require_simulator()
     with FolderLock(work, "recording"):
         _claim(work, [job.plan for job in jobs])
-        missing = recording_plan.missing(options)  # asked again: another process may have finished it meanwhile
+        missing = recording_plan.missing(
+            options
+        )  # asked again: another process may have finished it meanwhile
         if missing:
             previews = None if cfg.previews is None else Path(cfg.previews)
-            begun, there = time.perf_counter(), {path.stem for path in (work / "episodes").glob("*.json")}
+            begun, there = (
+                time.perf_counter(),
+                {path.stem for path in (work / "episodes").glob("*.json")},
+            )
             done = record(jobs, work / "episodes", cfg.workers, previews)
             seconds = time.perf_counter() - begun
             recording_plan.write(missing, work / "episodes", options)
             steps, again = sum(d["stored"] for d in done), sum(len(d["failed_seeds"]) for d in done)
-            print(f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were replaced by the next.")
+            print(
+                f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were"
+                " replaced by the next."
+            )
             if new := [d for job, d in zip(jobs, done, strict=True) if job.name not in there]:
                 print(_throughput(len(new), sum(d["stored"] for d in new), seconds, cfg.workers))
         else:
@@ -214,12 +258,18 @@ def record_environment(cfg: "DictConfig") -> None:
     source.check_installed()
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split, cfg.env)
     output, work = Path(cfg.output), _work_folder(cfg.output)
-    require(not output.exists(), f"{output} exists already; choose another output, or remove it yourself.")
+    require(
+        not output.exists(),
+        f"{output} exists already; choose another output, or remove it yourself.",
+    )
     with FolderLock(work, "recording"):
         _claim(work, [{"env": cfg.env, "fps": cfg.fps}, *map(vars, specs)])
         frames, failures = record_own(source, specs, output, work, cfg.fps)
         drop_plan(work)
-    print(f"{cfg.output}: {len(specs) - len(failures)} episodes, {frames} steps; {len(failures)} did not succeed.")
+    print(
+        f"{cfg.output}: {len(specs) - len(failures)} episodes, {frames} steps; {len(failures)} did"
+        " not succeed."
+    )
 
 
 def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
@@ -227,8 +277,8 @@ def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
     hours = max(seconds, 1e-9) / 3600
     named = f"{workers} worker{'s'[: workers > 1]}"
     return (
-        f"{episodes} episodes in {seconds:.0f} s with {named}: {episodes / hours:,.0f} episodes and "
-        f"{steps / hours:,.0f} steps an hour."
+        f"{episodes} episodes in {seconds:.0f} s with {named}: {episodes / hours:,.0f} episodes and"
+        f" {steps / hours:,.0f} steps an hour."
     )
 
 
@@ -240,8 +290,8 @@ def _claim(work: Path, plan: list[dict[str, Any]]) -> None:
     """Make `work` the folder of these episodes, or recognise it as such."""
     require(
         claim_plan(work, plan),
-        f"{work} holds an interrupted recording of other episodes. Repeat that command to finish it, choose "
-        "another output, or remove that folder yourself.",
+        f"{work} holds an interrupted recording of other episodes. Repeat that command to finish"
+        " it, choose another output, or remove that folder yourself.",
     )
 
 

@@ -1,6 +1,8 @@
-"""`python -m mme_vla.results RUN…`: from episode records to tables and a report, beside the paper's numbers.
+"""`python -m mme_vla.results RUN…`: from episode records to tables and a report, beside the paper's
+numbers.
 
-RUN is a file of episode records, or a folder with `episodes*.jsonl` in it or below; shards and runs are merged.
+RUN is a file of episode records, or a folder with `episodes*.jsonl` in it or below; shards and runs
+are merged.
 """
 
 import argparse
@@ -14,8 +16,19 @@ from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
 from mme_vla.errors import UserError, printable, require
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
-from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all, pair_methods, why_unpaired
-from mme_vla.evaluation.results.curves import process_tables, stress_curves, stress_figures, stress_table
+from mme_vla.evaluation.results.compare import (
+    Comparison,
+    common_episodes,
+    compare_all,
+    pair_methods,
+    why_unpaired,
+)
+from mme_vla.evaluation.results.curves import (
+    process_tables,
+    stress_curves,
+    stress_figures,
+    stress_table,
+)
 from mme_vla.evaluation.results.events import event_curves, event_table, matched_methods
 from mme_vla.evaluation.results.paper import demo_records
 from mme_vla.evaluation.results.report import read_runs, training_details
@@ -46,8 +59,15 @@ DEMO = (
 )
 
 
-EXAMPLES = ("outputs/evaluation --html report.html", "runs/a runs/b --compare framesamp_modul pi05", "--demo --brief")
-VERIFY_EXAMPLES = ("outputs/evaluation/framesamp_modul/80000/seed42", "receipt.json --checkpoint downloads/step_080000")
+EXAMPLES = (
+    "outputs/evaluation --html report.html",
+    "runs/a runs/b --compare framesamp_modul pi05",
+    "--demo --brief",
+)
+VERIFY_EXAMPLES = (
+    "outputs/evaluation/framesamp_modul/80000/seed42",
+    "receipt.json --checkpoint downloads/step_080000",
+)
 
 
 DIFFERS, NOT_COMPARED = 1, 3  # exit codes of `verify`; 2 is a mistake in the command
@@ -57,7 +77,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Read, aggregate, compare, print, write; or check receipts."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     checks = words[:1] == ["verify"]
-    args = _verify_parser().parse_args(words[1:]) if checks else _parser().parse_intermixed_args(words)
+    args = (
+        _verify_parser().parse_args(words[1:]) if checks else _parser().parse_intermixed_args(words)
+    )
     with print_user_errors():
         (verify if checks else run)(args)
 
@@ -69,8 +91,14 @@ def verify(args: argparse.Namespace) -> None:
     """
     from mme_vla.evaluation import receipts
 
-    paths = [args.receipt] if args.receipt.is_file() else sorted(args.receipt.rglob("receipt*.json"))
-    require(paths, f"{args.receipt} holds no receipt: name a receipt.json, or a folder with one in it or below.")
+    paths = (
+        [args.receipt] if args.receipt.is_file() else sorted(args.receipt.rglob("receipt*.json"))
+    )
+    require(
+        paths,
+        f"{args.receipt} holds no receipt: name a receipt.json, or a folder with one in it or"
+        " below.",
+    )
     results = {path: receipts.verify(path, args.checkpoint, not args.no_scenes) for path in paths}
     for path, result in results.items():
         print(f"{path}: {result.word}")
@@ -89,17 +117,28 @@ def run(args: argparse.Namespace) -> None:
     from rich.console import Console
 
     if args.demo == bool(args.runs):
-        raise UserError("Name files or folders of episode records, or --demo for synthetic ones (not both).")
+        raise UserError(
+            "Name files or folders of episode records, or --demo for synthetic ones (not both)."
+        )
     _check_outputs(args)
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
     protocol = Protocol(
-        tuple(args.tasks or tasks_of(records)), args.episodes or _episodes(records, args.split), args.errors,
-        args.confidence, args.samples, args.seed,
-    )  # fmt: skip
+        tuple(args.tasks or tasks_of(records)),
+        args.episodes or _episodes(records, args.split),
+        args.errors,
+        args.confidence,
+        args.samples,
+        args.seed,
+    )
     _check_views(args)
     if args.stress:
         curves = stress_curves(records, args.confidence, args.conflicts)
-        show_tables([stress_table(curves)], stress_figures(curves), "Episodes that every place of the dial has.", args)
+        show_tables(
+            [stress_table(curves)],
+            stress_figures(curves),
+            "Episodes that every place of the dial has.",
+            args,
+        )
         return
     if args.events:
         show_events(records, args)
@@ -109,7 +148,9 @@ def run(args: argparse.Namespace) -> None:
         return
     results = aggregate(records, protocol, args.split, args.conflicts)
     if any(record.extra.get("made_up") for record in records):
-        results.notes.insert(0, "Made-up records, sampled from the paper's rates: not a result of anything.")
+        results.notes.insert(
+            0, "Made-up records, sampled from the paper's rates: not a result of anything."
+        )
     comparisons = compare_all(_pairs(results, args.compare), protocol)
     results.notes += [note for comparison in comparisons for note in comparison.notes]
     # Piped into a file there is no terminal to fit: as wide as the tables are.
@@ -136,8 +177,14 @@ def _check_views(args: argparse.Namespace) -> None:
 
 
 def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
-    """Episodes of a task in the split that the records are of; of other environments as many as there are records."""
-    custom = [record.episode for record in records if split in (None, record.split) and record.extra.get("suite")]
+    """Episodes of a task in the split that the records are of; of other environments as many as
+    there are records.
+    """
+    custom = [
+        record.episode
+        for record in records
+        if split in (None, record.split) and record.extra.get("suite")
+    ]
     if custom and not any(record.task in TASK_FACTS for record in records):
         return 1 + max(custom)
     splits = {record.split for record in records if split in (None, record.split)}
@@ -147,28 +194,48 @@ def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
 
 
 def show_events(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
-    """Print runs with events beside their matched arms, and success over length; write both where a file is named."""
+    """Print runs with events beside their matched arms, and success over length; write both where a
+    file is named.
+    """
     curves = event_curves(records, args.confidence, args.conflicts)
-    tables = [event_table(records, args.conflicts), stress_table(curves, "Success over the length of events")]
+    tables = [
+        event_table(records, args.conflicts),
+        stress_table(curves, "Success over the length of events"),
+    ]
     figures = stress_figures(curves, "control steps, frames or factor")
     show_tables(tables, figures, "Episodes that every length has.", args)
 
 
 def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
-    """Print RoboMME-OOD by tier, the hard episodes, twins and extrapolation, and write them where a file is named."""
+    """Print RoboMME-OOD by tier, the hard episodes, twins and extrapolation, and write them where a
+    file is named.
+    """
     from mme_vla.evaluation.results import ood
 
     how = records, args.confidence, args.conflicts
     curves = ood.extrapolation(*how)
-    tables = [*ood.tier_tables(*how), ood.hard_table(*how), ood.twin_table(*how), ood.extrapolation_table(curves)]
+    tables = [
+        *ood.tier_tables(*how),
+        ood.hard_table(*how),
+        ood.twin_table(*how),
+        ood.extrapolation_table(curves),
+    ]
     caption = "All splits of a run together; the training range is shaded."
     filled = [table for table in tables if table]
-    require(filled, "None of these records is of RoboMME-OOD, the hard test episodes or a twin, or has an amount.")
+    require(
+        filled,
+        "None of these records is of RoboMME-OOD, the hard test episodes or a twin, or has an"
+        " amount.",
+    )
     show_tables(filled, ood.extrapolation_figures(curves), caption, args)
 
 
-def show_tables(tables: Sequence[Table], figures: dict[str, str], caption: str, args: argparse.Namespace) -> None:
-    """Print tables that have rows, and all notes, and write them, with figures, where a file is named."""
+def show_tables(
+    tables: Sequence[Table], figures: dict[str, str], caption: str, args: argparse.Namespace
+) -> None:
+    """Print tables that have rows, and all notes, and write them, with figures, where a file is
+    named.
+    """
     from mme_vla.evaluation.results.report import Section, html_page
 
     texts: dict[Path, str] = {}
@@ -234,12 +301,22 @@ def _tables(results: Results, comparisons: list[Comparison], detailed: bool = Tr
     tables = [overview(results)]
     if detailed:
         details = [detail(method, results) for method in results.methods]
-        tables = [*details, *process_tables(results), *subgoal_tables(results), runs_table(results), *tables]
+        tables = [
+            *details,
+            *process_tables(results),
+            *subgoal_tables(results),
+            runs_table(results),
+            *tables,
+        ]
     return [*tables, comparison_table(comparisons)] if comparisons else tables
 
 
-def _pairs(results: Results, requested: Sequence[Sequence[str]] | None) -> list[tuple[Method, Method]]:
-    """The pairs asked for; unasked, events and their matched arms, or two methods alone that share episodes."""
+def _pairs(
+    results: Results, requested: Sequence[Sequence[str]] | None
+) -> list[tuple[Method, Method]]:
+    """The pairs asked for; unasked, events and their matched arms, or two methods alone that share
+    episodes.
+    """
     if requested is not None:
         return [(results.method(first), results.method(second)) for first, second in requested]
     if pairs := matched_methods(results):
@@ -251,42 +328,84 @@ def _pairs(results: Results, requested: Sequence[Sequence[str]] | None) -> list[
     if common_episodes(first, second):
         return [(first, second)]
     reasons = pair_methods(first, second).notes(f"{first.label} and {second.label}")
-    results.notes += reasons or [f"{first.label} and {second.label} have no episode in common, and are not compared."]
+    results.notes += reasons or [
+        f"{first.label} and {second.label} have no episode in common, and are not compared."
+    ]
     return []
 
 
 def _verify_parser() -> argparse.ArgumentParser:
-    parser = argument_parser("mme-vla results verify", "Check receipts of runs, without a network.", VERIFY_EXAMPLES)
-    parser.add_argument("receipt", type=Path, help="receipt.json, or a folder with receipts in it or below")
-    parser.add_argument("--checkpoint", type=Path, help="its folder on this machine, if another than in the receipt")
-    parser.add_argument("--no-scenes", action="store_true",
-                        help="do not build the scenes here (0.1 s each); they count as not compared")  # fmt: skip
+    parser = argument_parser(
+        "mme-vla results verify", "Check receipts of runs, without a network.", VERIFY_EXAMPLES
+    )
+    parser.add_argument(
+        "receipt", type=Path, help="receipt.json, or a folder with receipts in it or below"
+    )
+    parser.add_argument(
+        "--checkpoint", type=Path, help="its folder on this machine, if another than in the receipt"
+    )
+    parser.add_argument(
+        "--no-scenes",
+        action="store_true",
+        help="do not build the scenes here (0.1 s each); they count as not compared",
+    )
     return parser
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argument_parser("python -m mme_vla.results", __doc__, EXAMPLES)
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="file of episode records, or folder")
-    parser.add_argument("--compare", nargs=2, action="append", metavar=("A", "B"), help="pair two methods; repeatable")
+    parser.add_argument(
+        "runs", nargs="*", type=Path, metavar="RUN", help="file of episode records, or folder"
+    )
+    parser.add_argument(
+        "--compare",
+        nargs=2,
+        action="append",
+        metavar=("A", "B"),
+        help="pair two methods; repeatable",
+    )
     parser.add_argument("--csv", type=Path, help="every figure, one a row")
     parser.add_argument("--latex", type=Path, help="tables for a paper (booktabs)")
     parser.add_argument("--markdown", type=Path, help="tables in the leaderboard's format")
     parser.add_argument("--html", type=Path, help="one self-contained page with plots")
     parser.add_argument("--title", default="RoboMME results", help="of the page")
-    parser.add_argument("--stress", action="store_true", help="success over the dials of split=stress:… instead")
-    parser.add_argument("--events", action="store_true", help="runs with event=… beside their matched arms instead")
-    parser.add_argument("--ood", action="store_true",
-                        help="RoboMME-OOD by tier beside published figures, twins, extrapolation")  # fmt: skip
+    parser.add_argument(
+        "--stress", action="store_true", help="success over the dials of split=stress:… instead"
+    )
+    parser.add_argument(
+        "--events", action="store_true", help="runs with event=… beside their matched arms instead"
+    )
+    parser.add_argument(
+        "--ood",
+        action="store_true",
+        help="RoboMME-OOD by tier beside published figures, twins, extrapolation",
+    )
     parser.add_argument("--brief", action="store_true", help="print the overview only")
-    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="of a whole run (default: all 16, and your own)")
-    parser.add_argument("--episodes", type=int, help="episodes of a task (default: as the split has)")
+    parser.add_argument(
+        "--tasks", nargs="+", metavar="TASK", help="of a whole run (default: all 16, and your own)"
+    )
+    parser.add_argument(
+        "--episodes", type=int, help="episodes of a task (default: as the split has)"
+    )
     parser.add_argument("--split", help="test, val or train, where there are records of several")
-    parser.add_argument("--errors", default="failure", choices=("failure", "missing"),
-                        help="episodes that ended in an error count as failures (default), or as not run")  # fmt: skip
-    parser.add_argument("--conflicts", default="refuse", choices=("refuse", "first", "last"),
-                        help="an episode evaluated twice with different outcomes (default: %(default)s)")  # fmt: skip
-    parser.add_argument("--confidence", type=float, default=0.95, help="level of intervals and tests")
+    parser.add_argument(
+        "--errors",
+        default="failure",
+        choices=("failure", "missing"),
+        help="episodes that ended in an error count as failures (default), or as not run",
+    )
+    parser.add_argument(
+        "--conflicts",
+        default="refuse",
+        choices=("refuse", "first", "last"),
+        help="an episode evaluated twice with different outcomes (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--confidence", type=float, default=0.95, help="level of intervals and tests"
+    )
     parser.add_argument("--samples", type=int, default=10_000, help="of the bootstrap")
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
-    parser.add_argument("--demo", action="store_true", help="synthetic records with the paper's success rates")
+    parser.add_argument(
+        "--demo", action="store_true", help="synthetic records with the paper's success rates"
+    )
     return parser

@@ -1,7 +1,9 @@
-"""`mme-vla sample FULL_FOLDER THINNED_FOLDER`: make the dataset that the package ships, `mme_vla/assets/sample`.
+"""`mme-vla sample FULL_FOLDER THINNED_FOLDER`: make the dataset that the package ships,
+`mme_vla/assets/sample`.
 
-Four real demonstrations, one of them with an image for every step, as a LeRobot v3.0 dataset of under 6 MB. It exists
-so that the first command of the README needs nothing else; users need not run this.
+Four real demonstrations, one of them with an image for every step, as a LeRobot v3.0 dataset of
+under 6 MB. It exists so that the first command of the README needs nothing else; users need not run
+this.
 """
 
 import argparse
@@ -20,8 +22,8 @@ EPISODES = (
     ("thinned", "PickXtimes", 8),
     ("thinned", "VideoUnmask", 4),
 )
-# Lossless luminance, halved colour resolution and few key frames: smaller than lossy video with frequent key frames,
-# and a patch in which nothing moves stays exactly the same.
+# Lossless luminance, halved colour resolution and few key frames: smaller than lossy video with
+# frequent key frames, and a patch in which nothing moves stays exactly the same.
 OPTIONS = ConvertOptions(pix_fmt="yuv420p", gop=32)
 LIMIT = 6_000_000
 
@@ -43,30 +45,44 @@ image, which is up to n - 1 steps old. States, actions, subgoals and flags are t
 shows motion as it was; use it where motion matters. Results on this sample say nothing about the benchmark.
 
 `configs/data/sample.yaml` holds out episode 3 for validation: another scene of the task of episode 0.
-"""
+"""  # noqa: E501
 
 
 def make_sample(full: Path, thinned: Path, output: Path = SAMPLE) -> int:
     """Write the sample and return its size in bytes."""
     folders = {"full": full, "thinned": thinned}
-    refs = [EpisodeRef(folders[kind] / f"record_dataset_{task}.h5", number, task) for kind, task, number in EPISODES]
+    refs = [
+        EpisodeRef(folders[kind] / f"record_dataset_{task}.h5", number, task)
+        for kind, task, number in EPISODES
+    ]
     for ref in refs:
-        require(ref.file.is_file(), f"{ref.file} does not exist; the sample needs {ref.group} of it.")
+        require(
+            ref.file.is_file(), f"{ref.file} does not exist; the sample needs {ref.group} of it."
+        )
     convert(refs, output, OPTIONS)
     (output / "README.md").write_text(README)
     size = sum(file.stat().st_size for file in output.rglob("*") if file.is_file())
     if size > LIMIT:
         shutil.rmtree(output)
-        raise UserError(f"The sample would take {size / 1e6:.1f} MB; the limit is {LIMIT / 1e6:.0f} MB.")
+        raise UserError(
+            f"The sample would take {size / 1e6:.1f} MB; the limit is {LIMIT / 1e6:.0f} MB."
+        )
     return size
 
 
 def main() -> None:
     """Run `mme-vla sample`."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
-    parser.add_argument("full", type=Path, help="folder with the VideoUnmask file that has an image for every step")
+    parser.add_argument(
+        "full", type=Path, help="folder with the VideoUnmask file that has an image for every step"
+    )
     parser.add_argument("thinned", type=Path, help="folder with the thinned files")
-    parser.add_argument("--output", type=Path, default=SAMPLE, help="new dataset folder (default: inside the package)")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=SAMPLE,
+        help="new dataset folder (default: inside the package)",
+    )
     arguments = parser.parse_args()
     size = make_sample(arguments.full, arguments.thinned, arguments.output)
     print(f"{arguments.output}: {size / 1e6:.2f} MB")

@@ -31,14 +31,21 @@ def main(cfg: DictConfig) -> None:
     prepare_sampling(policy, cfg.sampling, logger)
     server = PolicyServer(policy, settings, name=name, trained=cfg.checkpoint is not None)
     if not is_local(settings.host) and settings.api_key is None:
-        logger.warning("host=%s without api_key: every client that reaches this port can use it", settings.host)
+        logger.warning(
+            "host=%s without api_key: every client that reaches this port can use it", settings.host
+        )
     if server.metadata["subgoal"] is not None:
-        logger.info("reads the key %r of each request; without it, the goal alone", server.metadata["subgoal"])
+        logger.info(
+            "reads the key %r of each request; without it, the goal alone",
+            server.metadata["subgoal"],
+        )
     asyncio.run(run(server))
 
 
 async def run(server: "PolicyServer") -> None:
-    """Start, wait for SIGTERM or Ctrl-C, stop; a second signal does not wait for what is running."""
+    """Start, wait for SIGTERM or Ctrl-C, stop; a second signal does not wait for what
+    is running.
+    """
     loop, stop_requested = asyncio.get_running_loop(), asyncio.Event()
     serving = asyncio.current_task()
     assert serving is not None
@@ -52,7 +59,9 @@ async def run(server: "PolicyServer") -> None:
         loop.add_signal_handler(number, stop)
     await server.start()
     host = f"[{server.settings.host}]" if ":" in server.settings.host else server.settings.host
-    logger.info("ready at ws://%s:%d and http://%s:%d (healthz, metadata, stats)", *(host, server.port) * 2)
+    logger.info(
+        "ready at ws://%s:%d and http://%s:%d (healthz, metadata, stats)", *(host, server.port) * 2
+    )
     await stop_requested.wait()
     logger.info("stopping: no new clients, requests that are running are finished")
     try:

@@ -32,7 +32,9 @@ class BuildSettings:
 def main(cfg: DictConfig) -> dict[str, int]:
     """Build what configs/subgoal_build.yaml and the command line say."""
     settings = read_section(BuildSettings, OmegaConf.to_container(cfg, resolve=True), others=True)
-    options = read_section(RowOptions, settings.rows, "rows", noise=settings.noise, seed=settings.seed)
+    options = read_section(
+        RowOptions, settings.rows, "rows", noise=settings.noise, seed=settings.seed
+    )
     inputs = (settings.input,) if isinstance(settings.input, str) else settings.input
     tasks = None if settings.tasks is None else Path(settings.tasks)
     episodes = [episode for entry in inputs for episode in open_input(entry, tasks)]

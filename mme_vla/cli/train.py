@@ -38,7 +38,9 @@ def main(cfg: DictConfig) -> None:
             train_several(cfg, fresh, config["trainings"])
         from torch import distributed
 
-        if distributed.is_available() and distributed.is_initialized():  # all trainings share the group
+        if (
+            distributed.is_available() and distributed.is_initialized()
+        ):  # all trainings share the group
             distributed.destroy_process_group()
     except UserError:
         with suppress(OSError):
@@ -47,10 +49,12 @@ def main(cfg: DictConfig) -> None:
 
 
 def train_several(cfg: DictConfig, folder: Path, count: Any) -> list[Path]:
-    """Train several policies by one recipe, with consecutive seeds, one after the other; their last checkpoints.
+    """Train several policies by one recipe, with consecutive seeds, one after the other; their last
+    checkpoints.
 
-    Each has a numbered folder in `folder`. Finished ones are left as they are, and one that was interrupted resumes.
-    All have the vision tower of the first, frozen or to begin with, and so one vision cache.
+    Each has a numbered folder in `folder`. Finished ones are left as they are, and one that was
+    interrupted resumes. All have the vision tower of the first, frozen or to begin with, and so one
+    vision cache.
 
     Raises:
         UserError: a count below 1, or a training there by other settings.
@@ -58,16 +62,25 @@ def train_several(cfg: DictConfig, folder: Path, count: Any) -> list[Path]:
     from mme_vla.policy.run_folders import training_name
     from mme_vla.training.runs import SUMMARY, open_run, unfinished_trainings
 
-    require(isinstance(count, int) and count >= 1, f"trainings={count!r}: must be a whole number from 1 on.")
+    require(
+        isinstance(count, int) and count >= 1,
+        f"trainings={count!r}: must be a whole number from 1 on.",
+    )
     if cfg.resume is not None:
-        folder = unfinished_trainings(folder, count) if cfg.resume == "auto" else Path(str(cfg.resume))
+        folder = (
+            unfinished_trainings(folder, count) if cfg.resume == "auto" else Path(str(cfg.resume))
+        )
     checkpoints = []
     for number in range(count):
         one, place = cfg.copy(), folder / training_name(number)
         one.seed, one.output, one.resume = int(cfg.seed) + number, str(place), "auto"
         config = resolved(one)
         run = open_run(place, "auto", config)
-        if (place / SUMMARY).is_file() and run.checkpoint is not None and run.step == config["train"]["steps"]:
+        if (
+            (place / SUMMARY).is_file()
+            and run.checkpoint is not None
+            and run.step == config["train"]["steps"]
+        ):
             checkpoints.append(run.checkpoint)
             continue
         print(f"training {number + 1} of {count}, seed {one.seed}, in {place}")
@@ -83,16 +96,18 @@ def train(
     named: bool = True,
     tower_seed: int | None = None,
 ) -> Path:
-    """Train as `cfg` says (`config` is its plain form), in `folder` unless it resumes a run elsewhere.
+    """Train as `cfg` says (`config` is its plain form), in `folder` unless it resumes a run
+    elsewhere.
 
-    named: whether the user chose the folder's name; another run may have begun in the same second. tower_seed: of the
-    fresh vision tower, where it is not the training's own.
+    named: whether the user chose the folder's name; another run may have begun in the same second.
+    tower_seed: of the fresh vision tower, where it is not the training's own.
 
     Returns:
         The last checkpoint.
 
     Raises:
-        SystemExit: a signal asked it to stop, which it did after saving; the code is 128 and the signal's number.
+        SystemExit: a signal asked it to stop, which it did after saving; the code is 128 and the
+            signal's number.
     """
     import torch
     from accelerate import Accelerator
@@ -106,7 +121,8 @@ def train(
     check_logger(config)
     if settings.device == "cuda":
         find_device("cuda")  # says so where there is none
-    # Where processes have all weights each, gradients lie in what is sent instead of being copied there.
+    # Where processes have all weights each, gradients lie in what is sent instead of being copied
+    # there.
     one_copy = DistributedDataParallelKwargs(gradient_as_bucket_view=True)
     # Accelerate joins processes on CPUs only where it is told that there is nothing else.
     without_gpu = settings.device == "cpu" or not torch.accelerator.is_available()
@@ -114,7 +130,9 @@ def train(
     check_processes(accelerator.num_processes)
     selection: list[Any] = [None]
     with ExitStack() as resources:
-        if accelerator.is_main_process:  # the clock is in the folder's name: the first process decides
+        if (
+            accelerator.is_main_process
+        ):  # the clock is in the folder's name: the first process decides
             selection[0], lock = claim_run(folder, named, config["resume"], config)
             resources.push(lock)
         run = broadcast_object_list(selection)[0]
@@ -135,13 +153,14 @@ def check_processes(joined: int) -> None:
         joined: processes that Accelerate counts.
 
     Raises:
-        UserError: they are fewer than the launcher started, so that each would train a policy of its own.
+        UserError: they are fewer than the launcher started, so that each would train a policy of
+            its own.
     """
     started = started_processes()
     require(
         joined >= started,
-        f"A launcher started {started} processes (WORLD_SIZE), and each counts {joined}: they would train as many "
-        "policies. Use train.device=auto, or start a single process.",
+        f"A launcher started {started} processes (WORLD_SIZE), and each counts {joined}: they would"
+        " train as many policies. Use train.device=auto, or start a single process.",
     )
 
 
@@ -159,7 +178,12 @@ def _train(
 
     from mme_vla.policy.build import build_from_config
     from mme_vla.policy.capabilities import with_vision_memory
-    from mme_vla.policy.finetune import apply_finetuning, cast_frozen, copy_tower, warn_of_frozen_random_weights
+    from mme_vla.policy.finetune import (
+        apply_finetuning,
+        cast_frozen,
+        copy_tower,
+        warn_of_frozen_random_weights,
+    )
     from mme_vla.policy.tensor_files import take_memory
     from mme_vla.policy.training_identity import KEY as TRAINING
     from mme_vla.policy.training_identity import identify
@@ -171,7 +195,8 @@ def _train(
     from mme_vla.training.runs import CONFIG, check_content, start_from, weights_to_start_from
 
     first = accelerator.is_main_process
-    # Of processes that share the weights, one a machine holds them until they are shared: it may have to build a cache.
+    # Of processes that share the weights, one a machine holds them until they are shared: it may
+    # have to build a cache.
     sharded = settings.parallel.shards(accelerator.device)
     holds = accelerator.is_local_main_process or not sharded
     line = ProgressLine(settings.steps, run.step, visible=first)
@@ -179,7 +204,12 @@ def _train(
     init_from = None if run.checkpoint is not None else weights_to_start_from(config["init_from"])
     with nullcontext() if holds else torch.device("meta"):
         policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and init_from is None)
-        if run.checkpoint is None and init_from is None and tower_seed not in (None, config["seed"]) and holds:
+        if (
+            run.checkpoint is None
+            and init_from is None
+            and tower_seed not in (None, config["seed"])
+            and holds
+        ):
             copy_tower(build_from_config(cfg, seed=tower_seed), policy)
     check_frozen(policy, config["finetune"]["freeze_vision"])
     if init_from is not None and holds:
@@ -207,14 +237,18 @@ def _train(
     if run.checkpoint is not None:
         check_content(run.checkpoint, data.content)
         # A resumed command may leave it out. Later checkpoints keep what the run began with.
-        cfg["init_from"] = config["init_from"] = read_state(run.checkpoint)["config"].get("init_from")
+        cfg["init_from"] = config["init_from"] = read_state(run.checkpoint)["config"].get(
+            "init_from"
+        )
     config["data"]["content"] = data.content
     policy.config[TRAINING] = identify(config, data.content)
     check_disk(run.folder, policy, settings.keep, sharded)
     validation, collate = None, policy.require_processor().collate
     if data.val is not None and settings.val_samples:
         batch_size = settings.batch_size // (settings.accumulate * accelerator.num_processes)
-        validation = Validation(data.val, collate, settings.val_samples, max(batch_size, 1), settings.seed)
+        validation = Validation(
+            data.val, collate, settings.val_samples, max(batch_size, 1), settings.seed
+        )
     trainer = Trainer(policy, data.train, collate, validation, settings, run, config, accelerator)
     line.say(trainer.describe())
     loggers = open_loggers(run.folder, config, run.step) if first else Loggers()
@@ -234,13 +268,21 @@ def _train(
 
 
 def cache_command() -> str:
-    """The command that builds the vision cache of this run: the same words, but for those on resuming and output."""
+    """The command that builds the vision cache of this run: the same words, but for those on
+    resuming and output.
+    """
     from hydra.core.hydra_config import HydraConfig
 
     from mme_vla.config.composition import command_trees
 
     running = HydraConfig.initialized()
     overrides = HydraConfig.get().overrides.task if running else ["model=<model>", "data=<data>"]
-    words = [word for word in overrides if not word.startswith(("resume=", "output=", "trainings="))]
-    trees = [part for tree in command_trees()[1:] for part in ("--config-dir", str(tree))] if running else []
+    words = [
+        word for word in overrides if not word.startswith(("resume=", "output=", "trainings="))
+    ]
+    trees = (
+        [part for tree in command_trees()[1:] for part in ("--config-dir", str(tree))]
+        if running
+        else []
+    )
     return shlex.join(["mme-vla", "cache", *trees, *words])

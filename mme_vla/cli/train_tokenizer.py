@@ -1,10 +1,10 @@
 """Train the small tokenizer that the library ships: `mme-vla train-tokenizer [folder]`.
 
-Its corpus (`mme_vla/assets/tokenizer_corpus.txt`) is the language of RoboMME: the goals and subgoals of the 16 tasks
-with their colours, counts and ordinals, the prompts' own words, the numbers 0…255 and image points. The settings are
-those of PaliGemma's tokenizer wherever they touch behaviour: the same special ids, single digits, bytes for unknown
-characters, and text taken as it stands (no prefix, no case folding, spaces and newlines kept). Training is
-deterministic.
+Its corpus (`mme_vla/assets/tokenizer_corpus.txt`) is the language of RoboMME: the goals and
+subgoals of the 16 tasks with their colours, counts and ordinals, the prompts' own words, the
+numbers 0…255 and image points. The settings are those of PaliGemma's tokenizer wherever they touch
+behaviour: the same special ids, single digits, bytes for unknown characters, and text taken as it
+stands (no prefix, no case folding, spaces and newlines kept). Training is deterministic.
 """
 
 import argparse
@@ -52,21 +52,32 @@ def train_tokenizer(sentences: Iterable[str], vocab_size: int = VOCAB_SIZE) -> b
 
 def read_corpus() -> list[str]:
     """Return the sentences of the shipped corpus."""
-    return files("mme_vla").joinpath("assets/tokenizer_corpus.txt").read_text(encoding="utf-8").splitlines()
+    return (
+        files("mme_vla")
+        .joinpath("assets/tokenizer_corpus.txt")
+        .read_text(encoding="utf-8")
+        .splitlines()
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train on the shipped corpus and write `tokenizer.model` into a folder."""
-    parser = argparse.ArgumentParser(prog="mme-vla train-tokenizer", description=str(__doc__).partition("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="mme-vla train-tokenizer", description=str(__doc__).partition("\n")[0]
+    )
     parser.add_argument(
-        "folder", nargs="?", type=Path, default=Path(), help="where to write tokenizer.model (default: here)"
+        "folder",
+        nargs="?",
+        type=Path,
+        default=Path(),
+        help="where to write tokenizer.model (default: here)",
     )
     path = parser.parse_args(arguments).folder / "tokenizer.model"
     content = train_tokenizer(read_corpus())
     require(
         not path.exists() or path.read_bytes() == content,
-        f"{path} exists, and is another tokenizer, which a checkpoint or a training may need: choose another folder, "
-        "or remove it yourself.",
+        f"{path} exists, and is another tokenizer, which a checkpoint or a training may need:"
+        " choose another folder, or remove it yourself.",
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content)

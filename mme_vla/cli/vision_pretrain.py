@@ -35,20 +35,31 @@ def run(config: Mapping[str, Any]) -> Path:
 
     require(
         0 <= config["held_out"] < config["scenes"],
-        f"held_out={config['held_out']}: must be less than scenes={config['scenes']}, which it is a part of.",
+        f"held_out={config['held_out']}: must be less than scenes={config['scenes']}, which it is a"
+        " part of.",
     )
-    sizes = read_section(TowerConfig, resolved(compose("policy", ["backbone=nano"]).backbone.vision), "backbone.vision")
+    sizes = read_section(
+        TowerConfig,
+        resolved(compose("policy", ["backbone=nano"]).backbone.vision),
+        "backbone.vision",
+    )
     tasks, folder = choose_tasks(config["tasks"]), Path(config["output"])
     of_tower = {name: config[name] for name in ("steps", "batch_size", "lr", "seed")}
-    of_scenes = {name: config[name] for name in ("scenes", "held_out", "arrangements", "first_seed")}
+    of_scenes = {
+        name: config[name] for name in ("scenes", "held_out", "arrangements", "first_seed")
+    }
     claim_run(folder, {"tasks": tasks, **of_scenes, **of_tower})
     files, held_out = _record(config, tasks, sizes.image_size)
     settings = PretrainSettings(**of_tower, save_every=config["save_every"])
     return pretrain(fresh_tower(sizes, settings.seed), files, held_out, folder, settings)
 
 
-def _record(config: Mapping[str, Any], tasks: Sequence[str], size: int) -> tuple[list[Path], list[Path]]:
-    """Render what is missing; the files of the scenes to learn from, and of those held out: the last of each task."""
+def _record(
+    config: Mapping[str, Any], tasks: Sequence[str], size: int
+) -> tuple[list[Path], list[Path]]:
+    """Render what is missing; the files of the scenes to learn from, and of those held out: the
+    last of each task.
+    """
     from mme_vla.data.console import progress
     from mme_vla.envs.recording.processes import carry_out
 
@@ -66,7 +77,9 @@ def _record(config: Mapping[str, Any], tasks: Sequence[str], size: int) -> tuple
             if file is None:
                 logger.info("left out: %s", error)
             else:
-                (learned if seed < first + config["scenes"] - config["held_out"] else held_out).append(file)
+                (
+                    learned if seed < first + config["scenes"] - config["held_out"] else held_out
+                ).append(file)
             advance(1)
     if not learned:
         raise UserError(f"None of the {len(jobs)} scenes can be built: change first_seed={first}.")
@@ -74,7 +87,9 @@ def _record(config: Mapping[str, Any], tasks: Sequence[str], size: int) -> tuple
 
 
 def _recorded(job: tuple[Path, str, int, str, int, int]) -> tuple[int, Path | None, str]:
-    """The scene's seed, its file, and why there is none: the benchmark's own rule tries a layout so many times."""
+    """The scene's seed, its file, and why there is none: the benchmark's own rule tries a layout so
+    many times.
+    """
     from mme_vla.envs.scene.placement import SceneError
     from mme_vla.nano.scenes import record_scene
 

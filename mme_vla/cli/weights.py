@@ -1,7 +1,8 @@
 """`mme-vla weights SRC DST`: a checkpoint from one format to another.
 
-Words after the two places are overrides of configs/policy.yaml, as for every command; a checkpoint of ours brings its
-own configuration. The full backbone is assumed unless `backbone=…` says otherwise.
+Words after the two places are overrides of configs/policy.yaml, as for every command; a checkpoint
+of ours brings its own configuration. The full backbone is assumed unless `backbone=…` says
+otherwise.
 """
 
 import math
@@ -29,11 +30,15 @@ from mme_vla.weights.writers import check_target, write_policy
 
 
 def print_mapping(policy: Policy, source: Source, to: str, console: Console | None = None) -> None:
-    """Print which tensor becomes which, and the lists of unread, tied and derived ones. Numbered layers are one row."""
+    """Print which tensor becomes which, and the lists of unread, tied and derived ones. Numbered
+    layers are one row.
+    """
     console = console or Console(width=None if sys.stdout.isatty() else 200)
     read, target_format = f"{source.folder} ({FORMATS[source.format]})", FORMATS[to]
     console.print(f"{read} → {target_format}; every tensor fits.", soft_wrap=True)
-    sides = {fmt: title for fmt, title in ((source.format, "read"), (to, "written")) if fmt != "ours"}
+    sides = {
+        fmt: title for fmt, title in ((source.format, "read"), (to, "written")) if fmt != "ours"
+    }
     if not sides:
         console.print("Both sides have the same names.")
     for fmt, title in sides.items():
@@ -45,7 +50,9 @@ def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: st
     shapes = adapter.shapes(state)
     table = _table(f"{title}: {len(adapter.needed())} tensors ↔ {len(adapter.table)} of ours")
     for column in ("theirs", "shape", "layout", "ours", "tensors"):
-        table.add_column(column, overflow="fold", justify="right" if column == "tensors" else "left")
+        table.add_column(
+            column, overflow="fold", justify="right" if column == "tensors" else "left"
+        )
     rows: dict[tuple[str, ...], int] = {}
     for target, pieces in adapter.table.items():
         for piece in pieces:
@@ -58,17 +65,28 @@ def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: st
         table.add_row(*row, str(count))
     console.print(table)
     gaps = [
-        (gap.path, "whole" if gap.layer is None else f"layer {gap.layer}", _shape(gap.shape), str(math.prod(gap.shape)))
+        (
+            gap.path,
+            "whole" if gap.layer is None else f"layer {gap.layer}",
+            _shape(gap.shape),
+            str(math.prod(gap.shape)),
+        )
         for gap in adapter.unread
     ]
     about = "no action depends on them (dropped when read, zeros when written)"
-    _print_list(console, f"{title}, unread: {about}", gaps, ("tensor", "part", "shape", "parameters"))
+    _print_list(
+        console, f"{title}, unread: {about}", gaps, ("tensor", "part", "shape", "parameters")
+    )
     _print_list(console, f"{title}, tied: copies", adapter.tied.items(), ("tensor", "is"))
-    derived = [(constant.path, _shape(tuple(constant.make().shape))) for constant in adapter.derived]
+    derived = [
+        (constant.path, _shape(tuple(constant.make().shape))) for constant in adapter.derived
+    ]
     _print_list(console, f"{title}, derived: recomputed constants", derived, ("tensor", "shape"))
 
 
-def _print_list(console: Console, title: str, rows: Iterable[tuple[str, ...]], columns: tuple[str, ...]) -> None:
+def _print_list(
+    console: Console, title: str, rows: Iterable[tuple[str, ...]], columns: tuple[str, ...]
+) -> None:
     rows = list(rows)
     if not rows:
         console.print(f"{title}: none")
@@ -102,26 +120,56 @@ EXAMPLES = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Read the command line and convert; a mistake of the user's ends with a sentence and code 2."""
+    """Read the command line and convert; a mistake of the user's ends with a sentence
+    and code 2.
+    """
     parser = argument_parser("mme-vla weights", __doc__, EXAMPLES)
-    parser.add_argument("source", help="folder, safetensors file, Orbax run or step, or owner/name on the hub")
-    parser.add_argument("destination", help="new folder; never one that exists ('-' with --dry-run)")
+    parser.add_argument(
+        "source", help="folder, safetensors file, Orbax run or step, or owner/name on the hub"
+    )
+    parser.add_argument(
+        "destination", help="new folder; never one that exists ('-' with --dry-run)"
+    )
     parser.add_argument("overrides", nargs="*", help="model=…, backbone=…, memory.budget=…")
-    parser.add_argument("--to", default="ours", choices=list(FORMATS), help="format to write (default: ours)")
-    parser.add_argument("--dtype", default="float32", choices=list(DTYPES), help="what weights are stored in")
+    parser.add_argument(
+        "--to", default="ours", choices=list(FORMATS), help="format to write (default: ours)"
+    )
+    parser.add_argument(
+        "--dtype", default="float32", choices=list(DTYPES), help="what weights are stored in"
+    )
     parser.add_argument("--asset", help="which dataset's statistics, where the source has several")
     parser.add_argument("--revision", help="branch, tag or commit of a hub repository")
-    parser.add_argument("--base", help="what a run of OpenVLA-OFT was trained on, where it holds its adapters alone")
-    parser.add_argument("--dry-run", action="store_true", help="check the source and print the mapping, write nothing")
-    parser.add_argument(TRUST_FLAG, action="store_true", help="import the plugins that the checkpoint names: its code")
-    args = parser.parse_intermixed_args(trust_as_flag(sys.argv[1:] if arguments is None else arguments))
+    parser.add_argument(
+        "--base", help="what a run of OpenVLA-OFT was trained on, where it holds its adapters alone"
+    )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="check the source and print the mapping, write nothing",
+    )
+    parser.add_argument(
+        TRUST_FLAG,
+        action="store_true",
+        help="import the plugins that the checkpoint names: its code",
+    )
+    args = parser.parse_intermixed_args(
+        trust_as_flag(sys.argv[1:] if arguments is None else arguments)
+    )
     from mme_vla.cli.errors import print_user_errors
 
     with print_user_errors():
         convert(
-            args.source, args.destination, args.overrides, to=args.to, dtype=args.dtype, asset=args.asset,
-            revision=args.revision, base=args.base, dry_run=args.dry_run, trust_plugins=args.trust_plugins,
-        )  # fmt: skip
+            args.source,
+            args.destination,
+            args.overrides,
+            to=args.to,
+            dtype=args.dtype,
+            asset=args.asset,
+            revision=args.revision,
+            base=args.base,
+            dry_run=args.dry_run,
+            trust_plugins=args.trust_plugins,
+        )
 
 
 def convert(
@@ -142,7 +190,10 @@ def convert(
     With `trust_plugins` the modules that a checkpoint names are imported: its author's code.
     """
     target, kind = Path(destination).expanduser(), dtype_of(dtype)
-    require(dry_run or not target.exists(), f"{target} exists: give a new folder, nothing is ever written over.")
+    require(
+        dry_run or not target.exists(),
+        f"{target} exists: give a new folder, nothing is ever written over.",
+    )
     opened = open_source(source, revision, base=base)
     policy = _policy(opened, overrides, trust_plugins)
     check_target(policy, to)
@@ -176,9 +227,15 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
 
     if opened.format == "ours":
         if overrides:
-            raise UserError(f"{opened.folder} brings its own configuration: {' '.join(overrides)} would contradict it.")
+            raise UserError(
+                f"{opened.folder} brings its own configuration: {' '.join(overrides)} would"
+                " contradict it."
+            )
         config = {key: value for key, value in opened.config.items() if key != "adapters"}
-        require("backbone" in config, f"{opened.folder} holds our weights but no config.json that describes them.")
+        require(
+            "backbone" in config,
+            f"{opened.folder} holds our weights but no config.json that describes them.",
+        )
         import_trusted(config, str(opened.folder), trust_plugins)
         policy: Policy = build_saved(policy_class(config), config, str(opened.folder / CONFIG))
         policy.processor = load_processor(opened.folder)
@@ -187,12 +244,15 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
     words, variants = list(overrides), opened.variants
     named = [word.partition("=")[2] for word in words if word.startswith("model=")]
     if variants and named and named[-1] not in variants:
-        raise UserError(f"{opened.folder} says it is {listed(variants)}, but model={named[-1]} was given.")
+        raise UserError(
+            f"{opened.folder} says it is {listed(variants)}, but model={named[-1]} was given."
+        )
     if not named:
         require(
             len(variants) < 2,
-            f"history_config.txt beside {opened.folder} names no variant of the released code, and its tensors are "
-            f"those of {listed(variants)}: name one of these, such as model={variants[0] if variants else ''}.",
+            f"history_config.txt beside {opened.folder} names no variant of the released code, and"
+            f" its tensors are those of {listed(variants)}: name one of these, such as"
+            f" model={variants[0] if variants else ''}.",
         )
         words.insert(0, f"model={variants[0] if variants else 'pi05'}")
     if opened.lacks_positions and not any(word.startswith("memory.positions=") for word in words):

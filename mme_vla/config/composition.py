@@ -1,6 +1,7 @@
 """Composition of the YAML tree: every command and `build_policy` read the same Hydra tree.
 
-Mistakes in overrides are found here, before any work starts, and raise one `UserError` with the near names.
+Mistakes in overrides are found here, before any work starts, and raise one `UserError` with the
+near names.
 """
 
 import functools
@@ -56,7 +57,9 @@ _load_installed_plugins()
 
 
 def config_dir() -> Path:
-    """Return the folder of the YAML tree: inside the package when a wheel is installed, else the repository's."""
+    """Return the folder of the YAML tree: inside the package when a wheel is installed, else the
+    repository's.
+    """
     package = Path(__file__).resolve().parents[1]
     shipped = package / "configs"
     return shipped if shipped.is_dir() else package.parent / "configs"
@@ -64,13 +67,17 @@ def config_dir() -> Path:
 
 @contextmanager
 def local_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
-    """Hydra's compose API with further folders, handing back the Hydra that a surrounding command runs under."""
+    """Hydra's compose API with further folders, handing back the Hydra that a surrounding command
+    runs under.
+    """
     base = version.VersionBase.instance()
     outer, outer_base = GlobalHydra.instance().hydra, base.version_base
     GlobalHydra.instance().clear()
     search_path = create_config_search_path(str(directory))
     for folder in extra_dirs:
-        search_path.prepend("command-line", f"file://{folder.resolve()}", anchor=SearchPathQuery(provider="schema"))
+        search_path.prepend(
+            "command-line", f"file://{folder.resolve()}", anchor=SearchPathQuery(provider="schema")
+        )
     try:
         version.setbase(VERSION_BASE)
         name = JobRuntime.instance().get("name")  # a sweep's next job is still to be called by it
@@ -89,16 +96,22 @@ def parse(overrides: Sequence[str]) -> list[Override]:
                 raise OverrideParseException(str(override.input_line), "the key is missing")
     except OverrideParseException as error:
         raise UserError(
-            f"Cannot read the override {error.override!r}: {error.message.splitlines()[0]}. "
-            "Write key=value, +key=value to add a key, ~key to remove one; quote values with special characters."
+            f"Cannot read the override {error.override!r}: {error.message.splitlines()[0]}. Write"
+            " key=value, +key=value to add a key, ~key to remove one; quote values with special"
+            " characters."
         ) from error
     return parsed
 
 
 def compose(
-    config_name: str, overrides: Sequence[str] = (), *, directory: Path | None = None, extra_dirs: Sequence[Path] = ()
+    config_name: str,
+    overrides: Sequence[str] = (),
+    *,
+    directory: Path | None = None,
+    extra_dirs: Sequence[Path] = (),
 ) -> DictConfig:
-    """Compose `config_name` under Hydra's override grammar; also from inside a running Hydra command.
+    """Compose `config_name` under Hydra's override grammar; also from inside a running Hydra
+    command.
 
     Args:
         config_name: a YAML of the tree's top level, without its suffix.
@@ -124,16 +137,26 @@ def compose(
 
 
 def name_under_hydra(*, _root_: DictConfig) -> str:
-    """`${model_name:}` in a file of the tree: the composition's name, also while Hydra decides on the run's folder."""
+    """`${model_name:}` in a file of the tree: the composition's name, also while Hydra decides on
+    the run's folder.
+    """
     if not HydraConfig.initialized():
         return str(_root_.name)  # `compose` and the command have set it
     trees = command_trees()
-    return true_name(_root_, str(HydraConfig.get().job.config_name), trees) if trees else str(_root_.name)
+    return (
+        true_name(_root_, str(HydraConfig.get().job.config_name), trees)
+        if trees
+        else str(_root_.name)
+    )
 
 
 def command_trees() -> tuple[Path, ...]:
-    """Folders of YAML files that the running command reads: its own, then those of `--config-dir`."""
-    sources = [source for source in HydraConfig.get().runtime.config_sources if source.schema == "file"]
+    """Folders of YAML files that the running command reads: its own, then those of
+    `--config-dir`.
+    """
+    sources = [
+        source for source in HydraConfig.get().runtime.config_sources if source.schema == "file"
+    ]
     # The command's own comes first, whatever the order in which Hydra searches.
     sources.sort(key=lambda source: source.provider != "main")
     return tuple(dict.fromkeys(Path(source.path).resolve() for source in sources))
@@ -142,8 +165,11 @@ def command_trees() -> tuple[Path, ...]:
 OmegaConf.register_new_resolver("model_name", name_under_hydra, replace=True)
 
 
-def join_plugins(cfg: DictConfig, config_name: str, trees: Sequence[Path], overrides: Sequence[str]) -> None:
-    """Have `plugins` name the modules of every file that takes part; Hydra itself keeps the last file's list.
+def join_plugins(
+    cfg: DictConfig, config_name: str, trees: Sequence[Path], overrides: Sequence[str]
+) -> None:
+    """Have `plugins` name the modules of every file that takes part; Hydra itself keeps the last
+    file's list.
 
     A list on the command line counts alone. The library's own files name no plugins.
 
@@ -154,7 +180,8 @@ def join_plugins(cfg: DictConfig, config_name: str, trees: Sequence[Path], overr
     with local_hydra(trees[0], trees[1:]) as engine:
         loader = engine.config_loader
         parts = loader.compute_defaults_list(config_name, list(overrides), RunMode.RUN).defaults
-        loaded = [loader.repository.load_config(part.config_path) for part in parts if not part.package]  # type: ignore
+        repository = loader.repository  # type: ignore[attr-defined]
+        loaded = [repository.load_config(part.config_path) for part in parts if not part.package]
         lists = [plugins.plugins_of(part.config, part.path) for part in loaded if part is not None]
     if names := list(dict.fromkeys(name for names in lists for name in names)):
         with open_dict(cfg):
@@ -167,7 +194,9 @@ def resolved(cfg: DictConfig) -> dict[str, Any]:
 
 
 def import_plugins(cfg: DictConfig) -> None:
-    """Import the modules that the user's configuration names under `plugins`; see `mme_vla.config.plugins`."""
+    """Import the modules that the user's configuration names under `plugins`; see
+    `mme_vla.config.plugins`.
+    """
     plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
 
 
@@ -179,27 +208,36 @@ def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str
     if isinstance(cfg.get("memory"), ListConfig):
         cfg = join_memories(cfg.copy())
     configured_name = str(cfg.name)
-    config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
+    config_name = (
+        "policy" if (trees[0] / "policy.yaml").is_file() else config_name
+    )  # the least that holds a model
     mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
     plugin_models = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
 
     def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
-        library_alone = searched == (config_dir().resolve(),)  # its files do not change while a process runs
-        return (_cached_sections if library_alone else _composed_sections)(config_name, words, searched)
+        library_alone = searched == (
+            config_dir().resolve(),
+        )  # its files do not change while a process runs
+        return (_cached_sections if library_alone else _composed_sections)(
+            config_name, words, searched
+        )
 
     def parts() -> Sections | None:
         groups = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
         for group, section in groups.items():
             if section and not section.get("name"):
                 raise UserError(
-                    f"The section `{group}` has no name, only {', '.join(section)}. Choose one: {group}=<name>; its "
-                    f"keys are set beside it, {group}.<key>=<value>."
+                    f"The section `{group}` has no name, only {', '.join(section)}. Choose one:"
+                    f" {group}=<name>; its keys are set beside it, {group}.<key>=<value>."
                 )
-        words = [f"{group}={section.name if section else 'none'}" for group, section in groups.items()]
+        words = [
+            f"{group}={section.name if section else 'none'}" for group, section in groups.items()
+        ]
         if POLICY in decisive(cfg):  # another kind of policy has its own processor beside its parts
             words.insert(0, f"model={configured_name}")
         if "members" in (groups.get("memory") or {}):
-            words.append(f"memory.members={literal(OmegaConf.to_container(groups['memory'].members, resolve=True))}")
+            members = OmegaConf.to_container(groups["memory"].members, resolve=True)
+            words.append(f"memory.members={literal(members)}")
         result = composed(tuple(words), trees)
         return None if result is None else result[1]
 

@@ -1,8 +1,8 @@
 """The device that a command line names, how it multiplies, and which kernels attend.
 
-What stays in float32 is computed as it is anywhere (`ieee`), unless `policy.float32_products=tf32` lets a GPU's tensor
-cores round what goes into the products of recurrent memories. Nothing else is touched: no switch of PyTorch's is left
-other than it was.
+What stays in float32 is computed as it is anywhere (`ieee`), unless `policy.float32_products=tf32`
+lets a GPU's tensor cores round what goes into the products of recurrent memories. Nothing else is
+touched: no switch of PyTorch's is left other than it was.
 """
 
 import os
@@ -27,15 +27,22 @@ def find_device(name: str) -> "torch.device":
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise UserError(f"device={name!r} is not a device; choose auto, cpu, cuda or cuda:<number>.") from None
+        raise UserError(
+            f"device={name!r} is not a device; choose auto, cpu, cuda or cuda:<number>."
+        ) from None
     gpus = torch.cuda.device_count()
     if device.type == "cuda" and (device.index or 0) >= gpus:
-        raise UserError(f"device={name}: PyTorch sees {gpus} GPUs here, counted from 0; use one of them, or cpu.")
+        raise UserError(
+            f"device={name}: PyTorch sees {gpus} GPUs here, counted from 0; use one of them, or"
+            " cpu."
+        )
     return device
 
 
 def process_device(name: str) -> "torch.device":
-    """The device of that name; `auto` and `cuda` are a GPU of its own for each of a machine's processes (torchrun)."""
+    """The device of that name; `auto` and `cuda` are a GPU of its own for each of a machine's
+    processes (torchrun).
+    """
     import torch
 
     device, rank = find_device(name), int(os.environ.get("LOCAL_RANK", "0"))
@@ -47,27 +54,34 @@ def process_device(name: str) -> "torch.device":
 def fused_kernels(x: "torch.Tensor") -> AbstractContextManager[object]:
     """The context of an attention with a mask: on a GPU, every kernel but cuDNN's.
 
-    cuDNN's, which PyTorch prefers on H100, gives NaN gradients for masks at some lengths (pytorch#196678).
+    cuDNN's, which PyTorch prefers on H100, gives NaN gradients for masks at some lengths
+    (pytorch#196678).
     """
     if not x.is_cuda:
         return nullcontext()
     from torch.nn.attention import SDPBackend, sdpa_kernel
 
-    return sdpa_kernel([SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH])
+    return sdpa_kernel(
+        [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
+    )
 
 
 def checked_products(how: str) -> str:
     """`how`, once it is one of `FLOAT32_PRODUCTS`."""
-    check_choice("policy.float32_products", how, FLOAT32_PRODUCTS)  # exact; inputs keep ten bits on a GPU
+    check_choice(
+        "policy.float32_products", how, FLOAT32_PRODUCTS
+    )  # exact; inputs keep ten bits on a GPU
     return how
 
 
 @contextmanager
 def float32_products(how: str) -> Iterator[None]:
-    """Inside, float32 matrix products of a GPU are `ieee` or `tf32`; behind it they are what they were before.
+    """Inside, float32 matrix products of a GPU are `ieee` or `tf32`; behind it they are what they
+    were before.
 
-    `tf32` keeps ten bits of what goes into a product and adds up in float32: numbers that came from bfloat16, which has
-    seven, lose nothing. The switch is the process's: no other thread should be computing on the GPU in float32.
+    `tf32` keeps ten bits of what goes into a product and adds up in float32: numbers that came from
+    bfloat16, which has seven, lose nothing. The switch is the process's: no other thread should be
+    computing on the GPU in float32.
     """
     import torch
 

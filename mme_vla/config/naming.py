@@ -10,7 +10,8 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-JOINED = "joined"  # The memory that several memories make (`mme_vla.memory.joined`, configs/memory/joined.yaml)
+# The memory that several memories make (`mme_vla.memory.joined`, configs/memory/joined.yaml)
+JOINED = "joined"
 BUDGET = 512  # Memory tokens of a policy unless it says otherwise, as in the paper
 
 _SEVERAL = re.compile(r"/?memory=(\[.*\])")
@@ -38,7 +39,8 @@ def literal(value: Any) -> str:
 
 
 def several_memories(overrides: Iterable[str]) -> list[str]:
-    """Overrides in which `memory=[framesamp,ttt]` is written out: the memory `joined` with these members.
+    """Overrides in which `memory=[framesamp,ttt]` is written out: the memory `joined` with these
+    members.
 
     Hydra itself would lay the two files over each other.
     """
@@ -50,7 +52,8 @@ def several_memories(overrides: Iterable[str]) -> list[str]:
 
 
 def join_memories(cfg: DictConfig) -> DictConfig:
-    """A configuration in which a list of memories, as a file may give it (`memory: [framesamp, ttt]`), is one memory.
+    """A configuration in which a list of memories, as a file may give it
+    (`memory: [framesamp, ttt]`), is one memory.
 
     Changed in place, and returned.
     """
@@ -62,8 +65,16 @@ def join_memories(cfg: DictConfig) -> DictConfig:
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
-FREE = ("memory.budget", "processor.tokenizer", "processor.text", "processor.side", "processor.max_words")
-"""Keys in them that do not: a budget has a field of its own in records; pixels and words go with the backbone."""
+FREE = (
+    "memory.budget",
+    "processor.tokenizer",
+    "processor.text",
+    "processor.side",
+    "processor.max_words",
+)
+"""Keys in them that do not: a budget has a field of its own in records; pixels and words go with
+the backbone.
+"""
 POLICY, DEFAULT_POLICY = "policy.name", "mme"
 LONGEST = 32  # Letters that differences may take in a name; more are a digest
 
@@ -78,7 +89,9 @@ def decisive(cfg: DictConfig) -> Sections:
     for key in DECISIVE:
         if key in cfg:
             value = cfg[key]
-            container = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+            container = (
+                OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+            )
             values |= flat({key: container})
     if "policy" in cfg:
         values |= of_policy(cfg.policy)
@@ -86,18 +99,25 @@ def decisive(cfg: DictConfig) -> Sections:
 
 
 def may_be_of(model: Path, sections: Sections) -> bool:
-    """Whether a model may compose to this memory and integration: reads its files, where composing takes 60 ms."""
+    """Whether a model may compose to this memory and integration: reads its files, where composing
+    takes 60 ms.
+    """
     described = _read(model)
     if not isinstance(described, dict):
         return True
-    return all(_may_choose(model.parent.parent, described, part, sections) for part in ("memory", "integration"))
+    return all(
+        _may_choose(model.parent.parent, described, part, sections)
+        for part in ("memory", "integration")
+    )
 
 
 def _may_choose(tree: Path, described: dict[Any, Any], part: str, sections: Sections) -> bool:
     if "name" in (described.get(part) or {}):
         return True
     choices = [
-        one[f"/{part}"] for one in described.get("defaults") or () if isinstance(one, dict) and f"/{part}" in one
+        one[f"/{part}"]
+        for one in described.get("defaults") or ()
+        if isinstance(one, dict) and f"/{part}" in one
     ]
     file = tree / part / f"{choices[0]}.yaml" if choices else None
     if file is None or not file.is_file():
@@ -112,7 +132,9 @@ def _read(file: Path) -> Any:
 
 @lru_cache(maxsize=256)
 def _parsed(file: Path, changed: int) -> Any:
-    """A YAML file as it was when it was last changed; a name with differences compares all models."""
+    """A YAML file as it was when it was last changed; a name with differences compares
+    all models.
+    """
     return OmegaConf.to_container(OmegaConf.load(file))
 
 
@@ -126,15 +148,17 @@ def variant_name(
     """The name of a composition.
 
     Args:
-        name_in_config: what the chosen model's file calls it. sections: `decisive` of the composition.
-        models: the files of the group `model`. reference: what each of them composes to; None also where it cannot be
-            a composition of the same parts.
-        parts: what the memory and the integration compose to with no value changed; None where that is not known.
+        name_in_config: what the chosen model's file calls it. sections: `decisive` of the
+            composition.
+        models: the files of the group `model`. reference: what each of them composes to; None also
+            where it cannot be a composition of the same parts.
+        parts: what the memory and the integration compose to with no value changed; None where that
+            is not known.
 
     Returns:
-        `name_in_config` if the user chose a name that is no model's, or if it is true; else the name of the model that
-        equals the composition; else that of the nearest model with the same parts (or the parts' names) with the
-        differences.
+        `name_in_config` if the user chose a name that is no model's, or if it is true; else the
+        name of the model that equals the composition; else that of the nearest model with the same
+        parts (or the parts' names) with the differences.
     """
     names = sorted(models)
     if name_in_config not in names:
@@ -149,20 +173,30 @@ def variant_name(
     alike = [variant for variant in known if _kind(variant[1]) == _kind(sections)]
     if alike:
         name, base = min(
-            alike, key=lambda variant: (variant[0] != name_in_config, len(_differences(variant[1], sections)))
+            alike,
+            key=lambda variant: (
+                variant[0] != name_in_config,
+                len(_differences(variant[1], sections)),
+            ),
         )
         return f"{name}-{_suffix(_differences(base, sections))}"
-    name = "_".join(part for part in (sections.get(POLICY, ""), *_parts(sections)) if part) or "memoryless"
+    name = (
+        "_".join(part for part in (sections.get(POLICY, ""), *_parts(sections)) if part)
+        or "memoryless"
+    )
     part_sections = parts()
     if part_sections == sections:
         return name
-    return f"{name}-{_suffix(_differences(part_sections or {}, sections), words=part_sections is not None)}"
+    differences = _differences(part_sections or {}, sections)
+    return f"{name}-{_suffix(differences, words=part_sections is not None)}"
 
 
 def _parts(sections: Sections) -> tuple[str, str]:
     members = sections.get("memory.members")
     joined = [str(m.get("name") if isinstance(m, Mapping) else m) for m in members or ()]
-    return "_".join(joined) or str(sections.get("memory.name", "")), str(sections.get("integration.name", ""))
+    return "_".join(joined) or str(sections.get("memory.name", "")), str(
+        sections.get("integration.name", "")
+    )
 
 
 def _kind(sections: Sections) -> tuple[str, ...]:
@@ -170,7 +204,9 @@ def _kind(sections: Sections) -> tuple[str, ...]:
 
 
 def of_policy(section: Mapping[str, Any]) -> Sections:
-    """The kind of policy, where it is not the usual one, which configurations did not use to name."""
+    """The kind of policy, where it is not the usual one, which configurations did not
+    use to name.
+    """
     name = section.get("name", DEFAULT_POLICY)
     return {} if name == DEFAULT_POLICY else {POLICY: name}
 
@@ -182,12 +218,16 @@ def _differences(base: Sections, sections: Sections) -> Sections:
 
 def _suffix(differences: Sections, words: bool = True) -> str:
     """The differences spelt out where these are short, else a digest of them."""
-    text = "-".join(f"{key.rpartition('.')[2]}_{_word(value)}" for key, value in differences.items())
+    text = "-".join(
+        f"{key.rpartition('.')[2]}_{_word(value)}" for key, value in differences.items()
+    )
     return text if words and len(text) <= LONGEST else digest(differences, 6)
 
 
 def _word(value: Any) -> str:
-    text = "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    text = (
+        "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    )
     return re.sub(r"[^\w.]+", "_", text).strip("_.")
 
 
@@ -201,5 +241,9 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> Sections:
     """Nested sections as one, under dotted keys."""
     result: Sections = {}
     for key, value in values.items():
-        result |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+        result |= (
+            flat(value, f"{prefix}{key}.")
+            if isinstance(value, Mapping)
+            else {f"{prefix}{key}": value}
+        )
     return result

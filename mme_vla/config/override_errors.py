@@ -1,4 +1,6 @@
-"""Error messages of a failed composition: near names of what is misspelt, and values of the wrong kind."""
+"""Error messages of a failed composition: near names of what is misspelt, and values of the wrong
+kind.
+"""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,13 +19,19 @@ from omegaconf.errors import OmegaConfBaseException
 from mme_vla.errors import UserError, did_you_mean, missing_extra
 
 COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, ValueError)
-_BAD_KEY = re.compile(r"Could not override '(.+)'\.\n|Could not delete from config\. '(.+)' does not exist")
+_BAD_KEY = re.compile(
+    r"Could not override '(.+)'\.\n|Could not delete from config\. '(.+)' does not exist"
+)
 
 
 class ConfigTree:
-    """The tree under the user's choices of groups, before any of their values. Needs an initialised Hydra."""
+    """The tree under the user's choices of groups, before any of their values. Needs an initialised
+    Hydra.
+    """
 
-    def __init__(self, loader: ConfigLoader, config_name: str, overrides: Sequence[Override]) -> None:
+    def __init__(
+        self, loader: ConfigLoader, config_name: str, overrides: Sequence[Override]
+    ) -> None:
         self.loader, self.config_name = loader, config_name
         names = [o for o in overrides if "." not in o.key_or_group]  # a key with dots is no group
         self.choices = [o for o in names if loader.get_group_options(o.key_or_group)]
@@ -32,7 +40,9 @@ class ConfigTree:
     @cached_property
     def defaults(self) -> Any:
         """The composition of the group choices alone, as plain containers."""
-        return OmegaConf.to_container(hydra.compose(self.config_name, [str(o.input_line) for o in self.choices]))
+        return OmegaConf.to_container(
+            hydra.compose(self.config_name, [str(o.input_line) for o in self.choices])
+        )
 
     def explain(self, error: Exception) -> str:
         """Name what is misspelt, with the near names; Hydra's own message where nothing is."""
@@ -40,12 +50,17 @@ class ConfigTree:
             group, _, name = error.missing_cfg_file.rpartition("/")
             if group == "hydra/launcher":
                 return str(missing_extra(f"launcher={name}", "sweep"))
-            options = error.options or [n for n in self.loader.get_group_options(group) if not n.startswith("_")]
+            options = error.options or [
+                n for n in self.loader.get_group_options(group) if not n.startswith("_")
+            ]
             return f"Unknown {group or 'config'} {name!r}. {did_you_mean(name, options)}"
         for choice in self.choices:
             if not isinstance(choice.value(), str | list | None):
                 options = self.loader.get_group_options(choice.key_or_group)
-                return f"{choice.input_line!r} names no config of the group. Known: {', '.join(options)}."
+                return (
+                    f"{choice.input_line!r} names no config of the group. Known:"
+                    f" {', '.join(options)}."
+                )
         if isinstance(error, yaml.YAMLError):
             return f"Cannot read a config file: {error}"
         text = str(error) or str(error.__cause__)
@@ -53,13 +68,16 @@ class ConfigTree:
             defaults = self.defaults
         except COMPOSITION_ERRORS:  # it is a choice that does not fit
             return text
-        memory_lines = [o.input_line for o in self.values if str(o.key_or_group).startswith("memory.")]
+        memory_lines = [
+            o.input_line for o in self.values if str(o.key_or_group).startswith("memory.")
+        ]
         if memory_lines and isinstance(members := defaults.get("memory"), list):
             names = ", ".join(str(m.get("name") if isinstance(m, Mapping) else m) for m in members)
             return (
-                f"{memory_lines[0]!r}: the model's file gives memory as the list [{names}], without keys. In that file "
-                f"write `/memory: joined` under defaults and `memory: {{members: [{names}]}}`: the same memory with "
-                f"keys. Or choose it on the command line, memory=[{names.replace(' ', '')}], for a model with a memory."
+                f"{memory_lines[0]!r}: the model's file gives memory as the list [{names}], without"
+                " keys. In that file write `/memory: joined` under defaults and `memory:"
+                f" {{members: [{names}]}}`: the same memory with keys. Or choose it on the command"
+                f" line, memory=[{names.replace(' ', '')}], for a model with a memory."
             )
         unknown = _BAD_KEY.match(text)
         key = (unknown[1] or unknown[2]) if unknown else ""
@@ -68,19 +86,26 @@ class ConfigTree:
         for value in (o.value() for o in self.values if o.key_or_group == key):
             known = _select(defaults, key)
             if isinstance(value, Mapping) and isinstance(known, Mapping):
-                key = next((f"{key}.{name}" for name in paths(value) if _select(known, name) is None), key)
+                key = next(
+                    (f"{key}.{name}" for name in paths(value) if _select(known, name) is None), key
+                )
                 return _unknown_key(key, defaults, ()) + f" To add it: +{key}=…"
         return _unknown_key(key, defaults, self.loader.list_groups(""))
 
     def check_kinds(self) -> None:
-        """Refuse a value of another kind than the default: text for a number, a value for a section."""
+        """Refuse a value of another kind than the default: text for a number, a value for a
+        section.
+        """
         defaults = self.defaults if self.values else {}
         for override in self.values:
             default = _select(defaults, override.key_or_group)
             value = override.value()
             expected = _expected(default, value)
             if expected and not override.is_delete():
-                raise UserError(f"{override.input_line!r} does not fit: {override.key_or_group!r} is {expected}.")
+                raise UserError(
+                    f"{override.input_line!r} does not fit: {override.key_or_group!r} is"
+                    f" {expected}."
+                )
 
 
 def _expected(default: Any, value: Any) -> str:
@@ -105,7 +130,9 @@ def _select(tree: Any, key: str) -> Any:
 
 
 def _unknown_key(key: str, defaults: Any, groups: Sequence[str]) -> str:
-    """Walk down `key` as far as it exists and name what is near there, or the same word elsewhere in the tree."""
+    """Walk down `key` as far as it exists and name what is near there, or the same word elsewhere
+    in the tree.
+    """
     section, parents, remaining = defaults, [], key.split(".")
     while len(remaining) > 1 and isinstance(section, Mapping) and remaining[0] in section:
         parents.append(remaining[0])
@@ -121,12 +148,18 @@ def _unknown_key(key: str, defaults: Any, groups: Sequence[str]) -> str:
     if not other_paths and not parents:
         # `train.device` where there is `device`, `mode` where there is `subgoal_mode`.
         last = remaining[-1]
-        other_paths = [p for p in everywhere if last == p.split(".")[-1] or last in p.split(".")[-1].split("_")]
+        other_paths = [
+            p for p in everywhere if last == p.split(".")[-1] or last in p.split(".")[-1].split("_")
+        ]
         other_paths += [
-            name for name in get_close_matches(remaining[0], options) if other_paths and len(remaining) == 1
+            name
+            for name in get_close_matches(remaining[0], options)
+            if other_paths and len(remaining) == 1
         ]
     if other_paths:
-        return f"Unknown config key {key!r}. Did you mean {' or '.join(map(repr, other_paths[:3]))}?"
+        return (
+            f"Unknown config key {key!r}. Did you mean {' or '.join(map(repr, other_paths[:3]))}?"
+        )
     within = f" In {where!r}:" if where else ""
     return f"Unknown config key {key!r}.{within} {did_you_mean(remaining[0], options)}"
 

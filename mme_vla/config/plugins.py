@@ -1,7 +1,9 @@
-"""Modules of the user's own, whose decorators register memories, tasks, players: imported when the user says so.
+"""Modules of the user's own, whose decorators register memories, tasks, players: imported when the
+user says so.
 
-What a configuration or command line of the user's names is imported at once. What a checkpoint names is an untrusted
-word: it is imported only where the user says `trust_plugins=True` (`--trust-plugins`), or has imported it already.
+What a configuration or command line of the user's names is imported at once. What a checkpoint
+names is an untrusted word: it is imported only where the user says `trust_plugins=True`
+(`--trust-plugins`), or has imported it already.
 """
 
 import importlib
@@ -14,7 +16,9 @@ from typing import Any
 from mme_vla.errors import UserError, brief, listed, require
 
 TRUST_FLAG, TRUST_WORD = "--trust-plugins", "trust_plugins=true"
-"""How one says on a command line that the plugins of a checkpoint may be imported; every command takes both."""
+"""How one says on a command line that the plugins of a checkpoint may be imported; every command
+takes both.
+"""
 
 _MODULE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
 _imported: dict[str, None] = {}  # in order
@@ -23,8 +27,8 @@ _imported: dict[str, None] = {}  # in order
 def import_plugins(names: Iterable[str]) -> None:
     """Import modules that the user named.
 
-    The current directory counts as importable, so that a file beside the command is enough. Installed packages come
-    first, so that no file there takes the place of one.
+    The current directory counts as importable, so that a file beside the command is enough.
+    Installed packages come first, so that no file there takes the place of one.
     """
     for name in names:
         here = str(Path.cwd())
@@ -36,14 +40,16 @@ def import_plugins(names: Iterable[str]) -> None:
             if error.name is None or not f"{name}.".startswith(f"{error.name}."):
                 raise  # the plugin was found, something it imports was not
             raise UserError(
-                f"No module named {name!r} (from `plugins`). Looked in {here} and the installed packages; "
-                "give a dotted module name, not a file name."
+                f"No module named {name!r} (from `plugins`). Looked in {here} and the installed"
+                " packages; give a dotted module name, not a file name."
             ) from error
         _imported[name] = None
 
 
 def imported_plugins() -> tuple[str, ...]:
-    """The plugins of this process: what a worker process has to import before it can build the same things."""
+    """The plugins of this process: what a worker process has to import before it can build the same
+    things.
+    """
     return tuple(_imported)
 
 
@@ -53,32 +59,40 @@ def plugins_of(config: Any, source: str) -> list[str]:
     names = [names] if isinstance(names, str) else names
     listing = isinstance(names, Sequence)
     if not listing or not all(isinstance(name, str) and _MODULE.fullmatch(name) for name in names):
-        raise UserError(f"{source}: plugins={brief(names)} must be a list of modules, such as [my_package.my_memory].")
+        raise UserError(
+            f"{source}: plugins={brief(names)} must be a list of modules, such as"
+            " [my_package.my_memory]."
+        )
     return list(names)
 
 
 def import_trusted(config: Any, source: str, trust: bool) -> None:
     """Import the plugins that a checkpoint names.
 
-    config: the checkpoint's configuration. source: the checkpoint, for messages. trust: the user has said that what it
-    names may run here.
+    config: the checkpoint's configuration. source: the checkpoint, for messages. trust: the user
+    has said that what it names may run here.
     """
     names = plugins_of(config, source)
     strange = [name for name in names if name not in sys.modules]
     require(
         not strange or trust,
-        f"{source} needs the plugin {listed(strange)}: code that the checkpoint names and that would run on this "
-        f"machine. If you know it and trust it, say so with {TRUST_FLAG} (from Python trust_plugins=True), and "
-        "start where the module can be found: in its folder, or with it installed.",
+        f"{source} needs the plugin {listed(strange)}: code that the checkpoint names and that"
+        f" would run on this machine. If you know it and trust it, say so with {TRUST_FLAG} (from"
+        " Python trust_plugins=True), and start where the module can be found: in its folder, or"
+        " with it installed.",
     )
     import_plugins(names)
 
 
 def trust_as_override(words: Iterable[str]) -> list[str]:
-    """A command line whose `--trust-plugins` is written as an override, for commands that read overrides."""
+    """A command line whose `--trust-plugins` is written as an override, for commands that read
+    overrides.
+    """
     return [TRUST_WORD if word == TRUST_FLAG else word for word in words]
 
 
 def trust_as_flag(words: Iterable[str]) -> list[str]:
-    """A command line whose `trust_plugins=true` is written as a flag, for commands that read flags."""
+    """A command line whose `trust_plugins=true` is written as a flag, for commands
+    that read flags.
+    """
     return [TRUST_FLAG if word.lower() == TRUST_WORD else word for word in words]

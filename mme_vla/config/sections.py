@@ -1,7 +1,8 @@
-"""Reads a section of a configuration into a dataclass: keys, kinds of values, bounds and choices are checked once.
+"""Reads a section of a configuration into a dataclass: keys, kinds of values, bounds and choices
+are checked once.
 
-Annotations declare all of it: `port: Annotated[int, Range(0, 65535)]`, `kind: Literal["simple", "grounded"]`.
-`__post_init__` is for what several keys mean together.
+Annotations declare all of it: `port: Annotated[int, Range(0, 65535)]`,
+`kind: Literal["simple", "grounded"]`. `__post_init__` is for what several keys mean together.
 """
 
 import math
@@ -14,8 +15,12 @@ from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, g
 from mme_vla.errors import UserError, brief, did_you_mean, listed
 
 _WORDS: Mapping[Any, str] = {
-    bool: "true or false", int: "a whole number", float: "a number", str: "a text", NoneType: "null",
-}  # fmt: skip
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    NoneType: "null",
+}
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,9 @@ class Range:
     def text(self) -> str:
         if math.isfinite(self.most):
             return f" from {self.least:g} to {self.most:g}"
-        return f" above {self.above:g}" if math.isfinite(self.above) else f", {self.least:g} or more"
+        return (
+            f" above {self.above:g}" if math.isfinite(self.above) else f", {self.least:g} or more"
+        )
 
 
 Positive = Annotated[float, Range(above=0)]
@@ -47,17 +54,24 @@ class _MisfitError(Exception):
     """A value that its key does not take."""
 
 
-def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool = False, **fixed: Any) -> T:
+def read_section[T](
+    kind: type[T], values: Any, where: str = "", *, others: bool = False, **fixed: Any
+) -> T:
     """Build a dataclass from a mapping.
 
     Args:
-        kind: a dataclass. Its annotations: `bool`, `int`, `float` (whole numbers too), `str`, `Literal`, a dataclass (a
-            section of its own), tuples of these (lists are taken), mappings, `Any`, unions, and numbers with a `Range`.
+        kind: a dataclass. Its annotations: `bool`, `int`, `float` (whole numbers too), `str`,
+            `Literal`, a dataclass (a section of its own), tuples of these (lists are taken),
+            mappings, `Any`, unions, and numbers with a `Range`.
         values: the section. where: its dotted name in messages; empty for the top level.
         others: ignore keys that are no fields. fixed: fields that the section does not set.
     """
     specs = {spec.name: spec for spec in fields(kind) if spec.init and spec.name not in fixed}  # type: ignore[arg-type]
-    needed = [n for n, spec in specs.items() if spec.default is MISSING and spec.default_factory is MISSING]
+    needed = [
+        n
+        for n, spec in specs.items()
+        if spec.default is MISSING and spec.default_factory is MISSING
+    ]
     if others and isinstance(values, Mapping):
         values = {key: value for key, value in values.items() if key in specs}
     parsed, hints = section_keys(values, where, specs), _hints(kind)  # type: ignore[arg-type]
@@ -71,7 +85,11 @@ def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool
         except _MisfitError:
             assigned = f"={brief(value)}" if specs[key].repr else ""  # some values are secrets
             choices = isinstance(value, str) and _choices(hints[key])
-            hint = f". {did_you_mean(value, map(str, choices))}" if choices else f" must be {_expected(hints[key])}."
+            hint = (
+                f". {did_you_mean(value, map(str, choices))}"
+                if choices
+                else f" must be {_expected(hints[key])}."
+            )
             raise UserError(f"{name}{assigned}{hint}") from None
     return kind(**read, **fixed)
 
@@ -85,14 +103,21 @@ def _parts(kind: Any) -> tuple[Any, tuple[Any, ...]]:
     return get_origin(kind), get_args(kind)
 
 
-def section_keys(values: Any, where: str, known: Iterable[str], required: Iterable[str] = ()) -> dict[str, Any]:
+def section_keys(
+    values: Any, where: str, known: Iterable[str], required: Iterable[str] = ()
+) -> dict[str, Any]:
     """A mapping with no unknown key, and with a value for every required one."""
     if not isinstance(values, Mapping):
-        raise UserError(f"{where or 'the configuration'} must be a section of keys, got {brief(values)}.")
+        raise UserError(
+            f"{where or 'the configuration'} must be a section of keys, got {brief(values)}."
+        )
     for key in values:
         if key not in known:
             name = brief(key, quote=False)
-            raise UserError(f"Unknown key {f'{where}.' if where else ''}{name}. {did_you_mean(str(key), list(known))}")
+            raise UserError(
+                f"Unknown key {f'{where}.' if where else ''}{name}."
+                f" {did_you_mean(str(key), list(known))}"
+            )
     for key in required:
         if values.get(key) is None:
             raise _lacking(where, key, values)
@@ -100,7 +125,9 @@ def section_keys(values: Any, where: str, known: Iterable[str], required: Iterab
 
 
 def _lacking(where: str, key: str, keys: Iterable[Any]) -> UserError:
-    return UserError(f"{where or 'the configuration'} lacks the key {key!r}; it has {listed(keys) or 'none'}.")
+    return UserError(
+        f"{where or 'the configuration'} lacks the key {key!r}; it has {listed(keys) or 'none'}."
+    )
 
 
 def _converted(value: Any, kind: Any, name: str) -> Any:
@@ -111,7 +138,11 @@ def _converted(value: Any, kind: Any, name: str) -> Any:
     if origin in (Union, UnionType):
         return _first_that_fits(value, inside, name)
     if is_dataclass(kind):
-        return value if isinstance(value, cast(type, kind)) else read_section(cast(type, kind), value, name)
+        return (
+            value
+            if isinstance(value, cast(type, kind))
+            else read_section(cast(type, kind), value, name)
+        )
     if origin is tuple:
         return _tuple(value, inside, name)
     if origin is Annotated:
@@ -129,7 +160,9 @@ def _converted(value: Any, kind: Any, name: str) -> Any:
 
 def _first_that_fits(value: Any, kinds: Sequence[Any], name: str) -> Any:
     for kind in kinds:
-        if is_dataclass(kind) and isinstance(value, Mapping):  # its own words for what is wrong inside
+        if is_dataclass(kind) and isinstance(
+            value, Mapping
+        ):  # its own words for what is wrong inside
             return _converted(value, kind, name)
     for kind in kinds:
         if not is_dataclass(kind) or isinstance(value, cast(type, kind)):
@@ -142,7 +175,11 @@ def _first_that_fits(value: Any, kinds: Sequence[Any], name: str) -> Any:
 
 def _tuple(value: Any, kinds: Sequence[Any], name: str) -> tuple[Any, ...]:
     endless = len(kinds) == 2 and kinds[1] is Ellipsis
-    if not isinstance(value, Sequence) or isinstance(value, str) or not (endless or len(value) == len(kinds)):
+    if (
+        not isinstance(value, Sequence)
+        or isinstance(value, str)
+        or not (endless or len(value) == len(kinds))
+    ):
         raise _MisfitError
     each = [kinds[0]] * len(value) if endless else kinds
     return tuple(_converted(item, kind, name) for item, kind in zip(value, each, strict=True))

@@ -1,9 +1,10 @@
-"""The vision cache: pooled tokens of the memory view, computed once with the frozen encoder and read memory-mapped.
+"""The vision cache: pooled tokens of the memory view, computed once with the frozen encoder and
+read memory-mapped.
 
 `mme-vla cache model=… data=…` builds it; under `torchrun` every process takes its share of the
-episodes. One folder holds the tokens of one dataset under one encoder and one way of pooling; what it was made of
-is in its `fingerprint.json`, and a folder whose fingerprint is not the expected one is refused, never read and
-never replaced unless asked to.
+episodes. One folder holds the tokens of one dataset under one encoder and one way of pooling; what
+it was made of is in its `fingerprint.json`, and a folder whose fingerprint is not the expected one
+is refused, never read and never replaced unless asked to.
 """
 
 import re
@@ -36,7 +37,9 @@ def default_cache_root() -> Path:
     return user_cache("vision")
 
 
-def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: str = "bfloat16") -> dict[str, Any]:
+def fingerprint(
+    source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: str = "bfloat16"
+) -> dict[str, Any]:
     """Everything the tokens of a cache depend on.
 
     Args:
@@ -52,23 +55,36 @@ def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: s
         "view": source.columns[source.robot.memory_camera],
         "dtype": dtype,
         "storage": spec.to_dict(),
-        "dataset": {"content": source.fingerprint, "episodes": len(source), "frames": int(source.lengths.sum())},
+        "dataset": {
+            "content": source.fingerprint,
+            "episodes": len(source),
+            "frames": int(source.lengths.sum()),
+        },
     }
 
 
 def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) -> Path:
-    """The folder of a cache below `root`: readable, and another one for another dataset, encoder, pooling or camera."""
+    """The folder of a cache below `root`: readable, and another one for another dataset, encoder,
+    pooling or camera.
+    """
     spec = StorageSpec(**expected["storage"])
     scorer = f"-{spec.scorer}" if spec.scorer else ""
     encoder = sha256(f"{expected['encoder']}{expected['dtype']}".encode()).hexdigest()[:8]
-    # RoboMME's memory camera goes without saying, as in caches that were built before there were others.
-    view = "" if expected["view"] == ROBOMME_JOINT.cameras[0].key else re.sub(r"[^\w.-]", "_", f"-{expected['view']}")
+    # RoboMME's memory camera goes without saying, as in caches that were built before there were
+    # others.
+    view = (
+        ""
+        if expected["view"] == ROBOMME_JOINT.cameras[0].key
+        else re.sub(r"[^\w.-]", "_", f"-{expected['view']}")
+    )
     name = f"{spec.grid}x{spec.grid}-{spec.pooling}-every{spec.keep_every}{scorer}{view}-{encoder}"
     return root / f"{source.name}-{source.fingerprint[:8]}" / name
 
 
 def stored_frames(source: EpisodeSource, episode: int, spec: StorageSpec) -> np.ndarray:
-    """Frames of an episode whose tokens are stored: those that `spec` keeps, as far as they were rendered."""
+    """Frames of an episode whose tokens are stored: those that `spec` keeps, as far as they were
+    rendered.
+    """
     stored = spec.stored_frames(int(source.lengths[episode]))
     return stored[source.rendered(episode)[stored]]
 
@@ -79,45 +95,57 @@ def token_file(folder: Path, episode: int) -> Path:
 
 
 def score_file(folder: Path, episode: int) -> Path:
-    """Scores of an episode, where the memory needs them; written before the tokens, so that tokens imply scores."""
+    """Scores of an episode, where the memory needs them; written before the tokens, so that tokens
+    imply scores.
+    """
     return folder / f"episode_{episode:06d}.scores.npz"
 
 
 def sum_file(folder: Path, episode: int) -> Path:
-    """SHA-256 sums of an episode's files; written before the tokens, too. Caches of older versions have none."""
+    """SHA-256 sums of an episode's files; written before the tokens, too. Caches of older versions
+    have none.
+    """
     return folder / f"episode_{episode:06d}.sha256"
 
 
 class VisionCache:
-    """A finished cache of one dataset: histories of its episodes, of which only the rows asked for are read.
+    """A finished cache of one dataset: histories of its episodes, of which only the rows asked for
+    are read.
 
-    An episode's files are compared with their checksums when its history is first asked for, once a process.
+    An episode's files are compared with their checksums when its history is first asked for, once a
+    process.
     """
 
     max_open: int
     """Histories kept at hand: of all episodes, as far as the process may hold their files."""
 
-    def __init__(self, folder: Path, source: EpisodeSource, expected: dict[str, Any], command: str = COMMAND) -> None:
+    def __init__(
+        self, folder: Path, source: EpisodeSource, expected: dict[str, Any], command: str = COMMAND
+    ) -> None:
         """Open and check a cache.
 
         Args:
             folder: where it is (`cache_folder`). source: the dataset it belongs to.
-            expected: the fingerprint it must have. command: what to tell the user to run, without `rebuild=true`.
+            expected: the fingerprint it must have. command: what to tell the user to run, without
+                `rebuild=true`.
         """
         check_fingerprint(folder, expected, command)
         self.folder, self.spec = folder, StorageSpec(**expected["storage"])
         self._source, self._lengths, self._exec_starts = source, source.lengths, source.exec_starts
         self._dtype, self._command = DTYPES[expected["dtype"]], command
         files = (token_file, score_file) if self.spec.scorer else (token_file,)
-        missing = [e for e in range(len(source)) if not all(file(folder, e).is_file() for file in files)]
+        missing = [
+            e for e in range(len(source)) if not all(file(folder, e).is_file() for file in files)
+        ]
         if missing:
             raise CacheMissingError(
-                f"The vision cache {folder} is half-written: {len(missing)} of {len(source)} episodes are missing. "
-                f"Finish it with: {command}"
+                f"The vision cache {folder} is half-written: {len(missing)} of {len(source)}"
+                f" episodes are missing. Finish it with: {command}"
             )
         widths = {self._tokens(episode).shape[-1] for episode in range(len(source))}
         require(
-            len(widths) <= 1, f"{folder} mixes tokens of widths {sorted(widths)}. Rebuild it: {command} rebuild=true"
+            len(widths) <= 1,
+            f"{folder} mixes tokens of widths {sorted(widths)}. Rebuild it: {command} rebuild=true",
         )
         self.width = widths.pop()
         self.max_open = files_to_hold(len(source))
@@ -143,7 +171,9 @@ class VisionCache:
         return self._histories[episode]
 
     def verify(self, episode: int) -> None:
-        """Compare an episode's files with the checksums that were written with them, the first time it is asked for."""
+        """Compare an episode's files with the checksums that were written with them, the first time
+        it is asked for.
+        """
         if episode in self._verified:
             return
         sums = Sums(self.folder, sum_file(self.folder, episode).name, self._remedy)
@@ -160,9 +190,11 @@ class VisionCache:
         with decoding(require_file(path), "tokens of a vision cache", self._remedy):
             tokens = np.lib.format.open_memmap(path, mode="r")
         require(
-            tokens.ndim == 3 and tokens.shape[:2] == (rows, self.spec.grid**2) and tokens.dtype == self._dtype,
-            f"{path} holds {tokens.dtype} {list(tokens.shape)} where {np.dtype(self._dtype)} [{rows}, "
-            f"{self.spec.grid**2}, d] is expected. {self._remedy}",
+            tokens.ndim == 3
+            and tokens.shape[:2] == (rows, self.spec.grid**2)
+            and tokens.dtype == self._dtype,
+            f"{path} holds {tokens.dtype} {list(tokens.shape)} where {np.dtype(self._dtype)}"
+            f" [{rows}, {self.spec.grid**2}, d] is expected. {self._remedy}",
         )
         return tokens
 
@@ -170,7 +202,10 @@ class VisionCache:
         if not self.spec.scorer:
             return None
         path = score_file(self.folder, episode)
-        with decoding(require_file(path), "scores of a vision cache", self._remedy), np.load(path) as stored:
+        with (
+            decoding(require_file(path), "scores of a vision cache", self._remedy),
+            np.load(path) as stored,
+        ):
             frames, values = stored["frames"], stored["values"]
         length, patches = int(self._lengths[episode]), self.spec.grid**2
         require(
@@ -182,9 +217,9 @@ class VisionCache:
                 and not (frames >= length).any()
                 and np.isfinite(values).all()
             ),
-            f"{path} holds {values.dtype} scores {list(values.shape)} of {frames.dtype} frames "
-            f"{list(frames.shape)}, where finite float32 [n, {patches}] of int64 [n] frames below {length} are "
-            f"expected. {self._remedy}",
+            f"{path} holds {values.dtype} scores {list(values.shape)} of {frames.dtype} frames"
+            f" {list(frames.shape)}, where finite float32 [n, {patches}] of int64 [n] frames below"
+            f" {length} are expected. {self._remedy}",
         )
         return FrameScores(frames, values)
 
@@ -197,12 +232,19 @@ def check_fingerprint(folder: Path, expected: dict[str, Any], command: str = COM
     path = folder / FINGERPRINT
     if not path.is_file():
         if folder.is_dir() and any(folder.iterdir()):
-            raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache. Choose another data.cache.root.")
+            raise UserError(
+                f"{folder} has no {FINGERPRINT}: it is not a vision cache. Choose another"
+                " data.cache.root."
+            )
         raise CacheMissingError(f"There is no vision cache at {folder}. Build it with: {command}")
     recorded = read_json(path, "what a vision cache was made of")
     differing = [key for key, value in expected.items() if recorded.get(key) != value]
     if differing:
         details = "; ".join(
-            f"{key} is {brief(recorded.get(key), 200)}, expected {expected[key]!r}" for key in differing
+            f"{key} is {brief(recorded.get(key), 200)}, expected {expected[key]!r}"
+            for key in differing
         )
-        raise UserError(f"The vision cache {folder} is stale: {details}. Rebuild it with: {command} rebuild=true")
+        raise UserError(
+            f"The vision cache {folder} is stale: {details}. Rebuild it with: {command}"
+            " rebuild=true"
+        )

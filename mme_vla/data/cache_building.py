@@ -46,7 +46,9 @@ Encode = Callable[[np.ndarray], Tensor]  # frames [n, H, W, 3] uint8 → pooled 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What building would take: frames to encode, bytes on disk, seconds (one process), as measured on a few frames."""
+    """What building would take: frames to encode, bytes on disk, seconds (one process), as measured
+    on a few frames.
+    """
 
     frames: int
     bytes: int
@@ -63,7 +65,9 @@ def clear_cache(folder: Path) -> None:
     if not folder.exists():
         return
     if not (folder / FINGERPRINT).is_file() and any(folder.iterdir()):
-        raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache, so nothing is removed.")
+        raise UserError(
+            f"{folder} has no {FINGERPRINT}: it is not a vision cache, so nothing is removed."
+        )
     for pattern in ("episode_*.np[yz]", "episode_*.sha256", "*.partial", FINGERPRINT):
         for path in folder.glob(pattern):
             path.unlink(missing_ok=True)
@@ -81,8 +85,8 @@ def build_cache(
 ) -> int:
     """Encode the episodes that are still missing; return how many were written.
 
-    Stopped at any moment, it continues with the next call. Processes share the work: of the episodes, each takes those
-    whose number is its rank modulo the world size.
+    Stopped at any moment, it continues with the next call. Processes share the work: of the
+    episodes, each takes those whose number is its rank modulo the world size.
     """
     rank, world = process_rank() if shard is None else shard
     folder.mkdir(parents=True, exist_ok=True)
@@ -102,14 +106,18 @@ def build_cache(
     ):
         for episode, of_episode in groupby(chunks, lambda chunk: chunk[0]):
             some = (chunk for _, chunk in of_episode)
-            _build_episode(source, episode, some, memory, encode, folder, expected["dtype"], advance)
+            _build_episode(
+                source, episode, some, memory, encode, folder, expected["dtype"], advance
+            )
     return len(missing)
 
 
 def _of_all(
     source: EpisodeSource, episodes: Sequence[int], memory: Memory, batch_size: int
 ) -> Iterator[tuple[int, "_Chunk"]]:
-    """The chunks of all episodes, one after the other; an episode of which nothing was rendered has an empty one."""
+    """The chunks of all episodes, one after the other; an episode of which nothing was rendered has
+    an empty one.
+    """
     for episode in episodes:
         yield episode, _Chunk(0, np.zeros((0, 1, 1, 3), np.uint8), [], [])
         for chunk in _chunks(source, episode, memory, batch_size):
@@ -117,10 +125,16 @@ def _of_all(
 
 
 def estimate(
-    source: EpisodeSource, memory: Memory, encode: Encode, dtype: str = "bfloat16", batch_size: int = 32
+    source: EpisodeSource,
+    memory: Memory,
+    encode: Encode,
+    dtype: str = "bfloat16",
+    batch_size: int = 32,
 ) -> Estimate:
     """Measure a few batches of the first episode and extrapolate to the dataset."""
-    n_stored = sum(len(stored_frames(source, episode, memory.storage)) for episode in range(len(source)))
+    n_stored = sum(
+        len(stored_frames(source, episode, memory.storage)) for episode in range(len(source))
+    )
     chunk = next(_chunks(source, 0, memory, batch_size))
     encode(chunk.stored_images[:1])  # the first call pays for warming up
     started = time.perf_counter()
@@ -137,7 +151,9 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Chunk:
-    """A stretch of an episode: how many frames it spans, the images to encode, and the scores that came up."""
+    """A stretch of an episode: how many frames it spans, the images to encode, and the scores that
+    came up.
+    """
 
     length: int
     stored_images: np.ndarray
@@ -145,7 +161,9 @@ class _Chunk:
     score_values: list[np.ndarray]
 
 
-def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int) -> Iterator[_Chunk]:
+def _chunks(
+    source: EpisodeSource, episode: int, memory: Memory, batch_size: int
+) -> Iterator[_Chunk]:
     spec, length, scorer = memory.storage, int(source.lengths[episode]), make_scorer(memory)
     stored, scored = stored_frames(source, episode, memory.storage), frames_scored(memory, length)
     span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
@@ -184,10 +202,16 @@ def _build_episode(
         if len(chunk.stored_images):
             tokens = encode(chunk.stored_images)
             if tokens.shape[:2] != (len(chunk.stored_images), patches):
-                raise ValueError(f"encode() gave {list(tokens.shape)} for {len(chunk.stored_images)} frames")
+                raise ValueError(
+                    f"encode() gave {list(tokens.shape)} for {len(chunk.stored_images)} frames"
+                )
             rows.append(_to_numpy(tokens, dtype))
         advance(chunk.length)
-    require(rows, f"{source.name}, episode {episode}: none of the frames that the memory stores was rendered.")
+    require(
+        rows,
+        f"{source.name}, episode {episode}: none of the frames that the memory stores was"
+        " rendered.",
+    )
     drafts: dict[Path, Path] = {}
     if memory.storage.scorer:
         stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)
@@ -203,7 +227,9 @@ def _build_episode(
 
 
 def save_aligned(file: IO[bytes], array: np.ndarray) -> None:
-    """Write an array as .npy whose numbers begin at a page: a row of one page is then read as one, not as two."""
+    """Write an array as .npy whose numbers begin at a page: a row of one page is then read as one,
+    not as two.
+    """
     buffer = BytesIO()
     np.lib.format.write_array_header_1_0(buffer, np.lib.format.header_data_from_array_1_0(array))
     magic, described = buffer.getvalue()[:8], buffer.getvalue()[10:].rstrip()
@@ -218,7 +244,9 @@ def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:
     return tokens.detach().float().cpu().numpy()
 
 
-def _draft(path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray) -> Path:
+def _draft(
+    path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray
+) -> Path:
     draft = draft_of(path)
     with draft.open("wb") as handle:
         writer(handle, *arrays, **named)
@@ -242,23 +270,27 @@ def ensure_cache(
     batch_size: int = 32,
     command: str = COMMAND,
 ) -> VisionCache:
-    """Open the cache of a dataset for this memory; build it first, or finish it, where the dataset is small.
+    """Open the cache of a dataset for this memory; build it first, or finish it, where the dataset
+    is small.
 
     Args:
-        source, memory: whose tokens. encode: `policy.encode_frames`. encoder: `policy.vision_fingerprint()`.
+        source, memory: whose tokens. encode: `policy.encode_frames`. encoder:
+            `policy.vision_fingerprint()`.
         root: folder of all caches; None for `default_cache_root()`.
         dtype: of the stored tokens. batch_size: frames encoded at once.
-        max_build_frames: datasets of more frames are not built here: that is worth a command of its own.
+        max_build_frames: datasets of more frames are not built here: that is worth a command of its
+            own.
         command: that command, for messages.
     """
     coded = source.lossy.get(source.robot.memory_camera)
     if coded is not None and make_scorer(memory) is not None:
         log.warning(
-            "%s: its videos are coded as %s, and this memory scores patches by how little they change: what "
-            "compression changes passes for motion. Convert the recordings with lossless videos, or choose another "
-            "memory.",
-            source.name, coded,
-        )  # fmt: skip
+            "%s: its videos are coded as %s, and this memory scores patches by how little they"
+            " change: what compression changes passes for motion. Convert the recordings with"
+            " lossless videos, or choose another memory.",
+            source.name,
+            coded,
+        )
     expected = fingerprint(source, memory.storage, encoder, dtype)
     folder = cache_folder(default_cache_root() if root is None else Path(root), source, expected)
     try:
@@ -267,10 +299,12 @@ def ensure_cache(
         frames = int(source.lengths.sum())
         if frames > max_build_frames:
             raise UserError(
-                f"{error} (It is not built here because {source.name} has {frames} frames, more than "
-                f"data.cache.max_build_frames={max_build_frames}; add dry_run=true to see size and time first.)"
+                f"{error} (It is not built here because {source.name} has {frames} frames, more"
+                f" than data.cache.max_build_frames={max_build_frames}; add dry_run=true to see"
+                " size and time first.)"
             ) from None
-    # All of it here, also under torchrun, where training has its first process prepare the data for the others.
+    # All of it here, also under torchrun, where training has its first process prepare the data for
+    # the others.
     build_cache(source, memory, encode, folder, expected, batch_size=batch_size, shard=(0, 1))
     return VisionCache(folder, source, expected, command)
 
@@ -279,10 +313,14 @@ _END = object()
 
 
 def ahead[T](things: Iterable[T], count: int) -> Generator[T, None, None]:
-    """The same things, made in a thread up to `count` ahead; what goes wrong there is raised where they are used."""
+    """The same things, made in a thread up to `count` ahead; what goes wrong there is raised where
+    they are used.
+    """
     iterator, pool = iter(things), ThreadPoolExecutor(1, "ahead")
     try:
-        pending: deque[Future[Any]] = deque(pool.submit(next, iterator, _END) for _ in range(count + 1))
+        pending: deque[Future[Any]] = deque(
+            pool.submit(next, iterator, _END) for _ in range(count + 1)
+        )
         while (thing := pending.popleft().result()) is not _END:
             pending.append(pool.submit(next, iterator, _END))
             yield thing

@@ -1,4 +1,6 @@
-"""Further columns of a dataset: labels and weights of samples (numbers), and notes of a prompt (texts)."""
+"""Further columns of a dataset: labels and weights of samples (numbers), and notes of a prompt
+(texts).
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -16,18 +18,22 @@ from mme_vla.errors import UserError, check_known, listed, require
 from mme_vla.types import HistoryTokens, Labels
 
 BOUNDARY = "subtask_boundary"
-"""The label that is 1 at the first frame of every sub-task and 0 elsewhere, from the column `simple_subgoal`."""
+"""The label that is 1 at the first frame of every sub-task and 0 elsewhere, from the column
+`simple_subgoal`.
+"""
 SUBTASK = "subtask_index"
 """The label that counts the sub-tasks that have begun in an episode so far, from 1."""
 
 
 def with_labels(
-    selection: HistoryTokens, labels: Mapping[str, Callable[[np.ndarray], np.ndarray]], real: np.ndarray | None = None
+    selection: HistoryTokens,
+    labels: Mapping[str, Callable[[np.ndarray], np.ndarray]],
+    real: np.ndarray | None = None,
 ) -> HistoryTokens:
     """A selection, unbatched, with the labels of each token's frame.
 
-    labels: name → values [n] or [n, k] float32 of an episode's frames [n]. real: the recorded frame of each frame of a
-    transformed episode (`FrameMap.real`).
+    labels: name → values [n] or [n, k] float32 of an episode's frames [n]. real: the recorded frame
+    of each frame of a transformed episode (`FrameMap.real`).
     """
     frames = (selection.positions[:, 0] * selection.mask).numpy().astype(np.int64)
     tokens = Labels()
@@ -46,12 +52,16 @@ def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
         key: what names the column, for messages (`data.weights`).
 
     Raises:
-        UserError: no such column, or a value that is missing, not finite or of another size; it names the episode.
+        UserError: no such column, or a value that is missing, not finite or of another size; it
+            names the episode.
     """
     if name == BOUNDARY:
         return _boundaries(source, name)
     if name == SUBTASK:
-        begun, first = np.cumsum(_boundaries(source, name)), np.cumsum(source.lengths) - source.lengths
+        begun, first = (
+            np.cumsum(_boundaries(source, name)),
+            np.cumsum(source.lengths) - source.lengths,
+        )
         return (begun - np.repeat(begun[first] - 1, source.lengths)).astype(np.float32)
     column = _read(source, name, key)
     values = column.combine_chunks()
@@ -80,7 +90,10 @@ def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
 def weight_column(source: EpisodeSource, name: str) -> np.ndarray:
     """The weight of every frame of a dataset, [rows] float32, 0 or more (`data.weights`)."""
     weights = label_column(source, name, "data.weights")
-    require(weights.ndim == 1, f"data.weights: the column {name!r} of {source.name} needs one number a frame.")
+    require(
+        weights.ndim == 1,
+        f"data.weights: the column {name!r} of {source.name} needs one number a frame.",
+    )
     _check(source, name, "data.weights", weights < 0, "is negative")
     return weights
 
@@ -112,13 +125,16 @@ def _boundaries(source: EpisodeSource, label: str) -> np.ndarray:
 
 
 def _check(source: EpisodeSource, name: str, key: str, wrong: np.ndarray, problem: str) -> None:
-    """Raise an error that names the first frame, and the episodes, of rows that are wrong, [rows] bool."""
+    """Raise an error that names the first frame, and the episodes, of rows that are wrong, [rows]
+    bool.
+    """
     rows = np.flatnonzero(wrong)
     if not len(rows):
         return
     episode, frame = source.locate(int(rows[0]))
     episodes = np.unique(np.searchsorted(np.cumsum(source.lengths), rows, side="right")).tolist()
     raise UserError(
-        f"{key}: the column {name!r} of {source.name} {problem} at frame {frame} of episode {episode} (in all: "
-        f"{'episodes' if len(episodes) > 1 else 'episode'} {listed(episodes)}). Correct the column."
+        f"{key}: the column {name!r} of {source.name} {problem} at frame {frame} of episode"
+        f" {episode} (in all: {'episodes' if len(episodes) > 1 else 'episode'} {listed(episodes)})."
+        " Correct the column."
     )

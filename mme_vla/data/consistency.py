@@ -1,8 +1,10 @@
-"""What a dataset says twice, compared: one pass over a few numbers a row, whenever a dataset is opened.
+"""What a dataset says twice, compared: one pass over a few numbers a row, whenever a dataset is
+opened.
 
-LeRobot's format writes most facts more than once: the task of a frame, its place in time, where its picture is. Where
-two of them contradict each other, one is wrong, and what would be trained on is not what was recorded. An error names
-both. What does no harm here, and what LeRobot reads as well, is a warning.
+LeRobot's format writes most facts more than once: the task of a frame, its place in time, where its
+picture is. Where two of them contradict each other, one is wrong, and what would be trained on is
+not what was recorded. An error names both. What does no harm here, and what LeRobot reads as well,
+is a warning.
 """
 
 import io
@@ -30,7 +32,8 @@ from mme_vla.utils import decoding, read_json
 log = logging.getLogger(__name__)
 
 HALF = 0.5  # frames: what is nearer to another frame than to its own is that other frame
-QUARTER = 0.25  # frames: up to here a video's header is believed; beyond, its pictures are looked at one by one
+# frames: up to here a video's header is believed; beyond, its pictures are looked at one by one
+QUARTER = 0.25
 _CORRECT = "Correct the one that is wrong, or record or convert the dataset again."
 _AT_ONCE = 4  # video files
 _DEEP_MODES = ("I", "F")  # of Pillow: more than 8 bits a pixel
@@ -61,8 +64,9 @@ class FrameTasks:
 class Description:
     """What is compared: the parts of a dataset that were read already.
 
-    root: its folder. info: meta/info.json. episodes: of `read_episode_table`. fps: frames per second.
-    videos, pictures: columns of the cameras that are videos, and of those stored in the tables.
+    root: its folder. info: meta/info.json. episodes: of `read_episode_table`. fps: frames per
+    second. videos, pictures: columns of the cameras that are videos, and of those stored in the
+    tables.
     """
 
     root: Path
@@ -118,37 +122,44 @@ def check_consistency(dataset: Description, table: Any) -> FrameTasks:
 def _check_totals(dataset: Description) -> None:
     """Compare meta/info.json and the column `length` with the places of episodes."""
     lengths, info = dataset.lengths, dataset.root / "meta" / "info.json"
-    for key, count, what in (("total_episodes", len(lengths), "episodes"), ("total_frames", lengths.sum(), "frames")):
+    for key, count, what in (
+        ("total_episodes", len(lengths), "episodes"),
+        ("total_frames", lengths.sum(), "frames"),
+    ):
         declared = dataset.info.get(key)
         if declared is not None and declared != count:
             raise UserError(
-                f"{info}: {key} is {brief(declared)}, but meta/episodes describes {count} {what}. {_CORRECT}"
+                f"{info}: {key} is {brief(declared)}, but meta/episodes describes {count} {what}."
+                f" {_CORRECT}"
             )
     declared = np.asarray(dataset.episodes.get("length", lengths))
     if not np.array_equal(declared, lengths):
         episode = int(np.flatnonzero(declared != lengths)[0])
         raise UserError(
-            f"{dataset.root}/meta/episodes: episode {episode} has length {declared[episode]}, but dataset_from_index "
-            f"and dataset_to_index give it {lengths[episode]} rows. {_CORRECT}"
+            f"{dataset.root}/meta/episodes: episode {episode} has length {declared[episode]}, but"
+            f" dataset_from_index and dataset_to_index give it {lengths[episode]} rows. {_CORRECT}"
         )
 
 
 def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
-    """Make sure that rows lie in the order of time, none missing and none twice, and that time is frame / fps."""
+    """Make sure that rows lie in the order of time, none missing and none twice, and that time is
+    frame / fps.
+    """
     frames = np.arange(dataset.lengths.sum()) - np.repeat(dataset.starts, dataset.lengths)
     root, fps = dataset.root, dataset.fps
     if "frame_index" in rows and not np.array_equal(rows["frame_index"], frames):
         row = int(np.flatnonzero(rows["frame_index"] != frames)[0])
         raise UserError(
-            f"{root}: {dataset.place(row)}, has frame_index {rows['frame_index'][row]}; by its place it is "
-            f"{frames[row]}. Frames are missing, twice there or out of order, so that actions would not follow each "
-            f"other. Expected 0, 1, 2, … in every episode. {_CORRECT}"
+            f"{root}: {dataset.place(row)}, has frame_index {rows['frame_index'][row]}; by its"
+            f" place it is {frames[row]}. Frames are missing, twice there or out of order, so that"
+            " actions would not follow each other. Expected 0, 1, 2, … in every episode."
+            f" {_CORRECT}"
         )
     if "index" in rows and not np.array_equal(rows["index"], np.arange(len(frames))):
         row = int(np.flatnonzero(rows["index"] != np.arange(len(frames)))[0])
         raise UserError(
-            f"{root}: {dataset.place(row)}, has index {rows['index'][row]}; expected {row}, its place in the tables. "
-            f"{_CORRECT}"
+            f"{root}: {dataset.place(row)}, has index {rows['index'][row]}; expected {row}, its"
+            f" place in the tables. {_CORRECT}"
         )
     if "timestamp" not in rows:
         return
@@ -156,9 +167,10 @@ def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
     if off.any():
         row = int(np.flatnonzero(off)[0])
         raise UserError(
-            f"{root}: {dataset.place(row)}, has timestamp {rows['timestamp'][row]:.4f} s; at fps={fps:g} of "
-            f"meta/info.json it is {frames[row] / fps:.4f} s, more than half a frame away ({off.sum()} such rows). "
-            "Frames are taken as evenly spaced: correct fps, or resample the recording to one rate."
+            f"{root}: {dataset.place(row)}, has timestamp {rows['timestamp'][row]:.4f} s; at"
+            f" fps={fps:g} of meta/info.json it is {frames[row] / fps:.4f} s, more than half a"
+            f" frame away ({off.sum()} such rows). Frames are taken as evenly spaced: correct fps,"
+            " or resample the recording to one rate."
         )
 
 
@@ -173,13 +185,16 @@ def _check_phases(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
         row = int(np.flatnonzero(wrong)[0])
         episode = int(np.searchsorted(dataset.starts, row, side="right")) - 1
         raise UserError(
-            f"{dataset.root}: {dataset.place(row)}, has exec_start_idx {declared[row]}, but is_demo marks the first "
-            f"{counted[episode]} frames of the episode as its conditioning video. {_CORRECT}"
+            f"{dataset.root}: {dataset.place(row)}, has exec_start_idx {declared[row]}, but is_demo"
+            f" marks the first {counted[episode]} frames of the episode as its conditioning video."
+            f" {_CORRECT}"
         )
 
 
 def _check_side_file(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
-    """Compare what lies beside the tables of a converted dataset with them: others may edit the tables alone."""
+    """Compare what lies beside the tables of a converted dataset with them: others may edit the
+    tables alone.
+    """
     path = dataset.root / SIDE_FILE
     if not path.is_file():
         return
@@ -189,8 +204,8 @@ def _check_side_file(dataset: Description, rows: Mapping[str, np.ndarray]) -> No
     lengths, starts = dataset.lengths, dataset.starts
     require(
         len(records) <= len(lengths),
-        f"{path} tells of {len(records)} episodes, meta/episodes of {len(lengths)}. {_CORRECT} Without the file, "
-        "episodes have no names of tasks.",
+        f"{path} tells of {len(records)} episodes, meta/episodes of {len(lengths)}. {_CORRECT}"
+        " Without the file, episodes have no names of tasks.",
     )
     for episode, record in enumerate(records):
         if not isinstance(record, Mapping):
@@ -202,8 +217,9 @@ def _check_side_file(dataset: Description, rows: Mapping[str, np.ndarray]) -> No
             declared = record.get(key, value)
             if declared != value:
                 raise UserError(
-                    f"{path}: {key} of episode {episode} is {brief(declared)}; the tables say {value}. {_CORRECT} "
-                    "(LeRobot's tools for editing datasets do not edit this file.)"
+                    f"{path}: {key} of episode {episode} is {brief(declared)}; the tables say"
+                    f" {value}. {_CORRECT} (LeRobot's tools for editing datasets do not edit this"
+                    " file.)"
                 )
 
 
@@ -215,8 +231,9 @@ def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTa
         for episode, texts in enumerate(listed_tasks):
             require(
                 len(set(texts)) == 1,
-                f"{meta}: tasks of episode {episode} is {brief(list(texts))}, and the rows have no task_index that "
-                "says which one each frame has. Expected one text there, or a column task_index in the tables.",
+                f"{meta}: tasks of episode {episode} is {brief(list(texts))}, and the rows have no"
+                " task_index that says which one each frame has. Expected one text there, or a"
+                " column task_index in the tables.",
             )
         return FrameTasks(starts, _goals(root, [texts[0] for texts in listed_tasks]))
     numbers, texts = rows["task_index"], read_tasks(root)
@@ -224,8 +241,8 @@ def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTa
     if outside.any():
         row = int(np.flatnonzero(outside)[0])
         raise UserError(
-            f"{root}: {dataset.place(row)}, has task_index {numbers[row]}, but {TASKS} holds {len(texts)} tasks. "
-            f"{_CORRECT}"
+            f"{root}: {dataset.place(row)}, has task_index {numbers[row]}, but {TASKS} holds"
+            f" {len(texts)} tasks. {_CORRECT}"
         )
     begins = np.concatenate([[True], numbers[1:] != numbers[:-1]])
     begins[starts] = True
@@ -236,8 +253,9 @@ def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTa
         text = texts[numbers[row]]
         if known[episode] and _plain(text) not in known[episode]:
             raise UserError(
-                f"{root}: {dataset.place(row)}, has task_index {numbers[row]}, {brief(text)} in {TASKS}; meta/episodes "
-                f"lists for this episode {brief(list(listed_tasks[episode]), 200)}. {_CORRECT}"
+                f"{root}: {dataset.place(row)}, has task_index {numbers[row]}, {brief(text)} in"
+                f" {TASKS}; meta/episodes lists for this episode"
+                f" {brief(list(listed_tasks[episode]), 200)}. {_CORRECT}"
             )
     return FrameTasks(first, _goals(root, [texts[number] for number in numbers[first]]))
 
@@ -251,8 +269,9 @@ def _goals(root: Path, texts: Sequence[str]) -> tuple[str, ...]:
     """Goals as they are trained on, lower-case; an empty one tells a policy nothing."""
     if not all(map(str.strip, texts)):
         raise UserError(
-            f"{root}: the task {brief(next(text for text in texts if not text.strip()))} is empty (in {TASKS} or "
-            "meta/episodes), and a policy is told what to do in words. Write the task there."
+            f"{root}: the task {brief(next(text for text in texts if not text.strip()))} is empty"
+            f" (in {TASKS} or meta/episodes), and a policy is told what to do in words. Write the"
+            " task there."
         )
     spelled = {text: text.lower() for text in set(texts)}  # one text in memory for all its runs
     return tuple(spelled[text] for text in texts)
@@ -270,14 +289,17 @@ def _check_colour(dataset: Description, column: str) -> None:
 
 
 def _is_deep_grey(pixel_format: str) -> bool:
-    """Whether pixels are one number of more than 8 bits: gray10le, gray12le, gray16be, grayf32le, y210 is colour."""
+    """Whether pixels are one number of more than 8 bits: gray10le, gray12le, gray16be, grayf32le,
+    y210 is colour.
+    """
     return pixel_format.startswith("gray") and pixel_format not in ("gray", "gray8", "gray8a")
 
 
 def _depth(root: Path, column: str, reason: str) -> UserError:
     return UserError(
-        f"{root}: {column} holds depth, or numbers of more than 8 bits ({reason}). As a colour image it would be cut "
-        "off to 8 bits. Name a colour camera in its place (embodiment.cameras.<name>.key), or leave the camera out."
+        f"{root}: {column} holds depth, or numbers of more than 8 bits ({reason}). As a colour"
+        " image it would be cut off to 8 bits. Name a colour camera in its place"
+        " (embodiment.cameras.<name>.key), or leave the camera out."
     )
 
 
@@ -293,7 +315,9 @@ def check_mode(root: Path, column: str, image: Any) -> None:
 
 
 def _check_images(dataset: Description, column: str, table: Any) -> None:
-    """Look at the header of every episode's first picture; the others are looked at when they are read."""
+    """Look at the header of every episode's first picture; the others are looked at when they are
+    read.
+    """
     from PIL import Image
 
     sizes = set()
@@ -302,8 +326,8 @@ def _check_images(dataset: Description, column: str, table: Any) -> None:
         content = cell["bytes"] if isinstance(cell, Mapping) else None
         if content is None:
             raise UserError(
-                f"{dataset.root}: {dataset.place(start)}, holds no picture in {column} (only a path). Pictures lie in "
-                "the tables; LeRobot embeds them when an episode is saved."
+                f"{dataset.root}: {dataset.place(start)}, holds no picture in {column} (only a"
+                " path). Pictures lie in the tables; LeRobot embeds them when an episode is saved."
             )
         place = f"{dataset.root}, {dataset.place(start)}, {column}"
         with decoding(place, "a picture", REMEDY), Image.open(io.BytesIO(content)) as image:
@@ -316,17 +340,25 @@ def _check_images(dataset: Description, column: str, table: Any) -> None:
 def _compare_size(dataset: Description, column: str, width: int, height: int) -> None:
     """Warn of pictures of another size than described: all are scaled for the network anyway."""
     shape = dataset.info["features"][column]["shape"]
-    sides = [[shape[0], shape[1]], [shape[-2], shape[-1]]] if len(shape) == 3 else []  # colours last, or first
+    sides = (
+        [[shape[0], shape[1]], [shape[-2], shape[-1]]] if len(shape) == 3 else []
+    )  # colours last, or first
     if [height, width] not in sides:
         log.warning(
-            "%s: meta/info.json gives %s the shape %s, but its pictures have %d rows and %d columns.",
-            dataset.root, column, list(shape), height, width,
-        )  # fmt: skip
+            "%s: meta/info.json gives %s the shape %s, but its pictures have %d rows and %d"
+            " columns.",
+            dataset.root,
+            column,
+            list(shape),
+            height,
+            width,
+        )
 
 
 @dataclass(frozen=True)
 class _Header:
-    """What a video file says of itself: pictures (0: unknown), seconds, pictures per second (0: they vary), format.
+    """What a video file says of itself: pictures (0: unknown), seconds, pictures per second (0:
+    they vary), format.
 
     begin: of the first picture, seconds.
     """
@@ -341,7 +373,9 @@ class _Header:
 
 
 def _check_videos(dataset: Description, column: str) -> None:
-    """Compare the spans of episodes in video files with each other, with their lengths, and with the files."""
+    """Compare the spans of episodes in video files with each other, with their lengths, and with
+    the files.
+    """
     episodes, fps = dataset.episodes, dataset.fps
     begins = np.asarray(episodes[f"{column}/from_timestamp"])
     _check_ends(dataset, column, begins)
@@ -379,29 +413,35 @@ def _check_ends(dataset: Description, column: str, begins: np.ndarray) -> None:
     if wrong.any():
         episode = int(np.flatnonzero(wrong)[0])
         raise UserError(
-            f"{dataset.root}/meta/episodes: the pictures of {column} of episode {episode} lie between "
-            f"{begins[episode]:.4f} s and {ends[episode]:.4f} s, {spans[episode]:.2f} frames at fps={dataset.fps:g}, "
-            f"but the episode has {dataset.lengths[episode]} frames. {_CORRECT}"
+            f"{dataset.root}/meta/episodes: the pictures of {column} of episode {episode} lie"
+            f" between {begins[episode]:.4f} s and {ends[episode]:.4f} s, {spans[episode]:.2f}"
+            f" frames at fps={dataset.fps:g}, but the episode has {dataset.lengths[episode]}"
+            f" frames. {_CORRECT}"
         )
 
 
-def _check_neighbours(dataset: Description, column: str, path: Path, inside: np.ndarray, begins: np.ndarray) -> None:
+def _check_neighbours(
+    dataset: Description, column: str, path: Path, inside: np.ndarray, begins: np.ndarray
+) -> None:
     """Make sure that no two episodes have the same pictures of a file."""
     ends = begins + dataset.lengths[inside] / dataset.fps
     overlaps = (ends[:-1] - begins[1:]) * dataset.fps > HALF
     if overlaps.any():
         k = int(np.flatnonzero(overlaps)[0])
         raise UserError(
-            f"{dataset.root}/meta/episodes: episodes {inside[k]} and {inside[k + 1]} overlap in the video {path.name} "
-            f"of {column}: one ends at {ends[k]:.4f} s, and the other begins at {begins[k + 1]:.4f} s "
-            f"(from_timestamp). One of them would show the other's pictures. {_CORRECT}"
+            f"{dataset.root}/meta/episodes: episodes {inside[k]} and {inside[k + 1]} overlap in the"
+            f" video {path.name} of {column}: one ends at {ends[k]:.4f} s, and the other begins at"
+            f" {begins[k + 1]:.4f} s (from_timestamp). One of them would show the other's pictures."
+            f" {_CORRECT}"
         )
 
 
 def _read_header(path: Path) -> _Header:
     import av
 
-    require(path.is_file(), f"{path} is missing: the dataset is incomplete. Copy or download it again.")
+    require(
+        path.is_file(), f"{path} is missing: the dataset is incomplete. Copy or download it again."
+    )
     with decoding(path, "a video", "Copy or convert it again."), av.open(str(path)) as container:
         stream = container.streams.video[0]
         tick = float(stream.time_base or 0)
@@ -420,7 +460,9 @@ def _read_header(path: Path) -> _Header:
 
 
 def _is_even(header: _Header, begins: np.ndarray, lengths: np.ndarray, fps: float) -> bool:
-    """Whether a file holds the pictures of its episodes back to back, by its header alone; else one has to look."""
+    """Whether a file holds the pictures of its episodes back to back, by its header alone; else one
+    has to look.
+    """
     before = np.cumsum(lengths) - lengths
     total = int(lengths.sum())
     return bool(
@@ -436,33 +478,44 @@ def _is_even(header: _Header, begins: np.ndarray, lengths: np.ndarray, fps: floa
 def _check_frames_of_video(
     dataset: Description, column: str, path: Path, inside: np.ndarray, begins: np.ndarray
 ) -> None:
-    """Compare the time of every picture in a file with the times at which rows look for theirs. Decodes nothing."""
+    """Compare the time of every picture in a file with the times at which rows look for theirs.
+    Decodes nothing.
+    """
     times = _frame_times(path)
     lengths, fps = dataset.lengths[inside], dataset.fps
     exact = len(times) == lengths.sum()
     before = 0
-    for episode, begin, length in zip(inside.tolist(), begins.tolist(), lengths.tolist(), strict=True):
+    for episode, begin, length in zip(
+        inside.tolist(), begins.tolist(), lengths.tolist(), strict=True
+    ):
         targets = begin + np.arange(length) / fps
         after = np.clip(np.searchsorted(times, targets), 1, max(len(times) - 1, 1))
-        nearest = np.where(targets - times[after - 1] <= times[np.minimum(after, len(times) - 1)] - targets,
-                           after - 1, np.minimum(after, len(times) - 1))  # fmt: skip
+        nearest = np.where(
+            targets - times[after - 1] <= times[np.minimum(after, len(times) - 1)] - targets,
+            after - 1,
+            np.minimum(after, len(times) - 1),
+        )
         away = np.abs(times[nearest] - targets) * fps
-        # With a picture for every row, the n-th row's is the n-th. Otherwise only the distance tells.
+        # With a picture for every row, the n-th row's is the n-th. Otherwise only the distance
+        # tells.
         wrong = (nearest != before + np.arange(length)) if exact else away > QUARTER
         wrong |= away > HALF + 1e-6
         before += length
         if wrong.any():
             frame = int(np.flatnonzero(wrong)[0])
             raise UserError(
-                f"{path}: frame {frame} of episode {episode} is looked for at {targets[frame]:.4f} s "
-                f"({column}/from_timestamp {begin:.4f} s, fps={fps:g}), but the video, with {len(times)} pictures to "
-                f"{times[-1]:.4f} s for {lengths.sum()} rows, has the nearest at {times[nearest[frame]]:.4f} s: it is "
-                f"shorter than the table beside it, shifted, or of another rate. {_CORRECT}"
+                f"{path}: frame {frame} of episode {episode} is looked for at {targets[frame]:.4f}"
+                f" s ({column}/from_timestamp {begin:.4f} s, fps={fps:g}), but the video, with"
+                f" {len(times)} pictures to {times[-1]:.4f} s for {lengths.sum()} rows, has the"
+                f" nearest at {times[nearest[frame]]:.4f} s: it is shorter than the table beside"
+                f" it, shifted, or of another rate. {_CORRECT}"
             )
 
 
 def _frame_times(path: Path) -> np.ndarray:
-    """When each picture of a file is displayed, seconds, ascending [n]; reads the file without decoding it."""
+    """When each picture of a file is displayed, seconds, ascending [n]; reads the file without
+    decoding it.
+    """
     import av
 
     with decoding(path, "a video", "Copy or convert it again."), av.open(str(path)) as container:
@@ -499,30 +552,48 @@ def compare_stats(root: Path, name: str, least: np.ndarray, greatest: np.ndarray
     if len(wrong):
         d = int(wrong[0])
         log.warning(
-            "%s: by meta/stats.json number %d of %s lies within %.4g and %.4g, in the rows within %.4g and %.4g. "
-            "Statistics are computed anew here; LeRobot's own policies read these.",
-            root, d + 1, name, low[d], high[d], least[d], greatest[d],
-        )  # fmt: skip
+            "%s: by meta/stats.json number %d of %s lies within %.4g and %.4g, in the rows within"
+            " %.4g and %.4g. Statistics are computed anew here; LeRobot's own policies read these.",
+            root,
+            d + 1,
+            name,
+            low[d],
+            high[d],
+            least[d],
+            greatest[d],
+        )
 
 
 LARGEST_IN = {"rad": 20.0, "m": 20.0}
-"""What no robot reaches in a unit: three turns of a joint, twenty metres. Degrees and millimetres go beyond."""
+"""What no robot reaches in a unit: three turns of a joint, twenty metres. Degrees and millimetres
+go beyond.
+"""
 
 
-def compare_units(root: Path, names: Sequence[str], units: Sequence[str], scales: np.ndarray) -> None:
+def compare_units(
+    root: Path, names: Sequence[str], units: Sequence[str], scales: np.ndarray
+) -> None:
     """Warn of numbers far too large for the unit that the robot's description gives them.
 
     Args:
         names, units: of each number. scales: the greatest size of each, [w].
     """
-    beyond = [d for d, unit in enumerate(units) if scales[d] > LARGEST_IN.get(unit.strip().casefold(), np.inf)]
+    beyond = [
+        d
+        for d, unit in enumerate(units)
+        if scales[d] > LARGEST_IN.get(unit.strip().casefold(), np.inf)
+    ]
     if beyond:
         d = beyond[0]
         log.warning(
-            "%s: the action's %s reaches %.4g, which is hardly in %s, as embodiment.action.units says (%d such). "
-            "Correct the units, or convert the data.",
-            root, names[d], scales[d], units[d], len(beyond),
-        )  # fmt: skip
+            "%s: the action's %s reaches %.4g, which is hardly in %s, as embodiment.action.units"
+            " says (%d such). Correct the units, or convert the data.",
+            root,
+            names[d],
+            scales[d],
+            units[d],
+            len(beyond),
+        )
 
 
 def named_alike(name: str) -> str:
@@ -531,7 +602,12 @@ def named_alike(name: str) -> str:
 
 
 def compare_names(
-    first: Sequence[str], second: Sequence[str], what: str, of_first: str, of_second: str, same_place: str
+    first: Sequence[str],
+    second: Sequence[str],
+    what: str,
+    of_first: str,
+    of_second: str,
+    same_place: str,
 ) -> None:
     """Compare the names of the same numbers in two places; empty where one has none.
 
@@ -545,5 +621,7 @@ def compare_names(
         return
     both = f"{of_first}: {listed(first, 24)}; {of_second}: {listed(second, 24)}"
     if sorted(ours) == sorted(theirs):
-        raise UserError(f"The numbers of the {what} have the same names in another order. {both}. {same_place}")
+        raise UserError(
+            f"The numbers of the {what} have the same names in another order. {both}. {same_place}"
+        )
     log.warning("The numbers of the %s have different names. %s.", what, both)

@@ -1,4 +1,6 @@
-"""The progress of the long commands of this package: a bar on a terminal, a line now and then anywhere else."""
+"""The progress of the long commands of this package: a bar on a terminal, a line now and then
+anywhere else.
+"""
 
 import logging
 import time
@@ -11,7 +13,8 @@ from functools import partialmethod
 def quiet_libraries() -> Iterator[None]:
     """Surround work whose progress this library shows itself.
 
-    Notes go that are no warnings; bars of tqdm appear on terminals alone, those of `datasets` not at all.
+    Notes go that are no warnings; bars of tqdm appear on terminals alone, those of `datasets` not
+    at all.
     """
     import av.logging
     import tqdm
@@ -37,19 +40,33 @@ LINE_SECONDS = 20.0
 
 
 @contextmanager
-def progress(description: str, total: int, done: int = 0, unit: str = "") -> Iterator[Callable[[int], None]]:
-    """Show a bar of `total` steps, `done` of them finished before; the yielded function advances it.
+def progress(
+    description: str, total: int, done: int = 0, unit: str = ""
+) -> Iterator[Callable[[int], None]]:
+    """Show a bar of `total` steps, `done` of them finished before; the yielded function advances
+    it.
 
-    Where no terminal is, a line says what is finished: at most one every `LINE_SECONDS`, and one after the last step.
+    Where no terminal is, a line says what is finished: at most one every `LINE_SECONDS`, and one
+    after the last step.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     console = Console(stderr=True, highlight=False, soft_wrap=True)
-    if not (console.is_terminal and console.file.isatty()):  # FORCE_COLOR makes the first true, in notebooks too
+    if not (
+        console.is_terminal and console.file.isatty()
+    ):  # FORCE_COLOR makes the first true, in notebooks too
         begun = reported = time.monotonic()
         count = done
-        first: tuple[float, int] | None = None  # time and count after start-up, with what was there before
+        first: tuple[float, int] | None = (
+            None  # time and count after start-up, with what was there before
+        )
 
         def count_up(steps: int) -> None:
             nonlocal reported, count, first
@@ -61,13 +78,20 @@ def progress(description: str, total: int, done: int = 0, unit: str = "") -> Ite
             reported = now
             remaining, n_new = "", count - first[1]
             if n_new and count < total:
-                remaining = f", about {_duration_text((now - first[0]) / n_new * (total - count))} left"
+                remaining = (
+                    f", about {_duration_text((now - first[0]) / n_new * (total - count))} left"
+                )
             so_far = f"{count:,} of {total:,} {unit}".rstrip()
             console.print(f"{description}: {so_far} in {_duration_text(now - begun)}{remaining}")
 
         yield count_up
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(unit),
+    )
     with Progress(*columns, TimeRemainingColumn(), console=console) as bar:
         task = bar.add_task(description, total=total, completed=done)
 

@@ -1,9 +1,10 @@
 """From official HDF5 demonstrations to one LeRobot v3.0 dataset.
 
-Every episode first becomes a complete small dataset of its own in `<output>.partial`, which is renamed when it is
-whole; at the end all of them are merged and the result is moved to `<output>` in one step. LeRobot's own writer keeps
-files open across episodes, so a killed run would leave files that cannot be read: here it leaves finished episodes,
-and the next run continues with the missing ones.
+Every episode first becomes a complete small dataset of its own in `<output>.partial`, which is
+renamed when it is whole; at the end all of them are merged and the result is moved to `<output>` in
+one step. LeRobot's own writer keeps files open across episodes, so a killed run would leave files
+that cannot be read: here it leaves finished episodes, and the next run continues with the missing
+ones.
 """
 
 import json
@@ -17,7 +18,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.console import progress, quiet_libraries
-from mme_vla.data.hdf5 import POSE_STATE, SUBGOALS, EpisodeRef, RawEpisode, RawFrame, open_episode, recorded_options
+from mme_vla.data.hdf5 import (
+    POSE_STATE,
+    SUBGOALS,
+    EpisodeRef,
+    RawEpisode,
+    RawFrame,
+    open_episode,
+    recorded_options,
+)
 from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX, SIDE_FILE, parquet_files
 from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS
@@ -32,10 +41,12 @@ if TYPE_CHECKING:
 
 @contextmanager
 def episodes_without_statistics() -> Iterator[None]:
-    """While this lasts, LeRobot reads a dataset's list of episodes at once, and without their statistics.
+    """While this lasts, LeRobot reads a dataset's list of episodes at once, and without their
+    statistics.
 
-    It asks the `datasets` library, whose time grows with the square of the number of columns: of a dozen features that
-    are two hundred, nearly all of them statistics, and a fifth of a second for every episode that is merged.
+    It asks the `datasets` library, whose time grows with the square of the number of columns: of a
+    dozen features that are two hundred, nearly all of them statistics, and a fifth of a second for
+    every episode that is merged.
     """
     from lerobot.datasets import dataset_metadata
 
@@ -66,7 +77,11 @@ def episode_sheet(frames: Sequence[RawFrame], title: str) -> "Image":
     """Front views spread evenly over an episode, each with its step and sub-task."""
     displayed = [(step, frames[step]) for step in evenly_spaced(len(frames), TILES)]
     tiles = [
-        Tile(frame.front, f"{step} {frame.subgoals['simple_subgoal_online']}", RED if frame.is_demo else None)
+        Tile(
+            frame.front,
+            f"{step} {frame.subgoals['simple_subgoal_online']}",
+            RED if frame.is_demo else None,
+        )
         for step, frame in displayed
     ]
     return contact_sheet(tiles, COLUMNS, title, side=SIDE)
@@ -79,7 +94,10 @@ def write_previews(file: Path, index: int, task: str, folder: Path) -> tuple[Pat
     with open_episode(EpisodeRef(file, index, task)) as episode:
         frames, goal = list(episode), episode.goals[0]
     episode_sheet(frames, f"{task} {index}: {goal}").save(sheet)
-    images = (video_frame((f.front, f.wrist), f.subgoals["simple_subgoal_online"], f.is_demo) for f in frames)
+    images = (
+        video_frame((f.front, f.wrist), f.subgoals["simple_subgoal_online"], f.is_demo)
+        for f in frames
+    )
     write_video(images, video)
     return sheet, video
 
@@ -92,17 +110,22 @@ class ConvertOptions:
     """How images are stored.
 
     images: `video`, or `png` for lossless images inside the tables (about ten times larger).
-    names: of the columns: `robomme`, as in the released datasets, or `lerobot`, as LeRobot's own policies ask for
+    names: of the columns: `robomme`, as in the released datasets, or `lerobot`, as LeRobot's own
+    policies ask for
         (`lerobot_files.NAMES`). Readers here take either.
     fps: frames per second; 20 is the simulator's control rate.
-    codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
-        between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
-    poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all episodes have.
-    tool_pose: a column of where the tool was; `convert` keeps it where all episodes have it.
-    choices: a column of what was chosen among a task's options, and these options beside the tables; `convert` keeps
+    codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless
+    but for the rounding
+        between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop
+        relies on that.
+    poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all
+    episodes have. tool_pose: a column of where the tool was; `convert` keeps it where all episodes
+    have it. choices: a column of what was chosen among a task's options, and these options beside
+    the tables; `convert` keeps
         them where all episodes have them.
-    keyframes: keep the keyframes' depth and camera poses beside the tables too (`mme_vla.data.keyframes`).
-    partly: say in two more columns which frames were drawn; `convert` does where an episode was recorded at a choice of
+    keyframes: keep the keyframes' depth and camera poses beside the tables too
+    (`mme_vla.data.keyframes`). partly: say in two more columns which frames were drawn; `convert`
+    does where an episode was recorded at a choice of
         frames. The images of the others repeat an earlier one, and readers refuse them.
     """
 
@@ -120,10 +143,18 @@ class ConvertOptions:
     names: str = "robomme"
 
     def __post_init__(self) -> None:
-        require(self.images in ("video", "png"), f"images={self.images!r}: expected 'video' or 'png'.")
+        require(
+            self.images in ("video", "png"), f"images={self.images!r}: expected 'video' or 'png'."
+        )
         if self.names not in NAMES:
-            raise UserError(f"names={self.names!r} is no spelling of columns. {did_you_mean(str(self.names), NAMES)}")
-        require(self.fps >= 1 and self.gop >= 1, f"fps={self.fps} and video.gop={self.gop} must be positive.")
+            raise UserError(
+                f"names={self.names!r} is no spelling of columns."
+                f" {did_you_mean(str(self.names), NAMES)}"
+            )
+        require(
+            self.fps >= 1 and self.gop >= 1,
+            f"fps={self.fps} and video.gop={self.gop} must be positive.",
+        )
 
 
 def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
@@ -138,14 +169,25 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         "wrist_image": dict(view),
         "state": {"dtype": "float32", "shape": (len(joints),), "names": joints},
         "actions": {"dtype": "float32", "shape": (len(joints),), "names": joints},
-        **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in options.poses},
-        **({POSE_STATE: {"dtype": "float32", "shape": (len(POSE),), "names": list(POSE)}} if options.tool_pose else {}),
+        **{
+            name: {"dtype": "float32", "shape": (len(tool),), "names": tool}
+            for name in options.poses
+        },
+        **(
+            {POSE_STATE: {"dtype": "float32", "shape": (len(POSE),), "names": list(POSE)}}
+            if options.tool_pose
+            else {}
+        ),
         **({CHOICE_ACTIONS: choice} if options.choices else {}),
         "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
         "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
         **{name: {"dtype": "string", "shape": (1,), "names": None} for name in SUBGOALS},
-        **{f"{c}{RENDERED_SUFFIX}": {"dtype": "bool", "shape": (1,), "names": None} for c in CAMERAS if options.partly},
+        **{
+            f"{c}{RENDERED_SUFFIX}": {"dtype": "bool", "shape": (1,), "names": None}
+            for c in CAMERAS
+            if options.partly
+        },
     }
     return _spelt(columns, options)
 
@@ -155,11 +197,14 @@ def _spelt(columns: dict[str, Any], options: ConvertOptions) -> dict[str, Any]:
     return {spelling.get(name, name): value for name, value in columns.items()}
 
 
-def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOptions | None = None) -> int:
-    """Convert these episodes, in this order, into a dataset at `output`; return how many were newly written.
+def convert(
+    episodes: Sequence[EpisodeRef], output: Path, options: ConvertOptions | None = None
+) -> int:
+    """Convert these episodes, in this order, into a dataset at `output`; return how many were newly
+    written.
 
-    A run that was interrupted is continued by calling again with the same arguments. The files are told by their
-    content, so one that has changed since is noticed.
+    A run that was interrupted is continued by calling again with the same arguments. The files are
+    told by their content, so one that has changed since is noticed.
     """
     require(episodes, "There is no episode to convert.")
     options = replace(options or ConvertOptions(), **recorded_options(episodes))
@@ -175,7 +220,9 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
 
 
 def drop_work(output: Path) -> None:
-    """Remove what a conversion left beside `output` that was killed after it had moved its result there."""
+    """Remove what a conversion left beside `output` that was killed after it had moved its result
+    there.
+    """
     partial = _work_folder(output)
     if partial.exists():
         with FolderLock(partial, "conversion"):
@@ -187,13 +234,19 @@ def _work_folder(output: Path) -> Path:
 
 
 def planned_options(options: ConvertOptions) -> dict[str, Any]:
-    """The options as a plan holds them; what plans from before had none of stands beside them, or where it is said."""
-    beside = ["poses", "tool_pose", "choices", "partly", "keyframes"] + ["names"] * (options.names == "robomme")
+    """The options as a plan holds them; what plans from before had none of stands beside them, or
+    where it is said.
+    """
+    beside = ["poses", "tool_pose", "choices", "partly", "keyframes"] + ["names"] * (
+        options.names == "robomme"
+    )
     return {key: value for key, value in asdict(options).items() if key not in beside}
 
 
 def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
-    """What decides the result. Reading whole files takes a small part of what converting them takes."""
+    """What decides the result. Reading whole files takes a small part of what converting them
+    takes.
+    """
     files = list(dict.fromkeys(ref.file for ref in episodes))
     with progress("read", sum(file.stat().st_size for file in files), unit="bytes") as advance:
         sums = {}
@@ -201,21 +254,38 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
             sums[file] = file_sum(file)
             advance(file.stat().st_size)
     origins = [
-        {"file": ref.file.name, "bytes": ref.file.stat().st_size, "sha256": sums[ref.file], "episode": ref.index}
+        {
+            "file": ref.file.name,
+            "bytes": ref.file.stat().st_size,
+            "sha256": sums[ref.file],
+            "episode": ref.index,
+        }
         for ref in episodes
     ]
-    content = {"poses": list(options.poses), **{key: getattr(options, key) for key in ("tool_pose", "choices")}}
+    content = {
+        "poses": list(options.poses),
+        **{key: getattr(options, key) for key in ("tool_pose", "choices")},
+    }
     content["keyframes"] = options.keyframes
-    return {"options": planned_options(options), "episodes": origins, **{k: v for k, v in content.items() if v}}
+    return {
+        "options": planned_options(options),
+        "episodes": origins,
+        **{k: v for k, v in content.items() if v},
+    }
 
 
 def _convert(
-    episodes: Sequence[EpisodeRef], output: Path, partial: Path, plan: dict[str, Any], options: ConvertOptions
+    episodes: Sequence[EpisodeRef],
+    output: Path,
+    partial: Path,
+    plan: dict[str, Any],
+    options: ConvertOptions,
 ) -> int:
     require(
         claim_plan(partial, plan),
-        f"{partial} belongs to another conversion (other inputs, other content of an input, or options). Repeat "
-        "that one to finish it, choose another output, or remove that folder yourself.",
+        f"{partial} belongs to another conversion (other inputs, other content of an input, or"
+        " options). Repeat that one to finish it, choose another output, or remove that folder"
+        " yourself.",
     )
     for leftover in (partial / "writing", partial / _MERGED):
         shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
@@ -241,14 +311,21 @@ def _finished(output: Path, plan: dict[str, Any]) -> bool:
     side = output / SIDE_FILE
     if side.is_file():
         stored = read_json(side, "the facts of a converted dataset").get("plan")
-        if isinstance(stored, dict) and not any("sha256" in origin for origin in stored.get("episodes", ())):
+        if isinstance(stored, dict) and not any(
+            "sha256" in origin for origin in stored.get("episodes", ())
+        ):
             # Plans from before contents were compared name files and sizes only.
-            plan = {**plan, "episodes": [{k: v for k, v in o.items() if k != "sha256"} for o in plan["episodes"]]}
+            plan = {
+                **plan,
+                "episodes": [
+                    {k: v for k, v in o.items() if k != "sha256"} for o in plan["episodes"]
+                ],
+            }
         if stored == plan:
             return True
     raise UserError(
-        f"{output} exists and is not the result of this conversion (other files, other content of a file, other "
-        "episodes or options). Choose another output, or remove that folder yourself."
+        f"{output} exists and is not the result of this conversion (other files, other content of a"
+        " file, other episodes or options). Choose another output, or remove that folder yourself."
     )
 
 
@@ -291,7 +368,9 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
     for step, frame in enumerate(episode):
         if dataset is None:
             video = options.images == "video"
-            encoder = RGBEncoderConfig(vcodec=options.codec, crf=options.crf, pix_fmt=options.pix_fmt, g=options.gop)
+            encoder = RGBEncoderConfig(
+                vcodec=options.codec, crf=options.crf, pix_fmt=options.pix_fmt, g=options.gop
+            )
             dataset = LeRobotDataset.create(
                 repo_id=f"local/{episode.ref.task}",
                 fps=options.fps,
@@ -302,7 +381,8 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
                 video_backend="pyav",
                 rgb_encoder=encoder if video else None,
                 streaming_encoding=video,
-                # LeRobot drops frames when this queue is full, as a live recorder must: never let it be.
+                # LeRobot drops frames when this queue is full, as a live recorder must: never let
+                # it be.
                 encoder_queue_maxsize=episode.length + 1,
             )
         row = {
@@ -315,7 +395,11 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
             "exec_start_idx": np.array([episode.exec_start], np.int32),
             "step_idx": np.array([step], np.int32),
             **frame.subgoals,
-            **{f"{c}{RENDERED_SUFFIX}": np.array([c in frame.rendered]) for c in CAMERAS if options.partly},
+            **{
+                f"{c}{RENDERED_SUFFIX}": np.array([c in frame.rendered])
+                for c in CAMERAS
+                if options.partly
+            },
             "task": goal,
         }
         dataset.add_frame(_spelt(row, options))
@@ -337,7 +421,9 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
         aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
     for video in merged.glob("videos/**/*.mp4"):
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
-    stats = merged / "meta" / "stats.json"  # LeRobot writes its keys in the order of a set, another in each process
+    stats = (
+        merged / "meta" / "stats.json"
+    )  # LeRobot writes its keys in the order of a set, another in each process
     stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
     for i, part in enumerate(parts):
         if (part / _KEYFRAMES).is_file():

@@ -31,9 +31,9 @@ class Step:
     """What is recorded of one step, before any processing.
 
     source, episode, index: where it lies; index counts the episode's frames, video included.
-    exec_start: the episode's first execution frame. goal: the task in words. subgoals: the texts of this step by name.
-    state: [s] float32. actions: [h, w] float32, the chunk, its last recorded action repeated past the end.
-    recorded: [h] bool, False on repeated actions.
+    exec_start: the episode's first execution frame. goal: the task in words. subgoals: the texts of
+    this step by name. state: [s] float32. actions: [h, w] float32, the chunk, its last recorded
+    action repeated past the end. recorded: [h] bool, False on repeated actions.
     """
 
     source: int
@@ -48,7 +48,9 @@ class Step:
 
 
 class FurtherColumns:
-    """Labels, sample weights and texts of one dataset, read and checked once; see `TrainingDataset`."""
+    """Labels, sample weights and texts of one dataset, read and checked once; see
+    `TrainingDataset`.
+    """
 
     def __init__(
         self,
@@ -60,7 +62,10 @@ class FurtherColumns:
     ) -> None:
         key = "The policy's labels"
         self._source, self._memory_labels = source, tuple(memory_labels)
-        self._labels = {name: label_column(source, name, key) for name in dict.fromkeys((*labels, *memory_labels))}
+        self._labels = {
+            name: label_column(source, name, key)
+            for name in dict.fromkeys((*labels, *memory_labels))
+        }
         self._current = tuple(labels)
         self._weights = None if weights is None else weight_column(source, weights)
         self._texts = {note: text_column(source, column) for note, column in texts.items()}
@@ -89,9 +94,10 @@ class FurtherColumns:
 class TrainingDataset(Dataset[dict[str, Any]]):
     """Execution steps of several datasets, source by source, episode by episode, step by step.
 
-    Items are dictionaries of tensors for the processor's `collate`, with the step's goal, subgoals and place beside
-    them. They depend on (seed, epoch, index) alone, whatever worker makes them. Tables and token caches are
-    memory-mapped, and an item decodes only the images of its window, most often the current ones.
+    Items are dictionaries of tensors for the processor's `collate`, with the step's goal, subgoals
+    and place beside them. They depend on (seed, epoch, index) alone, whatever worker makes them.
+    Tables and token caches are memory-mapped, and an item decodes only the images of its window,
+    most often the current ones.
     """
 
     def __init__(
@@ -116,31 +122,39 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 
         Args:
             sources: the datasets.
-            processor: turns what is recorded into what the network reads; needs normalisation statistics.
+            processor: turns what is recorded into what the network reads; needs normalisation
+                statistics.
             memory: chooses the history of a step; None for policies without memory.
             caches: the vision tokens of each source, needed with a memory.
             episodes: which of each source's episodes to use (one side of a `Split`); None uses all.
-            action_offset: observation k is paired with actions k + offset, … 0 as released; 1 leaves out action k,
-                which the recorder had already executed when it took the observation.
-            mask_padding: leave repeated actions past the end of an episode out of the loss (released: they count).
-            jitter: hand the memory a random generator, for memories that vary their selection in training.
+            action_offset: observation k is paired with actions k + offset, … 0 as released; 1
+                leaves out action k, which the recorder had already executed when it took the
+                observation.
+            mask_padding: leave repeated actions past the end of an episode out of the loss
+                (released: they count).
+            jitter: hand the memory a random generator, for memories that vary their selection in
+                training.
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
-            labels: of the current frame, that integration and backbone read; those of the memory follow from it.
+            labels: of the current frame, that integration and backbone read; those of the memory
+                follow from it.
             weights: the column of sample weights. texts: note of the prompt → its column of texts.
             seed: of all randomness.
             transforms: of the frames of an episode, before anything reads its past.
         """
         require(
             memory is None or (caches is not None and len(caches) == len(sources)),
-            "A policy with memory trains on cached vision tokens, one cache a source: build them with "
-            "`mme-vla cache model=<model> data=<data>` and pass `caches`.",
+            "A policy with memory trains on cached vision tokens, one cache a source: build them"
+            " with `mme-vla cache model=<model> data=<data>` and pass `caches`.",
         )
         if not 0 <= action_offset <= 1:
-            raise UserError(f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean).")
+            raise UserError(
+                f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean)."
+            )
         require(
             not processor.prompt_spec.reads_subgoal or subgoal is not None,
-            f"The prompt format {processor.prompt_spec.name!r} reads a subgoal: set subgoal_text.kind to "
-            "simple_subgoal or grounded_subgoal, or choose processor.prompt=plain.",
+            f"The prompt format {processor.prompt_spec.name!r} reads a subgoal: set"
+            " subgoal_text.kind to simple_subgoal or grounded_subgoal, or choose"
+            " processor.prompt=plain.",
         )
         if subgoal is not None:
             _check_subgoals(sources, subgoal)
@@ -148,26 +162,36 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         lacking = sorted(set(spec.notes) - set(texts or {}))
         require(
             not lacking,
-            f"The prompt format {spec.name!r} reads the notes {listed(lacking)}: name their columns, such as "
-            f"data.texts={{{lacking[0] if lacking else ''}: simple_subgoal}}.",
+            f"The prompt format {spec.name!r} reads the notes {listed(lacking)}: name their"
+            f" columns, such as data.texts={{{lacking[0] if lacking else ''}: simple_subgoal}}.",
         )
         rate = processor.embodiment.fps
-        if processor.samples.history is not None and (other := [s for s in sources if rate not in (None, s.fps)]):
+        if processor.samples.history is not None and (
+            other := [s for s in sources if rate not in (None, s.fps)]
+        ):
             raise UserError(
-                f"{other[0].name} has {other[0].fps:g} frames per second and embodiment.fps={rate:g}: the video would "
-                "be shown at another speed than it is read at. Convert the data to that rate, or set embodiment.fps."
+                f"{other[0].name} has {other[0].fps:g} frames per second and"
+                f" embodiment.fps={rate:g}: the video would be shown at another speed than it is"
+                " read at. Convert the data to that rate, or set embodiment.fps."
             )
         self.sources, self.processor, self.memory = list(sources), processor, memory
         self.caches = list(caches) if memory is not None and caches is not None else []
         self.action_offset, self.mask_padding = action_offset, mask_padding
         self.jitter, self.subgoal, self.seed, self.epoch = jitter, subgoal, seed, 0
         self.transforms = tuple(transforms)
-        self.columns = [FurtherColumns(source, labels, labels_read(memory), weights, texts or {}) for source in sources]
+        self.columns = [
+            FurtherColumns(source, labels, labels_read(memory), weights, texts or {})
+            for source in sources
+        ]
         selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
-        self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(selected)]).astype(np.int64)
+        self._source = np.concatenate(
+            [np.full(len(part), i) for i, part in enumerate(selected)]
+        ).astype(np.int64)
         self._episode = np.concatenate([np.asarray(part, np.int64) for part in selected])
         pairs = zip(self._source, self._episode, strict=True)
-        self._ends = np.cumsum([len(self.decisions(int(s), int(e))) for s, e in pairs], dtype=np.int64)
+        self._ends = np.cumsum(
+            [len(self.decisions(int(s), int(e))) for s, e in pairs], dtype=np.int64
+        )
         require(self.steps, "The data hold no execution step of this robot.")
 
     def __len__(self) -> int:
@@ -175,13 +199,21 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 
     @property
     def steps(self) -> int:
-        """Number of steps at which the robot decides: all of the execution, or those before a planned motion."""
+        """Number of steps at which the robot decides: all of the execution, or those before a
+        planned motion.
+        """
         return int(self._ends[-1]) if len(self._ends) else 0
 
     def decisions(self, source: int, episode: int) -> Any:
-        """Frames of an episode at which the robot decides, without those that lack a full chunk where that counts."""
+        """Frames of an episode at which the robot decides, without those that lack a full chunk
+        where that counts.
+        """
         decisions = self.sources[source].decisions(episode)
-        short = self.processor.embodiment.action.horizon - 1 if self.processor.samples.full_chunks_only else 0
+        short = (
+            self.processor.embodiment.action.horizon - 1
+            if self.processor.samples.full_chunks_only
+            else 0
+        )
         return decisions[: max(len(decisions) - short, 0)]
 
     def set_epoch(self, epoch: int) -> None:
@@ -197,14 +229,18 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         return source, episode, int(decisions[len(decisions) - (int(self._ends[at]) - index)])
 
     def item_at(self, source: int, episode: int, frame: int) -> int:
-        """The item of a frame; frames at which the robot does not decide share their episode's items evenly.
+        """The item of a frame; frames at which the robot does not decide share their episode's
+        items evenly.
 
         Such are those of the conditioning video, for a sampler that draws from all frames alike.
         """
         at = np.flatnonzero((self._source == source) & (self._episode == episode))
         decisions = np.asarray(self.decisions(source, episode))
         if not len(at) or not len(decisions):
-            raise UserError(f"{self.sources[source].name}: no step of episode {episode} is among the chosen ones.")
+            raise UserError(
+                f"{self.sources[source].name}: no step of episode {episode} is among the chosen"
+                " ones."
+            )
         place = int(np.searchsorted(decisions, frame))
         if place == len(decisions) or decisions[place] != frame:
             place = frame * len(decisions) // int(self.sources[source].lengths[episode])
@@ -233,7 +269,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         )
 
     def past_actions(self, step: Step, frames: FrameMap | None = None) -> np.ndarray:
-        """The robot's own actions right before the chunk, [n, w], as many as the prompt reads and there are."""
+        """The robot's own actions right before the chunk, [n, w], as many as the prompt reads and
+        there are.
+        """
         source, most = self.sources[step.source], self.processor.prompt_spec.past_actions
         if frames is None or source.robot.action.frames is None:
             return source.past_actions(step.episode, step.index, most, self.action_offset)
@@ -244,7 +282,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         return source.actions(step.episode, int(rows[0]), int(rows[-1]) + 1)[rows - rows[0]]
 
     def observation(self, index: int) -> dict[str, Any]:
-        """Return the item whose last step is `index`, as it would be met when acting: without transforms."""
+        """Return the item whose last step is `index`, as it would be met when acting: without
+        transforms.
+        """
         return self._item(index, ())
 
     def __getitem__(self, index: int) -> dict[str, Any]:
@@ -253,7 +293,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     def _item(self, index: int, transforms: Sequence[HistoryTransform]) -> dict[str, Any]:
         step = self.step(index)
         rng = np.random.default_rng([self.seed, self.epoch, index])
-        frames = self._frame_map(step.source, step.episode, np.array([step.index]), index, transforms)
+        frames = self._frame_map(
+            step.source, step.episode, np.array([step.index]), index, transforms
+        )
         return self.inputs_at(step, rng, frames) | {
             "goal": step.goal,
             "subgoals": step.subgoals,
@@ -261,17 +303,27 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         }
 
     def _frame_map(
-        self, source: int, episode: int, frames: np.ndarray, index: int, transforms: Sequence[HistoryTransform]
+        self,
+        source: int,
+        episode: int,
+        frames: np.ndarray,
+        index: int,
+        transforms: Sequence[HistoryTransform],
     ) -> FrameMap | None:
-        """How transforms show an item's episode up to the last of its `frames`; None without transforms."""
+        """How transforms show an item's episode up to the last of its `frames`; None without
+        transforms.
+        """
         if not transforms:
             return None
         rng = np.random.default_rng([self.seed, self.epoch, index, TRANSFORMS])
         exec_start = int(self.sources[source].exec_starts[episode])
         return map_frames(transforms, int(frames[-1]) + 1, exec_start, rng, keep=frames)
 
-    def inputs_at(self, step: Step, rng: np.random.Generator, frames: FrameMap | None = None) -> dict[str, Any]:
-        """What the network reads and learns of a step, with what its memory selects: its `history` and `past`.
+    def inputs_at(
+        self, step: Step, rng: np.random.Generator, frames: FrameMap | None = None
+    ) -> dict[str, Any]:
+        """What the network reads and learns of a step, with what its memory selects: its `history`
+        and `past`.
 
         frames: the map of a transformed episode; all that is read of the past goes through it.
         """
@@ -291,13 +343,17 @@ class TrainingDataset(Dataset[dict[str, Any]]):
                 history = TransformedHistory(history, frames)
             selection = self.memory.gather_selection(history, now, rng if self.jitter else None)
             real = None if frames is None else frames.real
-            item["history"] = with_labels(selection, self.columns[step.source].of_memory(step.episode), real)
+            item["history"] = with_labels(
+                selection, self.columns[step.source].of_memory(step.episode), real
+            )
             if (spec := past_view_spec(self.memory)) is not None:
                 read = partial(self._images, step.source, step.episode, frames)
                 item["past"] = past_views(spec, now, read, self.processor.images)
         return item
 
-    def _images(self, source: int, episode: int, frame_map: FrameMap | None, frames: np.ndarray) -> list[np.ndarray]:
+    def _images(
+        self, source: int, episode: int, frame_map: FrameMap | None, frames: np.ndarray
+    ) -> list[np.ndarray]:
         frames = frames if frame_map is None else frame_map.real[frames]
         return [self.sources[source].frames(episode, frames, name) for name in self._cameras]
 
@@ -306,13 +362,19 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         return self.processor.samples.cameras or self.processor.embodiment.camera_names
 
     def _motion(self, source: int, episode: int, frames: np.ndarray) -> Tensor:
-        return motion_rows(self.processor, *self.sources[source].robot_motion(episode, frames, self.action_offset))
+        return motion_rows(
+            self.processor, *self.sources[source].robot_motion(episode, frames, self.action_offset)
+        )
 
     def _sample(self, step: Step, subgoal: str | None, now: int, frames: FrameMap | None) -> Sample:
-        """A step with the frames of its window; before the first frame of the execution that one is repeated."""
+        """A step with the frames of its window; before the first frame of the execution that one is
+        repeated.
+        """
         source, cameras = self.sources[step.source], self._cameras
         start = int(source.exec_starts[step.episode]) if frames is None else frames.exec_start
-        window = np.arange(now - self.processor.samples.window + 1, now + 1).clip(min=min(start, now))
+        window = np.arange(now - self.processor.samples.window + 1, now + 1).clip(
+            min=min(start, now)
+        )
         window = window if frames is None else frames.real[window]
         first = int(window[0])
         states = source.states(step.episode, first, step.index + 1)
@@ -335,13 +397,17 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         )
 
     def _notes(self, step: Step) -> dict[str, dict[str, str]]:
-        """Notes of the prompt, and the lines to write; one that the policy writes is read a decision later."""
+        """Notes of the prompt, and the lines to write; one that the policy writes is read a
+        decision later.
+        """
         spec, columns = self.processor.prompt_spec, self.columns[step.source]
         before = step.index - self.processor.embodiment.action.execute
         notes = {name: columns.text(name, step.episode, step.index) for name in spec.notes}
         stored = {name: notes[name] for name in spec.writes}
         for name in stored:
-            notes[name] = columns.text(name, step.episode, before) if before >= step.exec_start else ""
+            notes[name] = (
+                columns.text(name, step.episode, before) if before >= step.exec_start else ""
+            )
         return {"notes": notes, "written": stored}
 
 
@@ -350,16 +416,19 @@ def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> N
         lacking = sorted(set(subgoal.columns) - set(source.subgoal_names))
         require(
             not lacking,
-            f"{source.name} has no {' and no '.join(lacking)}, which subgoal_text.kind={subgoal.kind} reads; its "
-            f"subgoal texts are: {', '.join(source.subgoal_names) or 'none'}.",
+            f"{source.name} has no {' and no '.join(lacking)}, which"
+            f" subgoal_text.kind={subgoal.kind} reads; its subgoal texts are:"
+            f" {', '.join(source.subgoal_names) or 'none'}.",
         )
 
 
 class GroupDataset(TrainingDataset):
-    """Groups of `processor.samples.group_size` steps, sampled from whole records, conditioning videos included.
+    """Groups of `processor.samples.group_size` steps, sampled from whole records, conditioning
+    videos included.
 
-    Every episode gives as many groups as every other, whatever its length; an epoch shows about as many steps as there
-    are. A group's steps are distinct, sampled uniformly and sorted; a shorter episode gives all, the last one repeated.
+    Every episode gives as many groups as every other, whatever its length; an epoch shows about as
+    many steps as there are. A group's steps are distinct, sampled uniformly and sorted; a shorter
+    episode gives all, the last one repeated.
     """
 
     def __len__(self) -> int:
@@ -377,22 +446,35 @@ class GroupDataset(TrainingDataset):
             frames = np.sort(rng.choice(length, size, replace=False))
         else:
             frames = np.minimum(np.arange(size), length - 1)
-        return self._group(s, episode, frames, rng, self._frame_map(s, episode, frames, index, self.transforms))
+        return self._group(
+            s, episode, frames, rng, self._frame_map(s, episode, frames, index, self.transforms)
+        )
 
     def observation(self, index: int) -> dict[str, Any]:
-        """The group that ends at a step: the moments before it at which the policy would have been asked."""
+        """The group that ends at a step: the moments before it at which the policy would have been
+        asked.
+        """
         s, episode, frame = self.locate(index)
         stride = self.processor.embodiment.action.execute
         frames = np.arange(frame, -1, -stride)[: self.processor.samples.group_size][::-1]
-        return self._group(s, episode, frames, np.random.default_rng([self.seed, self.epoch, index]))
+        return self._group(
+            s, episode, frames, np.random.default_rng([self.seed, self.epoch, index])
+        )
 
     def _group(
-        self, s: int, episode: int, frames: np.ndarray, rng: np.random.Generator, frame_map: FrameMap | None = None
+        self,
+        s: int,
+        episode: int,
+        frames: np.ndarray,
+        rng: np.random.Generator,
+        frame_map: FrameMap | None = None,
     ) -> dict[str, Any]:
         steps = [self.step_at(s, episode, int(frame)) for frame in frames]
         return {
             "moments": [self.inputs_at(step, rng, frame_map) for step in steps],
-            "times": (frames if frame_map is None else frame_map.transformed(frames)).astype(np.int64),
+            "times": (frames if frame_map is None else frame_map.transformed(frames)).astype(
+                np.int64
+            ),
             "goal": steps[-1].goal,
             "subgoals": steps[-1].subgoals,
             "place": (s, episode, int(frames[-1])),

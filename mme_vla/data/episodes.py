@@ -1,7 +1,7 @@
 """`EpisodeSource`: one LeRobot v3.0 dataset, read episode by episode from a local folder.
 
-Tables are memory-mapped and videos opened on demand, so what stays in memory does not grow with the data except for a
-few numbers an episode.
+Tables are memory-mapped and videos opened on demand, so what stays in memory does not grow with the
+data except for a few numbers an episode.
 """
 
 import io
@@ -58,10 +58,11 @@ class EpisodeSource:
 
     name: short name (the folder's, or `sample`). fps: frames per second.
     robot: whose columns are read. columns: the dataset's column of each camera.
-    state_names, action_names: what the dataset calls the numbers of the state and of the action; may be empty.
-    tasks: which task each frame has.
+    state_names, action_names: what the dataset calls the numbers of the state and of the action;
+    may be empty. tasks: which task each frame has.
     scales: of the state and of the action, the greatest size of each number, [w] float64.
-    lengths: [e] int64, frames of each episode. exec_starts: [e] int64, its first execution frame (0 without a video).
+    lengths: [e] int64, frames of each episode. exec_starts: [e] int64, its first execution frame (0
+    without a video).
     """
 
     def __init__(
@@ -76,14 +77,16 @@ class EpisodeSource:
 
         Args:
             root: folder of a LeRobot v3.0 dataset, or `sample`.
-            exec_starts: side file with each episode's first execution frame (JSON or parquet), for datasets that
-                do not mark their conditioning video.
-            name: short name, which the validation split and the cache folder use; by default the folder's.
+            exec_starts: side file with each episode's first execution frame (JSON or parquet), for
+                datasets that do not mark their conditioning video.
+            name: short name, which the validation split and the cache folder use; by default the
+                folder's.
             max_open_videos: most video files kept open.
             robot: says which columns hold its images, states and actions.
 
         Raises:
-            UserError: a file is missing or damaged, the dataset does not fit the robot or contradicts itself.
+            UserError: a file is missing or damaged, the dataset does not fit the robot or
+                contradicts itself.
         """
         self.root = resolve_root(root)
         self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
@@ -97,15 +100,31 @@ class EpisodeSource:
         columns, self.columns = list(matches.tables), matches.cameras
         self.fps = float(info["fps"])
         if robot.fps is not None and robot.fps != self.fps:
-            log.warning("%s has %g frames per second; the robot %s has %g.", self.name, self.fps, robot.name, robot.fps)
+            log.warning(
+                "%s has %g frames per second; the robot %s has %g.",
+                self.name,
+                self.fps,
+                robot.name,
+                robot.fps,
+            )
         self._vectors_of = {
             kind: {name: width_of(features[name]) for name in names}
-            for kind, names in (("state", matches.state), ("action", matches.action), ("pose", matches.pose))
+            for kind, names in (
+                ("state", matches.state),
+                ("action", matches.action),
+                ("pose", matches.pose),
+            )
         }
         self._motions: dict[int, Motions] = {}
-        videos = {name: column for name, column in self.columns.items() if features[column]["dtype"] == "video"}
+        videos = {
+            name: column
+            for name, column in self.columns.items()
+            if features[column]["dtype"] == "video"
+        }
         self.video_cameras = tuple(videos)
-        self.lossy = {name: coding for name, c in videos.items() if (coding := lossy_coding(features[c]))}
+        self.lossy = {
+            name: coding for name, c in videos.items() if (coding := lossy_coding(features[c]))
+        }
         """Of cameras whose videos lost something when they were made: how they were coded."""
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
         # What every opening reads anyway; tables that hold images are left to `verify`.
@@ -129,22 +148,30 @@ class EpisodeSource:
                 greatest_sizes.append(np.maximum(np.abs(least), np.abs(greatest)))
             if greatest_sizes:
                 self.scales[kind] = np.concatenate(greatest_sizes)
-        compare_units(self.root, self.robot.action.names, self.robot.action.units, self.scales["action"])
+        compare_units(
+            self.root, self.robot.action.names, self.robot.action.units, self.scales["action"]
+        )
         pictures = tuple(column for column in self.columns.values() if column not in video_columns)
-        description = Description(self.root, info, episodes, self.fps, video_columns, tuple(dict.fromkeys(pictures)))
+        description = Description(
+            self.root, info, episodes, self.fps, video_columns, tuple(dict.fromkeys(pictures))
+        )
         self.tasks = check_consistency(description, self._table)
         self._rendered = {
             name: self._column(f"{name}{RENDERED_SUFFIX}").astype(bool)
             for name in self.columns
             if f"{name}{RENDERED_SUFFIX}" in columns
         }
-        self.exec_starts = self._read_exec_starts(columns, None if exec_starts is None else Path(exec_starts))
+        self.exec_starts = self._read_exec_starts(
+            columns, None if exec_starts is None else Path(exec_starts)
+        )
 
     def __len__(self) -> int:
         return len(self.lengths)
 
     def __repr__(self) -> str:
-        return f"EpisodeSource({self.name!r}, {len(self)} episodes, {int(self.lengths.sum())} frames)"
+        return (
+            f"EpisodeSource({self.name!r}, {len(self)} episodes, {int(self.lengths.sum())} frames)"
+        )
 
     @cached_property
     def fingerprint(self) -> str:
@@ -159,7 +186,9 @@ class EpisodeSource:
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:
-        """What the converter knows of each episode beside the columns: task, seed, difficulty, …; may be empty."""
+        """What the converter knows of each episode beside the columns: task, seed, difficulty, …;
+        may be empty.
+        """
         side = self.root / SIDE_FILE
         if not side.exists() and not side.is_symlink():
             return []
@@ -176,18 +205,23 @@ class EpisodeSource:
         return episode, row - int(self._starts[episode])
 
     def rows(self, episode: int, frames: np.ndarray) -> np.ndarray:
-        """Rows of the tables that hold frames [n] of an episode, int64 [n]: the inverse of `locate`."""
+        """Rows of the tables that hold frames [n] of an episode, int64 [n]: the inverse of
+        `locate`.
+        """
         return int(self._starts[episode]) + np.asarray(frames, np.int64)
 
     def task(self, episode: int) -> str:
         """Name of the episode's task (`VideoUnmask`), empty if the dataset does not tell."""
         task = self.records[episode].get("task", "") if episode < len(self.records) else ""
         if not isinstance(task, str):
-            raise UserError(f"{self.root / SIDE_FILE}: the task of episode {episode} is {brief(task)}. {REMEDY}")
+            raise UserError(
+                f"{self.root / SIDE_FILE}: the task of episode {episode} is {brief(task)}. {REMEDY}"
+            )
         return task
 
     def verify(self) -> int:
-        """Compare every file with the checksums beside them, if there are any; reads the whole dataset.
+        """Compare every file with the checksums beside them, if there are any; reads the whole
+        dataset.
 
         Returns:
             The number of files compared, 0 for a dataset that was written without checksums.
@@ -197,7 +231,8 @@ class EpisodeSource:
         return len(sums.table)
 
     def goal(self, episode: int, frame: int | None = None) -> str:
-        """The goal of a frame in words, lower-case; without a frame, of an episode whose frames all have the same.
+        """The goal of a frame in words, lower-case; without a frame, of an episode whose frames all
+        have the same.
 
         Raises:
             UserError: no frame is given, and the episode has several tasks; they are named.
@@ -207,13 +242,16 @@ class EpisodeSource:
         goals = self.goals(episode)
         require(
             len(goals) == 1,
-            f"{self.name}: the frames of episode {episode} have {len(goals)} tasks: {listed(map(repr, goals))}. What "
-            "was asked for needs an episode of one task: choose another, or split it at the change of task_index.",
+            f"{self.name}: the frames of episode {episode} have {len(goals)} tasks:"
+            f" {listed(map(repr, goals))}. What was asked for needs an episode of one task: choose"
+            " another, or split it at the change of task_index.",
         )
         return goals[0]
 
     def goals(self, episode: int) -> tuple[str, ...]:
-        """The different goals of an episode's frames, lower-case, in the order in which they begin."""
+        """The different goals of an episode's frames, lower-case, in the order in
+        which they begin.
+        """
         start = int(self._starts[episode])
         return self.tasks.within(start, start + int(self.lengths[episode]))
 
@@ -224,8 +262,8 @@ class EpisodeSource:
             return ()
         require(
             episode < len(self.records) and "options" in self.records[episode],
-            f"{self.root / SIDE_FILE} does not say which options episode {episode} offered, and the robot "
-            f"{self.robot.name!r} chooses among them. Convert or record the dataset again.",
+            f"{self.root / SIDE_FILE} does not say which options episode {episode} offered, and the"
+            f" robot {self.robot.name!r} chooses among them. Convert or record the dataset again.",
         )
         return read_options(self.records[episode]["options"], letters)
 
@@ -234,16 +272,20 @@ class EpisodeSource:
         return self._vectors("state", episode, start, stop)
 
     def actions(self, episode: int, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """The action recorded with each frame, [stop − start, w] float32: absolute, or a difference to its own pose."""
+        """The action recorded with each frame, [stop − start, w] float32: absolute, or a difference
+        to its own pose.
+        """
         recorded = self._vectors("action", episode, start, stop)
         if not self.robot.action.of_pose:
             return recorded
         return self.robot.action.from_poses(recorded, self._vectors("pose", episode, start, stop))
 
     def decisions(self, episode: int) -> Sequence[int] | np.ndarray:
-        """The frames at which the robot decides on actions: all of the execution, or those before a motion begins.
+        """The frames at which the robot decides on actions: all of the execution, or those before a
+        motion begins.
 
-        Of a recording that was rendered at a choice of frames, those of them that every camera shows.
+        Of a recording that was rendered at a choice of frames, those of them that every camera
+        shows.
         """
         first, length = int(self.exec_starts[episode]), int(self.lengths[episode])
         motions = self.robot.action.frames is None
@@ -255,9 +297,11 @@ class EpisodeSource:
         return decided[rendered[decided]]
 
     def rendered(self, episode: int, camera: str | None = None) -> np.ndarray:
-        """Which frames of an episode show what was seen, bool [t]; by default of the camera that feeds memory.
+        """Which frames of an episode show what was seen, bool [t]; by default of the camera that
+        feeds memory.
 
-        All, unless the dataset was recorded at a choice of frames; the images of others are placeholders.
+        All, unless the dataset was recorded at a choice of frames; the images of others are
+        placeholders.
         """
         camera = self.robot.memory_camera if camera is None else camera
         start, length = int(self._starts[episode]), int(self.lengths[episode])
@@ -265,10 +309,14 @@ class EpisodeSource:
             return np.ones(length, bool)
         return self._rendered[camera][start : start + length]
 
-    def action_chunk(self, episode: int, start: int, horizon: int, offset: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """The chunk decided at frame `start`, the last action repeated past the episode's end (differences are 0).
+    def action_chunk(
+        self, episode: int, start: int, horizon: int, offset: int = 0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The chunk decided at frame `start`, the last action repeated past the episode's end
+        (differences are 0).
 
-        Where an action takes a frame these are actions start + offset … start + offset + horizon − 1.
+        Where an action takes a frame these are actions start + offset … start + offset + horizon −
+        1.
 
         Returns:
             actions [horizon, w] float32, and [horizon] bool that is False on repeated ones.
@@ -279,14 +327,18 @@ class EpisodeSource:
         length = int(self.lengths[episode])
         steps = np.arange(start, start + horizon)
         first = min(start, length - 1)
-        recorded = self.actions(episode, first, min(start + horizon, length) if start < length else length)
+        recorded = self.actions(
+            episode, first, min(start + horizon, length) if start < length else length
+        )
         chunk, known = recorded[np.minimum(steps, length - 1) - first], steps < length
         for place in self.robot.action.of_pose:
             chunk[~known, place] = 0
         return chunk, known
 
     def past_actions(self, episode: int, start: int, most: int, offset: int = 0) -> np.ndarray:
-        """The robot's own actions right before the chunk of `start`, oldest first, [n, w]; as many as there are."""
+        """The robot's own actions right before the chunk of `start`, oldest first, [n, w]; as many
+        as there are.
+        """
         if self.robot.action.frames is None:
             return self._motions_of(episode).before(start, most)
         stop = start + offset
@@ -295,13 +347,15 @@ class EpisodeSource:
             return np.zeros((0, self.robot.action.width), np.float32)
         return self.actions(episode, first, stop)
 
-    def robot_motion(self, episode: int, frames: np.ndarray, offset: int = 0) -> tuple[np.ndarray, ...]:
+    def robot_motion(
+        self, episode: int, frames: np.ndarray, offset: int = 0
+    ) -> tuple[np.ndarray, ...]:
         """What the robot felt and did at frames [n] of an episode.
 
         Returns:
-            states [n, s]; the actions [n, w] that led to these frames, as `past_actions` pairs them; and bool [n],
-            whether there is one: not at frames of the video, nor at the first of the execution, and nowhere where an
-            action is a motion of many frames.
+            states [n, s]; the actions [n, w] that led to these frames, as `past_actions` pairs
+            them; and bool [n], whether there is one: not at frames of the video, nor at the first
+            of the execution, and nowhere where an action is a motion of many frames.
         """
         stop = int(np.max(frames, initial=0)) + 1
         is_known = (frames > self.exec_starts[episode]) & (self.robot.action.frames is not None)
@@ -312,7 +366,9 @@ class EpisodeSource:
         if episode not in self._motions:
             first = int(self.exec_starts[episode])
             rows, letters = self.actions(episode, first), self.robot.action.choice
-            self._motions[episode] = find_choices(rows, first, letters) if letters else find_motions(rows, first)
+            self._motions[episode] = (
+                find_choices(rows, first, letters) if letters else find_motions(rows, first)
+            )
         return self._motions[episode]
 
     def subgoals(self, episode: int, step: int) -> dict[str, str]:
@@ -321,33 +377,48 @@ class EpisodeSource:
         texts = {name: flat(row[name])[0].as_py() for name in self.subgoal_names}
         for name, text in texts.items():
             require(
-                text is not None, f"{self.root}: {name} of frame {step} of episode {episode} has no value. {REMEDY}"
+                text is not None,
+                f"{self.root}: {name} of frame {step} of episode {episode} has no value. {REMEDY}",
             )
         return {name: str(text).lower() for name, text in texts.items()}
 
-    def frames(self, episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
-        """Decode images [n, H, W, 3] uint8 of a camera at these frames; by default of the one that feeds memory."""
+    def frames(
+        self, episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None
+    ) -> np.ndarray:
+        """Decode images [n, H, W, 3] uint8 of a camera at these frames; by default of the one that
+        feeds memory.
+        """
         indices = np.asarray(indices, np.int64)
         length = int(self.lengths[episode])
         if not len(indices) or indices.min() < 0 or indices.max() >= length:
-            raise UserError(f"{self.name}, episode {episode}: frames {indices.tolist()[:5]} asked of {length}.")
+            raise UserError(
+                f"{self.name}, episode {episode}: frames {indices.tolist()[:5]} asked of {length}."
+            )
         camera = self.robot.memory_camera if camera is None else camera
-        require(camera in self.columns, f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}")
+        require(
+            camera in self.columns,
+            f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}",
+        )
         if not (rendered := self.rendered(episode, camera)[indices]).all():
             raise UserError(
-                f"{self.name}, episode {episode}: {camera} was not rendered at frames "
-                f"{indices[~rendered].tolist()[:5]}. "
-                "It was recorded at a choice of frames: record it again with frames=… that holds these, or frames=all."
+                f"{self.name}, episode {episode}: {camera} was not rendered at frames"
+                f" {indices[~rendered].tolist()[:5]}. It was recorded at a choice of frames: record"
+                " it again with frames=… that holds these, or frames=all."
             )
         column, start = self.columns[camera], int(self._starts[episode])
         if camera in self.video_cameras:
-            chunk, file = (int(self._episodes[f"{column}/{key}"][episode]) for key in ("chunk_index", "file_index"))
+            chunk, file = (
+                int(self._episodes[f"{column}/{key}"][episode])
+                for key in ("chunk_index", "file_index")
+            )
             path = video_file(self.root, self._video_path, column, chunk, file)
             offset = float(self._episodes[f"{column}/from_timestamp"][episode])
             return self._reader.read(path, offset + indices / self.fps, self.fps)
         from PIL import Image
 
-        cells = [self._table[start + int(i) : start + int(i) + 1][column][0].as_py() for i in indices]
+        cells = [
+            self._table[start + int(i) : start + int(i) + 1][column][0].as_py() for i in indices
+        ]
         with decoding(f"{self.root}, episode {episode}, {column}", "pictures", REMEDY):
             pictures = [Image.open(io.BytesIO(cell["bytes"])) for cell in cells]
             for picture in pictures:
@@ -358,7 +429,9 @@ class EpisodeSource:
         length = int(self.lengths[episode])
         stop = length if stop is None else stop
         if not 0 <= start < stop <= length:
-            raise UserError(f"{self.name}, episode {episode}: steps {start}…{stop - 1} asked of {length}.")
+            raise UserError(
+                f"{self.name}, episode {episode}: steps {start}…{stop - 1} asked of {length}."
+            )
         offset = int(self._starts[episode])
         return self._table[offset + start : offset + stop]
 
@@ -371,29 +444,46 @@ class EpisodeSource:
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def _compare_names(self, robot: Embodiment) -> None:
-        """Compare the names of numbers: the dataset's with the robot's, and of states with actions relative to them."""
+        """Compare the names of numbers: the dataset's with the robot's, and of states with actions
+        relative to them.
+        """
         own = robot.action.names if robot.action.names != numbered(robot.action.width) else ()
         compare_names(
-            self.action_names, own, "action", f"the dataset {self.name}", f"the robot {robot.name}",
-            "Order embodiment.action.names as the dataset's column is, or choose the robot that recorded it.",
-        )  # fmt: skip
-        relative = [i for i in robot.action.relative if i < min(len(self.state_names), len(self.action_names))]
+            self.action_names,
+            own,
+            "action",
+            f"the dataset {self.name}",
+            f"the robot {robot.name}",
+            "Order embodiment.action.names as the dataset's column is, or choose the robot that"
+            " recorded it.",
+        )
+        relative = [
+            i
+            for i in robot.action.relative
+            if i < min(len(self.state_names), len(self.action_names))
+        ]
         compare_names(
-            [self.state_names[i] for i in relative], [self.action_names[i] for i in relative],
-            f"state and action of {self.name}, subtracted from each other", "state", "action",
-            "A number is predicted relative to the state's number at the same place: record both in one order, or set "
-            "embodiment.action.relative=[].",
-        )  # fmt: skip
+            [self.state_names[i] for i in relative],
+            [self.action_names[i] for i in relative],
+            f"state and action of {self.name}, subtracted from each other",
+            "state",
+            "action",
+            "A number is predicted relative to the state's number at the same place: record both in"
+            " one order, or set embodiment.action.relative=[].",
+        )
 
     def _check_rows(self) -> None:
         """The tables hold the episodes back to back, as the metadata say."""
-        index = flat(self._table.with_format("arrow").select_columns("episode_index")[:]["episode_index"])
+        index = flat(
+            self._table.with_format("arrow").select_columns("episode_index")[:]["episode_index"]
+        )
         total = int(self.lengths.sum())  # before anything of that size is made
         expected = np.repeat(np.arange(len(self)), self.lengths) if len(index) == total else None
         require(
             expected is not None and np.array_equal(index.to_numpy(zero_copy_only=False), expected),
-            f"{self.root}: the tables hold {len(index)} rows where meta/episodes describes {total} in "
-            f"{len(self)} episodes; the dataset is incomplete or mixed up. Copy, download or convert it again.",
+            f"{self.root}: the tables hold {len(index)} rows where meta/episodes describes {total}"
+            f" in {len(self)} episodes; the dataset is incomplete or mixed up. Copy, download or"
+            " convert it again.",
         )
 
     def _read_exec_starts(self, columns: Sequence[str], side_file: Path | None) -> np.ndarray:
@@ -404,25 +494,31 @@ class EpisodeSource:
             starts = np.add.reduceat(demo, self._starts, dtype=np.int64)
             frame = np.arange(len(demo)) - np.repeat(self._starts, self.lengths)
             if not np.array_equal(demo, frame < np.repeat(starts, self.lengths)):
-                raise UserError(f"{self.root}: is_demo must be true for an episode's first frames only.")
+                raise UserError(
+                    f"{self.root}: is_demo must be true for an episode's first frames only."
+                )
         elif "exec_start_idx" in columns:
-            log.warning("%s has no is_demo; its exec_start_idx says where the conditioning video ends.", self.root)
+            log.warning(
+                "%s has no is_demo; its exec_start_idx says where the conditioning video ends.",
+                self.root,
+            )
             starts = self._column("exec_start_idx")[self._starts].astype(np.int64)
         elif not self.robot.conditioning_video:
             starts = np.zeros(len(self), np.int64)
         else:
             raise UserError(
-                f"{self.root} does not mark its conditioning videos: it has neither is_demo nor exec_start_idx. "
-                "Without them video frames would be trained on as if the robot had acted. Give a side file: "
-                'exec_starts=<file>.json with {"<episode_index>": <first execution frame>, …}, or a parquet table '
-                "with the columns episode_index and exec_start_idx (0 for an episode without video). A robot whose "
-                "episodes never begin with a video has embodiment.conditioning_video=false."
+                f"{self.root} does not mark its conditioning videos: it has neither is_demo nor"
+                " exec_start_idx. Without them video frames would be trained on as if the robot"
+                ' had acted. Give a side file: exec_starts=<file>.json with {"<episode_index>":'
+                " <first execution frame>, …}, or a parquet table with the columns episode_index"
+                " and exec_start_idx (0 for an episode without video). A robot whose episodes"
+                " never begin with a video has embodiment.conditioning_video=false."
             )
         if (starts < 0).any() or (starts >= self.lengths).any():
             episode = int(np.flatnonzero((starts < 0) | (starts >= self.lengths))[0])
             raise UserError(
-                f"{side_file or self.root}: episode {episode} starts execution at frame {starts[episode]}, but has "
-                f"{self.lengths[episode]} frames."
+                f"{side_file or self.root}: episode {episode} starts execution at frame"
+                f" {starts[episode]}, but has {self.lengths[episode]} frames."
             )
         return starts
 

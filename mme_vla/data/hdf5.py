@@ -1,6 +1,8 @@
-"""The official demonstration files, `record_dataset_<Task>.h5`: their episodes, read frame by frame.
+"""The official demonstration files, `record_dataset_<Task>.h5`: their episodes, read frame by
+frame.
 
-A value is checked where it is read: the files hold tens of gigabytes, and conversion reads each value once.
+A value is checked where it is read: the files hold tens of gigabytes, and conversion reads each
+value once.
 """
 
 import math
@@ -26,7 +28,9 @@ REMEDY = "Download or copy the file again."
 
 @dataclass(frozen=True)
 class EpisodeRef:
-    """Where one recorded episode lies: `group` (episode_<index>) of `file`; `task` is taken from the file's name."""
+    """Where one recorded episode lies: `group` (episode_<index>) of `file`; `task` is taken from
+    the file's name.
+    """
 
     file: Path
     index: int
@@ -37,31 +41,52 @@ class EpisodeRef:
         return f"episode_{self.index}"
 
 
-SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
+SUBGOALS = (
+    "simple_subgoal",
+    "grounded_subgoal",
+    "simple_subgoal_online",
+    "grounded_subgoal_online",
+)
 POSE_STATE = "eef_state"
-"""The dataset's column of the tool's pose [6], and the file's name of it among a step's observations."""
-POSE_ACTIONS = {"ee_pose_actions": "action/eef_action", "waypoint_actions": "action/waypoint_action"}
-"""Columns of the tool's poses (x, y, z, roll, pitch, yaw, gripper) and where they stand in a file."""
-CHOICES = ("setup/available_multi_choices", "timestep_0/action/choice_action", "timestep_0/info/is_subgoal_boundary")
+"""The dataset's column of the tool's pose [6], and the file's name of it among a step's
+observations.
+"""
+POSE_ACTIONS = {
+    "ee_pose_actions": "action/eef_action",
+    "waypoint_actions": "action/waypoint_action",
+}
+"""Columns of the tool's poses (x, y, z, roll, pitch, yaw, gripper) and where they
+stand in a file.
+"""
+CHOICES = (
+    "setup/available_multi_choices",
+    "timestep_0/action/choice_action",
+    "timestep_0/info/is_subgoal_boundary",
+)
 """What an episode has whose options and choices were recorded."""
 FRAMES = "setup/frames"
 """Where a file keeps the choice of frames it was recorded at, as JSON, if not all were rendered."""
 _IMAGE_KEYS = {camera: f"obs/{camera}_rgb" for camera in CAMERAS}
 _REQUIRED = (
-    "obs/joint_state", "obs/gripper_state", "action/joint_action", "info/is_video_demo", "info/is_completed",
+    "obs/joint_state",
+    "obs/gripper_state",
+    "action/joint_action",
+    "info/is_video_demo",
+    "info/is_completed",
     *(f"info/{name}" for name in SUBGOALS),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
 class RawFrame:
     """One recorded time step. The observation was taken after the action of the same step.
 
-    front, wrist: [H, W, 3] uint8. state: [8] float32, seven joint angles and the first finger's position.
-    action: [8] as stored, seven absolute joint targets and the gripper command (−1 close, 1 open).
-    is_demo: the step belongs to the conditioning video.
-    subgoals: the four texts of `SUBGOALS`, lower-case; after completion the last ones stay, as released.
-    rendered: the cameras that were rendered at this step; of the others `front` and `wrist` repeat an earlier image
+    front, wrist: [H, W, 3] uint8. state: [8] float32, seven joint angles and the first finger's
+    position. action: [8] as stored, seven absolute joint targets and the gripper command (−1 close,
+    1 open). is_demo: the step belongs to the conditioning video.
+    subgoals: the four texts of `SUBGOALS`, lower-case; after completion the last ones stay, as
+    released. rendered: the cameras that were rendered at this step; of the others `front` and
+    `wrist` repeat an earlier image
         (the first one, before there is any).
     """
 
@@ -75,16 +100,21 @@ class RawFrame:
 
 
 class RawEpisode:
-    """An open episode. Use `with open_episode(ref) as episode`; frames are read one by one, on demand."""
+    """An open episode. Use `with open_episode(ref) as episode`; frames are read one by one, on
+    demand.
+    """
 
     def __init__(self, ref: EpisodeRef, group: Any) -> None:
         self.ref, self._group = ref, group
         with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
-            steps = sorted(int(name[9:]) for name in group if re.fullmatch(r"timestep_\d{1,9}", name))
+            steps = sorted(
+                int(name[9:]) for name in group if re.fullmatch(r"timestep_\d{1,9}", name)
+            )
         require(
             steps == list(range(len(steps))) and steps,
-            f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(len(steps) - 1, 0)} without gaps, found "
-            f"{len(steps)} steps{f', the last is {steps[-1]}' if steps else ''}. The file is damaged.",
+            f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(len(steps) - 1, 0)}"
+            f" without gaps, found {len(steps)}"
+            f" steps{f', the last is {steps[-1]}' if steps else ''}. The file is damaged.",
         )
         self.length = len(steps)
         with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
@@ -93,16 +123,22 @@ class RawEpisode:
             needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in (*image_keys, *_REQUIRED)))
             missing = [name for name in needed if name not in group]
         require(
-            not missing, f"{ref.file} {ref.group} lacks {', '.join(missing)}: not the layout of RoboMME's recorder."
+            not missing,
+            f"{ref.file} {ref.group} lacks {', '.join(missing)}: not the layout of RoboMME's"
+            " recorder.",
         )
         demo = np.array([self._flag(k, "info/is_video_demo") for k in range(self.length)])
         self.exec_start = int(demo.sum())
         if demo[self.exec_start :].any() or self.exec_start == self.length:
-            raise UserError(f"{ref.file} {ref.group}: video frames must come first, then at least one execution frame.")
+            raise UserError(
+                f"{ref.file} {ref.group}: video frames must come first, then at least one execution"
+                " frame."
+            )
 
     def _value(self, name: str) -> Any:
         with decoding(self._path(name), "a dataset of HDF5", REMEDY):
-            # An episode has thousands: opened as h5py's own objects, each takes more than twice as long.
+            # An episode has thousands: opened as h5py's own objects, each takes more than twice as
+            # long.
             stored = h5d.open(self._group.id, name.encode())
             if stored.get_space().get_simple_extent_type() == h5s.NULL:
                 return Empty(stored.dtype)
@@ -124,13 +160,17 @@ class RawEpisode:
     def _numbers(self, step: int, name: str, count: int, finite: bool = True) -> np.ndarray:
         valid = self._checked(
             f"timestep_{step}/{name}",
-            lambda x: x.ndim <= 1 and x.size >= count and (not finite or bool(np.isfinite(x).all())),
+            lambda x: (
+                x.ndim <= 1 and x.size >= count and (not finite or bool(np.isfinite(x).all()))
+            ),
             f"at least {count} {'finite ' if finite else ''}numbers",
         )
         return np.atleast_1d(valid)[:count]
 
     def _flag(self, step: int, name: str) -> bool:
-        flag = self._checked(f"timestep_{step}/{name}", lambda x: x.size == 1 and x.dtype.kind in "biu", "a flag")
+        flag = self._checked(
+            f"timestep_{step}/{name}", lambda x: x.size == 1 and x.dtype.kind in "biu", "a flag"
+        )
         return bool(flag.reshape(-1)[0])
 
     def _text(self, name: str) -> str:
@@ -141,8 +181,8 @@ class RawEpisode:
     def _image(self, step: int, camera: str) -> np.ndarray:
         if self.frames is not None and not self.rendered[camera][step]:
             raise UserError(
-                f"{self.ref.file} {self.ref.group}: {camera} was not rendered at step {step}; the episode was recorded "
-                f"with frames={self.frames['at']}."
+                f"{self.ref.file} {self.ref.group}: {camera} was not rendered at step {step}; the"
+                f" episode was recorded with frames={self.frames['at']}."
             )
         return self._checked(
             f"timestep_{step}/{_IMAGE_KEYS[camera]}",
@@ -161,7 +201,9 @@ class RawEpisode:
     def seed(self) -> int | None:
         if "setup/seed" not in self._group:
             return None
-        seed = self._checked("setup/seed", lambda x: x.size == 1 and x.dtype.kind in "iu", "a whole number")
+        seed = self._checked(
+            "setup/seed", lambda x: x.size == 1 and x.dtype.kind in "iu", "a whole number"
+        )
         return int(seed.reshape(-1)[0])
 
     @property
@@ -194,11 +236,15 @@ class RawEpisode:
         subgoals: dict[str, str] = {}
         for k in range(self.length):
             if not subgoals or not self._flag(k, "info/is_completed"):
-                subgoals = {name: self._text(f"timestep_{k}/info/{name}").lower() for name in SUBGOALS}
+                subgoals = {
+                    name: self._text(f"timestep_{k}/info/{name}").lower() for name in SUBGOALS
+                }
             yield subgoals
 
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
-        """Joint angles and joint targets of every step, [t, 7] each, in the file's own precision."""
+        """Joint angles and joint targets of every step, [t, 7] each, in the file's own
+        precision.
+        """
         angles = [self._numbers(k, "obs/joint_state", 7) for k in range(self.length)]
         targets = [self._numbers(k, "action/joint_action", 7) for k in range(self.length)]
         return np.stack(angles), np.stack(targets)
@@ -206,12 +252,17 @@ class RawEpisode:
     def pose_actions(self, column: str) -> np.ndarray:
         """A column of `POSE_ACTIONS`, [t, 7] float32.
 
-        Of waypoints, which are noted when a motion begins: the one under way, and before the first one of the video
-        or the execution that first one; a part without any is one motion to where it ends.
+        Of waypoints, which are noted when a motion begins: the one under way, and before the first
+        one of the video or the execution that first one; a part without any is one motion to where
+        it ends.
         """
-        steps = [self._numbers(k, POSE_ACTIONS[column], 7, finite=False) for k in range(self.length)]
+        steps = [
+            self._numbers(k, POSE_ACTIONS[column], 7, finite=False) for k in range(self.length)
+        ]
         return known_poses(
-            np.stack(steps), self.exec_start, lambda k: self._numbers(k, POSE_ACTIONS["ee_pose_actions"], 7)
+            np.stack(steps),
+            self.exec_start,
+            lambda k: self._numbers(k, POSE_ACTIONS["ee_pose_actions"], 7),
         )
 
     def tool_poses(self) -> np.ndarray:
@@ -220,10 +271,14 @@ class RawEpisode:
         return np.stack(steps).astype(np.float32)
 
     def choice_actions(self) -> np.ndarray:
-        """What was chosen among `options`, [t, 10] float32: at the first frame of each, zeros at all others."""
+        """What was chosen among `options`, [t, 10] float32: at the first frame of each, zeros at
+        all others.
+        """
         rows = np.zeros((self.length, len(CHOICE_NUMBERS)), np.float32)
         for k in range(self.length):
-            begins = self._flag(k, "info/is_subgoal_boundary") and not self._flag(k, "info/is_completed")
+            begins = self._flag(k, "info/is_subgoal_boundary") and not self._flag(
+                k, "info/is_completed"
+            )
             if begins or k == self.exec_start:
                 name = f"timestep_{k}/action/choice_action"
                 with self._reported_at(name):
@@ -243,20 +298,28 @@ class RawEpisode:
         """What a camera (`front`, `wrist`) recorded at a step, and where it stood.
 
         Returns:
-            `colours` [H, W, 3] uint8; `depth` [H, W] float32 in millimetres; `intrinsic` [3, 3] and the world-to-camera
-            `extrinsic` [3, 4] float64.
+            `colours` [H, W, 3] uint8; `depth` [H, W] float32 in millimetres; `intrinsic` [3, 3] and
+            the world-to-camera `extrinsic` [3, 4] float64.
         """
         colours = self._image(step, camera)
-        parts = {"depth": f"timestep_{step}/obs/{camera}_depth", "intrinsic": f"setup/{camera}_camera_intrinsic",
-                 "extrinsic": f"timestep_{step}/obs/{camera}_camera_extrinsic"}  # fmt: skip
+        parts = {
+            "depth": f"timestep_{step}/obs/{camera}_depth",
+            "intrinsic": f"setup/{camera}_camera_intrinsic",
+            "extrinsic": f"timestep_{step}/obs/{camera}_camera_extrinsic",
+        }
         missing = [name for name in parts.values() if name not in self._group]
-        require(not missing, f"{self.ref.file} {self.ref.group} lacks {', '.join(missing)}: record it with depth.")
+        require(
+            not missing,
+            f"{self.ref.file} {self.ref.group} lacks {', '.join(missing)}: record it with depth.",
+        )
         shapes = {"depth": colours.shape[:2], "intrinsic": (3, 3), "extrinsic": (3, 4)}
         arrays: dict[str, np.ndarray] = {"colours": colours}
         for name, shape in shapes.items():
             valid = partial(_is_finite_array, size=math.prod(shape))
             values = self._checked(parts[name], valid, f"{list(shape)} finite numbers")
-            arrays[name] = values.reshape(shape).astype(np.float32 if name == "depth" else np.float64)
+            arrays[name] = values.reshape(shape).astype(
+                np.float32 if name == "depth" else np.float64
+            )
         return arrays
 
     @contextmanager
@@ -276,8 +339,14 @@ class RawEpisode:
 
     def __iter__(self) -> Iterator[RawFrame]:
         for camera, rendered in self.rendered.items():
-            require(rendered.any(), f"{self.ref.file} {self.ref.group} has no image of the camera {camera!r}. {REMEDY}")
-        latest = {camera: self._image(int(rendered.argmax()), camera) for camera, rendered in self.rendered.items()}
+            require(
+                rendered.any(),
+                f"{self.ref.file} {self.ref.group} has no image of the camera {camera!r}. {REMEDY}",
+            )
+        latest = {
+            camera: self._image(int(rendered.argmax()), camera)
+            for camera, rendered in self.rendered.items()
+        }
         for k, subgoals in enumerate(self.subgoals()):
             fingers = self._numbers(k, "obs/gripper_state", 1)
             now = frozenset(camera for camera, rendered in self.rendered.items() if rendered[k])
@@ -285,7 +354,9 @@ class RawEpisode:
             yield RawFrame(
                 **latest,
                 rendered=now,
-                state=np.concatenate([self._numbers(k, "obs/joint_state", 7), fingers]).astype(np.float32),
+                state=np.concatenate([self._numbers(k, "obs/joint_state", 7), fingers]).astype(
+                    np.float32
+                ),
                 action=self._numbers(k, "action/joint_action", 8),
                 is_demo=k < self.exec_start,
                 subgoals=subgoals,
@@ -309,8 +380,9 @@ def find_files(inputs: Sequence[str | Path]) -> list[Path]:
             advice = "give record_dataset_<Task>.h5 files or their folder."
             if (entry / "meta" / "info.json").is_file():
                 advice = (
-                    "it is a LeRobot dataset already, named by data.sources as it is. What conversion keeps besides, "
-                    "such as keyframes, needs the HDF5 files: `mme-vla record` writes them with hdf5=…"
+                    "it is a LeRobot dataset already, named by data.sources as it is. What"
+                    " conversion keeps besides, such as keyframes, needs the HDF5 files: `mme-vla"
+                    " record` writes them with hdf5=…"
                 )
             raise UserError(f"No HDF5 file at {str(entry)!r}: {advice}")
         files.update(matches)
@@ -323,8 +395,13 @@ def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
     for file in files:
         task = re.sub(r"^record_dataset_", "", file.stem)
         with _open(file) as handle, decoding(file, "HDF5", REMEDY):
-            numbers = sorted(int(name[8:]) for name in handle if re.fullmatch(r"episode_\d{1,9}", name))
-        require(numbers, f"{file} has no episode_<number> group: it is not a RoboMME demonstration file.")
+            numbers = sorted(
+                int(name[8:]) for name in handle if re.fullmatch(r"episode_\d{1,9}", name)
+            )
+        require(
+            numbers,
+            f"{file} has no episode_<number> group: it is not a RoboMME demonstration file.",
+        )
         refs += [EpisodeRef(file, number, task) for number in numbers]
     return refs
 
@@ -333,14 +410,17 @@ def recorded_options(refs: Sequence[EpisodeRef]) -> dict[str, Any]:
     """What was recorded with these episodes, as `ConvertOptions` names it.
 
     Returns:
-        `poses`: the columns of `POSE_ACTIONS` that all episodes have. `tool_pose`, `choices`: whether all have the
-        tool's poses, options and choices. `partly`: whether one of them has images of selected frames alone.
+        `poses`: the columns of `POSE_ACTIONS` that all episodes have. `tool_pose`, `choices`:
+        whether all have the tool's poses, options and choices. `partly`: whether one of them has
+        images of selected frames alone.
     """
     poses, tool_pose, choices, partly = list(POSE_ACTIONS), True, True, False
     for file in dict.fromkeys(ref.file for ref in refs):
         with _open(file) as handle:
             for group in (ref.group for ref in refs if ref.file == file):
-                poses = [name for name in poses if f"{group}/timestep_0/{POSE_ACTIONS[name]}" in handle]
+                poses = [
+                    name for name in poses if f"{group}/timestep_0/{POSE_ACTIONS[name]}" in handle
+                ]
                 tool_pose &= f"{group}/timestep_0/obs/{POSE_STATE}" in handle
                 choices &= all(f"{group}/{name}" in handle for name in CHOICES)
                 partly |= f"{group}/{FRAMES}" in handle

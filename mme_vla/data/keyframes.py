@@ -1,7 +1,9 @@
-"""Keyframes of recorded episodes with depth and camera poses: a small store beside a dataset's tables.
+"""Keyframes of recorded episodes with depth and camera poses: a small store beside a dataset's
+tables.
 
-Waypoint policies look at few frames: those before a planned motion begins, and every tenth one, from which a chain of
-motions can be entered. So these alone are kept with what a cloud of points is made of, one `.npz` an episode.
+Waypoint policies look at few frames: those before a planned motion begins, and every tenth one,
+from which a chain of motions can be entered. So these alone are kept with what a cloud of points is
+made of, one `.npz` an episode.
 """
 
 import zipfile
@@ -30,7 +32,17 @@ ENTRY_EVERY = 10
 """A chain of keyframes begins at every so manieth frame, as released."""
 SIDE = 128
 """Pixels that images are kept at, as released."""
-_ARRAYS = ("frames", "colours", "depth", "intrinsic", "extrinsic", "open", "decisions", "targets", "length")
+_ARRAYS = (
+    "frames",
+    "colours",
+    "depth",
+    "intrinsic",
+    "extrinsic",
+    "open",
+    "decisions",
+    "targets",
+    "length",
+)
 
 
 def file_of(root: Path, episode: int) -> Path:
@@ -44,7 +56,8 @@ def motions_of(episode: RawEpisode) -> Motions:
     parts = [(0, episode.exec_start), (episode.exec_start, episode.length)]
     motions = [find_motions(rows[start:stop], start) for start, stop in parts if stop > start]
     return Motions(
-        np.concatenate([part.decisions for part in motions]), np.concatenate([part.targets for part in motions])
+        np.concatenate([part.decisions for part in motions]),
+        np.concatenate([part.targets for part in motions]),
     )
 
 
@@ -52,7 +65,9 @@ def write_keyframes(episode: RawEpisode, path: Path, side: int = SIDE) -> int:
     """Keep the keyframes of a recorded episode; returns how many frames those are."""
     motions = motions_of(episode)
     frames = np.union1d(np.arange(0, episode.length, ENTRY_EVERY), motions.decisions)
-    arrays: dict[str, list[np.ndarray]] = {name: [] for name in ("colours", "depth", "intrinsic", "extrinsic")}
+    arrays: dict[str, list[np.ndarray]] = {
+        name: [] for name in ("colours", "depth", "intrinsic", "extrinsic")
+    }
     for frame in frames:
         shots = [Shot(**episode.shot(int(frame), camera)).shrunk(side) for camera in CAMERAS]
         for name, values in arrays.items():
@@ -97,10 +112,15 @@ class EpisodeKeyframes:
             with np.load(self.path, allow_pickle=False) as file:
                 missing = [name for name in _ARRAYS if name not in file]
                 if missing:
-                    raise UserError(f"{self.path} lacks {', '.join(missing)}: it holds no keyframes of this library.")
+                    raise UserError(
+                        f"{self.path} lacks {', '.join(missing)}: it holds no keyframes of this"
+                        " library."
+                    )
                 return {name: file[name] for name in names}
         except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-            raise UserError(f"{self.path} is damaged ({error}): convert the recordings again.") from None
+            raise UserError(
+                f"{self.path} is damaged ({error}): convert the recordings again."
+            ) from None
 
     @cached_property
     def motions(self) -> Motions:
@@ -115,7 +135,9 @@ class EpisodeKeyframes:
         for start in range(0, length, ENTRY_EVERY):
             first = max(int(np.searchsorted(decisions, start, side="right")) - 1, 0)
             visited = [start, *decisions[first + 1 :].tolist()]
-            chains.append([Link(frame, first + place, place) for place, frame in enumerate(visited)])
+            chains.append(
+                [Link(frame, first + place, place) for place, frame in enumerate(visited)]
+            )
         return chains
 
     def shots(self, frames: list[int]) -> list[list[Shot]]:
@@ -125,7 +147,10 @@ class EpisodeKeyframes:
         return [
             [
                 Shot(
-                    arrays["colours"][at, c], arrays["depth"][at, c], arrays["intrinsic"][c], arrays["extrinsic"][at, c]
+                    arrays["colours"][at, c],
+                    arrays["depth"][at, c],
+                    arrays["intrinsic"][c],
+                    arrays["extrinsic"][at, c],
                 )
                 for c in range(arrays["colours"].shape[1])
             ]
@@ -139,10 +164,12 @@ class EpisodeKeyframes:
         return frames
 
     def views(self, frames: np.ndarray, robot: Embodiment) -> dict[str, np.ndarray]:
-        """Kept frames [n] as an environment delivers them to a robot that reads depth; see `KeyframeEpisode.observe`.
+        """Kept frames [n] as an environment delivers them to a robot that reads depth; see
+        `KeyframeEpisode.observe`.
 
         Returns:
-            Of every camera images [n, s, s, 3] uint8, depths [n, s, s, 1] float32 in millimetres, poses [n, 3, 4].
+            Of every camera images [n, s, s, 3] uint8, depths [n, s, s, 1] float32 in millimetres,
+            poses [n, 3, 4].
         """
         arrays = self._read("frames", "colours", "depth", "extrinsic")
         at = np.searchsorted(arrays["frames"], frames)
@@ -153,7 +180,10 @@ class EpisodeKeyframes:
                 arrays["depth"][at, c][..., None].astype(np.float32),
                 arrays["extrinsic"][at, c].astype(np.float32),
             )
-            readings |= {camera.name: arrays["colours"][at, c], **dict(zip(camera.readings, beside, strict=False))}
+            readings |= {
+                camera.name: arrays["colours"][at, c],
+                **dict(zip(camera.readings, beside, strict=False)),
+            }
         return readings
 
     def commanded_open(self, frames: list[int]) -> np.ndarray:
@@ -167,8 +197,9 @@ class EpisodeKeyframes:
 class KeyframeSample:
     """A run of k keyframes as they are kept, before any processing.
 
-    goal: in words. shots: k times the shots of all cameras. open: [k] whether the gripper's command was to be open.
-    places: [k] keyframes since the chain was entered. targets: [k, 7] the motions that follow.
+    goal: in words. shots: k times the shots of all cameras. open: [k] whether the gripper's command
+    was to be open. places: [k] keyframes since the chain was entered. targets: [k, 7] the motions
+    that follow.
     """
 
     goal: str
@@ -181,10 +212,11 @@ class KeyframeSample:
 class KeyframeDataset(Dataset[dict[str, Any]]):
     """Runs of keyframes from the chains of several datasets' episodes.
 
-    There are as many samples to an epoch as places to begin at: with `length` 1 one for every transition of every
-    chain, else one for every chain that is long enough. What is sampled is fair to tasks, as released: with `length` 1
-    a task, then one of its transitions; else a task, one of its episodes and a chain of that, sampled again where the
-    chain is too short, and a window of it. Held-out samples are gone through one by one.
+    There are as many samples to an epoch as places to begin at: with `length` 1 one for every
+    transition of every chain, else one for every chain that is long enough. What is sampled is fair
+    to tasks, as released: with `length` 1 a task, then one of its transitions; else a task, one of
+    its episodes and a chain of that, sampled again where the chain is too short, and a window of
+    it. Held-out samples are gone through one by one.
     """
 
     def __init__(
@@ -202,34 +234,40 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
         Args:
             length: k; keyframes of a sample.
             episodes: which of each source's episodes to use; None uses all.
-            sampled: whether a sample is sampled anew each epoch; else it is the place of its number.
+            sampled: whether a sample is sampled anew each epoch; else it is the place of its
+                number.
         """
         self.sources, self.processor, self.length = list(sources), processor, length
         self.seed, self.epoch = seed, 0
         selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
         self.total_frames, self.sampled = 0, sampled
         self._items: list[tuple[int, int, EpisodeKeyframes, list[Link]]] = []
-        shares: list[float] = []  # how often an item is sampled within its task, relative to the task's others
+        shares: list[
+            float
+        ] = []  # how often an item is sampled within its task, relative to the task's others
         tasks: list[str] = []
         counted: Counter[str] = Counter()
         longest = 0
         for number, (source, part) in enumerate(zip(sources, selected, strict=True)):
             for episode in map(int, part):
-                source.goal(episode)  # a sample has one: an episode of several is refused here, not while training
+                source.goal(
+                    episode
+                )  # a sample has one: an episode of several is refused here, not while training
                 self.total_frames += int(source.lengths[episode])
                 keyframes = EpisodeKeyframes(file_of(source.root, episode))
                 chains = [chain for chain in keyframes.chains if len(chain) >= length]
                 longest = max(longest, *map(len, keyframes.chains))
                 runs = [[link] for chain in chains for link in chain] if length == 1 else chains
                 self._items += [(number, episode, keyframes, run) for run in runs]
-                # An episode too short for any run still takes its turn, and the draw is repeated for all tasks alike.
+                # An episode too short for any run still takes its turn, and the draw is repeated
+                # for all tasks alike.
                 counted[source.task(episode)] += 1
                 shares += [1.0 if length == 1 else 1 / len(keyframes.chains)] * len(runs)
                 tasks += [source.task(episode)] * len(runs)
         require(
             self._items,
-            f"No chain of keyframes in the data has {length} of them; the longest has {longest}. Train on longer "
-            "tasks, or remember fewer (backbone.remembered).",
+            f"No chain of keyframes in the data has {length} of them; the longest has {longest}."
+            " Train on longer tasks, or remember fewer (backbone.remembered).",
         )
         if length == 1:
             counted = Counter(tasks)
@@ -250,7 +288,10 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
         """
         rng = np.random.default_rng([self.seed, self.epoch, index])
         if self.sampled:
-            index = min(int(np.searchsorted(self._sample_thresholds, rng.random(), side="right")), len(self) - 1)
+            index = min(
+                int(np.searchsorted(self._sample_thresholds, rng.random(), side="right")),
+                len(self) - 1,
+            )
         number, episode, keyframes, chain = self._items[index]
         begin = int(rng.integers(max(len(chain) - self.length, 1)))
         return number, episode, keyframes, chain[begin : begin + self.length]
@@ -259,7 +300,9 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
         number, episode, keyframes, links = self.window(index)
         frames = [link.frame for link in links]
         sample = KeyframeSample(
-            goal=self.sources[number].goal(episode),  # one for the whole chain, or an error that names them
+            goal=self.sources[number].goal(
+                episode
+            ),  # one for the whole chain, or an error that names them
             shots=keyframes.shots(frames),
             open=keyframes.commanded_open(frames),
             places=np.array([link.place for link in links]),

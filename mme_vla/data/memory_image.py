@@ -1,4 +1,6 @@
-"""A memory as an image: a timeline of how much is remembered of each frame, and the frames themselves."""
+"""A memory as an image: a timeline of how much is remembered of each frame, and the frames
+themselves.
+"""
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -16,11 +18,14 @@ def memory_sheet(
     """Draw what is remembered at `step`.
 
     Args:
-        frames: [step + 1, H, W, 3] uint8. selected: [n, 2] of (frame, patch), as `Memory.select` returns.
-        grid: side of a frame's patch grid. exec_start: first execution frame. title: one line above.
+        frames: [step + 1, H, W, 3] uint8. selected: [n, 2] of (frame, patch), as `Memory.select`
+            returns.
+        grid: side of a frame's patch grid. exec_start: first execution frame. title: one line
+            above.
 
     Returns:
-        An image: remembered patches in colour, the rest of their frames dimmed, the current frame last.
+        An image: remembered patches in colour, the rest of their frames dimmed, the current frame
+        last.
     """
     counts = np.bincount(selected[:, 0], minlength=len(frames))
     remembered = np.flatnonzero(counts)
@@ -35,7 +40,11 @@ def memory_sheet(
         label = f"{frame} {kind} {len(patches)}/{grid**2}"
         tiles.append(Tile(np.asarray(_highlighted(frames[frame], patches, grid)), label, colour))
     tiles.append(Tile(frames[step], f"now: frame {step}", NOW))
-    header = Image.new("RGB", (max(min(COLUMNS, len(tiles)), 6) * (TILE + GAP) - GAP, TIMELINE + 2 * LABEL), "white")
+    header = Image.new(
+        "RGB",
+        (max(min(COLUMNS, len(tiles)), 6) * (TILE + GAP) - GAP, TIMELINE + 2 * LABEL),
+        "white",
+    )
     draw = ImageDraw.Draw(header)
     _timeline(draw, counts, grid**2, exec_start, step, (0, 0, header.width, TIMELINE))
     hidden = len(remembered) - len(displayed)
@@ -49,7 +58,9 @@ def _highlighted(frame: np.ndarray, patches: np.ndarray, grid: int) -> Image.Ima
     """The frame, bright in the remembered patches and outlined around them."""
     image = thumbnail(frame)
     mask = np.isin(np.arange(grid**2), patches).reshape(grid, grid)
-    large = Image.fromarray(mask.astype(np.uint8) * 255).resize((TILE, TILE), Image.Resampling.NEAREST)
+    large = Image.fromarray(mask.astype(np.uint8) * 255).resize(
+        (TILE, TILE), Image.Resampling.NEAREST
+    )
     grey = image.convert("L").convert("RGB")
     dimmed = Image.blend(grey, Image.new("RGB", grey.size, "white"), 0.62)
     tile = Image.composite(image, dimmed, large)
@@ -70,7 +81,12 @@ def _highlighted(frame: np.ndarray, patches: np.ndarray, grid: int) -> Image.Ima
 
 
 def _timeline(
-    draw: ImageDraw.ImageDraw, counts: np.ndarray, full: int, exec_start: int, step: int, box: tuple[int, int, int, int]
+    draw: ImageDraw.ImageDraw,
+    counts: np.ndarray,
+    full: int,
+    exec_start: int,
+    step: int,
+    box: tuple[int, int, int, int],
 ) -> None:
     """Bars of the tokens remembered of each frame, over video and execution."""
     left, top, right, height = box
@@ -79,11 +95,15 @@ def _timeline(
     split = left + exec_start * scale
     for begin, end, colour in ((left, split, VIDEO), (split, right, EXECUTION)):
         if end > begin:
-            draw.rectangle((begin, top, end, bottom), fill=tuple(235 + (c - 235) // 8 for c in colour))
+            draw.rectangle(
+                (begin, top, end, bottom), fill=tuple(235 + (c - 235) // 8 for c in colour)
+            )
     for frame in np.flatnonzero(counts):
         x = left + frame * scale
         y = bottom - max(3, counts[frame] / full * (bottom - top))
-        draw.rectangle((x, y, x + max(scale, 2), bottom), fill=VIDEO if frame < exec_start else EXECUTION)
+        draw.rectangle(
+            (x, y, x + max(scale, 2), bottom), fill=VIDEO if frame < exec_start else EXECUTION
+        )
     draw.line((left, bottom, right, bottom), fill=INK)
     phases = {0: "0 · conditioning video", exec_start: f"{exec_start} · execution", step: str(step)}
     for frame, text in phases.items():

@@ -26,14 +26,16 @@ class Split:
 
 
 def split_episodes(
-    sources: Sequence[EpisodeSource], val_fraction: float = 0.0, val_episodes: Sequence[int | str] | None = None
+    sources: Sequence[EpisodeSource],
+    val_fraction: float = 0.0,
+    val_episodes: Sequence[int | str] | None = None,
 ) -> Split:
     """Split every source by episode.
 
-    `val_episodes` holds out episodes by `<source name>/<number>`, or by number where there is one source; a source it
-    names holds out exactly those. Of any other, episode e validates if the first eight
-    bytes of SHA-256("<source name>/<e>"), read as a fraction of 2⁶⁴, are below `val_fraction`: the choice does not
-    change when data are added, and needs no random numbers.
+    `val_episodes` holds out episodes by `<source name>/<number>`, or by number where there is one
+    source; a source it names holds out exactly those. Of any other, episode e validates if the
+    first eight bytes of SHA-256("<source name>/<e>"), read as a fraction of 2⁶⁴, are below
+    `val_fraction`: the choice does not change when data are added, and needs no random numbers.
     """
     named: dict[str, list[int]] = {}
     for name in val_episodes or ():
@@ -41,14 +43,16 @@ def split_episodes(
         if not number.isdigit() or (not source_name and len(sources) > 1):
             reason = ", since there are several sources." if number.isdigit() else "."
             raise UserError(
-                f"val_episodes: {name!r} should read <source>/<episode>, such as {sources[0].name}/0{reason}"
+                f"val_episodes: {name!r} should read <source>/<episode>, such as"
+                f" {sources[0].name}/0{reason}"
             )
         named.setdefault(source_name or sources[0].name, []).append(int(number))
     unknown = set(named) - {source.name for source in sources}
     require(
         not unknown,
-        f"val_episodes names {', '.join(sorted(unknown))}, but the sources are "
-        f"{', '.join(source.name for source in sources)}. Name episodes of these, or set data.val_episodes=[].",
+        f"val_episodes names {', '.join(sorted(unknown))}, but the sources are"
+        f" {', '.join(source.name for source in sources)}. Name episodes of these, or set"
+        " data.val_episodes=[].",
     )
     require(0 <= val_fraction < 1, f"val_fraction={val_fraction} must lie in [0, 1).")
     split = Split([], [])
@@ -58,22 +62,29 @@ def split_episodes(
             wrong = [number for number in named[source.name] if not 0 <= number < len(source)]
             require(
                 not wrong,
-                f"val_episodes names {wrong} of {source.name}, which has episodes 0…{len(source) - 1}. "
-                "Name others, or hold out a share: data.val_episodes=[] data.val_fraction=0.1",
+                f"val_episodes names {wrong} of {source.name}, which has episodes"
+                f" 0…{len(source) - 1}. Name others, or hold out a share: data.val_episodes=[]"
+                " data.val_fraction=0.1",
             )
             held_out = np.isin(episodes, named[source.name])
         else:
             sums = (sha256(f"{source.name}/{e}".encode()).digest()[:8] for e in episodes)
-            held_out = np.array([int.from_bytes(number, "big") / 2**64 < val_fraction for number in sums], bool)
+            held_out = np.array(
+                [int.from_bytes(number, "big") / 2**64 < val_fraction for number in sums], bool
+            )
         split.train.append(episodes[~held_out])
         split.val.append(episodes[held_out])
     if not sum(map(len, split.train)):
-        raise UserError("The split leaves no episode to train on; lower val_fraction or shorten val_episodes.")
+        raise UserError(
+            "The split leaves no episode to train on; lower val_fraction or shorten val_episodes."
+        )
     return split
 
 
 def default_val_episodes(sources: Sequence[EpisodeSource]) -> list[str]:
-    """Episodes held out where `data.val_episodes` is null: the sample's episode 3, and none of any other dataset."""
+    """Episodes held out where `data.val_episodes` is null: the sample's episode 3, and none of any
+    other dataset.
+    """
     return [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
 
 
@@ -81,9 +92,11 @@ _KEYS = ("root", "name", "exec_starts")
 
 
 def open_sources(
-    entries: str | Mapping[str, Any] | Sequence[str | Mapping[str, Any]], robot: Embodiment = ROBOMME_JOINT
+    entries: str | Mapping[str, Any] | Sequence[str | Mapping[str, Any]],
+    robot: Embodiment = ROBOMME_JOINT,
 ) -> list[EpisodeSource]:
-    """Open the datasets of `data.sources`: folders, `sample`, or mappings with root, name and exec_starts.
+    """Open the datasets of `data.sources`: folders, `sample`, or mappings with root, name and
+    exec_starts.
 
     `robot` says which columns hold its images, states and actions.
     """
@@ -93,25 +106,37 @@ def open_sources(
     for entry in listed:
         options = {"root": entry} if isinstance(entry, str) else dict(entry)
         for key in options:
-            require(key in _KEYS, f"Unknown key {key!r} of a data source. {did_you_mean(str(key), _KEYS)}")
-        require(options.get("root"), "A data source needs its dataset folder: root=<folder>, or 'sample'.")
+            require(
+                key in _KEYS,
+                f"Unknown key {key!r} of a data source. {did_you_mean(str(key), _KEYS)}",
+            )
+        require(
+            options.get("root"),
+            "A data source needs its dataset folder: root=<folder>, or 'sample'.",
+        )
         sources.append(EpisodeSource(**options, robot=robot))
     names = [source.name for source in sources]
     if len(set(names)) < len(names):
-        raise UserError(f"Two data sources have the same name ({', '.join(names)}); give one a `name` of its own.")
+        raise UserError(
+            f"Two data sources have the same name ({', '.join(names)}); give one a `name` of its"
+            " own."
+        )
     for other in sources[1:]:
         compare_sources(sources[0], other)
     return sources
 
 
 UNITS_APART = 20
-"""How many times larger one source's numbers are than the other's where units differ: 57 from radians to degrees."""
+"""How many times larger one source's numbers are than the other's where units differ: 57 from
+radians to degrees.
+"""
 
 
 def compare_sources(first: EpisodeSource, second: EpisodeSource) -> None:
     """Compare two datasets that are trained on together.
 
-    Other rates and other sizes of numbers (degrees beside radians) are a warning: both may be meant.
+    Other rates and other sizes of numbers (degrees beside radians) are a warning: both may be
+    meant.
 
     Raises:
         UserError: their numbers have the same names in another order.
@@ -121,15 +146,24 @@ def compare_sources(first: EpisodeSource, second: EpisodeSource) -> None:
         ("action", first.action_names, second.action_names),
     ):
         compare_names(
-            ours, theirs, kind, f"the source {first.name}", f"the source {second.name}",
-            "Trained together, one number would mean two things: bring one dataset's columns into the other's order.",
-        )  # fmt: skip
+            ours,
+            theirs,
+            kind,
+            f"the source {first.name}",
+            f"the source {second.name}",
+            "Trained together, one number would mean two things: bring one dataset's columns into"
+            " the other's order.",
+        )
         _compare_scales(first, second, kind)
     if first.fps != second.fps:
         log.warning(
-            "The source %s has %g frames per second, %s has %g: one step of a chunk is another time in each.",
-            first.name, first.fps, second.name, second.fps,
-        )  # fmt: skip
+            "The source %s has %g frames per second, %s has %g: one step of a chunk is another time"
+            " in each.",
+            first.name,
+            first.fps,
+            second.name,
+            second.fps,
+        )
 
 
 def _compare_scales(first: EpisodeSource, second: EpisodeSource, kind: str) -> None:
@@ -143,7 +177,13 @@ def _compare_scales(first: EpisodeSource, second: EpisodeSource, kind: str) -> N
         return
     d = int(np.flatnonzero(moving)[int(np.argmin(np.abs(ratios - np.median(ratios))))])
     log.warning(
-        "The %s of %s and of %s seem to have different units: number %d reaches %.4g in one and %.4g in the other "
-        "(degrees beside radians differ by 57). Statistics are computed over both; convert one if that is not meant.",
-        kind, first.name, second.name, d + 1, ours[d], theirs[d],
-    )  # fmt: skip
+        "The %s of %s and of %s seem to have different units: number %d reaches %.4g in one and"
+        " %.4g in the other (degrees beside radians differ by 57). Statistics are computed over"
+        " both; convert one if that is not meant.",
+        kind,
+        first.name,
+        second.name,
+        d + 1,
+        ours[d],
+        theirs[d],
+    )

@@ -40,25 +40,32 @@ def compute_norm_stats(
     video: bool = False,
     narrow: str = "warn",
 ) -> NormStats:
-    """Mean, deviation and 1 % / 99 % quantiles of states and of action chunks as they are predicted.
+    """Mean, deviation and 1 % / 99 % quantiles of states and of action chunks as they are
+    predicted.
 
-    As released: one pass over all execution steps in shuffled order, in batches of 128 of which an incomplete last one
-    is left out (unless it is the only one), every step of every chunk counted, repeated last actions included.
-    Numbers of which one is 1, the letters of a choice, go from 0 to 1 whatever the data hold.
+    As released: one pass over all execution steps in shuffled order, in batches of 128 of which an
+    incomplete last one is left out (unless it is the only one), every step of every chunk counted,
+    repeated last actions included. Numbers of which one is 1, the letters of a choice, go from 0 to
+    1 whatever the data hold.
 
     Args:
         sources: the datasets.
         episodes: which of each dataset's episodes count; None counts all.
-        horizon, action_offset: as in training; chunk step i of observation k is action k + offset + i.
+        horizon, action_offset: as in training; chunk step i of observation k is action k + offset +
+            i.
         seed: of the order. robot: says which numbers of an action are relative to the state.
-        every: count every execution step, in the data's order. extremes: keep the smallest and largest values too.
+        every: count every execution step, in the data's order. extremes: keep the smallest and
+            largest values too.
         exact: quantiles of all rows at once (linear interpolation), not of their histogram.
         video: count the conditioning video's steps too.
         narrow: what to do about a number whose range the values leave by far (`check_ranges`).
     """
     check_choice("narrow", narrow, NARROW)
     steps = _counted_steps(sources, episodes, video)
-    require(len(steps) >= 2, f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.")
+    require(
+        len(steps) >= 2,
+        f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.",
+    )
     if not every:
         np.random.default_rng(seed).shuffle(steps)
     batches = -(-len(steps) // BATCH) if every else max(len(steps) // BATCH, 1)
@@ -66,7 +73,9 @@ def compute_norm_stats(
     with progress("statistics", batches, unit="batches") as advance:
         for i in range(batches):
             rows = steps[i * BATCH : (i + 1) * BATCH].tolist()
-            state = torch.from_numpy(np.stack([sources[s].states(e, t, t + 1)[0] for s, e, t in rows]))
+            state = torch.from_numpy(
+                np.stack([sources[s].states(e, t, t + 1)[0] for s, e, t in rows])
+            )
             chunks = [sources[s].action_chunk(e, t, horizon, action_offset)[0] for s, e, t in rows]
             chunk = torch.from_numpy(np.stack(chunks))
             states.update(state.numpy())
@@ -74,14 +83,18 @@ def compute_norm_stats(
             advance(1)
     values = actions.result(extremes).to_dict()
     for name, value in {"q01": 0.0, "q99": 1.0, "min": 0.0, "max": 1.0}.items():
-        for place in robot.action.choice if name in values else ():  # a letter that is seldom chosen has no range
+        for place in (
+            robot.action.choice if name in values else ()
+        ):  # a letter that is seldom chosen has no range
             values[name][place] = value
     stats = NormStats(state=states.result(extremes), actions=QuantileStats.from_dict(values))
     return check_ranges(stats, sources, episodes, horizon, action_offset, robot, video, narrow)
 
 
 NARROW = ("refuse", "warn", "widen", "ignore")
-"""What can be done about a range that is far too narrow; `ignore` does not look, for policies that do not need it."""
+"""What can be done about a range that is far too narrow; `ignore` does not look, for policies that
+do not need it.
+"""
 
 
 def check_ranges(
@@ -94,20 +107,24 @@ def check_ranges(
     video: bool = False,
     narrow: str = "refuse",
 ) -> NormStats:
-    """Compare statistics with the extremes of what they normalise: every state, and every action of every chunk.
+    """Compare statistics with the extremes of what they normalise: every state, and every action of
+    every chunk.
 
-    A number that never moves is in order. One that moves in so few samples that its quantiles do not show it, or that
-    has values beyond `NARROW_RANGES` ranges, gives the loss targets of many thousands.
+    A number that never moves is in order. One that moves in so few samples that its quantiles do
+    not show it, or that has values beyond `NARROW_RANGES` ranges, gives the loss targets of many
+    thousands.
 
     Args:
         stats: of any data. The others are as in `compute_norm_stats`.
-        narrow: `refuse`; `warn`; or `widen`, which makes the range of such a number reach to its extremes.
+        narrow: `refuse`; `warn`; or `widen`, which makes the range of such a number reach to its
+            extremes.
 
     Returns:
         The statistics, widened if asked to.
 
     Raises:
-        UserError: a range is too narrow, and `narrow` is `refuse`. It names the number, its range and its extremes.
+        UserError: a range is too narrow, and `narrow` is `refuse`. It names the number, its range
+            and its extremes.
     """
     check_choice("narrow", narrow, NARROW)
     if narrow == "ignore":
@@ -117,15 +134,20 @@ def check_ranges(
     changed = {}
     for kind, ends in (("state", state), ("actions", actions)):
         of = getattr(stats, kind)
-        places = [place for place in narrow_numbers(of, *ends) if kind == "state" or place not in robot.action.choice]
+        places = [
+            place
+            for place in narrow_numbers(of, *ends)
+            if kind == "state" or place not in robot.action.choice
+        ]
         if not places:
             continue
         lines = []
         for place in places:
             name = names[kind][place] if place < len(names[kind]) else f"number {place + 1}"
             lines.append(
-                f"{name} of the {kind.removesuffix('s')} has q01 {of.q01[place]:.6g} and q99 {of.q99[place]:.6g}, but "
-                f"values from {ends[0][place]:.6g} to {ends[1][place]:.6g}"
+                f"{name} of the {kind.removesuffix('s')} has q01 {of.q01[place]:.6g} and q99"
+                f" {of.q99[place]:.6g}, but values from {ends[0][place]:.6g} to"
+                f" {ends[1][place]:.6g}"
             )
         summary = "; ".join(lines)
         if narrow == "widen":
@@ -133,9 +155,10 @@ def check_ranges(
             changed[kind] = widened(of, places, *ends)
             continue
         message = (
-            f"{summary}. Normalised by such a range they become numbers in the hundreds to millions, and the loss with "
-            "them. If they are broken readings, correct the data. If the number seldom moves, set "
-            "data.narrow_ranges=widen: its range then reaches from the least to the greatest value."
+            f"{summary}. Normalised by such a range they become numbers in the hundreds to"
+            " millions, and the loss with them. If they are broken readings, correct the data. If"
+            " the number seldom moves, set data.narrow_ranges=widen: its range then reaches from"
+            " the least to the greatest value."
         )
         if narrow == "refuse":
             raise UserError(message)
@@ -151,7 +174,9 @@ def _extremes(
     robot: Embodiment,
     video: bool,
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Least and greatest of the states, [s] each, and of the actions as they are predicted, [w] each."""
+    """Least and greatest of the states, [s] each, and of the actions as they are predicted, [w]
+    each.
+    """
     bounds_of: dict[str, list[np.ndarray]] = {"state": [], "actions": []}
     for i, source in enumerate(sources):
         for number in range(len(source)) if episodes is None else episodes[i]:
@@ -163,30 +188,46 @@ def _extremes(
             states = source.states(episode)[steps]
             bounds_of["state"] += [states.min(axis=0), states.max(axis=0)]
             if robot.action.frames is None:
-                chunks = np.stack([source.action_chunk(episode, int(t), horizon, action_offset)[0] for t in steps])
+                chunks = np.stack(
+                    [source.action_chunk(episode, int(t), horizon, action_offset)[0] for t in steps]
+                )
             else:
                 later = steps[:, None] + action_offset + np.arange(horizon)
                 chunks = source.actions(episode)[np.minimum(later, length - 1)]
                 for place in robot.action.of_pose:
-                    chunks[..., place][later >= length] = 0  # as `action_chunk` has them past the end
-            relative = robot.action.to_relative(torch.from_numpy(chunks), torch.from_numpy(states)).numpy()
+                    chunks[..., place][later >= length] = (
+                        0  # as `action_chunk` has them past the end
+                    )
+            relative = robot.action.to_relative(
+                torch.from_numpy(chunks), torch.from_numpy(states)
+            ).numpy()
             bounds_of["actions"] += [relative.min(axis=(0, 1)), relative.max(axis=(0, 1))]
     return tuple((np.min(ends, axis=0), np.max(ends, axis=0)) for ends in bounds_of.values())  # type: ignore[return-value]
 
 
-def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool) -> np.ndarray:
+def _counted_steps(
+    sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool
+) -> np.ndarray:
     """All (source, episode, step) of the execution phases, or of whole records, int32 [n, 3]."""
     parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
     for i, source in enumerate(sources):
         for episode in range(len(source)) if episodes is None else episodes[i]:
-            every = range(int(source.lengths[int(episode)])) if video else source.decisions(int(episode))
+            every = (
+                range(int(source.lengths[int(episode)]))
+                if video
+                else source.decisions(int(episode))
+            )
             step = np.asarray(every, np.int32)
-            parts.append(np.stack([np.full_like(step, i), np.full_like(step, episode), step], axis=1))
+            parts.append(
+                np.stack([np.full_like(step, i), np.full_like(step, episode), step], axis=1)
+            )
     return np.concatenate(parts)
 
 
 def normalised_states(states: np.ndarray) -> Tensor:
-    """States [t, s] by their own quantiles, [t, s] float32: of recordings that no policy with statistics reads."""
+    """States [t, s] by their own quantiles, [t, s] float32: of recordings that no policy with
+    statistics reads.
+    """
     low, high = np.quantile(states.astype(np.float64), (0.01, 0.99), axis=0)
     stats = QuantileStats(states.mean(0), states.std(0), low, high)
     return normalize(torch.from_numpy(np.asarray(states, np.float32)), stats)

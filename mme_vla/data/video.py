@@ -1,8 +1,9 @@
 """Images out of video files, by time stamp, with PyAV.
 
-PyAV brings its own FFmpeg, so the same decoder runs on every machine; torchcodec needs FFmpeg's libraries from the
-system and is not used. Files stay open between calls, as many as the process may hold: samples are sampled from all
-episodes at random, and opening a file takes longer than decoding an image.
+PyAV brings its own FFmpeg, so the same decoder runs on every machine; torchcodec needs FFmpeg's
+libraries from the system and is not used. Files stay open between calls, as many as the process may
+hold: samples are sampled from all episodes at random, and opening a file takes longer than decoding
+an image.
 """
 
 import os
@@ -16,11 +17,15 @@ import numpy as np
 from mme_vla.errors import UserError, require
 from mme_vla.utils import decoding, files_to_hold
 
-_SEEK_BEYOND = 64  # images: a target further ahead than this is sought, a nearer one is decoded up to
+_SEEK_BEYOND = (
+    64  # images: a target further ahead than this is sought, a nearer one is decoded up to
+)
 
 
 class VideoReader:
-    """Decodes single images from a bounded number of open files. Safe across `fork`: a child opens its own."""
+    """Decodes single images from a bounded number of open files. Safe across `fork`: a child opens
+    its own.
+    """
 
     def __init__(self, max_open: int = 512) -> None:
         """Open nothing yet.
@@ -34,11 +39,16 @@ class VideoReader:
         self._may_hold: int | None = None
 
     def read(self, path: Path, timestamps: Sequence[float] | np.ndarray, fps: float) -> np.ndarray:
-        """Return the images nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order asked for."""
+        """Return the images nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order
+        asked for.
+        """
         order = np.argsort(np.asarray(timestamps), kind="stable")
         targets = np.asarray(timestamps, np.float64)[order]
         images: list[np.ndarray] = []
-        require(path.is_file(), f"{path} is missing: the dataset is incomplete. Copy or download it again.")
+        require(
+            path.is_file(),
+            f"{path} is missing: the dataset is incomplete. Copy or download it again.",
+        )
         try:
             with decoding(path, "a video", "Copy or convert it again."):
                 for image in self._decode(self._container(path), targets, fps):
@@ -51,8 +61,9 @@ class VideoReader:
         if len(images) < len(targets):
             self._drop(path)
             raise UserError(
-                f"{path} holds no image at {targets[len(images)]:.3f} s ({fps:g} frames per second): the video is "
-                "shorter than the table beside it, or damaged. Copy or convert the dataset again."
+                f"{path} holds no image at {targets[len(images)]:.3f} s ({fps:g} frames per"
+                " second): the video is shorter than the table beside it, or damaged. Copy or"
+                " convert the dataset again."
             )
         out = np.empty((len(targets), *images[0].shape), np.uint8)
         out[order] = images
@@ -77,7 +88,9 @@ class VideoReader:
                 if frame is None:
                     return
                 time, image = float(frame.pts * stream.time_base), frame
-            while target - time > tolerance / 2:  # of a video with more images a second, the next may be nearer
+            while (
+                target - time > tolerance / 2
+            ):  # of a video with more images a second, the next may be nearer
                 ahead = next(frames, None) if ahead is None else ahead
                 if ahead is None:
                     break
@@ -92,12 +105,16 @@ class VideoReader:
     def _container(self, path: Path) -> Any:
         import av
 
-        if self._process != os.getpid():  # open files of a parent process share their position with it
+        if (
+            self._process != os.getpid()
+        ):  # open files of a parent process share their position with it
             self._open, self._process = OrderedDict(), os.getpid()
             self._may_hold = None
         if path not in self._open:
             container = av.open(str(path))
-            container.streams.video[0].codec_context.thread_count = 1  # parallelism is across workers
+            container.streams.video[
+                0
+            ].codec_context.thread_count = 1  # parallelism is across workers
             self._open[path] = container
             if self._may_hold is None:
                 self._may_hold = files_to_hold(self.max_open)

@@ -15,7 +15,8 @@ from mme_vla.utils import parse_json
 class Motions:
     """The motions of one episode's execution.
 
-    decisions: [m] int64, ascending; the last frame seen before each motion began. targets: [m, w] float32.
+    decisions: [m] int64, ascending; the last frame seen before each motion began. targets: [m, w]
+    float32.
     """
 
     decisions: np.ndarray
@@ -39,11 +40,13 @@ class Motions:
 def find_motions(rows: np.ndarray, first: int) -> Motions:
     """Take apart a column that holds, for every frame, the target of the motion under way.
 
-    A motion begins where its target first is in the column: that frame was seen when it had already begun, so it
-    was decided one frame before. The first one was decided at the first execution frame.
+    A motion begins where its target first is in the column: that frame was seen when it had already
+    begun, so it was decided one frame before. The first one was decided at the first execution
+    frame.
 
     Args:
-        rows: [t, w] of the execution frames; NaN where no motion was noted yet. first: number of their first frame.
+        rows: [t, w] of the execution frames; NaN where no motion was noted yet. first: number of
+            their first frame.
     """
     noted = np.flatnonzero(np.isfinite(rows).all(1))
     targets = rows[noted]
@@ -55,7 +58,9 @@ def find_motions(rows: np.ndarray, first: int) -> Motions:
     return Motions(decisions.astype(np.int64) + first, targets[new].astype(np.float32))
 
 
-def known_poses(noted: np.ndarray, exec_start: int, reached: Callable[[int], np.ndarray]) -> np.ndarray:
+def known_poses(
+    noted: np.ndarray, exec_start: int, reached: Callable[[int], np.ndarray]
+) -> np.ndarray:
     """Poses of every step from those that were noted; see `RawEpisode.pose_actions`.
 
     Args:
@@ -81,25 +86,35 @@ CHOICE_NUMBERS = [*(f"choice_{letter}" for letter in LETTERS), "point_y", "point
 
 
 def row_of(text: str) -> np.ndarray | None:
-    """A recorded choice, `{"choice": "A", "point": [y, x]}` in pixels, as a row; None where no letter was chosen."""
+    """A recorded choice, `{"choice": "A", "point": [y, x]}` in pixels, as a row; None where no
+    letter was chosen.
+    """
     try:
         choice = parse_json(text, "a recorded choice")
-        letter, point = choice["choice"].strip().lower(), np.asarray(choice.get("point") or (), np.float64)
+        letter, point = (
+            choice["choice"].strip().lower(),
+            np.asarray(choice.get("point") or (), np.float64),
+        )
     except (UserError, ValueError, TypeError, KeyError, AttributeError):
         letter, point = None, np.zeros(0)
     right = letter == "" or (letter is not None and len(letter) == 1 and letter in LETTERS)
     if not right or point.shape not in ((0,), (2,)) or not np.isfinite(point).all():
-        raise UserError(f'{brief(text)} is no choice; expected {{"choice": "A", "point": [y, x]}}, letters A to H.')
+        raise UserError(
+            f'{brief(text)} is no choice; expected {{"choice": "A", "point": [y, x]}}, letters A'
+            " to H."
+        )
     return choice_row(letter, point.tolist()) if letter else None
 
 
 def find_choices(rows: np.ndarray, first: int, letters: Sequence[int]) -> Motions:
-    """The choices of an execution, each decided on the frame before the one it began at, the first one at the start.
+    """The choices of an execution, each decided on the frame before the one it began at, the first
+    one at the start.
 
     Unlike a waypoint a choice may be made twice in a row.
 
     Args:
-        rows: [t, w] of the execution frames. first: number of their first frame. letters: which numbers are letters.
+        rows: [t, w] of the execution frames. first: number of their first frame. letters: which
+            numbers are letters.
     """
     begun: Any = np.flatnonzero(rows[:, list(letters)].any(1))
     decisions = np.maximum(begun - 1, np.arange(len(begun)))

@@ -44,7 +44,9 @@ def centres(value: Any, where: str, width: int) -> dict[int, float]:
         if not all(map(math.isfinite, read.values())):
             raise ValueError
     except (AttributeError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{where} must be a map such as {{3: 3.14}}, number to centre, got {brief(value)}.") from None
+        raise UserError(
+            f"{where} must be a map such as {{3: 3.14}}, number to centre, got {brief(value)}."
+        ) from None
     column_indices(list(read), where, width)
     return read
 
@@ -67,7 +69,8 @@ MIDDLE: Place = (0.5, 0.5)
 
 @dataclass(frozen=True)
 class Option:
-    """What can be chosen: its letter (`a`, `b`, …), what it does in words, and whether it needs a point.
+    """What can be chosen: its letter (`a`, `b`, …), what it does in words, and whether it needs a
+    point.
 
     possible: whether the environment offers it now; it is listed in any case.
     """
@@ -94,7 +97,10 @@ def read_options(value: Any, letters: int) -> tuple[Option, ...]:
         letters: how many there can be.
     """
     known = ascii_lowercase[:letters]
-    expected = f'a list of {{"label": "a", "action": "…", "need_parameter": false}}, labels {known[0]} to {known[-1]}'
+    expected = (
+        f'a list of {{"label": "a", "action": "…", "need_parameter": false}}, labels {known[0]} to'
+        f" {known[-1]}"
+    )
     require(
         isinstance(value, Sequence) and not isinstance(value, str) and 1 <= len(value) <= letters,
         f"The options to choose from are {brief(value)}; expected {expected}.",
@@ -107,11 +113,22 @@ def read_options(value: Any, letters: int) -> tuple[Option, ...]:
         wordy = right and len(option["action"]) > MOST_WORDS
         if not (len(label) == 1 and label in known and not wordy and isinstance(needs, bool)):
             raise UserError(f"The option {brief(option)} cannot be chosen; expected {expected}.")
-        options.append(Option(label, " ".join(option["action"].split()), needs, option.get("possible", True) is True))
+        options.append(
+            Option(
+                label,
+                " ".join(option["action"].split()),
+                needs,
+                option.get("possible", True) is True,
+            )
+        )
     require(
-        len({option.label for option in options}) >= len(options), f"The options {brief(value)} have a letter twice."
+        len({option.label for option in options}) >= len(options),
+        f"The options {brief(value)} have a letter twice.",
     )
-    require(any(option.possible for option in options), f"None of the options {brief(value)} is possible.")
+    require(
+        any(option.possible for option in options),
+        f"None of the options {brief(value)} is possible.",
+    )
     return tuple(options)
 
 
@@ -126,31 +143,50 @@ ANGLES = (3, 4, 5)
 """The angles' places in it."""
 DELTA = "ee_delta"
 _KEYS = (
-    "key", "space", "width", "names", "units", "relative", "angles", "binary", "horizon", "execute", "frames",
-    "choice", "point", "options_length", "of_pose", "pose_key",
-)  # fmt: skip
+    "key",
+    "space",
+    "width",
+    "names",
+    "units",
+    "relative",
+    "angles",
+    "binary",
+    "horizon",
+    "execute",
+    "frames",
+    "choice",
+    "point",
+    "options_length",
+    "of_pose",
+    "pose_key",
+)
 
 
 @dataclass(frozen=True)
 class ActionSpace:
     """The actions of a policy.
 
-    width: w; numbers of an action. key: columns of the dataset that hold them, joined; empty for the usual names.
-    space: the benchmark's action space that takes them; None for a robot that is not the benchmark's.
-    names, units: of each number, for plots and reports. Without names a dataset's are taken (`with_names`).
-    relative: numbers predicted relative to the state's number at the same place; the others are absolute.
-    angles: number → centre in radians; what is predicted lies within π of the centre, so that it does not jump by 2π.
-    binary: numbers that are commanded as −1 or 1 and nothing between.
-    horizon: h; actions of a chunk. execute: how many of them are executed before the policy is asked again.
-    frames: camera frames an action takes; None where an action is one planned motion of any length.
-    choice: numbers of which one is 1 and the others 0, the letters a, b, … of the options that an episode offers; what
-        is predicted are scores, and `decide` takes the best that is offered. Normalised as [0, 1], never by statistics.
-    point: the two numbers of a point in the memory camera's image: y and x as shares of its height and width.
-    of_pose: numbers that are differences to the tool's pose at their own step, i. e. to the pose's number at the same
-        place, angles (from the fourth on) by the shorter way: recorded, predicted and sent as such. Who executes an
+    width: w; numbers of an action. key: columns of the dataset that hold them, joined; empty for
+    the usual names. space: the benchmark's action space that takes them; None for a robot that is
+    not the benchmark's. names, units: of each number, for plots and reports. Without names a
+    dataset's are taken (`with_names`). relative: numbers predicted relative to the state's number
+    at the same place; the others are absolute. angles: number → centre in radians; what is
+    predicted lies within π of the centre, so that it does not jump by 2π. binary: numbers that are
+    commanded as −1 or 1 and nothing between. horizon: h; actions of a chunk. execute: how many of
+    them are executed before the policy is asked again. frames: camera frames an action takes; None
+    where an action is one planned motion of any length. choice: numbers of which one is 1 and the
+    others 0, the letters a, b, … of the options that an episode offers; what
+        is predicted are scores, and `decide` takes the best that is offered. Normalised as [0, 1],
+        never by statistics.
+    point: the two numbers of a point in the memory camera's image: y and x as shares of its height
+    and width. of_pose: numbers that are differences to the tool's pose at their own step, i. e. to
+    the pose's number at the same
+        place, angles (from the fourth on) by the shorter way: recorded, predicted and sent as such.
+            Who executes an
         action adds the pose of that moment (`beside_pose`). Past a recording's end they are 0.
     pose_key: columns of the dataset that hold that pose.
-    options_length: tokens that the prompt has for the options, beside the processor's `prompt_length`.
+    options_length: tokens that the prompt has for the options, beside the processor's
+    `prompt_length`.
     """
 
     width: int
@@ -179,11 +215,13 @@ class ActionSpace:
         horizon = check_integer(f"{where}.horizon", values.get("horizon", 20))
         execute = check_integer(f"{where}.execute", values.get("execute", min(16, horizon)))
         require(
-            execute <= horizon, f"{where}.execute={execute}: a chunk has {horizon} actions (horizon); execute fewer."
+            execute <= horizon,
+            f"{where}.execute={execute}: a chunk has {horizon} actions (horizon); execute fewer.",
         )
         frames = values.get("frames", 1)
         require(
-            frames in (1, None), f"{where}.frames={brief(frames)}: expected 1; null if an action is one planned motion."
+            frames in (1, None),
+            f"{where}.frames={brief(frames)}: expected 1; null if an action is one planned motion.",
         )
         choice, point, length = _choices(values, where, width)
         return cls(
@@ -192,7 +230,9 @@ class ActionSpace:
             space=None if values.get("space") is None else str(values["space"]),
             names=words(values.get("names"), f"{where}.names", width, numbered(width)),
             units=words(values.get("units"), f"{where}.units", width, [""] * width),
-            relative=column_indices(values.get("relative"), f"{where}.relative", min(width, state_width)),
+            relative=column_indices(
+                values.get("relative"), f"{where}.relative", min(width, state_width)
+            ),
             angles=centres(values.get("angles"), f"{where}.angles", width),
             binary=column_indices(values.get("binary"), f"{where}.binary", width),
             horizon=horizon,
@@ -207,9 +247,18 @@ class ActionSpace:
 
     def to_dict(self) -> dict[str, Any]:
         """The section that `from_dict` reads, fit for JSON."""
-        listed = {name: list(getattr(self, name)) for name in ("key", "names", "units", "relative", "binary")}
-        scalars = {name: getattr(self, name) for name in ("space", "width", "horizon", "execute", "frames")}
-        choices = {"choice": list(self.choice), "point": list(self.point), "options_length": self.options_length}
+        listed = {
+            name: list(getattr(self, name))
+            for name in ("key", "names", "units", "relative", "binary")
+        }
+        scalars = {
+            name: getattr(self, name) for name in ("space", "width", "horizon", "execute", "frames")
+        }
+        choices = {
+            "choice": list(self.choice),
+            "point": list(self.point),
+            "options_length": self.options_length,
+        }
         posed = {"of_pose": list(self.of_pose), "pose_key": list(self.pose_key)}
         return {
             **scalars,
@@ -227,11 +276,15 @@ class ActionSpace:
 
     @property
     def answers(self) -> str | None:
-        """What clients call this action space: the benchmark's name, or `ee_delta` for differences to poses."""
+        """What clients call this action space: the benchmark's name, or `ee_delta` for differences
+        to poses.
+        """
         return DELTA if self.of_pose else self.space
 
     def from_poses(self, actions: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Recorded actions [t, w] as differences to the poses [t, 6] of their own steps, where they are such."""
+        """Recorded actions [t, w] as differences to the poses [t, 6] of their own steps, where they
+        are such.
+        """
         out = np.array(actions, np.float64)
         for place in self.of_pose:
             out[:, place] -= poses[:, place]
@@ -246,7 +299,8 @@ class ActionSpace:
         return out
 
     def to_relative(self, actions: "Tensor", state: "Tensor") -> "Tensor":
-        """Express a chunk as it is predicted: relative to one state, the same reference for all its steps.
+        """Express a chunk as it is predicted: relative to one state, the same reference for all its
+        steps.
 
         Args:
             actions: [..., h, w] as recorded. state: [..., s] when the chunk begins.
@@ -259,11 +313,15 @@ class ActionSpace:
             places = list(self.relative)
             out[..., places] -= state[..., None, places].to(actions)
         for place, centre in self.angles.items():
-            out[..., place] = (out[..., place] - centre + math.pi).remainder(2 * math.pi) - math.pi + centre
+            out[..., place] = (
+                (out[..., place] - centre + math.pi).remainder(2 * math.pi) - math.pi + centre
+            )
         return out
 
     def to_absolute(self, predicted: "Tensor", state: "Tensor") -> "Tensor":
-        """Turn what is predicted into commands: the inverse of `to_relative`, up to whole turns of angles."""
+        """Turn what is predicted into commands: the inverse of `to_relative`, up to whole turns of
+        angles.
+        """
         out = predicted.clone()
         if self.relative:
             places = list(self.relative)
@@ -281,7 +339,8 @@ class ActionSpace:
         return f"{goal.rstrip(' .')}. Options: {in_words(options)}"
 
     def decide(self, actions: "Tensor", options: Sequence[Option]) -> "Tensor":
-        """Turn the scores of letters into choices: the best of those offered is 1, all others are 0.
+        """Turn the scores of letters into choices: the best of those offered is 1, all others are
+        0.
 
         Args:
             actions: [..., w] absolute. options: what the episode offers.
@@ -317,25 +376,32 @@ def _require(options: Sequence[Option]) -> None:
 def _of_pose(values: Mapping[str, Any], where: str, width: int) -> tuple[int, ...]:
     """`of_pose`, which needs poses to differ from, and steps that have one."""
     places = column_indices(values.get("of_pose"), f"{where}.of_pose", min(width, POSE_WIDTH))
-    if places and (not values.get("pose_key") or values.get("frames", 1) is None or values.get("relative")):
+    if places and (
+        not values.get("pose_key") or values.get("frames", 1) is None or values.get("relative")
+    ):
         raise UserError(
-            f"{where}.of_pose={list(places)}: name the columns of the tool's pose (pose_key), one action a frame "
-            "(frames=1), and nothing relative to the state besides (relative=[])."
+            f"{where}.of_pose={list(places)}: name the columns of the tool's pose (pose_key), one"
+            " action a frame (frames=1), and nothing relative to the state besides (relative=[])."
         )
     return places
 
 
-def _choices(values: Mapping[str, Any], where: str, width: int) -> tuple[tuple[int, ...], tuple[int, ...], int]:
+def _choices(
+    values: Mapping[str, Any], where: str, width: int
+) -> tuple[tuple[int, ...], tuple[int, ...], int]:
     """`choice`, `point` and `options_length`."""
     choice = column_indices(values.get("choice"), f"{where}.choice", width)
     point = column_indices(values.get("point"), f"{where}.point", width)
     if len(point) not in (0, 2) or set(point) & set(choice) or (point and not choice):
         raise UserError(
-            f"{where}.point={brief(values.get('point'))}: expected the two numbers y, x beside the choice's."
+            f"{where}.point={brief(values.get('point'))}: expected the two numbers y, x beside the"
+            " choice's."
         )
     require(
-        len(choice) <= len(ascii_lowercase) and (not (choice and values.get("frames", 1) is not None)),
-        f"{where}.choice: at most {len(ascii_lowercase)} letters, each a motion of any length: frames=null.",
+        len(choice) <= len(ascii_lowercase)
+        and (not (choice and values.get("frames", 1) is not None)),
+        f"{where}.choice: at most {len(ascii_lowercase)} letters, each a motion of any length:"
+        " frames=null.",
     )
     length = values.get("options_length", 0)
     return choice, point, check_integer(f"{where}.options_length", length) if length else 0

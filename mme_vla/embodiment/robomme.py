@@ -16,7 +16,9 @@ POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 CAMERAS = ("front", "wrist")
 """What the benchmark's environments show."""
 SIDE = 256
-"""Of the benchmark's images, in pixels; points of subgoals and choices are pixels of its front image."""
+"""Of the benchmark's images, in pixels; points of subgoals and choices are pixels of its front
+image.
+"""
 LETTERS = "abcdefgh"
 """Of the options that a task can offer."""
 
@@ -38,11 +40,15 @@ ROBOMME_JOINT = Embodiment(
     fps=20.0,
     conditioning_video=True,
 )
-"""The same as `configs/embodiment/robomme_joint.yaml`; here too, so that a checkpoint loads without any YAML."""
+"""The same as `configs/embodiment/robomme_joint.yaml`; here too, so that a checkpoint loads without
+any YAML.
+"""
 
 
 def embodiment_of(config: Mapping[str, Any]) -> Embodiment:
-    """The robot of a policy's configuration; RoboMME's Panda where it names none, as before robots could be chosen."""
+    """The robot of a policy's configuration; RoboMME's Panda where it names none, as before robots
+    could be chosen.
+    """
     backbone = config.get("backbone", {})
     if config.get("embodiment") is None:
         return ROBOMME_JOINT.with_horizon(backbone.get("horizon", ROBOMME_JOINT.action.horizon))
@@ -58,7 +64,8 @@ def benchmark_action(
     """What an environment of the benchmark takes for an action [w] of a policy.
 
     Args:
-        stick: its robot holds a stick, and takes no command of the gripper, which is an action's last number.
+        stick: its robot holds a stick, and takes no command of the gripper, which is an action's
+            last number.
         pose: of the tool now [6], for actions that are differences to it.
 
     Returns:
@@ -73,10 +80,12 @@ def benchmark_action(
 
 
 def choice_row(letter: str, point: Sequence[float]) -> np.ndarray:
-    """A choice as numbers [10] float32: eight letters of which one is 1, then y and x as shares of the image.
+    """A choice as numbers [10] float32: eight letters of which one is 1, then y and x as shares of
+    the image.
 
     Args:
-        letter: `a` to `h`. point: y and x in pixels of the front image; empty for a choice that needs none.
+        letter: `a` to `h`. point: y and x in pixels of the front image; empty for a choice that
+            needs none.
     """
     row = np.zeros(len(LETTERS) + 2, np.float32)
     row[LETTERS.index(letter)] = 1
@@ -84,8 +93,12 @@ def choice_row(letter: str, point: Sequence[float]) -> np.ndarray:
     return row
 
 
-def benchmark_state(joints: Sequence[float] | np.ndarray, fingers: Sequence[float] | np.ndarray) -> np.ndarray:
-    """The state [8] float32 that RoboMME's robots have for a policy: the arm's joint angles and the first finger."""
+def benchmark_state(
+    joints: Sequence[float] | np.ndarray, fingers: Sequence[float] | np.ndarray
+) -> np.ndarray:
+    """The state [8] float32 that RoboMME's robots have for a policy: the arm's joint angles and the
+    first finger.
+    """
     arm, gripper = np.asarray(joints, np.float32)[:ARM_JOINTS], np.asarray(fingers, np.float32)[:1]
     return np.concatenate([arm, gripper])
 
@@ -99,8 +112,13 @@ def check_benchmark(robot: Embodiment, spaces: Sequence[str]) -> None:
     )
     other = [name for name in robot.camera_names if name not in CAMERAS]
     if other or robot.state.width != ROBOMME_JOINT.state.width:
-        difference = f"the cameras {', '.join(other)}" if other else f"a state of {robot.state.width} numbers"
+        difference = (
+            f"the cameras {', '.join(other)}"
+            if other
+            else f"a state of {robot.state.width} numbers"
+        )
         raise UserError(
-            f"The robot {robot.name!r} cannot be evaluated on the benchmark: it has {difference}, and the benchmark "
-            f"gives the cameras {', '.join(CAMERAS)} and {ROBOMME_JOINT.state.width} numbers."
+            f"The robot {robot.name!r} cannot be evaluated on the benchmark: it has {difference},"
+            f" and the benchmark gives the cameras {', '.join(CAMERAS)} and"
+            f" {ROBOMME_JOINT.state.width} numbers."
         )

@@ -20,9 +20,9 @@ _KEYS = ("name", "cameras", "memory_camera", "state", "action", "fps", "conditio
 class Camera:
     """One view of the scene.
 
-    name: the same from the simulator or the robot to the policy. key: its column in the dataset; None for the usual
-    names. augment: in training, `all` (crop, rotation, colour), `colour`, or `none`.
-    depth: whether the policy also reads how far each pixel is, and where the camera stands.
+    name: the same from the simulator or the robot to the policy. key: its column in the dataset;
+    None for the usual names. augment: in training, `all` (crop, rotation, colour), `colour`, or
+    `none`. depth: whether the policy also reads how far each pixel is, and where the camera stands.
     """
 
     name: str
@@ -32,7 +32,8 @@ class Camera:
 
     @property
     def readings(self) -> tuple[str, ...]:
-        """What is delivered beside the images: depth [H, W, 1] int16 in millimetres, and the camera's pose [3, 4].
+        """What is delivered beside the images: depth [H, W, 1] int16 in millimetres, and the
+        camera's pose [3, 4].
 
         The pose is from the world to the camera, in OpenCV's axes.
         """
@@ -41,7 +42,9 @@ class Camera:
 
 @dataclass(frozen=True)
 class State:
-    """What the robot feels: `width` numbers, in the columns `key` of the dataset (empty for the usual names)."""
+    """What the robot feels: `width` numbers, in the columns `key` of the dataset (empty for the
+    usual names).
+    """
 
     width: int
     key: tuple[str, ...] = ()
@@ -85,23 +88,35 @@ class Embodiment:
         Raises:
             UserError: an unknown or missing key, or a value that cannot be; it is named.
         """
-        values = section_keys(section, "embodiment", _KEYS, required=("name", "cameras", "state", "action"))
+        values = section_keys(
+            section, "embodiment", _KEYS, required=("name", "cameras", "state", "action")
+        )
         cameras = _cameras(values["cameras"])
         names = [camera.name for camera in cameras]
         memory_camera = values.get("memory_camera") or names[0]
         if memory_camera not in names:
             near = did_you_mean(str(memory_camera), names)
-            raise UserError(f"embodiment.memory_camera={brief(memory_camera)} is none of the cameras. {near}")
-        state = section_keys(values["state"], "embodiment.state", ("key", "width"), required=("width",))
+            raise UserError(
+                f"embodiment.memory_camera={brief(memory_camera)} is none of the cameras. {near}"
+            )
+        state = section_keys(
+            values["state"], "embodiment.state", ("key", "width"), required=("width",)
+        )
         width = check_integer("embodiment.state.width", state["width"])
         fps, video = values.get("fps"), values.get("conditioning_video", False)
         require(
             not (
-                fps is not None and (isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= 1000)
+                fps is not None
+                and (
+                    isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= 1000
+                )
             ),
             f"embodiment.fps must be a positive number to 1000 or null, got {brief(fps)}.",
         )
-        require(isinstance(video, bool), f"embodiment.conditioning_video must be true or false, got {brief(video)}.")
+        require(
+            isinstance(video, bool),
+            f"embodiment.conditioning_video must be true or false, got {brief(video)}.",
+        )
         return cls(
             name=str(values["name"]),
             cameras=cameras,
@@ -117,7 +132,9 @@ class Embodiment:
         depth = {True: {"depth": True}, False: {}}  # absent in files of earlier versions
         return {
             "name": self.name,
-            "cameras": {c.name: {"key": c.key, "augment": c.augment, **depth[c.depth]} for c in self.cameras},
+            "cameras": {
+                c.name: {"key": c.key, "augment": c.augment, **depth[c.depth]} for c in self.cameras
+            },
             "memory_camera": self.memory_camera,
             "state": {"key": list(self.state.key), "width": self.state.width},
             "action": self.action.to_dict(),
@@ -143,15 +160,16 @@ class Embodiment:
         )
         require(
             self.action.horizon == horizon,
-            f"embodiment.action.horizon={self.action.horizon} and backbone.horizon={horizon} are the same length "
-            "of a chunk: set the embodiment's, which the backbone follows.",
+            f"embodiment.action.horizon={self.action.horizon} and backbone.horizon={horizon} are"
+            " the same length of a chunk: set the embodiment's, which the backbone follows.",
         )
 
 
 def _cameras(section: Any) -> tuple[Camera, ...]:
     require(
         isinstance(section, Mapping) and section,
-        f"embodiment.cameras must name at least one camera with its settings, got {brief(section)}.",
+        "embodiment.cameras must name at least one camera with its settings, got"
+        f" {brief(section)}.",
     )
     cameras = []
     for name, settings in section.items():
@@ -159,11 +177,15 @@ def _cameras(section: Any) -> tuple[Camera, ...]:
         options = section_keys(settings or {}, where, ("key", "augment", "depth"))
         augment, key = options.get("augment", "all"), options.get("key")
         check_choice(f"{where}.augment", augment, AUGMENTATIONS)
-        require(isinstance(key, str | None), f"{where}.key must be a column of the dataset, got {brief(key)}.")
+        require(
+            isinstance(key, str | None),
+            f"{where}.key must be a column of the dataset, got {brief(key)}.",
+        )
         if not isinstance(depth := options.get("depth", False), bool):
             raise UserError(f"{where}.depth must be true or false, got {brief(depth)}.")
         require(
-            name != "state", f"{where}: the state goes under this name in messages; call the camera something else."
+            name != "state",
+            f"{where}: the state goes under this name in messages; call the camera something else.",
         )
         cameras.append(Camera(str(name), key, augment, depth))
     return tuple(cameras)

@@ -1,4 +1,6 @@
-"""The 16 RoboMME tasks as environments, with their demonstrations. Importing this does not import the simulator."""
+"""The 16 RoboMME tasks as environments, with their demonstrations. Importing this does not import
+the simulator.
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -10,15 +12,32 @@ if TYPE_CHECKING:
     from mme_vla.envs.vector.pool import Job, Reply, VecEnv, make_vec_env
 
 __all__ = [
-    "TASK_NAMES", "EpisodeSpec", "Job", "Reply", "RoboMMEEnv", "VecEnv", "episode", "episodes", "load_tasks",
-    "make_env", "make_vec_env",
-]  # fmt: skip
+    "TASK_NAMES",
+    "EpisodeSpec",
+    "Job",
+    "Reply",
+    "RoboMMEEnv",
+    "VecEnv",
+    "episode",
+    "episodes",
+    "load_tasks",
+    "make_env",
+    "make_vec_env",
+]
 
 _HOMES = {
-    "EpisodeSpec": "metadata", "Job": "vector.pool", "Reply": "vector.pool", "RoboMMEEnv": "interface",
-    "TASK_NAMES": "metadata", "VecEnv": "vector.pool", "episode": "metadata", "episodes": "metadata",
-    "load_tasks": "make", "make_env": "make", "make_vec_env": "vector.pool",
-}  # fmt: skip
+    "EpisodeSpec": "metadata",
+    "Job": "vector.pool",
+    "Reply": "vector.pool",
+    "RoboMMEEnv": "interface",
+    "TASK_NAMES": "metadata",
+    "VecEnv": "vector.pool",
+    "episode": "metadata",
+    "episodes": "metadata",
+    "load_tasks": "make",
+    "make_env": "make",
+    "make_vec_env": "vector.pool",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,9 +1,11 @@
-"""`Environment`: tasks, their episodes by split, and how one is made. `env=NAME` selects one in every command.
+"""`Environment`: tasks, their episodes by split, and how one is made. `env=NAME` selects one in
+every command.
 
-RoboMME is one entry of the registry (`mme_vla/envs/benchmark.py`). An environment of your own is a class beside a
-`gymnasium.Env`, whose observations are a dict: a uint8 image [H, W, 3] for each camera of the embodiment, and `state`,
-float32 [s]. Its info dict may hold `goal` (text, needed on reset), `video` (on reset: earlier observations, which
-become the conditioning video), `success` (bool) and `subgoal` (text).
+RoboMME is one entry of the registry (`mme_vla/envs/benchmark.py`). An environment of your own is a
+class beside a `gymnasium.Env`, whose observations are a dict: a uint8 image [H, W, 3] for each
+camera of the embodiment, and `state`, float32 [s]. Its info dict may hold `goal` (text, needed on
+reset), `video` (on reset: earlier observations, which become the conditioning video), `success`
+(bool) and `subgoal` (text).
 """
 
 from abc import ABC, abstractmethod
@@ -30,7 +32,9 @@ _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 @dataclass(frozen=True)
 class Hold:
-    """An action of every action space: the robot stays where it is for so many control steps, and the limit grows."""
+    """An action of every action space: the robot stays where it is for so many control steps, and
+    the limit grows.
+    """
 
     steps: int
 
@@ -42,8 +46,8 @@ class Environment(ABC):
         tasks: names, in the order of tables.
         splits: name → episodes of each task.
         suites: name → tasks; `results` makes a figure of each. A task belongs to at most one.
-        embodiment: as in a file of `configs/embodiment`: the robot of models that are built with `env=NAME`. None where
-            users select one.
+        embodiment: as in a file of `configs/embodiment`: the robot of models that are built with
+            `env=NAME`. None where users select one.
     """
 
     tasks: ClassVar[Sequence[str]]
@@ -56,13 +60,16 @@ class Environment(ABC):
         """A `gymnasium.Env` for an episode; the library calls `reset(seed=spec.seed)`."""
 
     def demonstrate(self, env: Any) -> Iterator[Any]:
-        """Actions that solve the episode of `env`, one for each `step` that the caller performs in between.
+        """Actions that solve the episode of `env`, one for each `step` that the caller performs in
+        between.
 
         Raises:
             UserError: the environment has no demonstrator.
         """
         require(
-            False, f"{type(self).__name__} has no demonstrator: implement demonstrate(env), a generator of actions."
+            False,
+            f"{type(self).__name__} has no demonstrator: implement demonstrate(env), a generator of"
+            " actions.",
         )
         yield from ()
 
@@ -72,27 +79,40 @@ class Environment(ABC):
         Raises:
             UserError: the environment has none.
         """
-        require(False, f"{type(self).__name__} cannot pause: implement hold(env), the action that keeps the robot.")
+        require(
+            False,
+            f"{type(self).__name__} cannot pause: implement hold(env), the action that keeps the"
+            " robot.",
+        )
 
     def choices(self, env: Any) -> Mapping[str, Actions]:
-        """What can be chosen in `play` now: text → the actions that carry it out. Empty: nothing."""
+        """What can be chosen in `play` now: text → the actions that carry it out.
+        Empty: nothing.
+        """
         return {}
 
     def scene_values(self, env: Any) -> Mapping[str, Any] | None:
-        """What makes the scene of `env`, right after its reset: plain values, the same on every machine.
+        """What makes the scene of `env`, right after its reset: plain values, the same on every
+        machine.
 
-        Records name a scene by their digest, and results compare equal scenes alone. By default there are none to give.
+        Records name a scene by their digest, and results compare equal scenes alone. By default
+        there are none to give.
         """
         return None
 
     def episodes(self, task: str, split: str) -> list[EpisodeSpec]:
-        """The episodes of a task in a split, in order; by default consecutive seeds, other ones in every split."""
+        """The episodes of a task in a split, in order; by default consecutive seeds, other ones in
+        every split.
+        """
         self.check_task(task)
         self.check_split(split)
         first = _FIRST_SEED.get(split, _OTHER_SPLITS)
-        return [EpisodeSpec(task, split, number, first + number, "") for number in range(self.splits[split])]
+        return [
+            EpisodeSpec(task, split, number, first + number, "")
+            for number in range(self.splits[split])
+        ]
 
-    # What commands call ---------------------------------------------------------------------------------------------
+    # What commands call ---------------------------------------------------------------------------
 
     def check_task(self, task: str) -> None:
         """Make sure that a task exists."""
@@ -122,20 +142,27 @@ class Environment(ABC):
         ):
             require(
                 here == there,
-                f"The robot {robot.name!r} of this policy does not fit the environment's {mine.name!r}, which has the "
-                f"cameras {', '.join(mine.camera_names)}, {mine.state.width} numbers of state and {mine.action.width} "
-                f"of an action ({what}). Train with env=<this environment>.",
+                f"The robot {robot.name!r} of this policy does not fit the environment's"
+                f" {mine.name!r}, which has the cameras {', '.join(mine.camera_names)},"
+                f" {mine.state.width} numbers of state and {mine.action.width} of an action"
+                f" ({what}). Train with env=<this environment>.",
             )
 
     def episode(self, task: str, split: str, number: int) -> EpisodeSpec:
         """One episode of a split."""
         known = self.episodes(task, split)
         exists = type(number) is int and 0 <= number < len(known)
-        require(exists, f"Unknown episode {number!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
+        require(
+            exists,
+            f"Unknown episode {number!r} of {task}, split {split!r}; expected 0 to"
+            f" {len(known) - 1}.",
+        )
         return known[number]
 
     def scene_digest(self, spec: EpisodeSpec) -> str:
-        """Digest of the scene that an episode has on this machine: builds it. `NO_VALUES` without `scene_values`."""
+        """Digest of the scene that an episode has on this machine: builds it. `NO_VALUES` without
+        `scene_values`.
+        """
         if type(self).scene_values is Environment.scene_values:
             return NO_VALUES
         env = self.open(spec.task, spec.split, spec.episode, render=False)
@@ -177,19 +204,26 @@ def environment(name: str) -> Environment:
 
 
 class EpisodeEnv:
-    """One episode of a `gymnasium.Env` with the interface of `RoboMMEEnv`: what rollouts and `play` use.
+    """One episode of a `gymnasium.Env` with the interface of `RoboMMEEnv`: what rollouts and `play`
+    use.
 
     Args:
         environment: whose choices are offered. env: its gymnasium environment. spec: which episode.
         max_steps: steps until the status becomes `timeout`.
-        by_choice: actions are `{"choice": letter}` among `environment.choices`, and all frames of one are returned.
+        by_choice: actions are `{"choice": letter}` among `environment.choices`, and all frames of
+            one are returned.
 
     Attributes:
         scene_digest: of the values of the scene, from the reset on.
     """
 
     def __init__(
-        self, environment: Environment, env: Any, spec: EpisodeSpec, max_steps: int, by_choice: bool = False
+        self,
+        environment: Environment,
+        env: Any,
+        spec: EpisodeSpec,
+        max_steps: int,
+        by_choice: bool = False,
     ) -> None:
         self.environment, self.env, self.spec = environment, env, spec
         self.max_steps, self._by_choice = max_steps, by_choice
@@ -200,7 +234,10 @@ class EpisodeEnv:
     def reset(self) -> tuple[dict[str, list[Any]], dict[str, Any]]:
         """The conditioning video, if there is one, and the current frame."""
         observation, info = self.env.reset(seed=self.spec.seed)
-        require(isinstance(info.get("goal"), str), f"{self.spec.task}: reset() must return the goal in info['goal'].")
+        require(
+            isinstance(info.get("goal"), str),
+            f"{self.spec.task}: reset() must return the goal in info['goal'].",
+        )
         self.goal, self._steps, self._limit = info["goal"], 0, self.max_steps
         values = self.environment.scene_values(self.env)
         self.scene_digest = NO_VALUES if values is None else scene_digest(values)
@@ -230,8 +267,12 @@ class EpisodeEnv:
         return self.env.render()
 
     def oracle(self) -> Mapping[str, Any] | None:
-        """The choice that a script takes next; None where the environment has no method `oracle()`, or this says so."""
-        choice: Mapping[str, Any] | None = self.env.oracle() if hasattr(self.env, "oracle") else None
+        """The choice that a script takes next; None where the environment has no method `oracle()`,
+        or this says so.
+        """
+        choice: Mapping[str, Any] | None = (
+            self.env.oracle() if hasattr(self.env, "oracle") else None
+        )
         return choice
 
     def close(self) -> None:
@@ -244,7 +285,9 @@ class EpisodeEnv:
         return self.environment.hold(self.env)
 
     def demonstration(self) -> Iterator[tuple[Mapping[str, Any], Any, bool]]:
-        """Observation, action and whether the frame is of the conditioning video, until the demonstrator is done."""
+        """Observation, action and whether the frame is of the conditioning video, until the
+        demonstrator is done.
+        """
         observation, info = self.env.reset(seed=self.spec.seed)
         self.goal = str(info["goal"])
         self.success = False
@@ -262,9 +305,13 @@ class EpisodeEnv:
                 return
 
     def _lists(self, frames: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-        lists: dict[str, list[Any]] = {"state_list": [np.asarray(frame["state"], np.float32) for frame in frames]}
+        lists: dict[str, list[Any]] = {
+            "state_list": [np.asarray(frame["state"], np.float32) for frame in frames]
+        }
         cameras = [name for name in frames[0] if name != "state"] if frames else []
-        lists |= {f"{name}_rgb_list": [np.asarray(frame[name]) for frame in frames] for name in cameras}
+        lists |= {
+            f"{name}_rgb_list": [np.asarray(frame[name]) for frame in frames] for name in cameras
+        }
         if self._by_choice and cameras:
             lists.setdefault("front_rgb_list", lists[f"{cameras[0]}_rgb_list"])  # what `play` shows
         return lists
@@ -280,11 +327,19 @@ class EpisodeEnv:
         if (terminated or truncated) and info.get("error_message"):
             report |= {"status": "error", "error_message": str(info["error_message"])}
         if self._by_choice and report["status"] == "ongoing":
-            choices, name = dict(self.environment.choices(self.env)), type(self.environment).__name__
+            choices, name = (
+                dict(self.environment.choices(self.env)),
+                type(self.environment).__name__,
+            )
             require(choices, f"{name} offers no choices to play: implement choices(env).")
             empty = [text for text, actions in choices.items() if not len(actions)]
-            require(not empty, f"{name}.choices(env) has no actions for {empty[:1]}: leave it out, or add one.")
+            require(
+                not empty,
+                f"{name}.choices(env) has no actions for {empty[:1]}: leave it out, or add one.",
+            )
             self._choices = dict(zip(_LETTERS, choices.values(), strict=False))
-            options = [Option(letter, text) for letter, text in zip(_LETTERS, choices, strict=False)]
+            options = [
+                Option(letter, text) for letter, text in zip(_LETTERS, choices, strict=False)
+            ]
             report["available_multi_choices"] = [option.to_dict() for option in options]
         return report

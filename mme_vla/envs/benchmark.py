@@ -1,4 +1,6 @@
-"""RoboMME as entries of the registry of environments: `mme_vla`, and `official` for the package `robomme`."""
+"""RoboMME as entries of the registry of environments: `mme_vla`, and `official` for the package
+`robomme`.
+"""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -15,7 +17,9 @@ from mme_vla.registry import ENVS
 
 @ENVS.register("mme_vla")
 class RoboMME(Environment):
-    """The sixteen tasks on stock ManiSkill, and tasks of the user's own; `mme-vla record` demonstrates them."""
+    """The sixteen tasks on stock ManiSkill, and tasks of the user's own; `mme-vla record`
+    demonstrates them.
+    """
 
     name: ClassVar[str] = "mme_vla"
     tasks = TASK_NAMES
@@ -94,4 +98,8 @@ class Official(RoboMME):
 
     def check_hold(self) -> None:
         """The package has no action for it in every action space."""
-        require(False, "env=official cannot pause: use env=mme_vla for events in which the robot holds its pose.")
+        require(
+            False,
+            "env=official cannot pause: use env=mme_vla for events in which the robot holds its"
+            " pose.",
+        )

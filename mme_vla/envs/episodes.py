@@ -9,15 +9,17 @@ from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import UserError, require
 
 ALL = "all"
-GRAMMAR = "3 for the first three, [3] for number three, 0-9 for a range, [0-3,7] for several, or all"
+GRAMMAR = (
+    "3 for the first three, [3] for number three, 0-9 for a range, [0-3,7] for several, or all"
+)
 
 
 def choose_tasks(tasks: str | Sequence[str], env: str = "mme_vla") -> list[str]:
     """Names of tasks in the order they are named, each once.
 
     Args:
-        tasks: `all` of the environment, a name, several in one text (`StopCube,BinFill`), or a list of names. Tasks
-            of the user's own need the plugin that registers them.
+        tasks: `all` of the environment, a name, several in one text (`StopCube,BinFill`), or a list
+            of names. Tasks of the user's own need the plugin that registers them.
         env: the environment.
     """
     names = tasks.split(",") if isinstance(tasks, str) else list(tasks)
@@ -35,20 +37,27 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
     """Numbers of episodes.
 
     Args:
-        episodes: None or `all` for all there are, a number for the first so many, a list of numbers, or text of
-            numbers and ranges (`0-9`, `0-3,7`). `[3]` is episode number three alone, `3` the first three.
+        episodes: None or `all` for all there are, a number for the first so many, a list of
+            numbers, or text of numbers and ranges (`0-9`, `0-3,7`). `[3]` is episode number three
+            alone, `3` the first three.
         count: of episodes in `what`, which messages name.
     """
     if episodes is None or episodes == ALL:
         return list(range(count))
     if isinstance(episodes, int) and not isinstance(episodes, bool):
-        alone = f" For number {episodes} alone write episodes=[{episodes}]." if 0 <= episodes < count else ""
+        alone = (
+            f" For number {episodes} alone write episodes=[{episodes}]."
+            if 0 <= episodes < count
+            else ""
+        )
         first = f"episodes={episodes} means the first {episodes}; {what} has {count}.{alone}"
         require(1 <= episodes <= count, first)
         return list(range(episodes))
     ranges = spans(episodes, "episodes", GRAMMAR)
     last = max((span.stop for span in ranges), default=0) - 1
-    require(last < count, f"There is no episode {last} in {what}, which has {count}: 0 to {count - 1}.")
+    require(
+        last < count, f"There is no episode {last} in {what}, which has {count}: 0 to {count - 1}."
+    )
     numbers = [number for span in ranges for number in span]
     once = numbers and len(set(numbers)) == len(numbers)
     require(once, f"episodes={episodes} must name each episode once, and at least one.")
@@ -56,13 +65,18 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
 
 
 def choose_episodes(
-    tasks: str | Sequence[str] = ALL, episodes: Any = None, split: str = "test", env: str = "mme_vla"
+    tasks: str | Sequence[str] = ALL,
+    episodes: Any = None,
+    split: str = "test",
+    env: str = "mme_vla",
 ) -> list[EpisodeSpec]:
     """The episodes of a run, task by task."""
     specs = []
     for task in choose_tasks(tasks, env):
         known = environment(env).episodes(task, split)
-        specs += [known[number] for number in choose_numbers(episodes, len(known), f"{task} in {split!r}")]
+        specs += [
+            known[number] for number in choose_numbers(episodes, len(known), f"{task} in {split!r}")
+        ]
     return specs
 
 
@@ -72,7 +86,9 @@ def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
     one = task is None or tasks in (None, ALL, task)
     require(one, f"tasks={tasks} and task={task} mean the same: give one of them.")
     names: Any = tasks if task is None else task
-    require(names is not None, "Name the tasks: tasks=StopCube, tasks=[StopCube,BinFill] or tasks=all.")
+    require(
+        names is not None, "Name the tasks: tasks=StopCube, tasks=[StopCube,BinFill] or tasks=all."
+    )
     return names if isinstance(names, str) else [str(name) for name in names]
 
 
@@ -82,7 +98,13 @@ def spans(value: Any, key: str, grammar: str) -> list[range]:
     Args:
         key, grammar: for messages.
     """
-    parts = value.split(",") if isinstance(value, str) else value if isinstance(value, Sequence) else [None]
+    parts = (
+        value.split(",")
+        if isinstance(value, str)
+        else value
+        if isinstance(value, Sequence)
+        else [None]
+    )
     ranges = []
     for part in parts:
         match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))

@@ -18,12 +18,15 @@ PLACE = "<>"
 def project(point: np.ndarray) -> np.ndarray:
     """Pixel [y, x] (float64) of a point [3] of the world in the front image."""
     extrinsic = front_extrinsic().astype(np.float64)
-    x, y, depth = INTRINSIC.astype(np.float64) @ (extrinsic @ np.append(np.asarray(point, np.float64), 1.0))
+    x, y, depth = INTRINSIC.astype(np.float64) @ (
+        extrinsic @ np.append(np.asarray(point, np.float64), 1.0)
+    )
     return np.array([y, x]) / depth
 
 
 def centroid(segmentation: np.ndarray, ids: Sequence[int]) -> tuple[int, int] | None:
-    """Mean row and mean column, cut to integers, of the pixels with one of the ids; None where there is no such pixel.
+    """Mean row and mean column, cut to integers, of the pixels with one of the ids; None where
+    there is no such pixel.
 
     Args:
         segmentation: object ids [height, width].
@@ -34,7 +37,8 @@ def centroid(segmentation: np.ndarray, ids: Sequence[int]) -> tuple[int, int] | 
 
 
 def ground(text: str, targets: Sequence["Thing"], segmentation: np.ndarray) -> str | None:
-    """Fill each `<>` of a text with the pixel of its object, `<y, x>`; None if one of them is hidden.
+    """Fill each `<>` of a text with the pixel of its object, `<y, x>`; None if one of them is
+    hidden.
 
     A single `<>` takes all targets together; several take one target each, in order.
     """
@@ -51,10 +55,12 @@ def ground(text: str, targets: Sequence["Thing"], segmentation: np.ndarray) -> s
 
 
 class Grounding:
-    """The grounded text of an episode's sub-tasks: computed when a sub-task begins, and kept until the next one.
+    """The grounded text of an episode's sub-tasks: computed when a sub-task begins, and kept until
+    the next one.
 
     Args:
-        retry: while an object is hidden, try again at each frame; otherwise keep the text without pixels.
+        retry: while an object is hidden, try again at each frame; otherwise keep the text without
+            pixels.
     """
 
     def __init__(self, retry: bool = True) -> None:
@@ -72,7 +78,8 @@ class Grounding:
 
         Args:
             subtask: whose text is shown now.
-            segmentation: reads the object ids of the present image; called only when needed. None: no images.
+            segmentation: reads the object ids of the present image; called only when needed. None:
+                no images.
         """
         if subtask is not self._subtask:
             self._subtask, self._text = subtask, None

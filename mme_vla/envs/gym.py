@@ -28,9 +28,10 @@ _STATE = ARM_JOINTS + 1
 class GymTask(gymnasium.Env[Any, np.ndarray]):
     """A task whose reset samples an episode of a split.
 
-    Observations are a dict of `state` [8] (joints in radians, first finger in metres) and, with `images`, `front` and
-    `wrist` [256, 256, 3] uint8: those of the newest frame. The info dict holds `goal`, `subgoal`, `status` and
-    `success`, and on reset `video`: the front images [t, 256, 256, 3] of the conditioning video, t = 0 without one.
+    Observations are a dict of `state` [8] (joints in radians, first finger in metres) and, with
+    `images`, `front` and `wrist` [256, 256, 3] uint8: those of the newest frame. The info dict
+    holds `goal`, `subgoal`, `status` and `success`, and on reset `video`: the front images [t, 256,
+    256, 3] of the conditioning video, t = 0 without one.
 
     Args:
         task: its name.
@@ -38,8 +39,9 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         action_space: `joint_angle`, `ee_pose` or `waypoint`.
         reward: `sparse`, `subtask` or `none`.
         images: whether frames are rendered; without, a step is about 80 times faster.
-        max_steps: control steps until an episode is truncated, several of which an action by poses may take; None: as
-            many as the split allows. `make_env` and `evaluate` count as the benchmark does, one step more.
+        max_steps: control steps until an episode is truncated, several of which an action by poses
+            may take; None: as many as the split allows. `make_env` and `evaluate` count as the
+            benchmark does, one step more.
         render_mode: `rgb_array` with images, None without.
 
     Raises:
@@ -62,25 +64,36 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         check_choice("action_space", action_space, SPACES)
         check_known("reward", reward, REWARDS)
         limit = step_limit(split) if max_steps is None else max_steps
-        require(type(limit) is int and limit >= 1, f"max_steps is {limit!r}; expected a positive integer.")
+        require(
+            type(limit) is int and limit >= 1,
+            f"max_steps is {limit!r}; expected a positive integer.",
+        )
         self.task, self.split, self.episode = task, split, episode
         self.images = images or render_mode is not None
         self.render_mode = render_mode
         # The environment itself times out a step after its limit, as the benchmark does.
         self._limit = limit
-        self._options: dict[str, Any] = {"action_space": action_space, "reward": reward, "max_steps": max(limit - 1, 1)}
+        self._options: dict[str, Any] = {
+            "action_space": action_space,
+            "reward": reward,
+            "max_steps": max(limit - 1, 1),
+        }
         self._count = len(episodes(task, split))
         self._env: RoboMMEEnv | None = None
         self._number: int | None = None
         self._observation: dict[str, np.ndarray] = {}
-        # Asked of the class: a vector environment forks after this, and a renderer does not survive a fork.
+        # Asked of the class: a vector environment forks after this, and a renderer does not survive
+        # a fork.
         load_tasks(task)
         self._stick = TASKS[task].stick
         pose = [_POSITION] * 3 + [_ANGLE] * 3
-        low, high = (_LOWEST, _HIGHEST) if action_space == "joint_angle" else ([-x for x in pose], pose)
+        low, high = (
+            (_LOWEST, _HIGHEST) if action_space == "joint_angle" else ([-x for x in pose], pose)
+        )
         gripper = [] if self._stick else [1.0]
         self.action_space = gymnasium.spaces.Box(
-            np.array([*low, *(-x for x in gripper)], np.float32), np.array([*high, *gripper], np.float32)
+            np.array([*low, *(-x for x in gripper)], np.float32),
+            np.array([*high, *gripper], np.float32),
         )
         image = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
         views: dict[str, Any] = dict.fromkeys(CAMERAS, image) if self.images else {}
@@ -90,7 +103,9 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode; `seed` fixes which episodes follow, `options={"episode": 3}` names one."""
+        """Begin an episode; `seed` fixes which episodes follow, `options={"episode":
+        3}` names one.
+        """
         super().reset(seed=seed)
         number = (options or {}).get("episode", self.episode)
         if number is None:
@@ -101,8 +116,12 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         video = np.stack(visible) if visible else np.zeros((0, SIDE, SIDE, 3), np.uint8)
         return self._copy(), {**self._info(info), "episode": number, "video": video}
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
-        """Perform one action; a pose that cannot be reached ends the episode with the status `error`."""
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
+        """Perform one action; a pose that cannot be reached ends the episode with the status
+        `error`.
+        """
         assert self._env is not None, "step() before reset(): call reset() first."
         frames, reward, terminated, truncated, info = self._env.step(np.asarray(action, np.float64))
         if frames:
@@ -133,7 +152,11 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
 
     def _take(self, frames: Mapping[str, Sequence[Any]]) -> None:
         state = benchmark_state(frames["joint_state_list"][-1], frames["gripper_state_list"][-1])
-        views = {name: np.asarray(frames[f"{name}_rgb_list"][-1], np.uint8) for name in CAMERAS if self.images}
+        views = {
+            name: np.asarray(frames[f"{name}_rgb_list"][-1], np.uint8)
+            for name in CAMERAS
+            if self.images
+        }
         self._observation = {**views, "state": state}
 
     def _copy(self) -> dict[str, np.ndarray]:
@@ -142,11 +165,18 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
         goals = info.get("task_goal")
         status = str(info.get("status", ""))
-        texts = {"goal": goals[0] if goals else "", "subgoal": str(info.get("simple_subgoal_online", ""))}
-        reasons = {key: str(info[key]) for key in ("error_message", "exception_type") if info.get(key)}
+        texts = {
+            "goal": goals[0] if goals else "",
+            "subgoal": str(info.get("simple_subgoal_online", "")),
+        }
+        reasons = {
+            key: str(info[key]) for key in ("error_message", "exception_type") if info.get(key)
+        }
         return {**texts, **reasons, "status": status, "success": status == "success"}
 
 
 for _task in TASK_NAMES:
     if f"mme_vla/{_task}-v0" not in gymnasium.registry:
-        gymnasium.register(id=f"mme_vla/{_task}-v0", entry_point="mme_vla.envs.gym:GymTask", kwargs={"task": _task})
+        gymnasium.register(
+            id=f"mme_vla/{_task}-v0", entry_point="mme_vla.envs.gym:GymTask", kwargs={"task": _task}
+        )

@@ -1,7 +1,9 @@
-"""The environment of one episode: official observation lists, info keys and statuses around one simulated task.
+"""The environment of one episode: official observation lists, info keys and statuses around one
+simulated task.
 
-`reset` simulates the conditioning video and returns all of its frames followed by the present one. `step` returns one
-frame, or all frames of the motion in the action spaces that plan. Images appear only when the environment renders.
+`reset` simulates the conditioning video and returns all of its frames followed by the present one.
+`step` returns one frame, or all frames of the motion in the action spaces that plan. Images appear
+only when the environment renders.
 """
 
 import logging
@@ -49,13 +51,15 @@ _MARGIN = 2  # The benchmark counts two steps more than its limit.
 
 @dataclass(frozen=True)
 class EpisodeState:
-    """The state of an episode as its scene and its actions: a replay restores it, to the last bit on one CPU type.
+    """The state of an episode as its scene and its actions: a replay restores it, to the last bit
+    on one CPU type.
 
-    Positions and velocities are not enough: contacts, the solver's last solution and the script's variables belong to
-    the state as well. A replay without images takes about two milliseconds a control step. Can be pickled.
+    Positions and velocities are not enough: contacts, the solver's last solution and the script's
+    variables belong to the state as well. A replay without images takes about two milliseconds a
+    control step. Can be pickled.
 
-    task, seed, difficulty, recovery, in_view, stress, row: the scene. action_space, max_steps: of the environment.
-    options: of the reset. actions: all that were given to `step` since.
+    task, seed, difficulty, recovery, in_view, stress, row: the scene. action_space, max_steps: of
+    the environment. options: of the reset. actions: all that were given to `step` since.
     """
 
     task: str
@@ -74,8 +78,13 @@ class EpisodeState:
         """Make sure that an environment whose own state is `other` can continue from here."""
         names = [field.name for field in fields(self) if field.name not in ("options", "actions")]
         pairs = [(name, getattr(self, name), getattr(other, name)) for name in names]
-        differences = ", ".join(f"{name} {value!r} (here {here!r})" for name, value, here in pairs if value != here)
-        require(not differences, f"This state is of another environment: {differences}. Make one of the same episode.")
+        differences = ", ".join(
+            f"{name} {value!r} (here {here!r})" for name, value, here in pairs if value != here
+        )
+        require(
+            not differences,
+            f"This state is of another environment: {differences}. Make one of the same episode.",
+        )
 
 
 @dataclass
@@ -112,23 +121,29 @@ class RoboMMEEnv(gymnasium.Env):
     """One episode's environment with the official interface.
 
     `step` does not raise: a malformed action, an unreachable pose or a simulator error
-    ends the episode with `info["status"] == "error"`. After the end of an episode further steps are simulated as the
-    benchmark does, so that recorded action sequences can be replayed to their last action.
+    ends the episode with `info["status"] == "error"`. After the end of an episode further steps are
+    simulated as the benchmark does, so that recorded action sequences can be replayed to their last
+    action.
 
     Args:
-        task: the simulated task, created with the observation mode `none` (or, for `maniskill_obs`, another).
+        task: the simulated task, created with the observation mode `none` (or, for `maniskill_obs`,
+            another).
         action: name of the action space.
-        max_steps: control steps after which the status becomes `timeout`; the video's steps do not count.
+        max_steps: control steps after which the status becomes `timeout`; the video's steps do not
+            count.
         include: what observations and infos hold beyond the standard keys.
         render: whether there are images.
-        only_possible: mark options whose every object is out of the arm's reach as not possible. The benchmark offers
-            them, and choosing one ends the episode.
-        reward: `none`, as in the benchmark, `sparse`, `subtask` (`mme_vla.envs.subtasks`), or your own in `REWARDS`.
+        only_possible: mark options whose every object is out of the arm's reach as not possible.
+            The benchmark offers them, and choosing one ends the episode.
+        reward: `none`, as in the benchmark, `sparse`, `subtask` (`mme_vla.envs.subtasks`), or your
+            own in `REWARDS`.
 
     Attributes:
         on_frame: called with every frame that is returned, for recording.
-        render_request: which frames have images, from the next call on; None for all. The others' are None.
-        scene_digest: of the values and places of the scene, from the reset on (`mme_vla.envs.scene_hash`).
+        render_request: which frames have images, from the next call on; None for all. The others'
+            are None.
+        scene_digest: of the values and places of the scene, from the reset on
+            (`mme_vla.envs.scene_hash`).
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -165,7 +180,7 @@ class RoboMMEEnv(gymnasium.Env):
         self._run: _Run | None = None
         self.scene_digest = NOT_BUILT
 
-    # Episodes -----------------------------------------------------------------------------------------------------
+    # Episodes -------------------------------------------------------------------------------------
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -174,18 +189,20 @@ class RoboMMEEnv(gymnasium.Env):
 
         Args:
             seed: without effect on the scene, which the environment's own seed fixes.
-            options: `{"video": False}` leaves the conditioning video out, for measuring and debugging: its sub-tasks
-                then remain to be done.
+            options: `{"video": False}` leaves the conditioning video out, for measuring and
+                debugging: its sub-tasks then remain to be done.
 
         Returns:
-            Observation lists (conditioning video, then the present frame) and the info of the present frame.
+            Observation lists (conditioning video, then the present frame) and the info of the
+            present frame.
         """
         task = self.task
         options = {"video": True} | (options or {})
         others = sorted(options.keys() - {"video"})
         require(not others, f"Unknown reset options {others}; there is only 'video'.")
         super().reset(seed=seed)
-        # Leftovers of an episode, in the solver and in what the script added, go only with the scene.
+        # Leftovers of an episode, in the solver and in what the script added, go only with the
+        # scene.
         self._muted = True
         task.reset(options={"reconfigure": self._episodes > 0})
         self._muted = False
@@ -212,9 +229,9 @@ class RoboMMEEnv(gymnasium.Env):
             action: as the action space describes it, or a `Hold`.
 
         Returns:
-            Observation lists, reward, terminated, truncated (0-d tensors) and the info of the last frame.
-            After an exception `(None, 0.0, True, False, info)` with the status `error`; after failed inverse kinematics
-            the observation is `{}`.
+            Observation lists, reward, terminated, truncated (0-d tensors) and the info of the last
+            frame. After an exception `(None, 0.0, True, False, info)` with the status `error`;
+            after failed inverse kinematics the observation is `{}`.
         """
         run = self._require_run()
         run.frames = []
@@ -225,10 +242,13 @@ class RoboMMEEnv(gymnasium.Env):
             else:
                 self._space.act(run.control, action)
             before = run.total_reward
-            run.total_reward = self._total_reward(self.task.progress, bool(run.info.get("success", False)))
+            run.total_reward = self._total_reward(
+                self.task.progress, bool(run.info.get("success", False))
+            )
             reward = torch.tensor(run.total_reward - before)
             if run.frames and run.terminated:
-                # Repeat the last action once without a frame, as the benchmark does at the end of an episode.
+                # Repeat the last action once without a frame, as the benchmark does at the end of
+                # an episode.
                 self._muted = True
                 self.task.step(run.last_action)
         except UnreachableError as error:
@@ -236,7 +256,11 @@ class RoboMMEEnv(gymnasium.Env):
         except Exception as error:  # the official contract: whatever goes wrong is a status
             log.debug("step failed", exc_info=True)
             kind = type(error).__name__
-            info = {"status": "error", "error_message": str(error) or f"{kind}, without a text", "exception_type": kind}
+            info = {
+                "status": "error",
+                "error_message": str(error) or f"{kind}, without a text",
+                "exception_type": kind,
+            }
             return None, 0.0, True, False, info
         finally:
             self._muted = False
@@ -250,23 +274,35 @@ class RoboMMEEnv(gymnasium.Env):
 
     def _state(self, options: dict[str, Any], actions: Sequence[Any]) -> EpisodeState:
         task = self.task
-        scene = type(task).__name__, task.seed, task.difficulty, task.recovery, task.in_view, task.stress, task.row
+        scene = (
+            type(task).__name__,
+            task.seed,
+            task.difficulty,
+            task.recovery,
+            task.in_view,
+            task.stress,
+            task.row,
+        )
         return EpisodeState(*scene, self._space.name, self.max_steps, options, tuple(actions))
 
     def restore_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
-        """Continue from a saved state of the same episode, which may come from another environment or process.
+        """Continue from a saved state of the same episode, which may come from another environment
+        or process.
 
-        Replays the episode. Renders only the newest frame and those whose pixels a text needs; `on_frame` is not
-        called.
+        Replays the episode. Renders only the newest frame and those whose pixels a text needs;
+        `on_frame` is not called.
 
         Returns:
-            Observation lists and info, as the last `reset` or `step` before `save_state` returned them, images of the
-            newest frame alone.
+            Observation lists and info, as the last `reset` or `step` before `save_state` returned
+            them, images of the newest frame alone.
         """
         state.check(self._state({}, ()))
         hook, request = self.on_frame, self.render_request
         grounded = request is None or request.grounded
-        hidden, newest = RenderRequest({}, now=(), grounded=grounded), RenderRequest({}, grounded=grounded)
+        hidden, newest = (
+            RenderRequest({}, now=(), grounded=grounded),
+            RenderRequest({}, grounded=grounded),
+        )
         self.on_frame = None
         try:
             self.render_request = hidden if state.actions else newest
@@ -279,7 +315,9 @@ class RoboMMEEnv(gymnasium.Env):
         return observation, info
 
     def render(self) -> np.ndarray | None:
-        """The newest front image [256, 256, 3]; None if it was not rendered, or before the first reset."""
+        """The newest front image [256, 256, 3]; None if it was not rendered, or before the first
+        reset.
+        """
         require(self._task is not None, _CLOSED)
         return None if self._run is None else self._run.newest.get("front_rgb")
 
@@ -298,11 +336,14 @@ class RoboMMEEnv(gymnasium.Env):
 
     @property
     def difficulty(self) -> str:
-        """`easy`, `medium` or `hard`, or the tier of RoboMME-OOD; read by the released evaluation script."""
+        """`easy`, `medium` or `hard`, or the tier of RoboMME-OOD; read by the released evaluation
+        script.
+        """
         return self.task.tier or self.task.difficulty
 
     def scene_values(self) -> dict[str, Any]:
-        """The row of this scene, plain values; `make_env(…, row=row)` or a line of a JSONL file builds it again.
+        """The row of this scene, plain values; `make_env(…, row=row)` or a line of a JSONL file
+        builds it again.
 
         What is sampled when an episode begins belongs to it, so call it after `reset`.
         """
@@ -310,7 +351,9 @@ class RoboMMEEnv(gymnasium.Env):
 
     @property
     def began(self) -> list[int]:
-        """Frames, counted from the reset and the video's first, at which another sub-task's text began."""
+        """Frames, counted from the reset and the video's first, at which another sub-task's text
+        began.
+        """
         return [] if self._run is None else list(self._run.began)
 
     @property
@@ -318,7 +361,7 @@ class RoboMMEEnv(gymnasium.Env):
         """Control steps that count towards the limit."""
         return 0 if self._run is None else self._run.count
 
-    # One control step ---------------------------------------------------------------------------------------------
+    # One control step -----------------------------------------------------------------------------
 
     def _on_frame(self, evaluated: dict[str, Any]) -> None:
         if self._muted:
@@ -345,8 +388,8 @@ class RoboMMEEnv(gymnasium.Env):
     def _step_control(self, action: np.ndarray) -> None:
         task, run = self.task, self._require_run()
         run.count += not run.in_video
-        # A frame has the text of the sub-task in which its step was made, not of the next one. In the video it has the
-        # text of the demonstrated sub-task where one of the two has none.
+        # A frame has the text of the sub-task in which its step was made, not of the next one. In
+        # the video it has the text of the demonstrated sub-task where one of the two has none.
         run.displayed, demonstrated = task.progress.displayed, task.progress.demonstrated
         if run.in_video and NO_RECORD in (run.displayed.text, demonstrated.text):
             run.displayed = demonstrated
@@ -374,7 +417,7 @@ class RoboMMEEnv(gymnasium.Env):
             log.info("conditioning video: %r was not carried out: %s", subtask.text, error)
         self.task.evaluate_planned()
 
-    # Info and status ---------------------------------------------------------------------------------------------
+    # Info and status ------------------------------------------------------------------------------
 
     def _info(self, run: _Run, evaluated: dict[str, Any]) -> dict[str, Any]:
         task = self.task
@@ -383,7 +426,13 @@ class RoboMMEEnv(gymnasium.Env):
         info: dict[str, Any] = {
             "task_goal": list(task.goals()),
             "simple_subgoal_online": subtask.text,
-            "status": "success" if success else "fail" if fail else "timeout" if self._timed_out(run) else "ongoing",
+            "status": "success"
+            if success
+            else "fail"
+            if fail
+            else "timeout"
+            if self._timed_out(run)
+            else "ongoing",
             "success": success,
             "fail": fail,
             "elapsed_steps": evaluated["elapsed_steps"].clone(),
@@ -402,13 +451,16 @@ class RoboMMEEnv(gymnasium.Env):
         """What the task offers to choose from."""
         choices = self.task.choices()
         options: list[dict[str, Any]] = [
-            {"label": choice.label, "action": choice.action, "need_parameter": choice.needs_point} for choice in choices
+            {"label": choice.label, "action": choice.action, "need_parameter": choice.needs_point}
+            for choice in choices
         ]
         if self._only_possible:
             base = self.task.agent.robot.pose.sp.p
             possible = [
                 choice.candidates is None
-                or any(np.linalg.norm(thing.position - base) < _REACH for thing in choice.candidates())
+                or any(
+                    np.linalg.norm(thing.position - base) < _REACH for thing in choice.candidates()
+                )
                 for choice in choices
             ]
             for option, here in zip(options, possible, strict=True):
@@ -420,5 +472,7 @@ class RoboMMEEnv(gymnasium.Env):
 
     def _require_run(self) -> _Run:
         if self._run is None:
-            raise UserError(_CLOSED if self._task is None else "step() before reset(): call reset() first.")
+            raise UserError(
+                _CLOSED if self._task is None else "step() before reset(): call reset() first."
+            )
         return self._run

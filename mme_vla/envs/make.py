@@ -46,27 +46,35 @@ def make_env(
 
     Args:
         task: one of the 16 task names, or a task of your own registered in `TASKS`.
-        split: `train`, `val`, `test`, `hard`, `challenge`, `ood`, `ood:<tier>`, or a JSONL file of scenes; `twin` or
-            `stress:<dial>=<n>` for variants of the test split, `twin:<split>` of another; `further` for 100 scenes
-            beyond it.
+        split: `train`, `val`, `test`, `hard`, `challenge`, `ood`, `ood:<tier>`, or a JSONL file of
+            scenes; `twin` or `stress:<dial>=<n>` for variants of the test split, `twin:<split>` of
+            another; `further` for 100 scenes beyond it.
         episode: which episode of the split.
         action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
         seed: builds the scene of this seed instead of an episode of the split.
         difficulty: with `seed`: `easy`, `medium` or `hard`; by default seed % 3 decides.
-        recovery: `z` or `xy`: sample as recovery demonstrations do, such as train episodes 0-5 (it changes the order of
-            BinFill's colours); by default nothing, as in the official evaluation.
-        max_steps: control steps until the status becomes `timeout`; by default as many as the split allows.
-        row: builds the scene of these values (`env.scene_values()`) instead of an episode of the split.
-        render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.
-        reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds. `subtask`: an equal
-            share for each sub-task of the execution as it is done, 1 in all. Or your own, registered in `REWARDS`.
-        env: `mme_vla`, `official` for the installed package `robomme`, or an environment of the user's own. Of the
-            options the latter reads `max_steps`, `render` and the action space `multi_choice`.
-        sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` requires.
+        recovery: `z` or `xy`: sample as recovery demonstrations do, such as train episodes 0-5 (it
+            changes the order of BinFill's colours); by default nothing, as in the official
+            evaluation.
+        max_steps: control steps until the status becomes `timeout`; by default as many as the split
+            allows.
+        row: builds the scene of these values (`env.scene_values()`) instead of an episode of the
+            split.
+        render: whether observations hold images; without it no Vulkan is needed and steps are about
+            80 times faster.
+        reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds.
+            `subtask`: an equal share for each sub-task of the execution as it is done, 1 in all. Or
+            your own, registered in `REWARDS`.
+        env: `mme_vla`, `official` for the installed package `robomme`, or an environment of the
+            user's own. Of the options the latter reads `max_steps`, `render` and the action space
+            `multi_choice`.
+        sessions: unrelated episodes that the caller shows the policy first, as
+            `split=stress:sessions=<n>` requires.
         only_possible: by choices, mark options that no object within reach fits (`RoboMMEEnv`).
         include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,
-            `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`, `include_wrist_camera_intrinsic`,
-            `include_available_multi_choices`, `include_maniskill_obs`.
+            `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`,
+            `include_wrist_camera_intrinsic`, `include_available_multi_choices`,
+            `include_maniskill_obs`.
 
     Returns:
         The environment; call `reset()` first. Close it when done.
@@ -82,30 +90,50 @@ def make_env(
     max_steps = metadata.step_limit(split) if max_steps is None else max_steps
     if env == "official":
         require(
-            seed is None and row is None and recovery is None and render and reward == "none" and not only_possible,
-            'env="official" takes episodes of a split, renders and gives no reward: leave out seed, row, '
-            "recovery, render, reward, only_possible.",
+            seed is None
+            and row is None
+            and recovery is None
+            and render
+            and reward == "none"
+            and not only_possible,
+            'env="official" takes episodes of a split, renders and gives no reward: leave out seed,'
+            " row, recovery, render, reward, only_possible.",
         )
         return make_official_env(task, split, episode, action_space, max_steps, include)
     scene: dict[str, Any] = {"seed": seed, "difficulty": difficulty}
     if row is not None:
         spec = metadata.read_row(row)
         fits = spec.task == task and seed is None
-        require(fits, f"row is a scene of {spec.task} with its own seed: name that task, and leave out seed.")
+        require(
+            fits,
+            f"row is a scene of {spec.task} with its own seed: name that task, and leave out seed.",
+        )
         scene = spec.options
     elif seed is None:
         scene = metadata.episode(task, split, episode).options
     if action_space == "multi_choice":
         # A policy that chooses a pixel needs the front camera's matrices.
-        include = include | {"include_front_camera_extrinsic": True, "include_front_camera_intrinsic": True}
+        include = include | {
+            "include_front_camera_extrinsic": True,
+            "include_front_camera_intrinsic": True,
+        }
     included = Include.from_options(include)
-    obs_mode = ("rgb+depth+segmentation" if render else "state_dict") if included.maniskill_obs else "none"
+    obs_mode = (
+        ("rgb+depth+segmentation" if render else "state_dict") if included.maniskill_obs else "none"
+    )
     require_simulator()
     from mme_vla.envs.interface import RoboMMEEnv
 
     scene |= {} if recovery is None else {"recovery": recovery}
-    return RoboMMEEnv(make_task(task, render=render, obs_mode=obs_mode, **scene), action_space, max_steps, included,
-                      render, reward, only_possible)  # fmt: skip
+    return RoboMMEEnv(
+        make_task(task, render=render, obs_mode=obs_mode, **scene),
+        action_space,
+        max_steps,
+        included,
+        render,
+        reward,
+        only_possible,
+    )
 
 
 def check_sessions(split: str, sessions: int) -> None:
@@ -114,9 +142,9 @@ def check_sessions(split: str, sessions: int) -> None:
     required = 0 if variant is None else variant.sessions
     require(
         required == sessions,
-        f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown. `python -m "
-        "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; other "
-        "callers declare them: make_env(…, sessions=2).",
+        f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown."
+        " `python -m mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded"
+        " ones; other callers declare them: make_env(…, sessions=2).",
     )
 
 
@@ -136,7 +164,8 @@ def require_simulator() -> None:
 
 
 def load_tasks(*tasks: str) -> None:
-    """Register tasks, all of them if none is named: in `TASKS`, and with Gymnasium under their own names.
+    """Register tasks, all of them if none is named: in `TASKS`, and with Gymnasium under their own
+    names.
 
     >>> load_tasks()  # doctest: +SKIP
     >>> gymnasium.make("StopCube", seed=0, difficulty="easy", obs_mode="rgb")  # doctest: +SKIP
@@ -166,13 +195,17 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
         from mme_vla.envs.rendering import render_backend
 
         backend = render_backend()
-    return TASKS[task](obs_mode=obs_mode, render_backend=backend, sim_backend="physx_cpu", **options)
+    return TASKS[task](
+        obs_mode=obs_mode, render_backend=backend, sim_backend="physx_cpu", **options
+    )
 
 
 class OfficialEnv:
-    """One episode of the official package `robomme`; `reset`, `step`, `render`, `close` as in `RoboMMEEnv`.
+    """One episode of the official package `robomme`; `reset`, `step`, `render`, `close` as in
+    `RoboMMEEnv`.
 
-    The package needs a patched simulator, numpy < 2 and gymnasium 0.29, therefore an environment of its own.
+    The package needs a patched simulator, numpy < 2 and gymnasium 0.29, therefore an environment of
+    its own.
 
     Args:
         env: what the official builder made.
@@ -230,13 +263,15 @@ def make_official_env(
     Include.from_options(options)  # refuses those that are unknown
     require(
         find_spec("robomme") is not None,
-        "The official package robomme is not installed. Install it from github.com/RoboMME/robomme_benchmark in an "
-        "environment of its own: it needs numpy < 2 and gymnasium 0.29. Or use env='mme_vla', which needs none.",
+        "The official package robomme is not installed. Install it from"
+        " github.com/RoboMME/robomme_benchmark in an environment of its own: it needs numpy < 2 and"
+        " gymnasium 0.29. Or use env='mme_vla', which needs none.",
     )
     require(
         not hasattr(import_module("robomme"), "STANDS_IN"),
-        "The installed package robomme is this library's stand-in (plugins/robomme), whose environments are those of "
-        "env='mme_vla'. Uninstall it and install the official one, or leave out env='official'.",
+        "The installed package robomme is this library's stand-in (plugins/robomme), whose"
+        " environments are those of env='mme_vla'. Uninstall it and install the official one, or"
+        " leave out env='official'.",
     )
     import_module("robomme.robomme_env")  # registers the tasks
     builder = import_module("robomme.env_record_wrapper").BenchmarkEnvBuilder(
@@ -244,7 +279,9 @@ def make_official_env(
     )
     count = builder.get_episode_num()
     exists = 0 <= episode < count
-    require(exists, f"Unknown episode {episode} of {task}, split {split!r}; expected 0 to {count - 1}.")
+    require(
+        exists, f"Unknown episode {episode} of {task}, split {split!r}; expected 0 to {count - 1}."
+    )
     flags = {name: True for name, yes in options.items() if yes}
     return OfficialEnv(builder.make_env_for_episode(episode, max_steps=max_steps, **flags))
 

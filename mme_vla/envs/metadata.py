@@ -1,9 +1,9 @@
 """Tasks, splits, and the seed and difficulty of every episode; importing this needs no simulator.
 
-The shipped tables are the benchmark's own. A seed follows from task, split and episode by a formula, except where the
-official demonstrator failed on it and the seed was raised until it succeeded (see benchmarks/episode_seeds.py). The
-official files are preferred: the installed package `robomme`, or the folder with `train/`, `val/` and `test/` that
-`MME_VLA_ROBOMME_METADATA` names.
+The shipped tables are the benchmark's own. A seed follows from task, split and episode by a
+formula, except where the official demonstrator failed on it and the seed was raised until it
+succeeded (see benchmarks/episode_seeds.py). The official files are preferred: the installed package
+`robomme`, or the folder with `train/`, `val/` and `test/` that `MME_VLA_ROBOMME_METADATA` names.
 """
 
 import csv
@@ -39,24 +39,38 @@ DIALS: dict[str, tuple[str, ...]] = {
     "count": ("PickXtimes", "SwingXtimes", "StopCube", "VideoRepick"),
     "containers": ("VideoUnmask", "ButtonUnmask"),
     "swaps": ("VideoUnmaskSwap", "ButtonUnmaskSwap"),
-    "delay": ("VideoUnmask", "VideoUnmaskSwap", "VideoPlaceButton", "VideoPlaceOrder", "VideoRepick", "MoveCube"),
+    "delay": (
+        "VideoUnmask",
+        "VideoUnmaskSwap",
+        "VideoPlaceButton",
+        "VideoPlaceOrder",
+        "VideoRepick",
+        "MoveCube",
+    ),
     "path": ("PatternLock",),
     "distractors": ("PickHighlight",),
 }
 """Dial → the tasks that have it.
 
-count: repetitions or visits more. containers: more, over nothing. swaps: more of them. delay: steps more between
-what is shown and the execution. path: discs more on the way. distractors: more objects that are not targets.
+count: repetitions or visits more. containers: more, over nothing. swaps: more of them. delay: steps
+more between what is shown and the execution. path: discs more on the way. distractors: more objects
+that are not targets.
 """
 SESSIONS = "sessions"
-"""Unrelated episodes before the actual one, in the same memory: a dial of all tasks that leaves scenes unchanged."""
+"""Unrelated episodes before the actual one, in the same memory: a dial of all tasks that leaves
+scenes unchanged.
+"""
 _STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
 HARD, CHALLENGE = "hard", "challenge"
-"""The test split's hard episodes (its numbers 3, 7, …, 47), and the held-out scenes of the 2026 challenge."""
+"""The test split's hard episodes (its numbers 3, 7, …, 47), and the held-out scenes of the 2026
+challenge.
+"""
 HARD_EPISODES = 12
 """Episodes a task has in `hard`."""
 STEPS = {CHALLENGE: 1500, OOD: 1800}
-"""Control steps that a split allows, where it is not `DEFAULT_STEPS`; `ood` also means its tiers."""
+"""Control steps that a split allows, where it is not `DEFAULT_STEPS`; `ood` also means
+its tiers.
+"""
 DEFAULT_STEPS = 1300
 
 
@@ -80,7 +94,9 @@ class Variant:
     @property
     def options(self) -> dict[str, Any]:
         """Keyword arguments of the task."""
-        stress = {"stress": {self.dial: self.turned}} if self.turned and self.dial != SESSIONS else {}
+        stress = (
+            {"stress": {self.dial: self.turned}} if self.turned and self.dial != SESSIONS else {}
+        )
         return stress | ({"in_view": True} if self.twin else {})
 
     @property
@@ -90,7 +106,10 @@ class Variant:
 
     def check(self, task: str) -> None:
         """Make sure that a task of the benchmark can be varied so."""
-        alone = f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is none."
+        alone = (
+            f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is"
+            " none."
+        )
         require(task in TASK_NAMES, alone)
         if self.dial and self.dial != SESSIONS:
             dials = ", ".join(dial for dial, tasks in DIALS.items() if task in tasks) or "none"
@@ -111,21 +130,31 @@ def read_variant(split: str) -> Variant | None:
     match, known = _STRESS.fullmatch(split), (*DIALS, SESSIONS)
     if match is None:
         raise UserError(
-            f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are {', '.join(known)}."
+            f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are"
+            f" {', '.join(known)}."
         )
-    require(match[1] in known, f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], known)}")
+    require(
+        match[1] in known,
+        f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], known)}",
+    )
     return Variant(dial=match[1], turned=int(match[2]))
 
 
 SPLITS = {"train": 100, "val": 50, "test": 50}
 """Episodes a task has in each split of the benchmark."""
 MORE = "more"
-"""Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits, nor is it a split."""
+"""Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits,
+nor is it a split.
+"""
 FURTHER, FURTHER_EPISODES = "further", 100
-"""Episodes that continue where the test split's rule ends, for tests on new scenes; no split either."""
+"""Episodes that continue where the test split's rule ends, for tests on new scenes; no split
+either.
+"""
 _CYCLE = ("easy", "easy", "medium", "hard")
 FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 400 for level in DIFFICULTIES}
-"""Episodes a task has in each of these; `further_hard` are the hard ones as the same rule continues, and so forth."""
+"""Episodes a task has in each of these; `further_hard` are the hard ones as the same rule
+continues, and so forth.
+"""
 RESERVED = "reserved"
 """Episodes for one final test of what was chosen on others; no split of the benchmark."""
 _COUNTS = {**SPLITS, MORE: 900, **FURTHER_SPLITS, RESERVED: 100}
@@ -157,17 +186,29 @@ class EpisodeSpec:
         """Keyword arguments of the task that make this episode's scene."""
         variant = read_variant(self.split)
         varied = {} if variant is None else variant.options
-        scene = {"seed": self.seed, "difficulty": self.difficulty} if self.row is None else task_options(self.row)
+        scene = (
+            {"seed": self.seed, "difficulty": self.difficulty}
+            if self.row is None
+            else task_options(self.row)
+        )
         return scene | varied
 
     @property
     def recovery(self) -> str | None:
-        """How the demonstration's one failed grasp misses: `z` in train episodes 0-2, `xy` in 3-5, None elsewhere."""
-        return _RECOVERY[self.episode] if self.split == "train" and self.episode < len(_RECOVERY) else None
+        """How the demonstration's one failed grasp misses: `z` in train episodes 0-2, `xy` in 3-5,
+        None elsewhere.
+        """
+        return (
+            _RECOVERY[self.episode]
+            if self.split == "train" and self.episode < len(_RECOVERY)
+            else None
+        )
 
 
 def formula(task: str, split: str, episode: int) -> tuple[int, str]:
-    """Seed before any retry, and difficulty, of an episode; of a task of the user's own, as if it were number 0."""
+    """Seed before any retry, and difficulty, of an episode; of a task of the user's own, as if it
+    were number 0.
+    """
     offset, stride = _FIRST_SEED[split]
     number = TASK_NAMES.index(task) + 1 if task in TASK_NAMES else 0
     place = _further_place(split, episode) if split in FURTHER_SPLITS else episode
@@ -180,7 +221,9 @@ def _further_place(split: str, episode: int) -> int:
     if not level:
         return first + episode
     round_, index = divmod(episode, _CYCLE.count(level))
-    places = [place for place in range(first, first + len(_CYCLE)) if _CYCLE[place % len(_CYCLE)] == level]
+    places = [
+        place for place in range(first, first + len(_CYCLE)) if _CYCLE[place % len(_CYCLE)] == level
+    ]
     return places[index] + round_ * len(_CYCLE)
 
 
@@ -194,14 +237,16 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 
     Args:
         task: one of the 16 task names, or a task of the user's own registered in `TASKS`.
-        split: `train`, `val` or `test`; `hard`, the hard ones of the latter; `challenge`; `ood` or `ood:<tier>`; the
-            path of a JSONL file of scenes (`rows`); a variant (`Variant`), whose seeds are the same; or `more`,
-            900 episodes a task that the benchmark does not have, or `further`, 100 that the rule of the test split
-            gives after its own 50 (number 0 is what number 50 would be; no seed was raised), or `further_easy`,
-            `further_medium`, `further_hard`, 400 of one difficulty by the same rule, or `reserved`, 100 with seeds of
+        split: `train`, `val` or `test`; `hard`, the hard ones of the latter; `challenge`; `ood` or
+            `ood:<tier>`; the path of a JSONL file of scenes (`rows`); a variant (`Variant`), whose
+            seeds are the same; or `more`, 900 episodes a task that the benchmark does not have, or
+            `further`, 100 that the rule of the test split gives after its own 50 (number 0 is what
+            number 50 would be; no seed was raised), or `further_easy`, `further_medium`,
+            `further_hard`, 400 of one difficulty by the same rule, or `reserved`, 100 with seeds of
             their own from 5,010,000 on.
-        folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
-            `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
+        folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by
+            default the one that `MME_VLA_ROBOMME_METADATA` names, then the installed official
+            package's, then the shipped table.
     """
     check_task_name(task)
     variant = check_split(split)
@@ -216,7 +261,9 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
     if split == CHALLENGE and task in TASK_NAMES:
         return list(_table(split)[task])
     if task not in TASK_NAMES or split not in SPLITS:
-        return [EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(_COUNTS[split])]
+        return [
+            EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(_COUNTS[split])
+        ]
     folder = folder or os.environ.get(FOLDER_VARIABLE)
     if folder:
         return read_official(Path(folder) / split / file_name(task), task, split)
@@ -233,7 +280,9 @@ def check_split(split: str) -> Variant | None:
     variant = read_variant(split)
     base = split if variant is None else variant.base
     if base not in KNOWN and not is_row_split(base):
-        known = f"{did_you_mean(str(base), [*KNOWN, TWIN, STRESS])} A file of scenes ends in .jsonl."
+        known = (
+            f"{did_you_mean(str(base), [*KNOWN, TWIN, STRESS])} A file of scenes ends in .jsonl."
+        )
         raise UserError(f"Unknown split {split!r}. {known}")
     return variant
 
@@ -256,15 +305,22 @@ def read_row(value: Any) -> EpisodeSpec:
 
 
 def _spec_of(row: Mapping[str, Any], split: str, number: int) -> EpisodeSpec:
-    return EpisodeSpec(row["task"], split, number, row["seed"], row.get("tier") or row.get("difficulty", HARD), row)
+    return EpisodeSpec(
+        row["task"], split, number, row["seed"], row.get("tier") or row.get("difficulty", HARD), row
+    )
 
 
-def episode(task: str, split: str = "test", index: int = 0, folder: str | Path | None = None) -> EpisodeSpec:
+def episode(
+    task: str, split: str = "test", index: int = 0, folder: str | Path | None = None
+) -> EpisodeSpec:
     """One episode of a split."""
     known = episodes(task, split, folder)
     require(known, f"{task} has no episodes in split {split!r}.")
     exists = type(index) is int and 0 <= index < len(known)
-    require(exists, f"Unknown episode {index!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
+    require(
+        exists,
+        f"Unknown episode {index!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.",
+    )
     return known[index]
 
 
@@ -274,7 +330,9 @@ def _table(split: str) -> dict[str, list[EpisodeSpec]]:
     table: dict[str, list[EpisodeSpec]] = {task: [] for task in TASK_NAMES}
     for row in csv.DictReader(text.splitlines()):
         table[row["task"]].append(
-            EpisodeSpec(row["task"], split, int(row["episode"]), int(row["seed"]), row["difficulty"])
+            EpisodeSpec(
+                row["task"], split, int(row["episode"]), int(row["seed"]), row["difficulty"]
+            )
         )
     return table
 
@@ -297,9 +355,9 @@ def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
         full = all(type(n) is int and 0 <= n < 2**31 for n in (number, seed))
         require(
             full and difficulty in list(_CYCLE),
-            f"{path} is not official metadata: a record has episode {brief(number)}, seed {brief(seed)} and "
-            f"difficulty {brief(difficulty)}; expected two whole numbers and one of {', '.join(sorted(set(_CYCLE)))}. "
-            "Get the file again.",
+            f"{path} is not official metadata: a record has episode {brief(number)}, seed"
+            f" {brief(seed)} and difficulty {brief(difficulty)}; expected two whole numbers and one"
+            f" of {', '.join(sorted(set(_CYCLE)))}. Get the file again.",
         )
         specs.append(EpisodeSpec(task, split, number, seed, difficulty))
     specs.sort(key=lambda spec: spec.episode)

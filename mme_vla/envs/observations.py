@@ -1,6 +1,7 @@
 """The frames of a task: robot state and the requested camera images.
 
-A frame is a dict with one value per observation key; the interface hands out lists of them, as the benchmark does.
+A frame is a dict with one value per observation key; the interface hands out lists of them, as the
+benchmark does.
 """
 
 from collections.abc import Collection, Container, Mapping, Sequence
@@ -26,12 +27,15 @@ NOTHING: Container[int] = frozenset()
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """The frames of an episode that are rendered: a control step costs milliseconds, an image of it some fifty.
+    """The frames of an episode that are rendered: a control step costs milliseconds, an image of it
+    some fifty.
 
-    frames: camera (`front`, `wrist`) → numbers of the frames it shows, counted from the reset on, those of the
+    frames: camera (`front`, `wrist`) → numbers of the frames it shows, counted from the reset on,
+    those of the
         conditioning video first. A `range` may reach beyond the episode's end.
-    now: the cameras that show, whatever its number, the newest frame of each call of `reset` and `step`.
-    grounded: whether texts need pixels, for which the front camera renders where a sub-task begins.
+    now: the cameras that show, whatever its number, the newest frame of each call of `reset` and
+    `step`. grounded: whether texts need pixels, for which the front camera renders where a sub-task
+    begins.
     """
 
     frames: Mapping[str, Container[int]] = field(default_factory=dict)
@@ -40,12 +44,18 @@ class RenderRequest:
 
     def cameras(self, frame: int, newest: bool) -> tuple[str, ...]:
         """The cameras that show a frame of this number."""
-        known = dict.fromkeys((*CAMERAS, *self.frames, *self.now))  # some environments have more than the benchmark
-        return tuple(c for c in known if frame in self.frames.get(c, NOTHING) or (newest and c in self.now))
+        known = dict.fromkeys(
+            (*CAMERAS, *self.frames, *self.now)
+        )  # some environments have more than the benchmark
+        return tuple(
+            c for c in known if frame in self.frames.get(c, NOTHING) or (newest and c in self.now)
+        )
 
 
 FOCAL_LENGTH = SIDE / 2  # pixels: the side is seen under 90 degrees
-INTRINSIC = np.array([[FOCAL_LENGTH, 0, SIDE / 2], [0, FOCAL_LENGTH, SIDE / 2], [0, 0, 1]], np.float32)
+INTRINSIC = np.array(
+    [[FOCAL_LENGTH, 0, SIDE / 2], [0, FOCAL_LENGTH, SIDE / 2], [0, 0, 1]], np.float32
+)
 """Intrinsic matrix of both cameras, [3, 3]."""
 SENSORS = {"front": "base_camera", "wrist": "hand_camera"}
 """The benchmark's names of the cameras, and the simulator's."""
@@ -78,10 +88,11 @@ class Include:
 
 
 class AngleTrack:
-    """Roll, pitch and yaw that continue where the previous frame's left off instead of jumping by a full turn.
+    """Roll, pitch and yaw that continue where the previous frame's left off instead of jumping by a
+    full turn.
 
-    Extrinsic x-y-z angles; the quaternion's sign follows the previous frame's, and each angle's change is folded into
-    [-π, π) and added, so that values may leave ±π.
+    Extrinsic x-y-z angles; the quaternion's sign follows the previous frame's, and each angle's
+    change is folded into [-π, π) and added, so that values may leave ±π.
     """
 
     def __init__(self) -> None:
@@ -131,11 +142,15 @@ class Observer:
         self.follow()
 
     def follow(self) -> None:
-        """Take note of the tool's pose; due at every control step, whether or not it becomes a frame."""
+        """Take note of the tool's pose; due at every control step, whether or not it becomes a
+        frame.
+        """
         pose = self.task.tcp_pose
         self._eef = np.concatenate([pose.p, self._angles.follow(pose.q)]).astype(np.float64)
 
-    def frame(self, info: dict[str, Any], cameras: Collection[str] = tuple(SENSORS)) -> dict[str, Any]:
+    def frame(
+        self, info: dict[str, Any], cameras: Collection[str] = tuple(SENSORS)
+    ) -> dict[str, Any]:
         """The present frame; `info` is what the task has just evaluated.
 
         Args:
@@ -160,13 +175,17 @@ class Observer:
                 images = read_images(self.task, name, rgb=True, depth=depth) if is_rendered else {}
                 frame[f"{name}_rgb"] = images.get("rgb")
                 if depth:
-                    frame[f"{name}_depth"] = images["depth"].astype(np.int16) if is_rendered else None
+                    frame[f"{name}_depth"] = (
+                        images["depth"].astype(np.int16) if is_rendered else None
+                    )
             if getattr(self.include, f"{name}_camera_extrinsic"):
                 frame[f"{name}_camera_extrinsic"] = self.extrinsic(name)
         return frame
 
     def segmentation(self) -> np.ndarray:
-        """Object ids [256, 256] of the present front image, which is taken if the frame has none."""
+        """Object ids [256, 256] of the present front image, which is taken if the
+        frame has none.
+        """
         if "front" not in self._taken:
             self._render_cameras(["front"])
         return read_images(self.task, "front", segmentation=True)["segmentation"][..., 0]
@@ -176,7 +195,9 @@ class Observer:
         if name == "front":
             return front_extrinsic()
         pose = self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose
-        return (_OPENCV @ np.asarray(pose.inv().to_transformation_matrix(), np.float64)[:3]).astype(np.float32)
+        return (_OPENCV @ np.asarray(pose.inv().to_transformation_matrix(), np.float64)[:3]).astype(
+            np.float32
+        )
 
     def _render_cameras(self, cameras: Collection[str]) -> None:
         cameras = [name for name in cameras if name in SENSORS]
@@ -201,7 +222,11 @@ def read_images(
     sensor = task.scene.sensors[SENSORS[camera]]
     shader = sensor.config.shader_config
     images: dict[str, Tensor] = {}
-    requested = {name for name, flag in (("rgb", rgb), ("depth", depth), ("segmentation", segmentation)) if flag}
+    requested = {
+        name
+        for name, flag in (("rgb", rgb), ("depth", depth), ("segmentation", segmentation))
+        if flag
+    }
     for texture, kinds in shader.texture_names.items():
         if requested.intersection(kinds):
             images |= shader.texture_transforms[texture](_read_texture(sensor.camera, texture))
@@ -213,7 +238,9 @@ def _read_texture(camera: "RenderCamera", name: str) -> "Tensor":
     if camera.scene.backend.render_backend == "sapien_cpu":
         import torch
 
-        return torch.from_numpy(camera._render_cameras[0].get_picture(name))  # ManiSkill's own copy takes 8 ms
+        return torch.from_numpy(
+            camera._render_cameras[0].get_picture(name)
+        )  # ManiSkill's own copy takes 8 ms
     return camera.get_picture(name)[0][0]
 
 

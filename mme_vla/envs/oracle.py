@@ -1,4 +1,6 @@
-"""The action that a task's own script takes next, by choices: what a player or a learner can be taught by."""
+"""The action that a task's own script takes next, by choices: what a player or a learner can be
+taught by.
+"""
 
 from collections.abc import Mapping
 from typing import Any, NoReturn
@@ -20,7 +22,8 @@ def oracle_choice(task: Any) -> tuple[dict[str, Any], str]:
         task: a running task (`Task`), whose state is read.
 
     Returns:
-        `{"choice": letter, "point": [y, x] or None}`, the point in pixels of the front image, and the sub-task's text.
+        `{"choice": letter, "point": [y, x] or None}`, the point in pixels of the front image, and
+        the sub-task's text.
 
     Raises:
         OracleStuckError: no option does it.
@@ -29,15 +32,20 @@ def oracle_choice(task: Any) -> tuple[dict[str, Any], str]:
     if subtask is None:
         _stuck("every sub-task is done, but the episode has not ended")
     if subtask.video:
-        _stuck(f"the conditioning video did not succeed ({subtask.text!r}), so the task cannot be done")
+        _stuck(
+            f"the conditioning video did not succeed ({subtask.text!r}), so the task cannot be done"
+        )
     choice = {choice.label: choice for choice in task.choices()}.get(subtask.choice)
     if choice is None:
         _stuck(f"the sub-task {subtask.text!r} has no option")
     if choice.candidates is None:
         return {"choice": choice.label, "point": None}, subtask.text
     candidates = list(choice.candidates())
-    # A sub-task may name the button it ends at as well: the point is of what the option chooses among.
-    targets = [thing for thing in subtask.targets if any(thing is candidate for candidate in candidates)]
+    # A sub-task may name the button it ends at as well: the point is of what the option chooses
+    # among.
+    targets = [
+        thing for thing in subtask.targets if any(thing is candidate for candidate in candidates)
+    ]
     if not targets:
         _stuck(f"the sub-task {subtask.text!r} is about nothing that its option can choose")
     pixel = np.clip(np.rint(project(targets[0].position)), 0, SIDE - 1)
@@ -47,8 +55,8 @@ def oracle_choice(task: Any) -> tuple[dict[str, Any], str]:
 def oracle_of(env: Any) -> Mapping[str, Any] | None:
     """The oracle's action in an environment by choices; None where its script has none.
 
-    A task of this library has its script. Any other environment has an oracle if it has a method `oracle()`, which
-    returns such a choice or None.
+    A task of this library has its script. Any other environment has an oracle if it has a method
+    `oracle()`, which returns such a choice or None.
     """
     task = getattr(env, "task", None)
     if task is None:

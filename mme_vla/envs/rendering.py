@@ -1,4 +1,6 @@
-"""The renderer: its device and shaders, culling of links, and the engine that is kept for the life of the process."""
+"""The renderer: its device and shaders, culling of links, and the engine that is kept for the life
+of the process.
+"""
 
 import hashlib
 import logging
@@ -23,9 +25,10 @@ if TYPE_CHECKING:
     from mani_skill.render import ShaderConfig
 
 INSTALL_HINT = (
-    "Rendering needs a Vulkan driver: an NVIDIA GPU's own, or, without one, Mesa's software driver, 24 or newer. "
-    "On Debian and Ubuntu run scripts/install_vulkan.sh (it installs libvulkan1 and mesa-vulkan-drivers >= 24; on "
-    "Debian 12 from bookworm-backports). Or pass render=False for an environment without images."
+    "Rendering needs a Vulkan driver: an NVIDIA GPU's own, or, without one, Mesa's software driver,"
+    " 24 or newer. On Debian and Ubuntu run scripts/install_vulkan.sh (it installs libvulkan1 and"
+    " mesa-vulkan-drivers >= 24; on Debian 12 from bookworm-backports). Or pass render=False for an"
+    " environment without images."
 )
 OLDEST_MESA = 24
 
@@ -38,18 +41,18 @@ def render_backend() -> str:
     """The simulator's name for the device that renders: the GPU if there is one, else the CPU.
 
     Raises:
-        UserError: this machine cannot render, or this process was forked from one in which the renderer had begun:
-            its threads are not in the copy, which would wait for them for ever.
+        UserError: this machine cannot render, or this process was forked from one in which the
+            renderer had begun: its threads are not in the copy, which would wait for them for ever.
     """
     global _process
     if _process is None:
         _process = os.getpid()
     require(
         _process == os.getpid(),
-        f"This process was forked from process {_process}, where images had been rendered: rendering would wait for "
-        'ever here. Start processes afresh (`spawn` or `forkserver`: AsyncVectorEnv(…, context="spawn"), '
-        'DataLoader(…, multiprocessing_context="spawn")), fork before the first image, or pass images=False or '
-        "render=False.",
+        f"This process was forked from process {_process}, where images had been rendered:"
+        " rendering would wait for ever here. Start processes afresh (`spawn` or `forkserver`:"
+        ' AsyncVectorEnv(…, context="spawn"), DataLoader(…, multiprocessing_context="spawn")),'
+        " fork before the first image, or pass images=False or render=False.",
     )
     return _find_backend()
 
@@ -78,7 +81,9 @@ def _find_backend() -> str:
 
 
 def mesa_version() -> int | None:
-    """Major version of the installed package mesa-vulkan-drivers; None where the system is not Debian's kind."""
+    """Major version of the installed package mesa-vulkan-drivers; None where the system is not
+    Debian's kind.
+    """
     if shutil.which("dpkg-query") is None:
         return None
     command = ["dpkg-query", "-W", "-f=${Version}", "mesa-vulkan-drivers"]
@@ -93,11 +98,13 @@ _systems: dict[str, "sapien.render.RenderSystem"] = {}
 
 
 def keep_renderer(device: "sapien.Device") -> None:
-    """Keep the engine that renders on a device until the process ends; further calls have no effect.
+    """Keep the engine that renders on a device until the process ends; further calls have no
+    effect.
 
-    ManiSkill makes a render system for each scene, and all of them share SAPIEN's engine. Its shaders and pipelines are
-    compiled for the first image, which takes half a second on a CPU, and are freed with the last render system. An
-    additional render system keeps them, and a single Vulkan device, of which NVIDIA's driver supports some thirty.
+    ManiSkill makes a render system for each scene, and all of them share SAPIEN's engine. Its
+    shaders and pipelines are compiled for the first image, which takes half a second on a CPU, and
+    are freed with the last render system. An additional render system keeps them, and a single
+    Vulkan device, of which NVIDIA's driver supports some thirty.
     """
     import sapien
 
@@ -145,9 +152,11 @@ def without_table(source: str) -> str:
 
 
 def lean_shaders() -> "ShaderConfig | None":
-    """Shaders for cameras in scenes without an environment map; None where the installed ones are not as expected.
+    """Shaders for cameras in scenes without an environment map; None where the installed ones are
+    not as expected.
 
-    Sets the formats of images, which ManiSkill sets by the pack's name, so call this right before the cameras are made.
+    Sets the formats of images, which ManiSkill sets by the pack's name, so call this right before
+    the cameras are made.
     """
     from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS, set_shader_pack
 
@@ -192,13 +201,17 @@ MARGIN = 1e-3
 
 @contextmanager
 def culled(
-    bodies: Sequence["sapien.render.RenderBodyComponent"], camera: "sapien.render.RenderCameraComponent"
+    bodies: Sequence["sapien.render.RenderBodyComponent"],
+    camera: "sapien.render.RenderCameraComponent",
 ) -> Iterator[None]:
     """Hide the bodies that a camera cannot see while it renders; the image stays the same.
 
-    A software renderer spends a millisecond on each link of the robot whose triangles all lie outside the image.
+    A software renderer spends a millisecond on each link of the robot whose triangles all lie
+    outside the image.
     """
-    beyond = _beyond(camera, np.array([body.get_global_aabb_fast() for body in bodies]).reshape(-1, 2, 3))
+    beyond = _beyond(
+        camera, np.array([body.get_global_aabb_fast() for body in bodies]).reshape(-1, 2, 3)
+    )
     hidden = [(body, body.visibility) for body, flag in zip(bodies, beyond, strict=True) if flag]
     try:
         for body, _ in hidden:
@@ -210,9 +223,13 @@ def culled(
 
 
 def _beyond(camera: "sapien.render.RenderCameraComponent", boxes: np.ndarray) -> np.ndarray:
-    """Which boxes lie beyond one edge of the camera's image, [n]; boxes: lowest and highest corner, [n, 2, 3]."""
+    """Which boxes lie beyond one edge of the camera's image, [n]; boxes: lowest and highest corner,
+    [n, 2, 3].
+    """
     view = camera.global_pose.inv().to_transformation_matrix()
-    corners = np.stack([boxes[:, ends, range(3)] for ends in product((0, 1), repeat=3)], 1)  # [n, 8, 3]
+    corners = np.stack(
+        [boxes[:, ends, range(3)] for ends in product((0, 1), repeat=3)], 1
+    )  # [n, 8, 3]
     x, y, z = np.moveaxis(corners @ view[:3, :3].T + view[:3, 3], -1, 0)  # forward, left, up
     right, top = x * np.tan(camera.fovx / 2), x * np.tan(camera.fovy / 2)
     outside = np.stack([y - right, -y - right, z - top, -z - top]) > MARGIN  # [4, n, 8]

@@ -1,8 +1,10 @@
-"""Scenes as rows of values: the 800 of RoboMME-OOD, and files of a user's own. Importing this needs no simulator.
+"""Scenes as rows of values: the 800 of RoboMME-OOD, and files of a user's own. Importing this needs
+no simulator.
 
-A file has one JSON object a line: `task`, `spec` (the values, see `scene/values.py`), and optionally `seed`,
-`difficulty`, `recovery`, `in_view` (as `split=twin`) and `tier`, which brings the rules of RoboMME-OOD. Other keys,
-such as `episode`, are kept and have no effect. `env.scene_values()` gives the row of any scene.
+A file has one JSON object a line: `task`, `spec` (the values, see `scene/values.py`), and
+optionally `seed`, `difficulty`, `recovery`, `in_view` (as `split=twin`) and `tier`, which brings
+the rules of RoboMME-OOD. Other keys, such as `episode`, are kept and have no effect.
+`env.scene_values()` gives the row of any scene.
 """
 
 import json
@@ -49,10 +51,15 @@ def rows_of(task: str, split: str, known: tuple[str, ...]) -> list[Row]:
     if match is None:
         path = Path(split).expanduser()
         if not path.is_file():
-            raise UserError(f"split={split}: there is no such file. Name a JSONL file of scenes, one object a line.")
+            raise UserError(
+                f"split={split}: there is no such file. Name a JSONL file of scenes, one object a"
+                " line."
+            )
         return list(_read_file(str(path), path.stat().st_mtime_ns, known).get(task, []))
     if match[1] not in (None, *TIERS):
-        raise UserError(f"split={split!r}: there is no tier {match[1]!r}. {did_you_mean(match[1], TIERS)}")
+        raise UserError(
+            f"split={split!r}: there is no tier {match[1]!r}. {did_you_mean(match[1], TIERS)}"
+        )
     return [row for row in _ood().get(task, []) if match[1] in (None, row["tier"])]
 
 
@@ -66,7 +73,9 @@ def _ood() -> dict[str, list[Row]]:
 def _read_file(path: str, modified: int, known: tuple[str, ...]) -> dict[str, list[Row]]:
     """Rows by task. modified: time of the last change, so that a changed file is read again."""
     try:
-        lines = Path(path).read_text(encoding="utf-8").split("\n")  # values may hold other separators
+        lines = (
+            Path(path).read_text(encoding="utf-8").split("\n")
+        )  # values may hold other separators
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read as text: {error}.") from error
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
@@ -106,22 +115,34 @@ def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
     if not isinstance(task, str) or task not in known:
         raise UserError(f"{where}: task is {brief(task)}. {did_you_mean(str(task), known)}")
     if not isinstance(spec, Mapping):
-        raise UserError(f"{where}: spec is {brief(spec)}; expected the values as an object of {', '.join(_PARTS)}.")
+        raise UserError(
+            f"{where}: spec is {brief(spec)}; expected the values as an object of"
+            f" {', '.join(_PARTS)}."
+        )
     for part, values in spec.items():
         kind = list if part == "initializations" else dict
         if part not in _PARTS or not isinstance(values, kind):
-            raise UserError(f"{where}: spec.{part} is {brief(values)}; the parts are {', '.join(_PARTS)}.")
+            raise UserError(
+                f"{where}: spec.{part} is {brief(values)}; the parts are {', '.join(_PARTS)}."
+            )
     if type(seed) is not int or not 0 <= seed < 2**31:
         raise UserError(f"{where}: seed is {brief(seed)}; expected a whole number from 0.")
     for name, known in _OPTIONAL.items():
         if name in row and row[name] not in known:
-            raise UserError(f"{where}: {name} is {brief(row[name])}; expected one of {', '.join(map(str, known))}.")
+            raise UserError(
+                f"{where}: {name} is {brief(row[name])}; expected one of"
+                f" {', '.join(map(str, known))}."
+            )
     if not isinstance(row.get("tier", ""), str):
-        raise UserError(f"{where}: tier is {brief(row['tier'])}; expected a name, such as {TIERS[0]}.")
+        raise UserError(
+            f"{where}: tier is {brief(row['tier'])}; expected a name, such as {TIERS[0]}."
+        )
     return row | {"where": where}
 
 
 def task_options(row: Mapping[str, Any]) -> dict[str, Any]:
     """Keyword arguments of the task whose scene a row describes."""
-    options = {name: row.get(name) for name in ("recovery",)} | {"in_view": bool(row.get("in_view"))}
+    options = {name: row.get(name) for name in ("recovery",)} | {
+        "in_view": bool(row.get("in_view"))
+    }
     return {"seed": row["seed"], "difficulty": row.get("difficulty", "hard"), "row": row} | options

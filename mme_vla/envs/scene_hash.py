@@ -1,4 +1,6 @@
-"""A digest that is equal for equal scenes, on every machine: of what was sampled, and of where things stand."""
+"""A digest that is equal for equal scenes, on every machine: of what was sampled, and of where
+things stand.
+"""
 
 import hashlib
 from collections.abc import Mapping
@@ -16,11 +18,12 @@ _DIGITS = 16
 
 
 def scene_digest(values: Mapping[str, Any]) -> str:
-    """Sixteen hexadecimal digits that are equal for two scenes exactly if their values are, to the last bit.
+    """Sixteen hexadecimal digits that are equal for two scenes exactly if their values are, to the
+    last bit.
 
     Args:
-        values: nested mappings with texts as keys, lists, arrays, numbers, texts, truth values and None. Their order
-            does not count, nor whether a number is written `1` or `1.0`.
+        values: nested mappings with texts as keys, lists, arrays, numbers, texts, truth values and
+            None. Their order does not count, nor whether a number is written `1` or `1.0`.
 
     Raises:
         UserError: a value of another kind, of which there is no text that is the same everywhere.
@@ -29,7 +32,9 @@ def scene_digest(values: Mapping[str, Any]) -> str:
 
 
 def _canonical(value: Any) -> str:
-    """One text of a value, the same on every machine: numbers as hexadecimal, to the bit; keys sorted."""
+    """One text of a value, the same on every machine: numbers as hexadecimal, to the bit; keys
+    sorted.
+    """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if value is None or isinstance(value, bool):
@@ -44,6 +49,6 @@ def _canonical(value: Any) -> str:
         entries = (f"{_canonical(key)}={_canonical(value[key])}" for key in sorted(value))
         return "{" + ",".join(entries) + "}"
     raise UserError(
-        f"A scene's values hold {brief(value)}; expected numbers, texts, truth values, None, lists, and mappings with "
-        "texts as keys. Give plain values in scene_values(env)."
+        f"A scene's values hold {brief(value)}; expected numbers, texts, truth values, None, lists,"
+        " and mappings with texts as keys. Give plain values in scene_values(env)."
     )

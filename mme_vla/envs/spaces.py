@@ -7,8 +7,8 @@
 | `waypoint` | the same | a planned motion, then the gripper |
 | `multi_choice` | `{"choice": "A", "point": [y, x]}` | the whole option |
 
-Positions in metres and angles in radians, in the world; gripper -1 closed, +1 open. The robots that hold a stick need
-no gripper number.
+Positions in metres and angles in radians, in the world; gripper -1 closed, +1 open. The robots that
+hold a stick need no gripper number.
 """
 
 import warnings
@@ -83,7 +83,9 @@ class JointAngle(ActionSpace):
 
 
 class EndEffectorPose(ActionSpace):
-    """An absolute pose of the tool, reached in one control step from inverse kinematics at the present joints."""
+    """An absolute pose of the tool, reached in one control step from inverse kinematics at the
+    present joints.
+    """
 
     name = "ee_pose"
 
@@ -92,12 +94,16 @@ class EndEffectorPose(ActionSpace):
         numbers = _pose_numbers(action, stick)
         joints = control.demonstrator.arm.ik(_pose(numbers), control.task.qpos)
         if joints is None:
-            raise UnreachableError(f"IK failed: no joint angles reach the pose {np.round(numbers[:6], 4).tolist()}.")
+            raise UnreachableError(
+                f"IK failed: no joint angles reach the pose {np.round(numbers[:6], 4).tolist()}."
+            )
         control.step(joints if stick else np.append(joints, numbers[6]))
 
 
 class Waypoint(ActionSpace):
-    """An absolute pose of the tool, reached by a planned motion; then the gripper closes at -1 or opens at +1."""
+    """An absolute pose of the tool, reached by a planned motion; then the gripper closes at -1 or
+    opens at +1.
+    """
 
     name = "waypoint"
 
@@ -116,7 +122,9 @@ class Waypoint(ActionSpace):
 
 
 class MultiChoice(ActionSpace):
-    """One of the task's options by its letter, with a pixel [y, x] of the front image where it needs an object."""
+    """One of the task's options by its letter, with a pixel [y, x] of the front image where it
+    needs an object.
+    """
 
     name = "multi_choice"
 
@@ -126,22 +134,34 @@ class MultiChoice(ActionSpace):
 
     def act(self, control: Control, action: Any) -> None:
         is_choice = isinstance(action, dict) and isinstance(action.get("choice"), str)
-        require(is_choice, f'Action {action!r} is no choice; expected {{"choice": "A", "point": [y, x]}}.')
+        require(
+            is_choice,
+            f'Action {action!r} is no choice; expected {{"choice": "A", "point": [y, x]}}.',
+        )
         label = action["choice"].strip().lower()
         choices = {choice.label: choice for choice in control.task.choices()}
         if label not in choices:
             # As in the benchmark, an unknown letter makes no step.
-            warnings.warn(f"Unknown choice {action['choice']!r}: no step. {did_you_mean(label, choices)}", stacklevel=2)
+            warnings.warn(
+                f"Unknown choice {action['choice']!r}: no step. {did_you_mean(label, choices)}",
+                stacklevel=2,
+            )
             return
         choice = choices[label]
         if choice.candidates is None:
             choice.run(control.demonstrator, None)
             return
         point = action.get("point")
-        needed = f"Choice {label!r} ({choice.action}) needs a point: the pixel [y, x] of the object meant."
+        needed = (
+            f"Choice {label!r} ({choice.action}) needs a point: the pixel [y, x] of the object"
+            " meant."
+        )
         require(point is not None and len(point), needed)
         pixel = _numbers(point, 2, "a pixel's row and column")
-        nearest = min(choice.candidates(), key=lambda thing: float(np.linalg.norm(project(thing.position) - pixel)))
+        nearest = min(
+            choice.candidates(),
+            key=lambda thing: float(np.linalg.norm(project(thing.position) - pixel)),
+        )
         choice.run(control.demonstrator, nearest)
 
 
@@ -161,11 +181,15 @@ def _numbers(action: Any, size: int, meaning: str, longer: bool = False) -> np.n
     try:
         numbers = np.asarray(action, np.float64)
     except (TypeError, ValueError):
-        raise UserError(f"Action {action!r} is not made of numbers; expected {size}: {meaning}.") from None
+        raise UserError(
+            f"Action {action!r} is not made of numbers; expected {size}: {meaning}."
+        ) from None
     fits = numbers.ndim == 1 and (len(numbers) == size or (longer and len(numbers) > size))
     least = "at least " if longer else ""
     require(fits, f"Action has shape {numbers.shape}; expected {least}{size} numbers: {meaning}.")
-    require(np.isfinite(numbers).all(), f"Action {numbers.tolist()} holds numbers that are not finite.")
+    require(
+        np.isfinite(numbers).all(), f"Action {numbers.tolist()} holds numbers that are not finite."
+    )
     return numbers
 
 
@@ -176,4 +200,6 @@ def _pose_numbers(action: Any, stick: bool) -> np.ndarray:
 
 
 def _pose(numbers: np.ndarray) -> sapien.Pose:
-    return sapien.Pose(numbers[:3], Rotation.from_euler("xyz", numbers[3:6]).as_quat(scalar_first=True))
+    return sapien.Pose(
+        numbers[:3], Rotation.from_euler("xyz", numbers[3:6]).as_quat(scalar_first=True)
+    )

@@ -1,4 +1,6 @@
-"""The sub-tasks of an episode, the pointer that walks over them, the options of multi-choice, and the scores."""
+"""The sub-tasks of an episode, the pointer that walks over them, the options of multi-choice, and
+the scores.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -12,7 +14,18 @@ if TYPE_CHECKING:
     from mme_vla.envs.scene.things import Thing
 
 
-ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
+ORDINALS = (
+    "first",
+    "second",
+    "third",
+    "fourth",
+    "fifth",
+    "sixth",
+    "seventh",
+    "eighth",
+    "ninth",
+    "tenth",
+)
 NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
@@ -39,7 +52,9 @@ OPERATIONS = ("which", "where", "how many", "order", "how")
 
 @dataclass(frozen=True, eq=False)
 class SubTask:
-    """One step of an episode: its text, when it is done, when it has failed, and how it is demonstrated."""
+    """One step of an episode: its text, when it is done, when it has failed, and how it is
+    demonstrated.
+    """
 
     text: str
     """Without coordinates."""
@@ -50,7 +65,9 @@ class SubTask:
     """With a `<>` for each target's pixel; empty: the same as `text`."""
     failed: Callable[[], bool] | None = None
     targets: Sequence["Thing"] = ()
-    """The objects whose pixels fill the `<>`, in order; a single `<>` takes all of them together."""
+    """The objects whose pixels fill the `<>`, in order; a single `<>` takes all of
+    them together.
+    """
     choice: str = ""
     """Letter of the multi-choice option that does this; empty where there is none."""
     video: bool = False
@@ -58,7 +75,9 @@ class SubTask:
     pick: bool = False
     """A grasp from the table: what a recovery demonstration may fail once."""
     operation: str | Callable[[], str] = ""
-    """Of `OPERATIONS`, what is mistaken where this fails; empty for a motion. A function is called at the failure."""
+    """Of `OPERATIONS`, what is mistaken where this fails; empty for a motion. A function is called
+    at the failure.
+    """
 
     @property
     def grounded_text(self) -> str:
@@ -68,7 +87,9 @@ class SubTask:
 
 @dataclass(frozen=True)
 class Choice:
-    """One option of the multi-choice action space: its letter (lower case), its text, and its motion."""
+    """One option of the multi-choice action space: its letter (lower case), its text, and its
+    motion.
+    """
 
     label: str
     action: str
@@ -86,22 +107,26 @@ class Choice:
 class Progress:
     """Which sub-task an episode is at.
 
-    At every evaluation, once a step after the physics: first the present sub-task's failure, then, if there was none,
-    its completion, upon which the pointer moves on by exactly one.
+    At every evaluation, once a step after the physics: first the present sub-task's failure, then,
+    if there was none, its completion, upon which the pointer moves on by exactly one.
     """
 
     def __init__(self, subtasks: Sequence[SubTask], latch_failure: bool) -> None:
         self.subtasks = list(subtasks)
         self.index = 0
         self.planned = 0
-        """The demonstrator's view of the pointer: moves only when a sub-task's routine has ended."""
+        """The demonstrator's view of the pointer: moves only when a sub-task's routine
+        has ended.
+        """
         self.failed = False
         self.mistaken = ""
         """What the last failure was a mistake of: one of `OPERATIONS`, or empty."""
         self._latch = latch_failure
 
     def update(self, failed: bool = False) -> None:
-        """Evaluate once; `failed` is what the task itself, whatever the sub-task, says of failure."""
+        """Evaluate once; `failed` is what the task itself, whatever the sub-task, says
+        of failure.
+        """
         if not self._latch:
             self.failed = False
         if self.succeeded:  # and stays so, whatever happens next
@@ -125,7 +150,9 @@ class Progress:
 
     @property
     def displayed(self) -> SubTask:
-        """The sub-task whose text is reported online: the current one, and at the end the last one."""
+        """The sub-task whose text is reported online: the current one, and at the end
+        the last one.
+        """
         return self.subtasks[min(self.index, len(self.subtasks) - 1)]
 
     @property
@@ -139,7 +166,8 @@ class Progress:
         return self.index >= len(self.subtasks)
 
 
-# A reward is a function `(progress, success) -> float`: the return so far. A step's reward is what it adds.
+# A reward is a function `(progress, success) -> float`: the return so far. A step's reward is what
+# it adds.
 
 
 @REWARDS.register("none")
@@ -156,7 +184,9 @@ def success_reward(progress: Progress, success: bool) -> float:
 
 @REWARDS.register("subtask")
 def subtask_reward(progress: Progress, success: bool) -> float:
-    """The share of the execution's sub-tasks that are done; those of the conditioning video do not count."""
+    """The share of the execution's sub-tasks that are done; those of the conditioning video do not
+    count.
+    """
     execution = [i for i, subtask in enumerate(progress.subtasks) if not subtask.video]
     return sum(i < progress.index for i in execution) / len(execution)
 
@@ -170,8 +200,9 @@ class ProcessScore:
     """How far an episode came.
 
     done, of: sub-tasks of the execution that are done, and how many there are.
-    broke: `wrong`, where the environment saw the wrong thing done; `stuck`, where the time ran out; empty on success.
-    operation: what the wrong thing was a mistake of: one of `OPERATIONS`, or a motion (a slip, or another object than
+    broke: `wrong`, where the environment saw the wrong thing done; `stuck`, where the time ran out;
+    empty on success. operation: what the wrong thing was a mistake of: one of `OPERATIONS`, or a
+    motion (a slip, or another object than
         the goal names). Empty for `stuck`, whose cause is unknown.
     subtask: the text of the one that was not done.
     """

@@ -1,7 +1,9 @@
-"""The script every task is made from: the order of a step, success and failure, on the stage of `scene/stage.py`.
+"""The script every task is made from: the order of a step, success and failure, on the stage of
+`scene/stage.py`.
 
-A task says which objects there are (`plan`, `build`, `start_episode`), what happens to them (`before_physics`,
-`after_step`), and what is to be done (`subtasks`, `goals`, `choices`). Everything else is here.
+A task says which objects there are (`plan`, `build`, `start_episode`), what happens to them
+(`before_physics`, `after_step`), and what is to be done (`subtasks`, `goals`, `choices`).
+Everything else is here.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -29,18 +31,24 @@ class Task(Stage):
         recovery: `z` or `xy` samples the pick that a recovery demonstration fails once.
         stress: how far dials are turned (`metadata.DIALS`); at 0 the scene is the benchmark's.
         in_view: the fact that is to be remembered stays in view, as `split=twin` has it.
-        row: the scene's values (`metadata.SceneRow`); nothing is sampled then, and its `tier`, if it has one, brings
-            the rules of RoboMME-OOD.
-        second_tries: the demonstrator continues where the benchmark's own gives up; without it, it fails where that
-        does. robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's names for `recovery`.
+        row: the scene's values (`metadata.SceneRow`); nothing is sampled then, and its `tier`, if
+            it has one, brings the rules of RoboMME-OOD.
+        second_tries: the demonstrator continues where the benchmark's own gives up; without it, it
+            fails where that
+        does. robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's names for
+            `recovery`.
     """
 
     shared_draws: ClassVar[bool] = False
-    """`plan`, `build` and `start_episode` sample from one generator; otherwise `plan` has one of its own."""
+    """`plan`, `build` and `start_episode` sample from one generator; otherwise `plan` has one of
+    its own.
+    """
     latch_failure: ClassVar[bool] = False
     """A failure lasts; otherwise it is evaluated anew at each step."""
     recovery_sampled_per_episode: ClassVar[bool] = False
-    """The failed pick is sampled in every initialisation (there are two), not once after the scene."""
+    """The failed pick is sampled in every initialisation (there are two), not once
+    after the scene.
+    """
 
     dials: ClassVar[frozenset[str]] = frozenset()
     """Dials of `metadata.DIALS` that the task has."""
@@ -61,9 +69,15 @@ class Task(Stage):
         require(seed >= 0, f"seed is {seed}; expected a non-negative integer.")
         if robomme_failure_recovery:
             recovery = robomme_failure_recovery_mode or recovery
-            needed = f"robomme_failure_recovery needs a robomme_failure_recovery_mode of {RECOVERY_MODES}."
+            needed = (
+                "robomme_failure_recovery needs a robomme_failure_recovery_mode of"
+                f" {RECOVERY_MODES}."
+            )
             require(recovery is not None, needed)
-        names = (("difficulty", difficulty, DIFFICULTIES), ("recovery mode", recovery, RECOVERY_MODES))
+        names = (
+            ("difficulty", difficulty, DIFFICULTIES),
+            ("recovery mode", recovery, RECOVERY_MODES),
+        )
         for kind, value, known in names:
             if value is not None:
                 check_known(kind, value, known)
@@ -80,17 +94,20 @@ class Task(Stage):
         self.difficulty = difficulty or DIFFICULTIES[seed % 3]
         self.recovery = recovery
         self.on_frame: Callable[[dict[str, Any]], None] | None = None
-        """Called once a step with the info of the evaluation, after the physics and before `after_step`. While it is
-        set, the simulator makes no observation of its own."""
+        """Called once a step with the info of the evaluation, after the physics and before
+        `after_step`. While it is set, the simulator makes no observation of its own.
+        """
         self.failed_pick: int | None = None
-        """Index, among the picks of the execution, of the one that a recovery demonstration fails first."""
+        """Index, among the picks of the execution, of the one that a recovery demonstration fails
+        first.
+        """
         super().__init__(*args, seed=seed, **kwargs)
 
     def turned(self, dial: str) -> int:
         """How far a dial is turned; 0 as in the benchmark."""
         return self.stress.get(dial, 0)
 
-    # What a task supplies -----------------------------------------------------------------------------------------
+    # What a task supplies -------------------------------------------------------------------------
 
     def plan(self, draws: Draws) -> None:
         """Sample what is decided before there is a scene."""
@@ -100,7 +117,9 @@ class Task(Stage):
         raise NotImplementedError
 
     def start_episode(self, draws: Draws) -> None:
-        """Sample what is decided per episode and set the script's state; objects are already in their places."""
+        """Sample what is decided per episode and set the script's state; objects are already in
+        their places.
+        """
 
     def subtasks(self) -> list[SubTask]:
         """The sub-tasks in order."""
@@ -118,17 +137,21 @@ class Task(Stage):
         """Scripted changes before the physics of a step; `k` steps have been done."""
 
     def after_step(self, k: int) -> None:
-        """Scripted changes after a step's physics, evaluation and observation; `k` steps have been done."""
+        """Scripted changes after a step's physics, evaluation and observation; `k` steps have been
+        done.
+        """
 
     def cues(self) -> Sequence[Cue]:
-        """With `in_view`: the discs that show what is to be remembered; built with the scene, moved at each step."""
+        """With `in_view`: the discs that show what is to be remembered; built with the scene, moved
+        at each step.
+        """
         return ()
 
     def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
         """Names of the facts that the present frame shows and that the episode needs later.
 
-        By default the key poses: the end of each sub-task of the video that a policy could choose, or, in a task
-        without a video, of the execution.
+        By default the key poses: the end of each sub-task of the video that a policy could choose,
+        or, in a task without a video, of the execution.
 
         Args:
             ended: the sub-tasks that have ended in the last frames, by their number.
@@ -144,12 +167,14 @@ class Task(Stage):
         """What counts as success: by default that every sub-task is done."""
         return self.progress.succeeded
 
-    # The scene ----------------------------------------------------------------------------------------------------
+    # The scene ------------------------------------------------------------------------------------
 
     def _load_scene(self, options: dict) -> None:
         self.set_up()
         row = self.row or {}
-        self.values = Values(row.get("spec"), str(row.get("where", f"{type(self).__name__}, seed {self.seed}")))
+        self.values = Values(
+            row.get("spec"), str(row.get("where", f"{type(self).__name__}, seed {self.seed}"))
+        )
         draws = Draws(self.seed)
         self.plan(draws)
         if not self.shared_draws:
@@ -162,7 +187,8 @@ class Task(Stage):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.tidy(env_idx)
         self.draws.restore(self._draws_state)
-        # The official construction initialises an episode twice, and the samples of the second one count.
+        # The official construction initialises an episode twice, and the samples of the second one
+        # count.
         for attempt in range(2):
             for thing in self.things:
                 thing.restore()
@@ -188,18 +214,21 @@ class Task(Stage):
         return scene | facts | {"spec": self.values.copy().spec}
 
     def placed_values(self) -> dict[str, Any]:
-        """What was sampled, and position and quaternion [7] of every object; right after the reset, before any step.
+        """What was sampled, and position and quaternion [7] of every object; right after the reset,
+        before any step.
 
         The discs of `in_view` do not count: the twin of a scene is the same scene.
         """
-        poses = {thing.name: [*thing.pose.p.tolist(), *thing.pose.q.tolist()] for thing in self.things}
+        poses = {
+            thing.name: [*thing.pose.p.tolist(), *thing.pose.q.tolist()] for thing in self.things
+        }
         return {"spec": self.values.copy().spec, "poses": poses}
 
     def draw_failed_pick(self, draws: Draws, picks: int) -> int:
         """Which of the execution's `picks` a recovery demonstration fails first."""
         return draws.integer(0, picks)
 
-    # A step -------------------------------------------------------------------------------------------------------
+    # A step ---------------------------------------------------------------------------------------
 
     def step(self, action: Any) -> tuple:
         result = super().step(action)
@@ -225,7 +254,9 @@ class Task(Stage):
             show_cue(disc, cue)
 
     def evaluate_planned(self) -> None:
-        """Evaluate once before or after a sub-task's routine, where the demonstrator's pointer moves."""
+        """Evaluate once before or after a sub-task's routine, where the demonstrator's pointer
+        moves.
+        """
         self.evaluate()
         self.progress.planned = self.progress.index
 

@@ -1,4 +1,6 @@
-"""`evaluate` from Python: a policy on the benchmark in one call, with what the command would set."""
+"""`evaluate` from Python: a policy on the benchmark in one call, with what the command
+would set.
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -41,43 +43,58 @@ def evaluate(
 ) -> Evaluation:
     """Run a policy on episodes of the benchmark; what `output` holds already is not run again.
 
-    Workers are processes that import the calling script: keep its work under `if __name__ == "__main__":`. A notebook
-    needs nothing of the kind.
+    Workers are processes that import the calling script: keep its work under
+    `if __name__ == "__main__":`. A notebook needs nothing of the kind.
 
     Args:
-        policy: one with statistics; or what to load one from: a folder, a hub repository, or the name of a
-            shipped one, such as `nano`.
-        tasks, episodes: as `tasks=` and `episodes=` of the command: `"all"` or names; None for all of the split, a
-            number for the first so many, or a list.
+        policy: one with statistics; or what to load one from: a folder, a hub repository, or the
+            name of a shipped one, such as `nano`.
+        tasks, episodes: as `tasks=` and `episodes=` of the command: `"all"` or names; None for all
+            of the split, a number for the first so many, or a list.
         seed: of the policy's noise.
         output: the run's folder, by default the one the command would choose.
         subgoal: a predictor, or the name of one, for policies that read subgoals.
         name: what records call the policy; its own name by default.
         base: makes an environment with the benchmark's interface, importable by name.
         recordings: datasets whose first episodes `split="stress:sessions=2"` shows before each.
-        event: what happens in every episode, such as `"pause:100@subtask:2"`; of a list each by itself. Every episode
-            runs without it too, in `output` itself.
-        show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=4` or
+        event: what happens in every episode, such as `"pause:100@subtask:2"`; of a list each by
+            itself. Every episode runs without it too, in `output` itself.
+        show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as
+            `workers=4` or
         `render=False`.
 
     Returns:
-        The records of these episodes, and `success_rate`; of those with events, `matched` are the ones without.
+        The records of these episodes, and `success_rate`; of those with events, `matched` are the
+        ones without.
 
-    >>> evaluate("outputs/framesamp_modul/latest", "StopCube", 5, seed=7).success_rate  # doctest: +SKIP
+    >>> result = evaluate("outputs/framesamp_modul/latest", "StopCube", 5)  # doctest: +SKIP
+    >>> result.success_rate  # doctest: +SKIP
     0.4
     """
-    run_settings, arms = read_section(RolloutSettings, {**settings, "seed": seed}), event_arms(event)
+    run_settings, arms = (
+        read_section(RolloutSettings, {**settings, "seed": seed}),
+        event_arms(event),
+    )
     jobs = choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
     if base is make_env:
         environment(run_settings.env).check_installed()
     loaded, source = load(policy)
     predictor = predictor_of(loaded, subgoal)
-    subgoal_label = subgoal if isinstance(subgoal, str) else None if subgoal is None else type(subgoal).__name__
+    subgoal_label = (
+        subgoal if isinstance(subgoal, str) else None if subgoal is None else type(subgoal).__name__
+    )
     facts = facts_of(loaded, name, source, run_settings, subgoal_label)
     folder = default_output(facts) if output is None else Path(output).expanduser()
-    donor_episodes = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
+    donor_episodes = (
+        [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
+    )
     wrapped = with_sessions(loaded.eval(), run_settings.split, donor_episodes)
-    options: dict[str, Any] = {"subgoals": predictor, "source": source, "base": base, "show_progress": show_progress}
+    options: dict[str, Any] = {
+        "subgoals": predictor,
+        "source": source,
+        "base": base,
+        "show_progress": show_progress,
+    }
     return evaluate_events(wrapped, jobs, folder, facts, run_settings, arms, **options)
 
 

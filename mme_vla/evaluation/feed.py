@@ -1,4 +1,6 @@
-"""Frames on their way from an environment to a policy: other episodes first, no video, or frames transformed."""
+"""Frames on their way from an environment to a policy: other episodes first, no video, or frames
+transformed.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +16,13 @@ from mme_vla.evaluation.recordings import Recording, stored_frames
 from mme_vla.memory.base import MemoryModule
 from mme_vla.memory.transforms import HistoryTransform, map_frames
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, WritesNotes, frames_read, with_vision_memory
+from mme_vla.policy.capabilities import (
+    LimitsActions,
+    SamplesInSteps,
+    WritesNotes,
+    frames_read,
+    with_vision_memory,
+)
 from mme_vla.policy.episode import Episode, Host
 from mme_vla.types import Noise
 
@@ -23,8 +31,9 @@ from mme_vla.types import Noise
 class Feed:
     """Changes which frames of an episode a policy observes. The default changes nothing.
 
-    sessions: unrelated episodes that come first, as part of the conditioning video. video: whether the conditioning
-    video is shown. transforms: of the frames, those that training applies, in this order.
+    sessions: unrelated episodes that come first, as part of the conditioning video. video: whether
+    the conditioning video is shown. transforms: of the frames, those that training applies, in this
+    order.
     """
 
     sessions: int = 0
@@ -51,7 +60,8 @@ class Feed:
         return counts
 
     def displayed(self, frames: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
-        """The episode's frames [n] as numbers of observed frames, int64 [n]; −1 for one that is left out.
+        """The episode's frames [n] as numbers of observed frames, int64 [n]; −1 for one that is
+        left out.
 
         exec_start: the episode's first execution frame. before: frames of the sessions.
         """
@@ -65,7 +75,9 @@ class Feed:
         return before + int(self._counts(exec_start, exec_start).sum())
 
     def source_frames(self, displayed: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
-        """The episode's frames behind observed ones [m], ascending, each once; those of sessions are left out."""
+        """The episode's frames behind observed ones [m], ascending, each once; those of sessions
+        are left out.
+        """
         displayed = np.asarray(displayed, np.int64) - before
         displayed = displayed[displayed >= 0]
         if not len(displayed):
@@ -90,8 +102,8 @@ class FeedHost(Host, Protocol):
 class FedEpisode(Episode):
     """Passes frames on to `inner`, the policy's own episode, through a feed.
 
-    exec_start: the first execution frame, once it is observed. boundaries: observed frames at which sub-tasks began,
-    where the environment reports them.
+    exec_start: the first execution frame, once it is observed. boundaries: observed frames at which
+    sub-tasks began, where the environment reports them.
     """
 
     def __init__(self, host: FeedHost, goal: str, seed: int = 0) -> None:
@@ -132,13 +144,27 @@ class FedEpisode(Episode):
         executed = order[order >= video]
         if actions is not None:
             per_frame = self._robot.action.frames is not None
-            actions = np.asarray(actions)[executed - video] if per_frame else actions if len(executed) else None
+            actions = (
+                np.asarray(actions)[executed - video]
+                if per_frame
+                else actions
+                if len(executed)
+                else None
+            )
         views, places = {}, {}
         for name, view in frames.items():
-            at = np.arange(len(states)) if rendered is None or name not in rendered else np.asarray(rendered[name])
+            at = (
+                np.arange(len(states))
+                if rendered is None or name not in rendered
+                else np.asarray(rendered[name])
+            )
             places[name] = np.flatnonzero(np.isin(order, at))
-            views[name] = view if (repeats == 1).all() else view[np.searchsorted(at, order[places[name]])]
-        visible = {} if rendered is None else {"rendered": {name: places[name] for name in rendered}}
+            views[name] = (
+                view if (repeats == 1).all() else view[np.searchsorted(at, order[places[name]])]
+            )
+        visible = (
+            {} if rendered is None else {"rendered": {name: places[name] for name in rendered}}
+        )
         self.inner.observe(views, states[order], demo[order], actions, **visible)
         if len(self._starts):
             self.boundaries = self.numbers(self._starts)
@@ -159,10 +185,14 @@ class FedEpisode(Episode):
         self.boundaries = self.numbers(self._starts)
 
     def numbers(self, frames: np.ndarray) -> list[int]:
-        """The episode's frames [n] as numbers of observed frames, without those that are not observed."""
+        """The episode's frames [n] as numbers of observed frames, without those that are not
+        observed.
+        """
         frames = frames[frames < len(self._counts)]
         last = self._host.before + np.cumsum(self._counts)[frames] - 1
-        return [int(number) for number, count in zip(last, self._counts[frames], strict=True) if count]
+        return [
+            int(number) for number, count in zip(last, self._counts[frames], strict=True) if count
+        ]
 
     @property
     def state(self) -> Tensor:
@@ -173,21 +203,28 @@ class FedEpisode(Episode):
 
     def add_frames(self, *_: Any, **__: Any) -> None:
         """Not offered: a feed decides on whole observations."""
-        raise UserError("A probed episode takes whole observations: observe(), not add_frames() and set_view().")
+        raise UserError(
+            "A probed episode takes whole observations: observe(), not add_frames() and set_view()."
+        )
 
     set_view = add_frames
 
 
 class FedPolicy(Policy):
-    """`inner` with a feed before it. It evaluates and rolls out as any policy does, with the same noise."""
+    """`inner` with a feed before it. It evaluates and rolls out as any policy does, with the same
+    noise.
+    """
 
     n_distractor_episodes: int = 0
-    """Episodes of a stress split's sessions, which a run names; those of a probe's arm do not count."""
+    """Episodes of a stress split's sessions, which a run names; those of a probe's arm do not
+    count.
+    """
 
     def __init__(self, inner: Policy, feed: Feed, sessions: Sequence[Recording] = ()) -> None:
         """Wrap a policy.
 
-        sessions: recorded episodes; the first `feed.sessions` of them are observed before each episode.
+        sessions: recorded episodes; the first `feed.sessions` of them are observed before each
+        episode.
         """
         super().__init__()
         self.inner, self.feed, self.sessions = inner, feed, list(sessions)[: feed.sessions]
@@ -207,7 +244,9 @@ class FedPolicy(Policy):
     def sampling_noise(self, generator: torch.Generator) -> Noise:
         return self.inner.sampling_noise(generator)
 
-    def sample_actions(self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
+    def sample_actions(
+        self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
+    ) -> Tensor:
         return self.inner.sample_actions(batch, draws, steps)
 
     @property
@@ -224,14 +263,20 @@ class FedPolicy(Policy):
         return with_vision_memory(self.inner).encode_frames(frames)
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
-        """The episode's frames that the policy reads through the feed; None for all, where the feed leaves some out."""
+        """The episode's frames that the policy reads through the feed; None for all, where the feed
+        leaves some out.
+        """
         if self.feed.drops:
             return None
         displayed = self.feed.displayed(steps, exec_start, self.before)
-        reads = frames_read(self.inner, displayed, self.feed.first_executed(exec_start, self.before))
+        reads = frames_read(
+            self.inner, displayed, self.feed.first_executed(exec_start, self.before)
+        )
         if reads is None:
             return None
-        paused = np.flatnonzero(self.feed.repeats(np.arange(int(max(steps, default=-1)) + 1), exec_start) > 1)
+        paused = np.flatnonzero(
+            self.feed.repeats(np.arange(int(max(steps, default=-1)) + 1), exec_start) > 1
+        )
         return np.union1d(self.feed.source_frames(reads, exec_start, self.before), paused)
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
@@ -241,13 +286,23 @@ class FedPolicy(Policy):
         return self.inner.observation(inner)
 
     def predict_chunk(
-        self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Any,
+        episodes: Sequence[Episode],
+        draws: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
-        return self.inner.predict_chunk(batch, [inner_episode(episode) for episode in episodes], draws, steps)
+        return self.inner.predict_chunk(
+            batch, [inner_episode(episode) for episode in episodes], draws, steps
+        )
 
     def write_notes(self, batch: Any, episodes: Sequence[Episode]) -> Sequence[Mapping[str, str]]:
         inner = [inner_episode(episode) for episode in episodes]
-        return self.inner.write_notes(batch, inner) if isinstance(self.inner, WritesNotes) else [{} for _ in inner]
+        return (
+            self.inner.write_notes(batch, inner)
+            if isinstance(self.inner, WritesNotes)
+            else [{} for _ in inner]
+        )
 
 
 def inner_episode(episode: Episode) -> Episode:
@@ -257,21 +312,26 @@ def inner_episode(episode: Episode) -> Episode:
 
 
 def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -> Policy:
-    """The policy as a split evaluates it: a split with sessions has it observe them before each episode.
+    """The policy as a split evaluates it: a split with sessions has it observe them before each
+    episode.
 
-    They are the first of the recordings, the same before every episode, and count as part of its video.
+    They are the first of the recordings, the same before every episode, and count as part of its
+    video.
     """
     variant = read_variant(split)
     if variant is None or variant.dial != SESSIONS:
-        require(not recordings, f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.")
+        require(
+            not recordings,
+            f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.",
+        )
         return policy
     count = variant.sessions
     if not count:
         return policy
     if policy.embodiment.readings or count > len(recordings):
         raise UserError(
-            f"split={split} needs {count} recorded episodes to take from, and there are {len(recordings)}: name them "
-            "with recordings=…."
+            f"split={split} needs {count} recorded episodes to take from, and there are"
+            f" {len(recordings)}: name them with recordings=…."
         )
     fed = FedPolicy(policy, Feed(sessions=count), recordings).eval()
     fed.n_distractor_episodes = count

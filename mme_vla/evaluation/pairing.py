@@ -1,4 +1,6 @@
-"""Which episodes of several runs are of the same scenes, and may be paired: every comparison asks here."""
+"""Which episodes of several runs are of the same scenes, and may be paired: every comparison asks
+here.
+"""
 
 from collections import Counter
 from collections.abc import Collection, Hashable, Mapping, Sequence
@@ -11,9 +13,10 @@ from mme_vla.evaluation.records import EpisodeRecord
 class Pairing[Key: Hashable]:
     """What may be paired, and what was left out.
 
-    keys: of the episodes whose scenes are the same in all runs, in the order of the first run. unnamed: of these, how
-    many have no digest in any run, so that task, number and seed alone say that they are the same. other: task → how
-    many were left out because their scenes differ. mixed: task → because only some of the runs name the scene.
+    keys: of the episodes whose scenes are the same in all runs, in the order of the first run.
+    unnamed: of these, how many have no digest in any run, so that task, number and seed alone say
+    that they are the same. other: task → how many were left out because their scenes differ. mixed:
+    task → because only some of the runs name the scene.
     """
 
     keys: tuple[Key, ...]
@@ -31,23 +34,28 @@ class Pairing[Key: Hashable]:
         lines = self.gaps(what)
         if self.unnamed:
             lines.append(
-                f"{what}: {self.unnamed} of {len(self.keys)} paired episodes have no digest of their scene on either "
-                "side: they are taken for the same by task, number and seed."
+                f"{what}: {self.unnamed} of {len(self.keys)} paired episodes have no digest of"
+                " their scene on either side: they are taken for the same by task, number and"
+                " seed."
             )
         return lines
 
     def gaps(self, what: str) -> list[str]:
-        """The notes on episodes that are not paired: all that matters where one command ran both sides."""
+        """The notes on episodes that are not paired: all that matters where one command ran both
+        sides.
+        """
         lines = []
         if self.other:
             lines.append(
-                f"{what}: {sum(self.other.values())} episodes are not paired, for their scenes are different ones in "
-                f"these runs ({_by_task(self.other)}): they were built by other versions or on other machines."
+                f"{what}: {sum(self.other.values())} episodes are not paired, for their scenes are"
+                f" different ones in these runs ({_by_task(self.other)}): they were built by other"
+                " versions or on other machines."
             )
         if self.mixed:
             lines.append(
-                f"{what}: {sum(self.mixed.values())} episodes are not paired, for only some of the runs name their "
-                f"scene ({_by_task(self.mixed)}): evaluate the others again with this version."
+                f"{what}: {sum(self.mixed.values())} episodes are not paired, for only some of the"
+                f" runs name their scene ({_by_task(self.mixed)}): evaluate the others again with"
+                " this version."
             )
         return lines
 
@@ -55,7 +63,8 @@ class Pairing[Key: Hashable]:
 def pair[Key: Hashable](sides: Sequence[Mapping[Key, Collection[EpisodeRecord]]]) -> Pairing[Key]:
     """Pair the episodes that all sides have and whose scenes are the same in all their records.
 
-    Scenes are the same where all records have equal digests, or where none has one; and where their seeds are equal.
+    Scenes are the same where all records have equal digests, or where none has one; and where their
+    seeds are equal.
 
     Args:
         sides: of each run, its records by what makes an episode the same, such as task and number.

@@ -37,23 +37,62 @@ from mme_vla.utils import (
 )
 
 CODE = (
-    "backbone", "embodiment", "envs", "evaluation/rollout", "integration", "memory", "methods", "policy", "processing",
-    "speed", "subgoal",
-)  # fmt: skip
-"""Packages of this library that can change a result: policies, scenes, rollouts. Their source is digested."""
-SIMULATOR = ("mani_skill", "sapien", "robomme", "gymnasium", "trimesh", "scipy", "ompl", "pin", "toppra")
+    "backbone",
+    "embodiment",
+    "envs",
+    "evaluation/rollout",
+    "integration",
+    "memory",
+    "methods",
+    "policy",
+    "processing",
+    "speed",
+    "subgoal",
+)
+"""Packages of this library that can change a result: policies, scenes, rollouts. Their source is
+digested.
+"""
+SIMULATOR = (
+    "mani_skill",
+    "sapien",
+    "robomme",
+    "gymnasium",
+    "trimesh",
+    "scipy",
+    "ompl",
+    "pin",
+    "toppra",
+)
 """Packages that decide scenes and motions."""
 LIBRARIES = ("torch", "numpy", "pillow", "safetensors", "sentencepiece", "timm", "transformers")
 """Packages that decide what a policy computes."""
 MOTIONS = ("waypoint", "multi_choice")
-"""Action spaces of RoboMME whose actions are motions of many steps: the last one may go beyond the step limit."""
+"""Action spaces of RoboMME whose actions are motions of many steps: the last one may go beyond the
+step limit.
+"""
 _MARGIN = 2  # steps beyond its limit that the benchmark counts
 _CONFIG = "config.json"  # every checkpoint's
-_OF_TRAINING = ("raw.", "raw-", "optimizer", STATE)  # Files of a checkpoint that no policy is loaded from
-_LOADED = (".safetensors", ".json", ".model", ".pt", ".pth", ".bin")  # and endings of those that one may be
+_OF_TRAINING = (
+    "raw.",
+    "raw-",
+    "optimizer",
+    STATE,
+)  # Files of a checkpoint that no policy is loaded from
+_LOADED = (
+    ".safetensors",
+    ".json",
+    ".model",
+    ".pt",
+    ".pth",
+    ".bin",
+)  # and endings of those that one may be
 _IDENTITY = {
-    "model": "model", "checkpoint": "checkpoint", "seed": "model_seed", "split": "split", "max_steps": "max_steps",
-}  # fmt: skip
+    "model": "model",
+    "checkpoint": "checkpoint",
+    "seed": "model_seed",
+    "split": "split",
+    "max_steps": "max_steps",
+}
 """Setting of `run.json` → field of its records."""
 _FEW = 5  # differences of one kind that are listed
 
@@ -61,8 +100,9 @@ _FEW = 5  # differences of one kind that are listed
 class Verification(NamedTuple):
     """What came of checking a receipt, a line each.
 
-    differences: what is another here than in the receipt. not_compared: what there was nothing to compare with, which
-    is no agreement. notes: what may be another without any weight, such as the type of CPU.
+    differences: what is another here than in the receipt. not_compared: what there was nothing to
+    compare with, which is no agreement. notes: what may be another without any weight, such as the
+    type of CPU.
     """
 
     differences: list[str]
@@ -71,7 +111,9 @@ class Verification(NamedTuple):
 
     @property
     def word(self) -> str:
-        """`differs`, `not compared` where nothing differs and something was not compared, or `agrees`."""
+        """`differs`, `not compared` where nothing differs and something was not compared, or
+        `agrees`.
+        """
         if self.differences:
             return "differs"
         return "not compared" if self.not_compared else "agrees"
@@ -82,29 +124,38 @@ class Verification(NamedTuple):
 
 
 def receipt_file(records: Path) -> Path:
-    """The receipt of `episodes.jsonl` is `receipt.json`, that of `episodes-0of4.jsonl.xz` `receipt-0of4.json`."""
+    """The receipt of `episodes.jsonl` is `receipt.json`, that of `episodes-0of4.jsonl.xz`
+    `receipt-0of4.json`.
+    """
     name = records.name.removesuffix(".xz").replace("episodes", "receipt")
     return records.with_name(name).with_suffix(".json")
 
 
 @contextmanager
-def receipt(records: Path, policy: Policy, run: Mapping[str, Any], source: str | None, renders: bool) -> Iterator[None]:
+def receipt(
+    records: Path, policy: Policy, run: Mapping[str, Any], source: str | None, renders: bool
+) -> Iterator[None]:
     """Write the receipt of a file of records before and after episodes are added to it.
 
-    A run that was continued on another machine, or after an update, lists the conditions of each part.
+    A run that was continued on another machine, or after an update, lists the conditions of each
+    part.
 
     Args:
-        records: the file. run: what `run.json` holds. source: where the weights are from. renders: whether the
-            simulator of this library renders.
+        records: the file. run: what `run.json` holds. source: where the weights are from. renders:
+            whether the simulator of this library renders.
     """
     path = receipt_file(records)
     earlier = read_receipt(path)["conditions"] if path.exists() else []
-    here = to_json({**_conditions(policy.device.type == "cuda", renders), **_checkpoint(policy, source)})
+    here = to_json(
+        {**_conditions(policy.device.type == "cuda", renders), **_checkpoint(policy, source)}
+    )
     conditions = earlier if here in earlier else [*earlier, here]
     trained = identity_of(policy.config)
     facts = {
-        "settings": run["settings"], "training": None if trained is None else asdict(trained), "conditions": conditions
-    }  # fmt: skip
+        "settings": run["settings"],
+        "training": None if trained is None else asdict(trained),
+        "conditions": conditions,
+    }
 
     def write() -> None:
         write_json(path, with_checksum(to_json({**facts, **_score(records, run["settings"])})))
@@ -123,19 +174,31 @@ def read_receipt(path: Path) -> dict[str, Any]:
         UserError: it is damaged, lacks a part, or a part is of another kind.
     """
     content: dict[str, Any] = verified(read_json(path, "a receipt"), str(path))
-    missing = [key for key in ("settings", "conditions", "records", "scenes", "score") if key not in content]
+    missing = [
+        key
+        for key in ("settings", "conditions", "records", "scenes", "score")
+        if key not in content
+    ]
     require(not missing, f"{path} is no receipt of an evaluation: it has no {', '.join(missing)}.")
     for key in ("settings", "records", "score"):
         kind = isinstance(content[key], Mapping)
-        require(kind, f"{path} is no receipt of an evaluation: {key} must hold an object, not {brief(content[key])}.")
+        require(
+            kind,
+            f"{path} is no receipt of an evaluation: {key} must hold an object, not"
+            f" {brief(content[key])}.",
+        )
     parts = content["conditions"]
     kinds = isinstance(parts, list) and all(isinstance(part, Mapping) for part in parts)
-    require(kinds, f"{path} is no receipt of an evaluation: conditions must list objects, not {brief(parts)}.")
+    require(
+        kinds,
+        f"{path} is no receipt of an evaluation: conditions must list objects, not {brief(parts)}.",
+    )
     return content
 
 
 def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Verification:
-    """Check a receipt offline: recompute the digests of the files that are here, compare versions of what is installed.
+    """Check a receipt offline: recompute the digests of the files that are here, compare versions
+    of what is installed.
 
     Args:
         path: of the receipt; its records, or these as `.xz`, and `run.json` are beside it.
@@ -143,7 +206,8 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
         build: whether the scenes are built here, without images, and compared: about 0.1 s a scene.
 
     Raises:
-        UserError: the file is no receipt, or a name in it leads outside of the folder that it is of.
+        UserError: the file is no receipt, or a name in it leads outside of the folder that it is
+            of.
     """
     content = read_receipt(path)
     result = Verification([], [], [])
@@ -151,14 +215,16 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
     _compare_records(result, content, path.parent, build)
     if not content["conditions"]:
         parts = ("code", "simulator", "renderer", "libraries", "checkpoint", "statistics")
-        result.not_compared.extend(f"{part}: the receipt names no conditions, and has one at least." for part in parts)
+        result.not_compared.extend(
+            f"{part}: the receipt names no conditions, and has one at least." for part in parts
+        )
     for part in content["conditions"]:
         _compare_conditions(result, part)
         _compare_checkpoint(result, part, checkpoint)
     return result.once()
 
 
-# The records and their settings -----------------------------------------------------------------------------------
+# The records and their settings -------------------------------------------------------------------
 
 
 def _compare_settings(result: Verification, settings: Mapping[str, Any], folder: Path) -> None:
@@ -168,7 +234,9 @@ def _compare_settings(result: Verification, settings: Mapping[str, Any], folder:
         result.not_compared.append(f"settings: {RUN_FILE} is not beside the receipt.")
 
 
-def _compare_records(result: Verification, content: Mapping[str, Any], folder: Path, build: bool) -> None:
+def _compare_records(
+    result: Verification, content: Mapping[str, Any], folder: Path, build: bool
+) -> None:
     """Digests and score of the records, each record with the settings, and their scenes."""
     settings, name = content["settings"], content["records"].get("file")
     if not isinstance(name, str):
@@ -201,8 +269,12 @@ def _compare_records(result: Verification, content: Mapping[str, Any], folder: P
     _compare_scenes(result, lines, env, build)
 
 
-def _compare_identity(result: Verification, records: Sequence[EpisodeRecord], content: Mapping[str, Any]) -> None:
-    """Whether every record is of the settings: model, checkpoint, seed, split, step limit, event, training."""
+def _compare_identity(
+    result: Verification, records: Sequence[EpisodeRecord], content: Mapping[str, Any]
+) -> None:
+    """Whether every record is of the settings: model, checkpoint, seed, split, step limit, event,
+    training.
+    """
     settings = content["settings"]
     expected: dict[str, Any] = {}
     for key, field in _IDENTITY.items():
@@ -219,20 +291,39 @@ def _compare_identity(result: Verification, records: Sequence[EpisodeRecord], co
         others = [record for record in records if str(getattr(record, field)) != str(value)]
         _add_records(result, others, field, attrgetter(field), value, "settings")
     if "training" in content:
-        others = [r for r in records if (None if r.training is None else asdict(r.training)) != content["training"]]
-        _add_records(result, others, "training", lambda record: record.training, content["training"], "receipt")
+        others = [
+            r
+            for r in records
+            if (None if r.training is None else asdict(r.training)) != content["training"]
+        ]
+        _add_records(
+            result,
+            others,
+            "training",
+            lambda record: record.training,
+            content["training"],
+            "receipt",
+        )
     named = [record for record in records if "env" in record.extra and "env" in settings]
     others = [record for record in named if record.extra["env"] != settings["env"]]
-    _add_records(result, others, "env", lambda record: record.extra["env"], settings.get("env"), "settings")
+    _add_records(
+        result, others, "env", lambda record: record.extra["env"], settings.get("env"), "settings"
+    )
     for field in ("composition", "action_space"):
         values = sorted({str(getattr(record, field)) for record in records})
         if len(values) > 1:
-            result.differences.append(f"records.{field}: several in one run, {', '.join(map(brief, values[:_FEW]))}")
+            result.differences.append(
+                f"records.{field}: several in one run, {', '.join(map(brief, values[:_FEW]))}"
+            )
     _compare_steps(result, records, settings)
 
 
-def _compare_steps(result: Verification, records: Sequence[EpisodeRecord], settings: Mapping[str, Any]) -> None:
-    """Whether no episode is longer than its limit, by which the time that events hold the robot counts as well."""
+def _compare_steps(
+    result: Verification, records: Sequence[EpisodeRecord], settings: Mapping[str, Any]
+) -> None:
+    """Whether no episode is longer than its limit, by which the time that events hold the robot
+    counts as well.
+    """
     from mme_vla.evaluation.rollout.events import read_events
 
     limit = settings.get("max_steps")
@@ -244,11 +335,18 @@ def _compare_steps(result: Verification, records: Sequence[EpisodeRecord], setti
     except UserError as error:
         result.not_compared.append(f"steps: {error}")
         return
-    motions = settings.get("env") in ROBOMME and any(record.action_space in MOTIONS for record in records)
-    long = [record for record in records if record.steps < 0 or (record.steps > limit and not motions)]
+    motions = settings.get("env") in ROBOMME and any(
+        record.action_space in MOTIONS for record in records
+    )
+    long = [
+        record for record in records if record.steps < 0 or (record.steps > limit and not motions)
+    ]
     _add_records(result, long, "steps", lambda record: record.steps, f"0 to {limit}", "settings")
     if motions and any(record.steps > limit for record in records):
-        result.notes.append("steps: some episodes end beyond their limit, with a last action that is a motion of many.")
+        result.notes.append(
+            "steps: some episodes end beyond their limit, with a last action that is a motion of"
+            " many."
+        )
 
 
 def _add_records(
@@ -264,12 +362,15 @@ def _add_records(
         first = others[0]
         more = f", and {len(others) - 1} more" if len(others) > 1 else ""
         result.differences.append(
-            f"records.{field}: {brief(value_of(first))} in the record of {brief(first.task, quote=False)} "
-            f"{first.episode}{more}; {brief(expected)} by the {where}"
+            f"records.{field}: {brief(value_of(first))} in the record of"
+            f" {brief(first.task, quote=False)} {first.episode}{more}; {brief(expected)} by the"
+            f" {where}"
         )
 
 
-def _compare_seeds(result: Verification, records: Iterable[EpisodeRecord], env: Environment) -> None:
+def _compare_seeds(
+    result: Verification, records: Iterable[EpisodeRecord], env: Environment
+) -> None:
     """Episodes whose seed or difficulty is not the one that the environment gives them here."""
     for record in records:
         spec = env.episode(record.task, record.split, record.episode)
@@ -277,18 +378,24 @@ def _compare_seeds(result: Verification, records: Iterable[EpisodeRecord], env: 
         result.differences.extend(_differences(f"scene {record.task} {record.episode}", then, here))
 
 
-def _compare_scenes(result: Verification, records: Sequence[EpisodeRecord], env: Environment, build: bool) -> None:
+def _compare_scenes(
+    result: Verification, records: Sequence[EpisodeRecord], env: Environment, build: bool
+) -> None:
     """Build the scenes that records name, and compare their digests."""
     unnamed = sum(record.scene is None for record in records)
     valueless = sum(record.scene == NO_VALUES for record in records)
     if unnamed:
         result.not_compared.append(
-            f"scenes: {unnamed} records do not name the scene that was built, as those of earlier versions; seeds and "
-            "difficulties alone are compared."
+            f"scenes: {unnamed} records do not name the scene that was built, as those of earlier"
+            " versions; seeds and difficulties alone are compared."
         )
     if valueless:
-        result.not_compared.append(f"scenes: the environment gave no values of {valueless} episodes.")
-    named = {(r.task, r.split, r.episode, r.scene) for r in records if r.scene not in (None, NO_VALUES)}
+        result.not_compared.append(
+            f"scenes: the environment gave no values of {valueless} episodes."
+        )
+    named = {
+        (r.task, r.split, r.episode, r.scene) for r in records if r.scene not in (None, NO_VALUES)
+    }
     if named and not build:
         result.not_compared.append(f"scenes: {len(named)} were not built here, as was asked.")
         return
@@ -306,11 +413,15 @@ def _compare_scenes(result: Verification, records: Sequence[EpisodeRecord], env:
         else:
             result.differences.extend(_differences(f"scene {task} {episode}", scene, here))
     if unbuilt:
-        result.not_compared.append(f"scenes: {unbuilt} episodes ended before their scene was built; it can be here.")
+        result.not_compared.append(
+            f"scenes: {unbuilt} episodes ended before their scene was built; it can be here."
+        )
 
 
 def _score(records: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Outcomes of each task, digests of the records, uncompressed, and of their scenes, and those scenes built."""
+    """Outcomes of each task, digests of the records, uncompressed, and of their scenes, and those
+    scenes built.
+    """
     lines, total = list[EpisodeRecord](), None
     if records.exists():
         lines = read_records(records)
@@ -319,18 +430,26 @@ def _score(records: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "records": {"file": records.name.removesuffix(".xz"), "sha256": total},
         "scenes": _scenes(lines, str(settings.get("split"))),
-        "scene_digests": {f"{record.task} {record.episode}": record.scene for record in lines if record.scene},
-        "score": {task: count_outcomes(line for line in lines if line.task == task) for task in tasks},
+        "scene_digests": {
+            f"{record.task} {record.episode}": record.scene for record in lines if record.scene
+        },
+        "score": {
+            task: count_outcomes(line for line in lines if line.task == task) for task in tasks
+        },
     }
 
 
 def _scenes(records: Iterable[EpisodeRecord], split: str) -> str:
-    """Digest of what names the scenes: task, number, seed and difficulty; and the file of a split that is one."""
+    """Digest of what names the scenes: task, number, seed and difficulty; and the file of a split
+    that is one.
+    """
     scenes: dict[str, Any] = {f"{r.task} {r.episode}": [r.seed, r.difficulty] for r in records}
-    return digest({"split": file_sum(Path(split)) if Path(split).is_file() else split, "scenes": scenes}, 64)
+    return digest(
+        {"split": file_sum(Path(split)) if Path(split).is_file() else split, "scenes": scenes}, 64
+    )
 
 
-# The conditions ---------------------------------------------------------------------------------------------------
+# The conditions -----------------------------------------------------------------------------------
 
 
 def _conditions(on_gpu: bool, renders: bool) -> dict[str, Any]:
@@ -354,7 +473,10 @@ def _code(packages: Iterable[str]) -> str:
 def _hardware(on_gpu: bool) -> dict[str, Any]:
     import torch
 
-    return {"cpu": _cpu(), "gpu": torch.cuda.get_device_name() if on_gpu and torch.cuda.is_available() else None}
+    return {
+        "cpu": _cpu(),
+        "gpu": torch.cuda.get_device_name() if on_gpu and torch.cuda.is_available() else None,
+    }
 
 
 def _compare_conditions(result: Verification, part: Mapping[str, Any]) -> None:
@@ -367,13 +489,17 @@ def _compare_conditions(result: Verification, part: Mapping[str, Any]) -> None:
         result.differences.extend(_differences("renderer", part["renderer"], _renderer()))
     hardware = part.get("hardware")
     if isinstance(hardware, Mapping):
-        result.notes.extend(_differences("hardware", hardware, _hardware(hardware.get("gpu") is not None)))
+        result.notes.extend(
+            _differences("hardware", hardware, _hardware(hardware.get("gpu") is not None))
+        )
     else:
         result.not_compared.append("hardware: the receipt names none.")
 
 
 def _compare_code(result: Verification, code: Any) -> None:
-    """The source of the packages that the receipt's digest covers, if these are all that can change a result."""
+    """The source of the packages that the receipt's digest covers, if these are all that can change
+    a result.
+    """
     if not isinstance(code, Mapping) or not ({"sha256", "files"} & code.keys()):
         result.not_compared.append("code: the receipt has no digest of it.")
         return
@@ -384,16 +510,24 @@ def _compare_code(result: Verification, code: Any) -> None:
     if "sha256" not in code:  # of an earlier version, which digested every file
         if code["files"] != _code([""]):
             result.not_compared.append(
-                "code: this receipt's digest is of every file of the library, and some file has changed since: whether "
-                "one that can change a result, it cannot tell."
+                "code: this receipt's digest is of every file of the library, and some file has"
+                " changed since: whether one that can change a result, it cannot tell."
             )
         return
     covers = code.get("covers")
     covered = [package for package in CODE if isinstance(covers, list) and package in covers]
-    result.not_compared.extend(f"code.{package}: not in the digest." for package in CODE if package not in covered)
-    others = [] if not isinstance(covers, list) else [package for package in covers if package not in covered]
+    result.not_compared.extend(
+        f"code.{package}: not in the digest." for package in CODE if package not in covered
+    )
+    others = (
+        []
+        if not isinstance(covers, list)
+        else [package for package in covers if package not in covered]
+    )
     if others:
-        result.not_compared.append(f"code: its digest covers packages that are not compared here, {brief(others)}.")
+        result.not_compared.append(
+            f"code: its digest covers packages that are not compared here, {brief(others)}."
+        )
     elif covered:
         result.differences.extend(_differences("code.sha256", code["sha256"], _code(covered)))
 
@@ -409,12 +543,16 @@ def _compare_versions(result: Verification, what: str, then: Any, known: Sequenc
     lacking = [name for name in known if name not in then and _version(name) is not None]
     others = [name for name in then if name not in known]
     if lacking:
-        result.not_compared.append(f"{what}: the receipt does not name the version of {listed(lacking)}.")
+        result.not_compared.append(
+            f"{what}: the receipt does not name the version of {listed(lacking)}."
+        )
     if others:
-        result.not_compared.append(f"{what}: {listed(others)} of the receipt are no packages that are compared.")
+        result.not_compared.append(
+            f"{what}: {listed(others)} of the receipt are no packages that are compared."
+        )
 
 
-# The checkpoint ---------------------------------------------------------------------------------------------------
+# The checkpoint -----------------------------------------------------------------------------------
 
 
 def _checkpoint(policy: Policy, source: str | None) -> dict[str, Any]:
@@ -422,15 +560,25 @@ def _checkpoint(policy: Policy, source: str | None) -> dict[str, Any]:
     folder = None if source is None or not Path(source).is_dir() else Path(source).resolve()
     files: dict[str, str | None] = {}
     if folder is not None:
-        # Those of the table were compared with the files when they were loaded; a file beside it may be loaded too.
+        # Those of the table were compared with the files when they were loaded; a file beside it
+        # may be loaded too.
         files = dict(Sums(folder).table)
-        names = [path.name for path in folder.iterdir() if path.is_file()] if not files else _loaded(folder)
+        names = (
+            [path.name for path in folder.iterdir() if path.is_file()]
+            if not files
+            else _loaded(folder)
+        )
         files |= _sums(folder, [name for name in names if name not in files])
     statistics = digest(policy.require_processor().require_stats().to_dict(), 64)
-    selected = {name: value for name, value in sorted(files.items()) if not name.startswith((*_OF_TRAINING, SUMS))}
+    selected = {
+        name: value
+        for name, value in sorted(files.items())
+        if not name.startswith((*_OF_TRAINING, SUMS))
+    }
     return {
-        "checkpoint": {"folder": str(source if folder is None else folder), "files": selected}, "statistics": statistics
-    }  # fmt: skip
+        "checkpoint": {"folder": str(source if folder is None else folder), "files": selected},
+        "statistics": statistics,
+    }
 
 
 def _loaded(folder: Path) -> list[str]:
@@ -439,12 +587,16 @@ def _loaded(folder: Path) -> list[str]:
     return sorted(name for name in names if not name.startswith(_OF_TRAINING))
 
 
-def _compare_checkpoint(result: Verification, part: Mapping[str, Any], checkpoint: Path | None) -> None:
+def _compare_checkpoint(
+    result: Verification, part: Mapping[str, Any], checkpoint: Path | None
+) -> None:
     """Every file that the policy was loaded from, none beside these, and the statistics."""
     named = part.get("checkpoint")
     files = named.get("files") if isinstance(named, Mapping) else None
     if not isinstance(files, Mapping) or not files:
-        result.not_compared.append("checkpoint: no file of it was on the machine of the run, so none is compared.")
+        result.not_compared.append(
+            "checkpoint: no file of it was on the machine of the run, so none is compared."
+        )
         files = {}
     folder = named.get("folder") if isinstance(named, Mapping) else None
     place = checkpoint

@@ -1,4 +1,6 @@
-"""Recorded episodes that a policy observes: in a probe, or before each episode of a stress split."""
+"""Recorded episodes that a policy observes: in a probe, or before each episode of a
+stress split.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -64,7 +66,9 @@ class Recording:
         return sorted({0, self.exec_start, *changes})
 
     def decisions(self, stride: int, most: int | None) -> list[int]:
-        """Steps at which chunks are chosen: every `stride`-th at which the robot decides, `most` of them at most."""
+        """Steps at which chunks are chosen: every `stride`-th at which the robot decides, `most` of
+        them at most.
+        """
         every = 1 if self.source.robot.action.frames is None else stride
         steps = np.asarray(self.source.decisions(self.episode))[::every]
         if most is not None and len(steps) > most:
@@ -76,8 +80,9 @@ class Recording:
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray] | None]:
         """Images of frames start … stop − 1 and where they stand, as `Episode.observe` takes them.
 
-        required: frames that the memory camera shows beside the last, which all cameras do; None for every frame. A
-        robot that reads depth observes the frames that the dataset keeps depth of.
+        required: frames that the memory camera shows beside the last, which all cameras do; None
+        for every frame. A robot that reads depth observes the frames that the dataset keeps depth
+        of.
         """
         robot = self.source.robot
         if robot.readings:
@@ -87,18 +92,32 @@ class Recording:
             return stored_views, dict.fromkeys(stored_views, here - start)
         if required is None:
             indices = np.arange(start, stop)
-            return {name: self.source.frames(self.episode, indices, name) for name in robot.camera_names}, None
+            return {
+                name: self.source.frames(self.episode, indices, name) for name in robot.camera_names
+            }, None
         here = np.union1d(required[(required >= start) & (required < stop)], [stop - 1])
-        camera_frames = {name: here if name == robot.memory_camera else here[-1:] for name in robot.camera_names}
-        views = {name: self.source.frames(self.episode, frames, name) for name, frames in camera_frames.items()}
+        camera_frames = {
+            name: here if name == robot.memory_camera else here[-1:] for name in robot.camera_names
+        }
+        views = {
+            name: self.source.frames(self.episode, frames, name)
+            for name, frames in camera_frames.items()
+        }
         return views, {name: frames - start for name, frames in camera_frames.items()}
 
     def show(
-        self, running: Any, start: int, stop: int, required: np.ndarray | None = None, video: bool = False
+        self,
+        running: Any,
+        start: int,
+        stop: int,
+        required: np.ndarray | None = None,
+        video: bool = False,
     ) -> None:
-        """Observe frames start … stop − 1 in a running episode, which then offers the options that were recorded.
+        """Observe frames start … stop − 1 in a running episode, which then offers the options that
+        were recorded.
 
-        required: as for `views`. video: all of it as if it were a conditioning video of that episode.
+        required: as for `views`. video: all of it as if it were a conditioning video of that
+        episode.
         """
         if stop <= start:
             return
@@ -116,7 +135,9 @@ class Recording:
             actions = self.source.actions(self.episode)[np.maximum(executed - 1, 0)]
         demo = np.ones(len(frames), bool) if video else frames < self.exec_start
         states = self.source.states(self.episode, start, stop)
-        running.observe(views, states, demo, actions, **({} if rendered is None else {"rendered": rendered}))
+        running.observe(
+            views, states, demo, actions, **({} if rendered is None else {"rendered": rendered})
+        )
 
 
 def all_recordings(sources: Sequence[EpisodeSource]) -> list[Recording]:
@@ -125,8 +146,14 @@ def all_recordings(sources: Sequence[EpisodeSource]) -> list[Recording]:
 
 
 def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
-    """Frames of an episode that a memory may have stored or scored, whatever it chooses; None for all."""
+    """Frames of an episode that a memory may have stored or scored, whatever it chooses; None for
+    all.
+    """
     memory = policy.memory
-    if memory is None or past_view_spec(memory) is not None or frames_read(policy, np.zeros(1, np.int64), 0) is None:
+    if (
+        memory is None
+        or past_view_spec(memory) is not None
+        or frames_read(policy, np.zeros(1, np.int64), 0) is None
+    ):
         return None
     return np.union1d(memory.storage.stored_frames(length), frames_scored(memory, length))

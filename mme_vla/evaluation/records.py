@@ -17,7 +17,9 @@ OUTCOMES = ("success", "fail", "timeout", "error")
 
 
 class RunKey(NamedTuple):
-    """What one pass over the benchmark is a pass of: one policy, one training, one checkpoint, one model seed."""
+    """What one pass over the benchmark is a pass of: one policy, one training, one checkpoint, one
+    model seed.
+    """
 
     model: str
     subgoal: str | None
@@ -37,7 +39,10 @@ class RunKey(NamedTuple):
             seed = "" if self.training.seed is None else f"training seed {self.training.seed} of "
             trained = f", {seed}recipe {str(self.training.recipe)[:6]}"
         happens = f", event {self.event}" if self.event else ""
-        return f"{name}{trained}, checkpoint {self.checkpoint}, seed {self.model_seed}, {self.split}{happens}"
+        return (
+            f"{name}{trained}, checkpoint {self.checkpoint}, seed {self.model_seed},"
+            f" {self.split}{happens}"
+        )
 
 
 class EpisodeKey(NamedTuple):
@@ -51,8 +56,9 @@ class EpisodeKey(NamedTuple):
 class Seconds:
     """Where an episode's wall time went.
 
-    sim: building and stepping the environment, without its images. render: those (0 where they cannot be separated).
-    policy: the episode's share of the policy's batches. total: from its beginning to its end, waiting included.
+    sim: building and stepping the environment, without its images. render: those (0 where they
+    cannot be separated). policy: the episode's share of the policy's batches. total: from its
+    beginning to its end, waiting included.
     """
 
     sim: Number = 0.0
@@ -67,19 +73,24 @@ class EpisodeRecord:
 
     model: name of the model (`framesamp_modul`). checkpoint: its step, or a name.
     model_seed: of the policy's noise; it does not reach the environment.
-    task, episode: which episode of the split; seed, difficulty: the environment's, from the benchmark's metadata.
-    scene: digest of the scene's values and places (`mme_vla/envs/scene_hash.py`); `no values` of an environment that
-        gives none, `not built` where the episode ended before; None in records from before there were digests.
-    outcome: `success`, `fail` (the environment ended it), `timeout` (`max_steps` passed), `error` (see `error`).
-    steps: control steps executed, one an action but for planned motions. seconds: where the time went.
-    subgoal: name of the subgoal predictor, None for a policy without.
+    task, episode: which episode of the split; seed, difficulty: the environment's, from the
+    benchmark's metadata. scene: digest of the scene's values and places
+    (`mme_vla/envs/scene_hash.py`); `no values` of an environment that
+        gives none, `not built` where the episode ended before; None in records from before there
+        were digests.
+    outcome: `success`, `fail` (the environment ended it), `timeout` (`max_steps` passed), `error`
+    (see `error`). steps: control steps executed, one an action but for planned motions. seconds:
+    where the time went. subgoal: name of the subgoal predictor, None for a policy without.
     memory_budget: memory tokens, where it is not the model's usual number (a sweep over budgets).
-    composition: `composition_digest` (policy/saving.py) of the policy, so that no two configurations are averaged
-        under one name; None in records written before there was one, and of players that are no policy of this library.
-    training: seed, recipe, data and weights of the training that the checkpoint is of; None in records written before
+    composition: `composition_digest` (policy/saving.py) of the policy, so that no two
+    configurations are averaged
+        under one name; None in records written before there was one, and of players that are no
+        policy of this library.
+    training: seed, recipe, data and weights of the training that the checkpoint is of; None in
+    records written before
         checkpoints named it, and of what was not trained.
-    event: what happened in the rollout (`pause:100@subtask:2`); None in the matched arm, which is the plain run.
-    extra: whatever else a runner keeps.
+    event: what happened in the rollout (`pause:100@subtask:2`); None in the matched arm, which is
+    the plain run. extra: whatever else a runner keeps.
     when: UTC time of the end, ISO 8601.
     """
 
@@ -107,7 +118,9 @@ class EpisodeRecord:
     scene: str | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():  # 60000 and "60000" are one checkpoint
+        if (
+            isinstance(self.checkpoint, str) and self.checkpoint.isdecimal()
+        ):  # 60000 and "60000" are one checkpoint
             object.__setattr__(self, "checkpoint", int(self.checkpoint))
 
     @property
@@ -116,8 +129,17 @@ class EpisodeRecord:
 
     @property
     def run(self) -> RunKey:
-        return RunKey(self.model, self.subgoal, self.memory_budget, self.checkpoint, self.model_seed, self.split,
-                      self.composition, self.training, self.event)  # fmt: skip
+        return RunKey(
+            self.model,
+            self.subgoal,
+            self.memory_budget,
+            self.checkpoint,
+            self.model_seed,
+            self.split,
+            self.composition,
+            self.training,
+            self.event,
+        )
 
     @property
     def named_scene(self) -> str | None:
@@ -136,7 +158,9 @@ class EpisodeRecord:
     def from_json(cls, line: str | bytes) -> Self:
         """Read a line."""
         # Not only finite numbers: a score that does not exist is kept as NaN in `extra`.
-        return cls.from_dict(verified(parse_json(line, "an episode record", finite=False), "an episode record"))
+        return cls.from_dict(
+            verified(parse_json(line, "an episode record", finite=False), "an episode record")
+        )
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
@@ -149,8 +173,9 @@ class EpisodeRecord:
 def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[EpisodeRecord]:
     """One record for each episode of each run, in the order they first came.
 
-    Any other outcome supersedes an `error`, which was retried. Of equal outcomes the first stays. Different outcomes
-    of one episode are refused: the same checkpoint and seed were evaluated twice. So are different scenes.
+    Any other outcome supersedes an `error`, which was retried. Of equal outcomes the first stays.
+    Different outcomes of one episode are refused: the same checkpoint and seed were evaluated
+    twice. So are different scenes.
 
     records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
     """
@@ -164,23 +189,26 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
             continue
         require(
             new.seed == old.seed,
-            f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and {new.seed}: "
-            "these are not the same benchmark; evaluate both from the same episode metadata.",
+            f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and"
+            f" {new.seed}: these are not the same benchmark; evaluate both from the same episode"
+            " metadata.",
         )
         if new.outcome == "error":
             continue
         scenes = {new.named_scene, old.named_scene} - {None}
         require(
             conflicts != "refuse" or len(scenes) < 2,
-            f"{new.task} {new.episode} ({new.run}) was run in different scenes: {old.scene} at {old.when}, {new.scene} "
-            f"at {new.when}. Name one of the runs, or choose conflicts first or last.",
+            f"{new.task} {new.episode} ({new.run}) was run in different scenes: {old.scene} at"
+            f" {old.when}, {new.scene} at {new.when}. Name one of the runs, or choose conflicts"
+            " first or last.",
         )
         if new.outcome == old.outcome and len(scenes) < 2:
             continue
         require(
             conflicts != "refuse",
-            f"{new.task} {new.episode} ({new.run}) was evaluated twice with different outcomes: {old.outcome} at "
-            f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last.",
+            f"{new.task} {new.episode} ({new.run}) was evaluated twice with different outcomes:"
+            f" {old.outcome} at {old.when}, {new.outcome} at {new.when}. Name one of the runs, or"
+            " choose conflicts first or last.",
         )
         supersedes = new.when > old.when if conflicts == "last" else new.when < old.when
         if supersedes:
@@ -189,17 +217,21 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
 
 
 def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
-    """Give records without a digest the one that others of their run have; only for the records of one folder.
+    """Give records without a digest the one that others of their run have; only for the records of
+    one folder.
 
-    `run.json` sees to it that a folder holds one configuration: a run that was begun before records had digests and
-    ended after is one run. Where a run's other records have none, or several, nothing is assumed.
+    `run.json` sees to it that a folder holds one configuration: a run that was begun before records
+    had digests and ended after is one run. Where a run's other records have none, or several,
+    nothing is assumed.
     """
     digests: dict[RunKey, set[str]] = {}
     for record in records:
         if record.composition is not None:
             digests.setdefault(record.run._replace(composition=None), set()).add(record.composition)
     only = {run: next(iter(of_run)) for run, of_run in digests.items() if len(of_run) == 1}
-    return [replace(r, composition=only.get(r.run)) if r.composition is None else r for r in records]
+    return [
+        replace(r, composition=only.get(r.run)) if r.composition is None else r for r in records
+    ]
 
 
 def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]]:
@@ -211,12 +243,17 @@ def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]
         for name in ("max_steps", "action_space"):
             values = sorted({getattr(member, name) for member in members})
             if len(values) > 1:
-                raise UserError(f"{run} mixes {name} {' and '.join(map(str, values))}: evaluate it with one of them.")
+                raise UserError(
+                    f"{run} mixes {name} {' and '.join(map(str, values))}: evaluate it with one of"
+                    " them."
+                )
     return runs
 
 
 def finished(records: Iterable[EpisodeRecord], retry_errors: bool = True) -> set[EpisodeKey]:
-    """The episodes of one run that need not be run again; those that ended in an error do by default."""
+    """The episodes of one run that need not be run again; those that ended in an error do by
+    default.
+    """
     return {record.key for record in records if not (retry_errors and record.outcome == "error")}
 
 

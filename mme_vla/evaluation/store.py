@@ -1,4 +1,6 @@
-"""The files of a run's folder: settings (`run.json`), records (`episodes.jsonl`) and claims (`claims/`)."""
+"""The files of a run's folder: settings (`run.json`), records (`episodes.jsonl`) and claims
+(`claims/`).
+"""
 
 import fcntl
 import json
@@ -33,9 +35,23 @@ from mme_vla.utils import (
 )
 
 RUN_FILE = "run.json"
-INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "base_url", "timeout", "retries", "backoff",
-               "requests_per_minute", "input_price", "output_price")  # fmt: skip
-"""Options of a model that predicts or plays which do not affect its output, and may differ when a run continues."""
+INDIFFERENT = (
+    "workers",
+    "batch_size",
+    "device",
+    "cache",
+    "key_variable",
+    "base_url",
+    "timeout",
+    "retries",
+    "backoff",
+    "requests_per_minute",
+    "input_price",
+    "output_price",
+)
+"""Options of a model that predicts or plays which do not affect its output, and may differ when a
+run continues.
+"""
 
 
 def fingerprint(settings: Mapping[str, Any]) -> str:
@@ -43,14 +59,18 @@ def fingerprint(settings: Mapping[str, Any]) -> str:
     return digest(settings, 64)
 
 
-def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def claim_run(
+    folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """Begin a run in `folder`, or continue with the one that is there.
 
-    settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action space, … notes: what
-    does not (device, workers, versions); written down when the run begins, never compared.
+    settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action
+    space, … notes: what does not (device, workers, versions); written down when the run begins,
+    never compared.
 
     Returns:
-        What `run.json` holds. Several shards may claim the same folder at once: the first writes it.
+        What `run.json` holds. Several shards may claim the same folder at once: the first writes
+        it.
     """
     settings = to_json(settings)  # as they will be read back
     content = {
@@ -61,15 +81,18 @@ def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any
     }
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        _write_new(folder / RUN_FILE, json.dumps(with_checksum(content), indent=2, sort_keys=True) + "\n")
+        _write_new(
+            folder / RUN_FILE, json.dumps(with_checksum(content), indent=2, sort_keys=True) + "\n"
+        )
         return content
     except FileExistsError:
         _await_content(folder / RUN_FILE)
     there = read_run(folder)
     if there["fingerprint"] != content["fingerprint"]:
         raise UserError(
-            f"{folder} holds a run with other settings: {_differences(there['settings'], settings)}. "
-            "Resume it with its own settings, or choose another folder."
+            f"{folder} holds a run with other settings:"
+            f" {_differences(there['settings'], settings)}. Resume it with its own settings, or"
+            " choose another folder."
         )
     return there
 
@@ -80,8 +103,8 @@ def read_run(folder: Path) -> dict[str, Any]:
     content = read_json(path, "a run's settings", finite=False)
     require(
         content.get("fingerprint") == fingerprint(content.get("settings", {})),
-        f"{path} is damaged or was changed manually: its settings do not have its fingerprint. Remove it if the "
-        "records beside it are of this run.",
+        f"{path} is damaged or was changed manually: its settings do not have its fingerprint."
+        " Remove it if the records beside it are of this run.",
     )
     return verified(content, str(path))
 
@@ -115,9 +138,14 @@ def _await_content(path: Path, patience: float = 2) -> None:
 
 def _differences(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     pairs = {
-        key: [flat(values).get(key, "not set") for values in (there, now)] for key in sorted({*flat(there), *flat(now)})
+        key: [flat(values).get(key, "not set") for values in (there, now)]
+        for key in sorted({*flat(there), *flat(now)})
     }
-    return "; ".join(f"{key} was {brief(old)}, is {brief(new)}" for key, (old, new) in pairs.items() if old != new)
+    return "; ".join(
+        f"{key} was {brief(old)}, is {brief(new)}"
+        for key, (old, new) in pairs.items()
+        if old != new
+    )
 
 
 RECORDS = "episodes.jsonl"  # Name of a run's file; its shards are called `episodes-<shard>.jsonl`
@@ -154,7 +182,10 @@ class RecordLog:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         name_place(error, self.path)
         try:
@@ -172,7 +203,10 @@ class RecordLog:
         try:
             EpisodeRecord.from_json(last_line)
         except UserError:
-            warnings.warn(f"{self.path}: removed a half-written last line ({len(last_line)} bytes).", stacklevel=3)
+            warnings.warn(
+                f"{self.path}: removed a half-written last line ({len(last_line)} bytes).",
+                stacklevel=3,
+            )
             self._file.truncate(len(content) - len(last_line))
         else:  # only the line's end is missing
             self._file.write(b"\n")
@@ -192,14 +226,18 @@ def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:
 
 
 def find_records(paths: Iterable[Path]) -> list[Path]:
-    """The files behind a list of files and folders; of a folder, every `episodes*.jsonl`, or `.jsonl.xz`, below it."""
+    """The files behind a list of files and folders; of a folder, every `episodes*.jsonl`, or
+    `.jsonl.xz`, below it.
+    """
     files: list[Path] = []
     for path in paths:
         below = sorted([*path.rglob("episodes*.jsonl"), *path.rglob("episodes*.jsonl.xz")])
         inside = below if path.is_dir() else [path] * path.is_file()
         if not inside:
-            what = f"holds no results: no {RECORDS} or episodes-<shard>.jsonl in it or below"
-            raise UserError(f"{path} {what if path.is_dir() else 'does not exist: name files of records, or folders'}.")
+            fault = "does not exist: name files of records, or folders"
+            if path.is_dir():
+                fault = f"holds no results: no {RECORDS} or episodes-<shard>.jsonl in it or below"
+            raise UserError(f"{path} {fault}.")
         files += inside
     return list({path.resolve(): path for path in files}.values())
 
@@ -209,7 +247,8 @@ def _lock(file: IO[bytes], path: Path) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise UserError(
-            f"{path} is being written by another process; give every shard a file of its own, episodes-<shard>.jsonl."
+            f"{path} is being written by another process; give every shard a file of its own,"
+            " episodes-<shard>.jsonl."
         ) from None
     except OSError:  # a file system without locks
         return
@@ -224,8 +263,8 @@ _RECORDS = re.compile(r"episodes(-\d+of\d+)?\.jsonl")
 class Claim:
     """One process's claim on an episode.
 
-    records: name of the file that the process holds and writes its records to; None gives the episode back.
-    host, process: of the writer, for file systems without locks.
+    records: name of the file that the process holds and writes its records to; None gives the
+    episode back. host, process: of the writer, for file systems without locks.
     """
 
     records: str | None
@@ -234,27 +273,35 @@ class Claim:
 
     def __post_init__(self) -> None:
         if self.records is not None and not _RECORDS.fullmatch(self.records):
-            raise UserError(f"records={brief(self.records)} must name a file of records, such as {RECORDS}.")
+            raise UserError(
+                f"records={brief(self.records)} must name a file of records, such as {RECORDS}."
+            )
 
 
 class Claims:
     """The claims on a run's episodes, as one of its processes sees them.
 
-    `claims/<task>-<episode>.<n>.json` is claim number n on an episode. Each is created exclusively and never changed
-    or removed, so that two processes never hold the same one, on network file systems too. The newest claim counts.
-    It holds while its process locks its file of records, and where that file has the episode's result.
+    `claims/<task>-<episode>.<n>.json` is claim number n on an episode. Each is created exclusively
+    and never changed or removed, so that two processes never hold the same one, on network file
+    systems too. The newest claim counts. It holds while its process locks its file of records, and
+    where that file has the episode's result.
     """
 
     def __init__(self, folder: Path, records: str) -> None:
-        """Join the run. Gives back what an earlier process with the same file of records had not finished.
+        """Join the run. Gives back what an earlier process with the same file of records had not
+        finished.
 
-        folder: of the run. records: the name of the file that this process holds and writes its records to.
+        folder: of the run. records: the name of the file that this process holds and writes its
+        records to.
         """
         self.folder, self.records = folder, records
         self._newest: dict[EpisodeKey, tuple[int, Claim]] = {}
         for path in sorted((folder / CLAIMS).glob("[!.]*.json")):
             if match := _CLAIM.fullmatch(path.name):
-                key, number = EpisodeKey(unquote(match["task"]), int(match["episode"])), int(match["number"])
+                key, number = (
+                    EpisodeKey(unquote(match["task"]), int(match["episode"])),
+                    int(match["number"]),
+                )
                 if number > self._newest.get(key, (-1, None))[0]:
                     self._newest[key] = number, _read_claim(path)
         done = _finished_in(folder / records)
@@ -263,7 +310,9 @@ class Claims:
                 self._create(key, number + 1, Claim(None))
 
     def take(self, waiting: Sequence[Job]) -> Job | None:
-        """Claim the first episode that no process runs or has finished; None where all are taken."""
+        """Claim the first episode that no process runs or has finished; None where all
+        are taken.
+        """
         finished_by: dict[str, set[EpisodeKey] | None] = {}
         for job in waiting:
             key = EpisodeKey(job.task, job.episode)
@@ -275,14 +324,20 @@ class Claims:
                     return job
         return None
 
-    def _holds(self, claim: Claim, key: EpisodeKey, finished_by: dict[str, set[EpisodeKey] | None]) -> bool:
-        """Whether the claim's process is alive (None in `finished_by`) or has finished the episode."""
+    def _holds(
+        self, claim: Claim, key: EpisodeKey, finished_by: dict[str, set[EpisodeKey] | None]
+    ) -> bool:
+        """Whether the claim's process is alive (None in `finished_by`) or has finished
+        the episode.
+        """
         records = claim.records
         if records is None:
             return False
         if records not in finished_by:
             path = self.folder / records
-            finished_by[records] = None if records == self.records or _is_held(path, claim) else _finished_in(path)
+            finished_by[records] = (
+                None if records == self.records or _is_held(path, claim) else _finished_in(path)
+            )
         done = finished_by[records]
         return done is None or key in done
 
@@ -306,8 +361,8 @@ def _read_claim(path: Path) -> Claim:
         return read_section(Claim, read_json(path, "a claim on an episode", limit=4096))
     except UserError as error:
         raise UserError(
-            f"{path} is damaged: {error} Remove the folder {path.parent} while no process of the run is alive: "
-            "nothing of the run is lost."
+            f"{path} is damaged: {error} Remove the folder {path.parent} while no process of the"
+            " run is alive: nothing of the run is lost."
         ) from None
 
 
@@ -318,7 +373,8 @@ def _finished_in(path: Path) -> set[EpisodeKey]:
 def _is_held(path: Path, claim: Claim) -> bool:
     """Whether a process writes to a file of records.
 
-    Where the file system has no locks, a process of this machine is looked up by its number, and others are alive.
+    Where the file system has no locks, a process of this machine is looked up by its number, and
+    others are alive.
     """
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

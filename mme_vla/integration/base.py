@@ -17,12 +17,18 @@ MEMORY_VISIBILITY: Visibility = {
     "prompt": {"memory", "images", "prompt"},
     "action": {"memory", "images", "prompt", "action"},
 }
-"""As released, wherever memory is a block. The paper's text has one word less: the prompt does not see memory."""
+"""As released, wherever memory is a block. The paper's text has one word less: the prompt does not
+see memory.
+"""
 
 
 def memory_visibility(prompt_sees_memory: bool) -> Visibility:
     """Return the table, with or without that one word."""
-    return MEMORY_VISIBILITY if prompt_sees_memory else {**MEMORY_VISIBILITY, "prompt": PI05_VISIBILITY["prompt"]}
+    return (
+        MEMORY_VISIBILITY
+        if prompt_sees_memory
+        else {**MEMORY_VISIBILITY, "prompt": PI05_VISIBILITY["prompt"]}
+    )
 
 
 POSITIONS = ("slot", "time")
@@ -42,13 +48,17 @@ class Integration(nn.Module):
         visibility: the table for its block list.
         extra_experts: experts the backbone has to have besides its own two.
         blocks: the prefix's block list, memory in its place.
-        hook: the action expert's per-layer hook for this chunk, with all that depends on memory alone computed now.
-        condition: what becomes of the condition of the action expert's norms (the embedded flow time).
-        beside: blocks that stand beside the actions in every step; `visibility` needs rows for them.
+        hook: the action expert's per-layer hook for this chunk, with all that depends on memory
+            alone computed now.
+        condition: what becomes of the condition of the action expert's norms (the embedded flow
+            time).
+        beside: blocks that stand beside the actions in every step; `visibility` needs rows for
+            them.
         past: stored keys and values, which the blocks read whose row of `visibility` names `cache`.
-        required_features: what a backbone must support beside the methods overridden here (`Backbone.supports`).
-        memory_position: `time` where its attention on memory counts frames, which needs a memory whose tokens tell
-            their ages; `slot` where it counts tokens.
+        required_features: what a backbone must support beside the methods overridden here
+            (`Backbone.supports`).
+        memory_position: `time` where its attention on memory counts frames, which needs a memory
+            whose tokens tell their ages; `slot` where it counts tokens.
     """
 
     memory_width: int = 0
@@ -78,18 +88,26 @@ class Integration(nn.Module):
         return None
 
     def inject(self, observation: Sequence[Block], memory: MemoryTokens | None) -> Injection:
-        """All that enters the backbone for one chunk, from its observation blocks and the memory's tokens."""
+        """All that enters the backbone for one chunk, from its observation blocks and the memory's
+        tokens.
+        """
         return Injection(
-            self.blocks(observation, memory), self.visibility, self.hook(memory), self.condition(memory),
-            self.beside(memory), self.past(memory),
-        )  # fmt: skip
+            self.blocks(observation, memory),
+            self.visibility,
+            self.hook(memory),
+            self.condition(memory),
+            self.beside(memory),
+            self.past(memory),
+        )
 
 
 def explicit_positions(memory: MemoryTokens, memory_position: str) -> Tensor | None:
-    """Rotary positions of memory tokens by the age of their frames, [b, budget] float32; None numbers them by slots.
+    """Rotary positions of memory tokens by the age of their frames, [b, budget] float32; None
+    numbers them by slots.
 
-    The current frame has the last position before the blocks that follow, and a frame t frames ago lies t positions
-    before it. So the distance between two tokens does not depend on the other tokens in memory.
+    The current frame has the last position before the blocks that follow, and a frame t frames ago
+    lies t positions before it. So the distance between two tokens does not depend on the other
+    tokens in memory.
     """
     if memory_position == "slot":
         return None
@@ -99,7 +117,10 @@ def explicit_positions(memory: MemoryTokens, memory_position: str) -> Tensor | N
 def ages_of(memory: MemoryTokens) -> Tensor:
     """How many frames ago each memory token's frame was, [b, budget]."""
     if memory.ages is None:
-        raise ValueError("memory_position=time: these memory tokens tell no ages (HistoryTokens.step was not given).")
+        raise ValueError(
+            "memory_position=time: these memory tokens tell no ages (HistoryTokens.step was not"
+            " given)."
+        )
     return memory.ages
 
 
@@ -107,13 +128,19 @@ EXTENSION_POINTS = {name: name for name in ("blocks", "hook", "condition", "besi
     "extra_experts": "expert",
     "past": "cache",
 }
-"""Method of an integration → the feature that a backbone must support for it (`Backbone.supports`)."""
+"""Method of an integration → the feature that a backbone must support for it
+(`Backbone.supports`).
+"""
 
 
 def extension_points(kind: type[Integration]) -> frozenset[str]:
-    """The features of a backbone that an integration uses, known before it is built to the backbone's sizes."""
+    """The features of a backbone that an integration uses, known before it is built to the
+    backbone's sizes.
+    """
     overridden = {
-        point for name, point in EXTENSION_POINTS.items() if getattr(kind, name) is not getattr(Integration, name)
+        point
+        for name, point in EXTENSION_POINTS.items()
+        if getattr(kind, name) is not getattr(Integration, name)
     }
     return kind.required_features | overridden
 
@@ -121,5 +148,7 @@ def extension_points(kind: type[Integration]) -> frozenset[str]:
 def required(memory: MemoryTokens | None) -> MemoryTokens:
     """The memory tokens, which must be there."""
     if memory is None:
-        raise ValueError("This policy has a memory: batch.history must hold its selection (it is None).")
+        raise ValueError(
+            "This policy has a memory: batch.history must hold its selection (it is None)."
+        )
     return memory

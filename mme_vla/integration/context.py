@@ -38,22 +38,25 @@ class Context(Integration):
 
         Args:
             prompt_sees_memory: as released; False as the paper's text.
-            memory_position: `slot` numbers memory tokens one after the other, as released; `time` places them as many
-                positions before the images as their frames lie in the past.
-            mutual: memory stands between images and prompt, and all three see each other, as LeRobot's tokens of past
-                states do.
+            memory_position: `slot` numbers memory tokens one after the other, as released; `time`
+                places them as many positions before the images as their frames lie in the past.
+            mutual: memory stands between images and prompt, and all three see each other, as
+                LeRobot's tokens of past states do.
         """
         super().__init__(backbone)
         require(
             not (not prompt_sees_memory and getattr(backbone, "everything_sees_everything", False)),
-            "integration.prompt_sees_memory=false hides memory from the prompt, but in this backbone every token "
-            "sees every other: leave it true.",
+            "integration.prompt_sees_memory=false hides memory from the prompt, but in this"
+            " backbone every token sees every other: leave it true.",
         )
-        self.memory_width, self.memory_position = backbone.vlm.width, checked_position(memory_position)
+        self.memory_width, self.memory_position = (
+            backbone.vlm.width,
+            checked_position(memory_position),
+        )
         require(
             not (mutual and (memory_position == "time" or not prompt_sees_memory)),
-            "integration.mutual=true puts memory between images and prompt, where all see each other: that goes "
-            "with memory_position=slot and prompt_sees_memory=true alone.",
+            "integration.mutual=true puts memory between images and prompt, where all see each"
+            " other: that goes with memory_position=slot and prompt_sees_memory=true alone.",
         )
         self.mutual = mutual
         self.visibility = MUTUAL if mutual else memory_visibility(prompt_sees_memory)
@@ -78,7 +81,8 @@ class MemoryExpert(Integration):
         prompt_sees_memory: bool = True,
         memory_position: str = "slot",
     ) -> None:
-        """`width` defaults to the action expert's, `mlp_dim` to twice the width: 1024 and 2048 at full size.
+        """`width` defaults to the action expert's, `mlp_dim` to twice the width: 1024 and 2048 at
+        full size.
 
         The others are as `Context` has them.
         """
@@ -86,7 +90,9 @@ class MemoryExpert(Integration):
         self.memory_width = backbone.action.width if width is None else width
         self.memory_position = checked_position(memory_position)
         self.visibility = memory_visibility(prompt_sees_memory)
-        self._expert = ExpertConfig(self.memory_width, 2 * self.memory_width if mlp_dim is None else mlp_dim)
+        self._expert = ExpertConfig(
+            self.memory_width, 2 * self.memory_width if mlp_dim is None else mlp_dim
+        )
         check_positive(self._expert, "integration.")
 
     def extra_experts(self) -> dict[str, ExpertConfig]:

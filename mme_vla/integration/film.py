@@ -1,4 +1,6 @@
-"""Memory as video: one vector, joined to the condition that scales and shifts every block of a denoising network."""
+"""Memory as video: one vector, joined to the condition that scales and shifts every block of a
+denoising network.
+"""
 
 from typing import Any
 
@@ -11,7 +13,9 @@ from mme_vla.types import MemoryTokens
 
 
 class PooledIntegration(Integration):
-    """Hands memory over as one vector of `feature_width` numbers; a backbone that reads one supports `vector`."""
+    """Hands memory over as one vector of `feature_width` numbers; a backbone that reads one
+    supports `vector`.
+    """
 
     required_features = frozenset({"vector"})
     feature_width: int

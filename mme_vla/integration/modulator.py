@@ -1,4 +1,6 @@
-"""Memory as modulator: each action layer's MLP input is scaled and shifted by what it recalls (paper, section 4.3)."""
+"""Memory as modulator: each action layer's MLP input is scaled and shifted by what it recalls
+(paper, section 4.3).
+"""
 
 from functools import partial
 
@@ -7,7 +9,16 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.base import Hook, LayerHooks
 from mme_vla.backbone.config import BackboneConfig
-from mme_vla.backbone.layers import EPS, RMSNorm, additive_mask, attend, compute_dtype, rms_normalise, rotate, rotation
+from mme_vla.backbone.layers import (
+    EPS,
+    RMSNorm,
+    additive_mask,
+    attend,
+    compute_dtype,
+    rms_normalise,
+    rotate,
+    rotation,
+)
 from mme_vla.integration.base import Integration, ages_of, checked_position, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens
@@ -16,7 +27,9 @@ from mme_vla.types import MemoryTokens
 class ModulatorLayer(nn.Module):
     """One layer's cross-attention on memory and the linear map from what it read to (a, β)."""
 
-    def __init__(self, width: int, heads: int, kv_heads: int, head_dim: int, exact_identity: bool) -> None:
+    def __init__(
+        self, width: int, heads: int, kv_heads: int, head_dim: int, exact_identity: bool
+    ) -> None:
         super().__init__()
         self.kv_heads, self.head_dim, self.exact_identity = kv_heads, head_dim, exact_identity
         self.norm = RMSNorm(width)  # shared by queries and memory
@@ -30,24 +43,33 @@ class ModulatorLayer(nn.Module):
         nn.init.zeros_(self.modulation.bias)
 
     def keys_values(self, memory: Tensor, positions: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Memory [b, m, d] → rotated keys and values [b, m, K, h]: once per chunk, whatever the number of steps.
+        """Memory [b, m, d] → rotated keys and values [b, m, K, h]: once per chunk, whatever the
+        number of steps.
 
-        Queries stand after all memory slots, padding included; positions [b, m] of the memory's own are on that line.
+        Queries stand after all memory slots, padding included; positions [b, m] of the memory's own
+        are on that line.
         """
         kv = self.kv(self.norm(memory)[0]).unflatten(-1, (-1, self.head_dim))
         k, v = kv.chunk(2, dim=-2)
-        return rotate(k, rotation(_positions(0, memory) if positions is None else positions, self.head_dim)), v
+        return rotate(
+            k, rotation(_positions(0, memory) if positions is None else positions, self.head_dim)
+        ), v
 
     def read_memory(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
-        """r: what actions [b, h, d] read from memory; queries stand after all memory slots, padding included."""
+        """r: what actions [b, h, d] read from memory; queries stand after all memory slots, padding
+        included.
+        """
         q = self.q(self.norm(x)[0]).unflatten(-1, (-1, self.head_dim))
-        return self.out(attend(rotate(q, rotation(_positions(k.shape[1], x), self.head_dim)), k, v, mask))
+        return self.out(
+            attend(rotate(q, rotation(_positions(k.shape[1], x), self.head_dim)), k, v, mask)
+        )
 
     def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
         """x̂ = rms(x)·(1 + a) + β with (a, β) = W r + b."""
         a, beta = self.modulation(self.read_memory(x, k, v, mask)).float().chunk(2, dim=-1)
         if self.exact_identity:
-            # The same direction at x's own size: the norm that follows removes it, and a = β = 0 gives x to the bit.
+            # The same direction at x's own size: the norm that follows removes it, and a = β = 0
+            # gives x to the bit.
             size = (x.float().square().mean(-1, keepdim=True) + EPS).sqrt()
             return (x.float() * (1 + a) + size * beta).to(x.dtype)
         return (rms_normalise(x) * (1 + a) + beta).to(x.dtype)
@@ -69,25 +91,44 @@ class Modulator(Integration):
         """Build one `ModulatorLayer` per layer.
 
         Args:
-            num_heads, num_kv_heads, head_dim: of the cross-attention; `head_dim` defaults to the backbone's.
-            exact_identity: start as the memoryless policy to the bit; as released (False) it starts near it.
-            memory_position: `slot` numbers memory tokens one after the other, as released; `time` places a token as
-                many positions before the first action as its frame lies in the past, and one.
+            num_heads, num_kv_heads, head_dim: of the cross-attention; `head_dim` defaults to the
+                backbone's.
+            exact_identity: start as the memoryless policy to the bit; as released (False) it starts
+                near it.
+            memory_position: `slot` numbers memory tokens one after the other, as released; `time`
+                places a token as many positions before the first action as its frame lies in the
+                past, and one.
         """
         super().__init__(backbone)
-        self.memory_width, self.memory_position = backbone.action.width, checked_position(memory_position)
-        sizes = (self.memory_width, num_heads, num_kv_heads, head_dim or backbone.head_dim, exact_identity)
+        self.memory_width, self.memory_position = (
+            backbone.action.width,
+            checked_position(memory_position),
+        )
+        sizes = (
+            self.memory_width,
+            num_heads,
+            num_kv_heads,
+            head_dim or backbone.head_dim,
+            exact_identity,
+        )
         self.layers = nn.ModuleList(ModulatorLayer(*sizes) for _ in range(backbone.depth))
 
     def hook(self, memory: MemoryTokens | None) -> Hook:
         memory = required(memory)
         tokens = memory.tokens.to(compute_dtype(memory.tokens))
-        positions = None if self.memory_position == "slot" else tokens.shape[1] - 1 - ages_of(memory)
-        mask = additive_mask(memory.mask[:, None], tokens.dtype)  # b 1 1 m: every action sees the same keys
+        positions = (
+            None if self.memory_position == "slot" else tokens.shape[1] - 1 - ages_of(memory)
+        )
+        mask = additive_mask(
+            memory.mask[:, None], tokens.dtype
+        )  # b 1 1 m: every action sees the same keys
         cached = [layer.keys_values(tokens, positions) for layer in self.layers]  # type: ignore[operator]
-        return LayerHooks([
-            partial(layer, k=k, v=v, mask=mask) for layer, (k, v) in zip(self.layers, cached, strict=True)
-        ])  # fmt: skip
+        return LayerHooks(
+            [
+                partial(layer, k=k, v=v, mask=mask)
+                for layer, (k, v) in zip(self.layers, cached, strict=True)
+            ]
+        )
 
 
 def _positions(start: int, x: Tensor) -> Tensor:

@@ -1,1 +1,3 @@
-"""Memories: each selects stored vision tokens and encodes them into at most `budget` memory tokens."""
+"""Memories: each selects stored vision tokens and encodes them into at most `budget`
+memory tokens.
+"""

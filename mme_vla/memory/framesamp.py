@@ -12,7 +12,8 @@ from mme_vla.registry import MEMORIES
 
 
 def evenly_spaced_frames(step: int, count: int) -> np.ndarray:
-    """Frames 0 … `step`: all of them while they fit in `count`, else `count` evenly spaced ones, both ends included.
+    """Frames 0 … `step`: all of them while they fit in `count`, else `count` evenly spaced ones,
+    both ends included.
 
     One frame is the current one.
     """
@@ -22,19 +23,23 @@ def evenly_spaced_frames(step: int, count: int) -> np.ndarray:
 
 
 def evenly_spaced_stored_frames(storage: StorageSpec, step: int, count: int) -> np.ndarray:
-    """At most `count` of the stored frames up to `step`, evenly spaced among them, both ends included."""
+    """At most `count` of the stored frames up to `step`, evenly spaced among them, both ends
+    included.
+    """
     stored = storage.stored_frames(step + 1)
     return stored[evenly_spaced_frames(len(stored) - 1, count)]
 
 
 def budget_frames(budget: int, grid: int, at_least: int = 1) -> int:
-    """How many frames of grid×grid tokens a budget holds; raises `UserError` unless it holds whole ones, and enough."""
+    """How many frames of grid×grid tokens a budget holds; raises `UserError` unless it holds whole
+    ones, and enough.
+    """
     check_sizes("memory", budget=budget, grid=grid)
     least = max(budget // grid**2, at_least) * grid**2
     require(
         budget == least,
-        f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames, at least {at_least}: choose a "
-        f"multiple of {grid**2}, such as {least}.",
+        f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames, at least"
+        f" {at_least}: choose a multiple of {grid**2}, such as {least}.",
     )
     return budget // grid**2
 
@@ -56,7 +61,8 @@ class FrameSamp(PerceptualMemory):
         """See `PerceptualMemory`; `grid` is the side of a remembered frame's token grid.
 
         Args:
-            every: frames 0 and k·every − 1 can be remembered; the others are neither rendered nor encoded. 1: all.
+            every: frames 0 and k·every − 1 can be remembered; the others are neither rendered nor
+                encoded. 1: all.
         """
         frames = budget_frames(budget, grid)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
@@ -65,7 +71,9 @@ class FrameSamp(PerceptualMemory):
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return union_frames([self.selected_frames(int(step)) for step in steps])
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         return all_patches(self.selected_frames(step), self.storage.grid)
 
     def selected_frames(self, step: int) -> np.ndarray:

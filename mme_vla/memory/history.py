@@ -1,7 +1,8 @@
 """The history store: one episode's pooled vision tokens, grown online or read from the cache.
 
-Both forms answer the same three questions: which frames are there (`len`), what did the scorer say of them
-(`scores`), and what are the tokens at these (frame, patch) pairs (`gather`). A memory cannot tell them apart.
+Both forms answer the same three questions: which frames are there (`len`), what did the scorer say
+of them (`scores`), and what are the tokens at these (frame, patch) pairs (`gather`). A memory
+cannot tell them apart.
 """
 
 import ast
@@ -24,11 +25,13 @@ from mme_vla.types import FrameBatch
 class StorageSpec:
     """What a memory wants kept of every frame. It is data, so that a cache can be named after it.
 
-    grid: side of the pooled token grid (a view's tokens are pooled to grid×grid before they are stored); it divides the
+    grid: side of the pooled token grid (a view's tokens are pooled to grid×grid before they are
+    stored); it divides the
         backbone's (`check_grid`).
     pooling: `mean` (as released) or `max` (paper, section 4.2).
     keep_every: frame 0 and frames k·keep_every − 1 are kept; 1 keeps all. Others are never encoded.
-    scorer: key of the frame scorer whose rows are stored beside the tokens (`FrameScorer.key`); empty for none.
+    scorer: key of the frame scorer whose rows are stored beside the tokens (`FrameScorer.key`);
+    empty for none.
     """
 
     grid: int
@@ -41,7 +44,11 @@ class StorageSpec:
         check_choice("memory.pooling", self.pooling, ("mean", "max"))
         every = self.keep_every
         whole = isinstance(every, int) and every >= 1
-        require(whole, f"memory: keeping every {every}th frame is not possible: give a whole number, at least 1.")
+        require(
+            whole,
+            f"memory: keeping every {every}th frame is not possible: give a whole number, at"
+            " least 1.",
+        )
 
     def keeps(self, frame: int) -> bool:
         """Whether tokens of this frame are stored."""
@@ -57,38 +64,52 @@ class StorageSpec:
 
 
 FORMER_KEYS: dict[str, str] = {}
-"""Digest of a scorer's code → the format of its key in caches that were built before keys had a digest."""
+"""Digest of a scorer's code → the format of its key in caches that were built before keys had a
+digest.
+"""
 
 
 class FrameScorer:
-    """Scores raw frames as they pass, for memories that choose by content. One instance per episode.
+    """Scores raw frames as they pass, for memories that choose by content. One instance per
+    episode.
 
     Subclasses are dataclasses: their fields are the options.
     """
 
     @classmethod
     def digest(cls) -> str:
-        """A hash of the code of the class and its bases, without comments, docstrings and helper functions."""
+        """A hash of the code of the class and its bases, without comments, docstrings and helper
+        functions.
+        """
         code = []
         for part in cls.__mro__[: cls.__mro__.index(FrameScorer)]:
             tree = ast.parse(textwrap.dedent(inspect.getsource(part)))
             for node in ast.walk(tree):
-                if isinstance(node, ast.FunctionDef | ast.ClassDef) and ast.get_docstring(node) is not None:
+                if (
+                    isinstance(node, ast.FunctionDef | ast.ClassDef)
+                    and ast.get_docstring(node) is not None
+                ):
                     node.body = node.body[1:] or [ast.Pass()]
             code.append(ast.unparse(tree))
         return hashlib.sha256("\n".join(code).encode()).hexdigest()[:8]
 
     @property
     def key(self) -> str:
-        """The name of these scores in a cache: it follows from the class, its code and its options."""
+        """The name of these scores in a cache: it follows from the class, its code and
+        its options.
+        """
         options = {f.name: getattr(self, f.name) for f in fields(self) if f.init}  # type: ignore[arg-type]
         digest = self.digest()
         if digest in FORMER_KEYS:
             return FORMER_KEYS[digest].format(**options)
-        return "-".join([type(self).__name__.lower(), *(f"{k}{v}" for k, v in options.items()), digest])
+        return "-".join(
+            [type(self).__name__.lower(), *(f"{k}{v}" for k, v in options.items()), digest]
+        )
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
-        """Take one RGB frame [H, W, 3] uint8 of the memory view; return a score per patch [grid²] or None."""
+        """Take one RGB frame [H, W, 3] uint8 of the memory view; return a score per patch [grid²]
+        or None.
+        """
         raise NotImplementedError
 
 
@@ -110,10 +131,11 @@ class FrameScores:
 
 
 class History:
-    """One episode's stored tokens. `exec_start` is the index of the first execution frame (0 without a video).
+    """One episode's stored tokens. `exec_start` is the index of the first execution frame (0
+    without a video).
 
-    `motion` gives what the robot felt and did at frames [n], [n, w] float32, normalised, the first `state_width` of
-    them its state; both are there for a `ProprioMemory`.
+    `motion` gives what the robot felt and did at frames [n], [n, w] float32, normalised, the first
+    `state_width` of them its state; both are there for a `ProprioMemory`.
     """
 
     motion: Callable[[np.ndarray], Tensor] | None = None
@@ -147,7 +169,9 @@ class History:
         self.clock_starts = (*self.clock_starts, max(len(self) - 1, 0))
 
     def times(self, frames: np.ndarray) -> np.ndarray:
-        """The frame index that frames [n] have: their number, or counted from the last restart before them."""
+        """The frame index that frames [n] have: their number, or counted from the last restart
+        before them.
+        """
         starts = np.array(self.clock_starts)
         times: np.ndarray = frames - starts[np.searchsorted(starts, frames, side="right") - 1]
         return times
@@ -157,15 +181,17 @@ class History:
         return np.stack([self.times(indices[:, 0]), indices[:, 1]], axis=1)
 
     def stored(self, indices: np.ndarray) -> Tensor:
-        """`gather` without what a prompt does to tokens: what a selection may look at, in training as in episodes."""
+        """`gather` without what a prompt does to tokens: what a selection may look at, in training
+        as in episodes.
+        """
         return self.gather(indices)
 
     def motion_rows(self, frames: np.ndarray) -> Tensor:
         """What the robot felt and did at frames [n]: [n, w] float32."""
         if self.motion is None:
             raise UserError(
-                "This memory reads the robot's own states and actions, and this history has none of them: give states "
-                "with the frames (`Episode.observe`)."
+                "This memory reads the robot's own states and actions, and this history has none of"
+                " them: give states with the frames (`Episode.observe`)."
             )
         return self.motion(frames)
 
@@ -178,9 +204,10 @@ class History:
         if len(frames) and (len(stored) == 0 or (stored[rows] != frames).any()):
             lost = sorted(set(np.asarray(frames).tolist()) - set(stored.tolist()))
             raise UserError(
-                f"The history holds no tokens of frames {lost[:5]}: it has seen {len(self)} frames and keeps frame 0 "
-                f"and every {self.spec.keep_every}th, as far as they were rendered. The memory selects frames that its "
-                "StorageSpec does not keep, or that its `frames_read` does not name, which are not rendered."
+                f"The history holds no tokens of frames {lost[:5]}: it has seen {len(self)} frames"
+                f" and keeps frame 0 and every {self.spec.keep_every}th, as far as they were"
+                " rendered. The memory selects frames that its StorageSpec does not keep, or that"
+                " its `frames_read` does not name, which are not rendered."
             )
         return rows
 
@@ -188,7 +215,8 @@ class History:
 class CachedHistory(History):
     """Tokens read from disk: only the rows a selection names are touched.
 
-    tokens: array-like [kept, patches, d_vision] (usually a memory map); bfloat16 is stored as its uint16 bits.
+    tokens: array-like [kept, patches, d_vision] (usually a memory map); bfloat16 is stored as its
+    uint16 bits.
     """
 
     def __init__(
@@ -227,7 +255,9 @@ class OnlineHistory(History):
     Tokens stay on the device that encoded them; scores are numbers on the CPU.
     """
 
-    def __init__(self, spec: StorageSpec, scorer: FrameScorer | None = None, exec_start: int = 0) -> None:
+    def __init__(
+        self, spec: StorageSpec, scorer: FrameScorer | None = None, exec_start: int = 0
+    ) -> None:
         super().__init__(spec, exec_start)
         self._scorer = scorer
         self._length = 0
@@ -267,13 +297,21 @@ class OnlineHistory(History):
         """Add frames in order.
 
         Args:
-            frames: images [n, H, W, 3] uint8. tokens: of those of `to_encode`, [k, patches, d_vision].
-            rendered: offsets [n] of the images among the frames, of which there are `count`; by default they are all.
+            frames: images [n, H, W, 3] uint8. tokens: of those of `to_encode`, [k, patches,
+                d_vision].
+            rendered: offsets [n] of the images among the frames, of which there are `count`; by
+                default they are all.
         """
         count = len(frames) if count is None else count
-        offsets, numbers = self.to_encode(count, rendered), np.arange(count) if rendered is None else rendered
+        offsets, numbers = (
+            self.to_encode(count, rendered),
+            np.arange(count) if rendered is None else rendered,
+        )
         if len(tokens) != len(offsets):
-            raise ValueError(f"append() got tokens of {len(tokens)} frames, expected {len(offsets)}: see to_encode().")
+            raise ValueError(
+                f"append() got tokens of {len(tokens)} frames, expected {len(offsets)}: see"
+                " to_encode()."
+            )
         self._score(frames, numbers)
         if len(tokens):
             self._grow(len(self._stored_frames) + len(tokens), tokens)
@@ -293,7 +331,9 @@ class OnlineHistory(History):
         self._scored += 1
 
     def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
-        """Add frames in order, through `encode`: images [n, H, W, 3] → tokens [n, patches, d_vision]."""
+        """Add frames in order, through `encode`: images [n, H, W, 3] → tokens [n, patches,
+        d_vision].
+        """
         stored = frames.select(self.to_encode(frames.length, frames.index))
         self.append(frames.images, encode(stored), frames.index, frames.length)
 
@@ -320,11 +360,15 @@ class OnlineHistory(History):
             raise UserError("The history is empty: observe at least one frame before acting.")
         rows = self._row_of(indices[:, 0], np.asarray(self._stored_frames, np.int64))
         device = self._tokens.device
-        return self._tokens[torch.as_tensor(rows, device=device), torch.as_tensor(indices[:, 1], device=device)]
+        return self._tokens[
+            torch.as_tensor(rows, device=device), torch.as_tensor(indices[:, 1], device=device)
+        ]
 
 
 class PromptConditionedHistory(History):
-    """A history whose tokens are changed by `condition` [n, d_vision] → [n, d_vision] as they are gathered."""
+    """A history whose tokens are changed by `condition` [n, d_vision] → [n, d_vision] as they are
+    gathered.
+    """
 
     def __init__(self, source: History, condition: Callable[[Tensor], Tensor]) -> None:
         super().__init__(source.spec, source.exec_start)
@@ -353,8 +397,8 @@ class PromptConditionedHistory(History):
 class LazyHistory(OnlineHistory):
     """Frames wait as images in the CPU's memory; their tokens stay on the device that encoded them.
 
-    A recurrent memory reads one frame in sixteen: the vision tower then runs sixteen times less. An image of 256×256
-    takes 192 KiB, less than its 8×8 tokens at full width would on the GPU.
+    A recurrent memory reads one frame in sixteen: the vision tower then runs sixteen times less. An
+    image of 256×256 takes 192 KiB, less than its 8×8 tokens at full width would on the GPU.
 
     Args:
         encode: frames [n, H, W, 3] uint8 → tokens [n, patches, d_vision].
@@ -396,9 +440,13 @@ class LazyHistory(OnlineHistory):
         raise TypeError("A LazyHistory encodes its frames itself: give them to take().")
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch), encoding the frames that wait."""
+        """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch), encoding the frames
+        that wait.
+        """
         frames, rows = np.unique(indices[:, 0], return_inverse=True)
-        self._row_of(frames, np.asarray(self._stored_frames, np.int64))  # says which frames are missing
+        self._row_of(
+            frames, np.asarray(self._stored_frames, np.int64)
+        )  # says which frames are missing
         new = [int(frame) for frame in frames if int(frame) in self._waiting]
         if new:
             tokens = self._encode(np.stack([self._waiting[frame] for frame in new]))

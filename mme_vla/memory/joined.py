@@ -1,4 +1,6 @@
-"""Several memories under one budget, side by side: their tokens stand one after the other (beyond the paper)."""
+"""Several memories under one budget, side by side: their tokens stand one after the other (beyond
+the paper).
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -37,37 +39,58 @@ SHARE_UNIT = 16  # shares are multiples of it, so that they hold whole frames of
 
 @MEMORIES.register("joined")
 class JoinedMemory(
-    MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, PastViewMemory, CompilableMemory, ReadsLabels
+    MemoryModule,
+    StreamingMemory,
+    ScoringMemory,
+    ProprioMemory,
+    PastViewMemory,
+    CompilableMemory,
+    ReadsLabels,
 ):
     """Each member selects and encodes as if it were alone, within its share of the budget.
 
-    The history keeps what serves all of them: a grid of which all of theirs are pooled when they are read
-    (exact but for the rounding of what is stored), and every frame that anyone keeps.
+    The history keeps what serves all of them: a grid of which all of theirs are pooled when they
+    are read (exact but for the rounding of what is stored), and every frame that anyone keeps.
 
-    Selections lie one after the other in `HistoryTokens`, each padded as its member pads. One member's may vary in
-    length, and comes first, where batches pad the shorter ones; all others are padded to their capacity.
+    Selections lie one after the other in `HistoryTokens`, each padded as its member pads. One
+    member's may vary in length, and comes first, where batches pad the shorter ones; all others are
+    padded to their capacity.
     """
 
-    def __init__(self, d_vision: int, width: int, members: Sequence[str | Mapping[str, Any]], budget: int = 512):
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        members: Sequence[str | Mapping[str, Any]],
+        budget: int = 512,
+    ):
         """Build the members.
 
         Args:
             d_vision: width of a vision token. width: of a memory token, given by the integration.
             members: names, or sections with `name` and the memory's own options.
-            budget: most memory tokens of all together. Members that name no budget share evenly what the others leave.
+            budget: most memory tokens of all together. Members that name no budget share evenly
+                what the others leave.
         """
         super().__init__()
         sections = shares(members, budget)
-        built: list[MemoryModule] = [MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections]
+        built: list[MemoryModule] = [
+            MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections
+        ]
         self.members = nn.ModuleList(built)
         names = [section["name"] for section in sections]
         require(
             not any(isinstance(member, CacheMemory) for member in built),
-            f"memory.members={brief(names)}: a memory of keys and values (CacheMemory) cannot be joined with others.",
+            f"memory.members={brief(names)}: a memory of keys and values (CacheMemory) cannot be"
+            " joined with others.",
         )
         # Equal names get a number.
-        self.names = [f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)]
-        self.storage = common_storage(dict(zip(self.names, [member.storage for member in built], strict=True)))
+        self.names = [
+            f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)
+        ]
+        self.storage = common_storage(
+            dict(zip(self.names, [member.storage for member in built], strict=True))
+        )
         self.budget = sum(member.budget for member in built)
         self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
         self.pad_left = any(member.pad_left for member in built)
@@ -86,7 +109,9 @@ class JoinedMemory(
             if isinstance(member, CompilableMemory):
                 member.compile(**options)
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         """What any member remembers, as the stored tokens it is made of."""
         indices = [
             finer(member.select(view, step, rng), member.storage.grid, self.storage.grid)
@@ -109,19 +134,30 @@ class JoinedMemory(
 
     def padded_length(self, count: int) -> int:
         first, *others = (self.memories[i] for i in self._order)
-        return first.padded_length(min(count, first.capacity)) + sum(member.capacity for member in others)
+        return first.padded_length(min(count, first.capacity)) + sum(
+            member.capacity for member in others
+        )
 
-    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+    def gather_selection(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> HistoryTokens:
         memories, views = self.memories, self._views(history)
         parts = []
         for place, i in enumerate(self._order):
             part = memories[i].gather_selection(views[i], step, rng)
             parts.append(_padded(part, memories[i]) if place else part)
-        features, positions, mask = (torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS)
+        features, positions, mask = (
+            torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS
+        )
         return HistoryTokens(features, positions, mask, parts[0].step)
 
-    def condition_on_prompt(self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]) -> HistoryTokens:
-        parts = [self.memories[i].condition_on_prompt(piece, condition) for i, piece in self._pieces(history)]
+    def condition_on_prompt(
+        self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
+    ) -> HistoryTokens:
+        parts = [
+            self.memories[i].condition_on_prompt(piece, condition)
+            for i, piece in self._pieces(history)
+        ]
         return replace(history, features=torch.cat([part.features for part in parts], 1))
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
@@ -158,7 +194,9 @@ class JoinedMemory(
 
     def prepare(self, history: History, stream: Any) -> bool:
         members = zip(self.memories, self._views(history), stream, strict=True)
-        left = [m.prepare(view, piece) for m, view, piece in members if isinstance(m, StreamingMemory)]
+        left = [
+            m.prepare(view, piece) for m, view, piece in members if isinstance(m, StreamingMemory)
+        ]
         return any(left)
 
     @property
@@ -171,11 +209,16 @@ class JoinedMemory(
 
     def _joined(self, outputs: Sequence[MemoryTokens]) -> MemoryTokens:
         pairs = list(zip(self.names, outputs, strict=True))
-        metrics = {f"{name}/{key}": value for name, of in pairs for key, value in of.metrics.items()}
+        metrics = {
+            f"{name}/{key}": value for name, of in pairs for key, value in of.metrics.items()
+        }
         losses = {f"{name}/{key}": value for name, of in pairs for key, value in of.losses.items()}
         member_ages = [f.ages for f in outputs if f.ages is not None]
         ages = torch.cat(member_ages, 1) if len(member_ages) == len(outputs) else None
-        tokens, mask = torch.cat([f.tokens for f in outputs], 1), torch.cat([f.mask for f in outputs], 1)
+        tokens, mask = (
+            torch.cat([f.tokens for f in outputs], 1),
+            torch.cat([f.mask for f in outputs], 1),
+        )
         return MemoryTokens(tokens, mask, metrics, ages, losses)
 
 
@@ -228,11 +271,15 @@ class _Upsampled(FrameScorer):
         row = self._scorer(frame_index, frame)
         if row is None:
             return None
-        return np.kron(row.reshape(self._grid, self._grid), np.ones((self._times, self._times), row.dtype)).reshape(-1)
+        return np.kron(
+            row.reshape(self._grid, self._grid), np.ones((self._times, self._times), row.dtype)
+        ).reshape(-1)
 
 
 def finer(indices: np.ndarray, grid: int, fine: int) -> np.ndarray:
-    """(frame, patch) [n, 2] of a grid as the patches [n·k², 2] of a grid k times as fine; one after the other."""
+    """(frame, patch) [n, 2] of a grid as the patches [n·k², 2] of a grid k times as fine; one after
+    the other.
+    """
     times = fine // grid
     row, column = np.divmod(indices[:, 1], grid)
     inside = np.arange(times)
@@ -247,7 +294,9 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict
         not isinstance(members, str | Mapping) and len(members) >= 2,
         f"memory.members={brief(members)}: name at least two, such as [framesamp, ttt].",
     )
-    sections: list[dict[str, Any]] = [dict(m) if isinstance(m, Mapping) else {"name": m} for m in members]
+    sections: list[dict[str, Any]] = [
+        dict(m) if isinstance(m, Mapping) else {"name": m} for m in members
+    ]
     for section in sections:
         require(
             isinstance(section.get("name"), str) and section["name"] != "joined",
@@ -260,13 +309,18 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict
     if taken > budget or (open_ones and share < 1):
         requested = ", ".join(f"{s['name']} {s.get('budget') or 'an even share'}" for s in sections)
         raise UserError(
-            f"memory.budget={budget} is less than its members use ({requested}): lower their budgets, or raise it."
+            f"memory.budget={budget} is less than its members use ({requested}): lower their"
+            " budgets, or raise it."
         )
-    return [{**section, "budget": share} if section in open_ones else section for section in sections]
+    return [
+        {**section, "budget": share} if section in open_ones else section for section in sections
+    ]
 
 
 def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
-    """What has to be stored so that every one of these memories finds what it wants; some store nothing."""
+    """What has to be stored so that every one of these memories finds what it wants; some store
+    nothing.
+    """
     stored = {name: spec for name, spec in specs.items() if spec.keep_every != NEVER} or dict(specs)
     (first, one), *_ = stored.items()
     for name, other in stored.items():
@@ -278,8 +332,9 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
     scorers = {name: spec.scorer for name, spec in stored.items() if spec.scorer}
     if len(set(scorers.values())) > 1:
         raise UserError(
-            f"{' and '.join(scorers)} score frames differently ({', '.join(scorers.values())}), and one history keeps "
-            "one set of scores: set the same grid and stride for both, or join only one of them."
+            f"{' and '.join(scorers)} score frames differently ({', '.join(scorers.values())}), and"
+            " one history keeps one set of scores: set the same grid and stride for both, or join"
+            " only one of them."
         )
     grid = math.lcm(*(spec.grid for spec in stored.values()))
     every = math.gcd(*(spec.keep_every for spec in stored.values()))
@@ -289,7 +344,10 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
 def single_past_view_spec(specs: Mapping[str, PastViewSpec | None]) -> PastViewSpec | None:
     """What the one member gives that looks back; None where none does."""
     defined = {name: spec for name, spec in specs.items() if spec is not None}
-    require(len(defined) <= 1, f"{' and '.join(defined)} each give the vision tower past views: join only one of them.")
+    require(
+        len(defined) <= 1,
+        f"{' and '.join(defined)} each give the vision tower past views: join only one of them.",
+    )
     return next(iter(defined.values()), None)
 
 

@@ -1,4 +1,6 @@
-"""RMT: memory as a fixed set of slots that look at every frame and at each other (paper, section 4.2)."""
+"""RMT: memory as a fixed set of slots that look at every frame and at each other (paper, section
+4.2).
+"""
 
 from typing import Any
 
@@ -50,8 +52,8 @@ class RMTLayer(RecurrentLayer):
         super().__init__()
         require(
             hidden % (2 * heads) == 0 and heads % kv_heads == 0,
-            f"memory.hidden={hidden}, memory.heads={heads}, memory.kv_heads={kv_heads} do not fit: hidden must be "
-            "an even multiple of heads, and heads a multiple of kv_heads.",
+            f"memory.hidden={hidden}, memory.heads={heads}, memory.kv_heads={kv_heads} do not fit:"
+            " hidden must be an even multiple of heads, and heads a multiple of kv_heads.",
         )
         check_choice("memory.rotation", rotation, ROTATIONS)
         check_choice("memory.attention_dtype", attention_dtype, ATTENTION_DTYPES)
@@ -78,8 +80,12 @@ class RMTLayer(RecurrentLayer):
             cos, sin = rope.cos(), rope.sin()
             of_frame, of_slots = (cos[:patches], sin[:patches]), (cos[patches:], sin[patches:])
             kv = self.kv.weight.float()
-            qkv = torch.cat([self.q.weight.float(), kv])  # projected and rotated together: fewer small operations
-            frame_k, frame_v = self._heads(layer_norm(self.pre_norm, x.float()), kv, of_frame)  # b t p kv h
+            qkv = torch.cat(
+                [self.q.weight.float(), kv]
+            )  # projected and rotated together: fewer small operations
+            frame_k, frame_v = self._heads(
+                layer_norm(self.pre_norm, x.float()), kv, of_frame
+            )  # b t p kv h
             for t in range(x.shape[1]):
                 qk, v = self._heads(layer_norm(self.pre_norm, slots.float()), qkv, of_slots)
                 q, k = qk.tensor_split([-self.kv_heads], -2)
@@ -96,21 +102,29 @@ class RMTLayer(RecurrentLayer):
         (slots,) = state
         return slots, torch.ones(slots.shape[:2], dtype=torch.bool, device=slots.device)
 
-    def _heads(self, x: Tensor, weight: Tensor, rope: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Project x [..., n, hidden] to heads [..., n, heads, h], and rotate all but the values, which are last."""
+    def _heads(
+        self, x: Tensor, weight: Tensor, rope: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Project x [..., n, hidden] to heads [..., n, heads, h], and rotate all but the values,
+        which are last.
+        """
         heads = nn.functional.linear(x, weight).unflatten(-1, (-1, self.head_dim))
         qk, v = heads.tensor_split([-self.kv_heads], -2)
         return self._rotate(qk, *rope), v
 
     def _rotate(self, x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-        """Rotate the pairs (2i, 2i + 1) of [..., n, heads, h] by angles with cosines and sines [n, 1, h/2]."""
+        """Rotate the pairs (2i, 2i + 1) of [..., n, heads, h] by angles with cosines and sines [n,
+        1, h/2].
+        """
         a, b = x[..., 0::2], x[..., 1::2]
         if self.rotation == "cosine_only":
             return torch.stack([a * cos, b * cos], -1).flatten(-2)
         return torch.stack([a * cos - b * sin, a * sin + b * cos], -1).flatten(-2)
 
     def _attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Every slot attends to every key: q [b, n, heads, h], k and v [b, m, kv, h] → [b, n, heads·h] float32."""
+        """Every slot attends to every key: q [b, n, heads, h], k and v [b, m, kv, h] → [b, n,
+        heads·h] float32.
+        """
         b, n, heads, h = q.shape
         # Without a mask, the queries that share a key head are simply more queries of that head.
         q = q.unflatten(2, (self.kv_heads, -1)).permute(0, 2, 3, 1, 4).flatten(2, 3)  # b kv (g n) h
@@ -123,13 +137,19 @@ class RMTLayer(RecurrentLayer):
 
 
 def attend_rounded(q: Tensor, k: Tensor, v: Tensor, dtype: torch.dtype) -> Tensor:
-    """Attention that rounds where the released code does: inputs, weights and result to `dtype`; softmax in float32.
+    """Attention that rounds where the released code does: inputs, weights and result to `dtype`;
+    softmax in float32.
 
-    Fused kernels round the weights before they are normalised, which moves a slot by up to 2 % over a window.
+    Fused kernels round the weights before they are normalised, which moves a slot by up to 2 % over
+    a window.
     """
     q, k, v = q.to(dtype), k.to(dtype), v.to(dtype)
-    weights = ((q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)).softmax(-1).to(dtype)
-    if q.device.type == "cpu":  # sums are float32 either way, and many CPUs only emulate products of bfloat16
+    weights = (
+        ((q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)).softmax(-1).to(dtype)
+    )
+    if (
+        q.device.type == "cpu"
+    ):  # sums are float32 either way, and many CPUs only emulate products of bfloat16
         return (weights.float() @ v.float()).to(dtype).float()
     return (weights @ v).float()
 
@@ -160,15 +180,17 @@ class RMT(RecurrentMemory):
 
         Args:
             hidden: width of the recurrence; None is a quarter of `d_vision`, at least 64.
-            heads, kv_heads: query and key heads of the slots' attention; None is a head for each 64 of `hidden`, at
-                least 2, or fewer where these do not divide it into even widths.
-            rotation: `full`, or `cosine_only`: what the released evaluation ran, because its loading dropped the
-                imaginary part of the rotary table.
-            attention_dtype: what queries, keys and values are cast to; `bfloat16` as released; `float32` takes
-                the fused kernel, which keeps no weights: less memory.
+            heads, kv_heads: query and key heads of the slots' attention; None is a head for each 64
+                of `hidden`, at least 2, or fewer where these do not divide it into even widths.
+            rotation: `full`, or `cosine_only`: what the released evaluation ran, because its
+                loading dropped the imaginary part of the rotary table.
+            attention_dtype: what queries, keys and values are cast to; `bfloat16` as released;
+                `float32` takes the fused kernel, which keeps no weights: less memory.
         """
         check_sizes("memory", budget=budget)
         hidden = default_hidden(d_vision, hidden)
-        heads = heads or next(n for n in range(max(2, hidden // 64), 0, -1) if hidden % (2 * n) == 0 or n == 1)
+        heads = heads or next(
+            n for n in range(max(2, hidden // 64), 0, -1) if hidden % (2 * n) == 0 or n == 1
+        )
         layer = RMTLayer(hidden, heads, kv_heads, budget, rotation, attention_dtype)
         super().__init__(d_vision, width, layer, hidden, budget, **options)

@@ -16,7 +16,8 @@ THRESHOLD = 1e-4  # patches that changed less are never candidates
 
 @dataclass
 class ChangeScorer(FrameScorer):
-    """Mean |ΔRGB| per patch, in units of [−1, 1], between every `stride`-th frame and the one scored before it.
+    """Mean |ΔRGB| per patch, in units of [−1, 1], between every `stride`-th frame and the one
+    scored before it.
 
     Frames stride−1, 2·stride−1, … are scored; the first of them against frame 0, as released.
     """
@@ -33,7 +34,9 @@ class ChangeScorer(FrameScorer):
             return None
         height, width, _ = frame.shape
         if height % self.grid or width % self.grid:
-            raise UserError(f"A {height}×{width} frame does not divide into {self.grid}×{self.grid} patches.")
+            raise UserError(
+                f"A {height}×{width} frame does not divide into {self.grid}×{self.grid} patches."
+            )
         image = frame.astype(np.float32) / 255 * 2 - 1
         reference, self._reference = self._reference, image
         if reference is None or frame_index == 0:
@@ -49,7 +52,9 @@ FORMER_KEYS["4a0a7e45"] = "change{grid}x{grid}-every{stride}"
 
 @MEMORIES.register("tokendrop")
 class TokenDrop(PerceptualMemory, ScoringMemory):
-    """The `budget` highest-scored patches up to now, the first frame's among them, in time order."""
+    """The `budget` highest-scored patches up to now, the first frame's among them, in
+    time order.
+    """
 
     def __init__(
         self,
@@ -68,8 +73,9 @@ class TokenDrop(PerceptualMemory, ScoringMemory):
         Args:
             grid: side of a frame's token grid. stride: frames between two scored ones.
             candidates: length of the list of best patches that is kept along an episode.
-            causal: only frames up to the current one compete for that list. False lets the whole episode compete,
-                as the released offline preprocessing does; it needs a finished episode.
+            causal: only frames up to the current one compete for that list. False lets the whole
+                episode compete, as the released offline preprocessing does; it needs a finished
+                episode.
         """
         check_sizes("memory", stride=stride)
         require(
@@ -77,7 +83,9 @@ class TokenDrop(PerceptualMemory, ScoringMemory):
             f"memory.budget={budget} must lie between {grid**2} (the first frame, always kept) and "
             f"memory.candidates={candidates} (the patches a running list holds).",
         )
-        storage = StorageSpec(grid, pooling, keep_every=stride, scorer=ChangeScorer(grid, stride).key)
+        storage = StorageSpec(
+            grid, pooling, keep_every=stride, scorer=ChangeScorer(grid, stride).key
+        )
         super().__init__(d_vision, width, budget, storage, **encoder)
         self.stride, self.candidates, self.causal = stride, candidates, causal
 
@@ -87,27 +95,39 @@ class TokenDrop(PerceptualMemory, ScoringMemory):
     def frames_scored(self, length: int) -> np.ndarray:
         return self.storage.stored_frames(length)
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         patches = self.storage.grid**2
-        if self.causal:  # none lies later, so that the best `budget` of all are the best of the best `candidates`
-            return most_changed(ranked_patches(history.scores.until(step), patches, self.budget), step, self.budget)
-        return most_changed(ranked_patches(history.scores, patches, self.candidates), step, self.budget)
+        # none lies later, so that the best `budget` of all are the best of the best `candidates`
+        if self.causal:
+            return most_changed(
+                ranked_patches(history.scores.until(step), patches, self.budget), step, self.budget
+            )
+        return most_changed(
+            ranked_patches(history.scores, patches, self.candidates), step, self.budget
+        )
 
 
 def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
     """The best `limit` candidates as (frame, patch) [n, 2], ascending by (score, frame, patch).
 
-    This is what a heap of that size holds after all frames have passed; the first frame's patches rank highest.
+    This is what a heap of that size holds after all frames have passed; the first frame's patches
+    rank highest.
     """
     changed = scores.values >= THRESHOLD
     beside = max(limit - patches, 0)  # places that the first frame leaves
-    if np.count_nonzero(changed) > beside > 0:  # sort no more than can stay: an episode's length costs next to nothing
+    if (
+        np.count_nonzero(changed) > beside > 0
+    ):  # sort no more than can stay: an episode's length costs next to nothing
         flat = scores.values.reshape(-1)
         changed &= scores.values >= np.partition(flat, len(flat) - beside)[len(flat) - beside]
     row, patch = np.nonzero(changed)
     frame = np.concatenate([np.zeros(patches, np.int64), scores.frames[row]])
     patch = np.concatenate([np.arange(patches), patch])
-    score = np.concatenate([np.full(patches, FIRST_FRAME_SCORE, np.float32), scores.values[changed]])
+    score = np.concatenate(
+        [np.full(patches, FIRST_FRAME_SCORE, np.float32), scores.values[changed]]
+    )
     order = np.lexsort((patch, frame, score))[-limit:]
     return np.stack([frame[order], patch[order]], axis=1)
 

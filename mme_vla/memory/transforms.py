@@ -1,7 +1,9 @@
-"""Transforms of a history: which frames a policy learns from, and at which times it takes them to be.
+"""Transforms of a history: which frames a policy learns from, and at which times it takes them to
+be.
 
-One object says how often each frame of an episode is observed. In training a dataset applies it to everything that a
-sample reads of the past (`data.history_transforms`), and a probe applies the same object to a running episode.
+One object says how often each frame of an episode is observed. In training a dataset applies it to
+everything that a sample reads of the past (`data.history_transforms`), and a probe applies the same
+object to a running episode.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +23,8 @@ Share = Annotated[float, Range(0.0, 1.0)]
 
 
 class HistoryTransform:
-    """Changes nothing. A subclass overrides what it changes; a dataclass, so that its options are its fields.
+    """Changes nothing. A subclass overrides what it changes; a dataclass, so that its options are
+    its fields.
 
     dial: the option that a probe sets by `name:value`. drops: whether it may leave frames out.
     """
@@ -29,18 +32,23 @@ class HistoryTransform:
     dial: ClassVar[str | None] = None
     drops: ClassVar[bool] = False
 
-    def repeats(self, length: int, exec_start: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        """How often each of the first `length` frames is observed, int64 [length]; 0 leaves one out.
+    def repeats(
+        self, length: int, exec_start: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
+        """How often each of the first `length` frames is observed, int64 [length]; 0 leaves one
+        out.
 
         Args:
             exec_start: the first execution frame, video included.
-            rng: randomness for training; None for the reproducible choice that a probe makes, in which a frame's
-                number depends on no later frame.
+            rng: randomness for training; None for the reproducible choice that a probe makes, in
+                which a frame's number depends on no later frame.
         """
         return np.ones(length, np.int64)
 
     def perturb(self, rows: Tensor, rng: np.random.Generator | None = None) -> Tensor:
-        """Tokens [n, d] of past frames, or what the robot felt and did at them, as they are read."""
+        """Tokens [n, d] of past frames, or what the robot felt and did at them, as
+        they are read.
+        """
         return rows
 
 
@@ -49,8 +57,9 @@ class HistoryTransform:
 class RepeatFrame(HistoryTransform):
     """One frame is repeated `frames` times more, as if the robot had paused.
 
-    at: which, from the first execution frame on; None: any frame in training, the first of the execution in a probe.
-    p: share of the samples that have a pause. In training it has any length from one frame to `frames`.
+    at: which, from the first execution frame on; None: any frame in training, the first of the
+    execution in a probe. p: share of the samples that have a pause. In training it has any length
+    from one frame to `frames`.
     """
 
     frames: NonNegativeInt = 64
@@ -58,11 +67,16 @@ class RepeatFrame(HistoryTransform):
     p: Share = 1.0
     dial: ClassVar = "frames"
 
-    def repeats(self, length: int, exec_start: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def repeats(
+        self, length: int, exec_start: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         counts = np.ones(length, np.int64)
         count, place = self.frames, exec_start + (self.at or 0)
         if rng is not None:
-            selection, count = rng.random() < self.p, int(rng.integers(1, self.frames + 1)) if self.frames else 0
+            selection, count = (
+                rng.random() < self.p,
+                int(rng.integers(1, self.frames + 1)) if self.frames else 0,
+            )
             place = int(rng.integers(length)) if self.at is None else place
             count = count if selection else 0
         if place < length:
@@ -73,13 +87,17 @@ class RepeatFrame(HistoryTransform):
 @HISTORY_TRANSFORMS.register("speed")
 @dataclass(frozen=True)
 class Speed(HistoryTransform):
-    """The past seems to be `factor` times as fast; below 1 it is slower. In training by any factor between it and 1."""
+    """The past seems to be `factor` times as fast; below 1 it is slower. In training by any factor
+    between it and 1.
+    """
 
     factor: Annotated[float, Range(1 / 16, 16.0)] = 2.0
     dial: ClassVar = "factor"
     drops: ClassVar = True
 
-    def repeats(self, length: int, exec_start: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def repeats(
+        self, length: int, exec_start: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         factor = self.factor if rng is None else self.factor ** rng.random()
         edges = np.floor(np.arange(length + 1) / factor).astype(np.int64)
         return np.diff(edges)
@@ -94,7 +112,9 @@ class DropFrames(HistoryTransform):
     dial: ClassVar = "share"
     drops: ClassVar = True
 
-    def repeats(self, length: int, exec_start: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def repeats(
+        self, length: int, exec_start: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         if rng is not None:
             return (rng.random(length) >= self.share).astype(np.int64)
         return 1 - np.diff(np.floor(np.arange(length + 1) * self.share)).astype(np.int64)
@@ -103,7 +123,9 @@ class DropFrames(HistoryTransform):
 @HISTORY_TRANSFORMS.register("noise")
 @dataclass(frozen=True)
 class Noise(HistoryTransform):
-    """Gaussian noise on what is read of the past; `std` is in standard deviations of the numbers that are read."""
+    """Gaussian noise on what is read of the past; `std` is in standard deviations of the numbers
+    that are read.
+    """
 
     std: NonNegative = 0.1
     dial: ClassVar = "std"
@@ -137,8 +159,8 @@ def build_transforms(entries: Any) -> tuple[HistoryTransform, ...]:
             and not isinstance(entries, str)
             and all(isinstance(e, str) or (isinstance(e, Mapping) and "name" in e) for e in entries)
         ),
-        f"history_transforms={entries}: write a list of names or of mappings with a name, such as [repeat_frame] or "
-        "[{name: speed, factor: 2}].",
+        f"history_transforms={entries}: write a list of names or of mappings with a name, such as"
+        " [repeat_frame] or [{name: speed, factor: 2}].",
     )
     return tuple(build_transform(entry) for entry in entries or ())
 
@@ -147,8 +169,9 @@ def build_transforms(entries: Any) -> tuple[HistoryTransform, ...]:
 class FrameMap:
     """The one map from the frames of a transformed episode to those that were recorded.
 
-    real: int64 [n], ascending; the recorded frame of each transformed one, up to the current one. exec_start: the first
-    transformed frame of the execution. transforms, rng: what made it, and perturbs what is read.
+    real: int64 [n], ascending; the recorded frame of each transformed one, up to the current one.
+    exec_start: the first transformed frame of the execution. transforms, rng: what made it, and
+    perturbs what is read.
     """
 
     real: np.ndarray
@@ -157,7 +180,9 @@ class FrameMap:
     rng: np.random.Generator | None = None
 
     def transformed(self, frames: np.ndarray) -> np.ndarray:
-        """The last transformed frame that shows each of these recorded ones, or one before it; int64, at least 0."""
+        """The last transformed frame that shows each of these recorded ones, or one before it;
+        int64, at least 0.
+        """
         return np.maximum(np.searchsorted(self.real, frames, side="right") - 1, 0)
 
     def perturb(self, rows: Tensor) -> Tensor:
@@ -177,8 +202,8 @@ def map_frames(
     """Apply transforms one after the other to the first `length` frames of an episode.
 
     Args:
-        rng: see `HistoryTransform.repeats`. keep: frames that stay whatever the transforms leave out: those at which
-            the policy decides.
+        rng: see `HistoryTransform.repeats`. keep: frames that stay whatever the transforms leave
+            out: those at which the policy decides.
     """
     real, retained = np.arange(length), np.asarray(keep, np.int64)
     for transform in transforms:
@@ -186,8 +211,9 @@ def map_frames(
         counts = np.array(transform.repeats(len(real), start, rng), np.int64)
         require(
             counts.shape == real.shape and (counts >= 0).all(),
-            f"{type(transform).__name__}.repeats returned {counts.shape} numbers, the least {counts.min(initial=0)}: "
-            f"it must return one for each of {len(real)} frames, 0 or more.",
+            f"{type(transform).__name__}.repeats returned {counts.shape} numbers, the least"
+            f" {counts.min(initial=0)}: it must return one for each of {len(real)} frames, 0 or"
+            " more.",
         )
         last = np.searchsorted(real, retained, side="right") - 1
         counts[last] = np.maximum(counts[last], 1)
@@ -196,7 +222,9 @@ def map_frames(
 
 
 class TransformedHistory(History):
-    """A history as transforms show it. A frame without tokens is replaced by the newest stored one before it."""
+    """A history as transforms show it. A frame without tokens is replaced by the newest stored one
+    before it.
+    """
 
     def __init__(self, source: History, frames: FrameMap) -> None:
         super().__init__(source.spec, frames.exec_start)
@@ -224,7 +252,9 @@ class TransformedHistory(History):
         stored = self._source.stored_frames
         real = self._frames.real[indices[:, 0]]
         places = np.maximum(np.searchsorted(stored, real, side="right") - 1, 0)
-        return self._frames.perturb(self._source.gather(np.stack([stored[places], indices[:, 1]], 1)))
+        return self._frames.perturb(
+            self._source.gather(np.stack([stored[places], indices[:, 1]], 1))
+        )
 
     def _motion(self, frames: np.ndarray) -> Tensor:
         return self._frames.perturb(self._source.motion_rows(self._frames.real[frames]))

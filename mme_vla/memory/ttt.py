@@ -1,4 +1,6 @@
-"""TTT: memory as the weights of a small linear model that learns from every frame as it comes (paper, section 4.2)."""
+"""TTT: memory as the weights of a small linear model that learns from every frame as it comes
+(paper, section 4.2).
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -35,14 +37,15 @@ class InnerOutput(NamedTuple):
 
 
 class TTTLayer(RecurrentLayer):
-    """Per head, a linear model W, b with an RMS norm N, trained to map keys to (value − key) by one step a frame.
+    """Per head, a linear model W, b with an RMS norm N, trained to map keys to (value − key) by one
+    step a frame.
 
-    The loss of a frame is Σ ½‖N(kW + b) − (v − k)‖², each token weighted by a learned rate; gradients of W and of b
-    are clipped by norm, each for itself. A frame's output, N(qW + b) + q, uses the weights it has just updated. N is
-    trained with the network and does not change inside.
+    The loss of a frame is Σ ½‖N(kW + b) − (v − k)‖², each token weighted by a learned rate;
+    gradients of W and of b are clipped by norm, each for itself. A frame's output, N(qW + b) + q,
+    uses the weights it has just updated. N is trained with the network and does not change inside.
 
-    State: W [b, h, d/h, d/h], b [b, h, d/h], the outputs of the last frames [b, r, p, d] and which of these were real
-    [b, r]. W and b are carried in the dtype their initial values are stored in.
+    State: W [b, h, d/h, d/h], b [b, h, d/h], the outputs of the last frames [b, r, p, d] and which
+    of these were real [b, r]. W and b are carried in the dtype their initial values are stored in.
     """
 
     def __init__(
@@ -56,11 +59,21 @@ class TTTLayer(RecurrentLayer):
         max_grad_norm: float,
     ) -> None:
         super().__init__()
-        require(hidden % heads == 0, f"memory.hidden={hidden} must be a multiple of memory.heads={heads}.")
+        require(
+            hidden % heads == 0,
+            f"memory.hidden={hidden} must be a multiple of memory.heads={heads}.",
+        )
         positive = min(base_rate, max_rate, max_grad_norm) > 0
-        require(positive, "memory.base_rate, memory.max_rate and memory.max_grad_norm must be above 0.")
+        require(
+            positive, "memory.base_rate, memory.max_rate and memory.max_grad_norm must be above 0."
+        )
         width = hidden // heads
-        self.heads, self.budget, self.patches, self.window = heads, budget, patches, -(-budget // patches)
+        self.heads, self.budget, self.patches, self.window = (
+            heads,
+            budget,
+            patches,
+            -(-budget // patches),
+        )
         self.base_rate, self.max_rate, self.max_grad_norm = base_rate, max_rate, max_grad_norm
         self.q, self.k, self.v, self.out = (nn.Linear(hidden, hidden, bias=False) for _ in range(4))
         self.q_norm, self.k_norm, self.v_norm = (nn.LayerNorm(width, eps=EPS) for _ in range(3))
@@ -69,7 +82,13 @@ class TTTLayer(RecurrentLayer):
         self.weight = nn.Parameter(torch.randn(heads, width, width) * width**-0.5)
         self.bias = nn.Parameter(torch.zeros(heads, width))
         self.inner_norm = nn.Parameter(torch.zeros(heads, 2, width))  # N's scale and shift
-        for layer, std in ((self.q, 0.02), (self.k, 0.02), (self.rate, 0.02), (self.v, 0.01), (self.out, 0.01)):
+        for layer, std in (
+            (self.q, 0.02),
+            (self.k, 0.02),
+            (self.rate, 0.02),
+            (self.v, 0.01),
+            (self.out, 0.01),
+        ):
             nn.init.normal_(layer.weight, std=std)
         nn.init.zeros_(self.rate.bias)
 
@@ -80,7 +99,9 @@ class TTTLayer(RecurrentLayer):
 
     def initial(self, batch: int) -> State:
         window = -(-self.budget // self.patches)
-        outputs = self.weight.new_zeros(batch, window, self.patches, self.out.out_features, dtype=torch.float32)
+        outputs = self.weight.new_zeros(
+            batch, window, self.patches, self.out.out_features, dtype=torch.float32
+        )
         window_valid = torch.zeros(batch, window, dtype=torch.bool, device=outputs.device)
         weight, bias = (p.expand(batch, *p.shape) for p in (self.weight, self.bias))
         return weight, bias, outputs, window_valid
@@ -104,7 +125,10 @@ class TTTLayer(RecurrentLayer):
             answers, numbers = [], []
             for t in range(steps):
                 real = valid[:, t, None, None]
-                before, updated = (weight, bias), self.learn(weight, bias, k[:, t], v[:, t], rate[:, t])
+                before, updated = (
+                    (weight, bias),
+                    self.learn(weight, bias, k[:, t], v[:, t], rate[:, t]),
+                )
                 weight = torch.where(real[..., None], updated[0], weight)
                 bias = torch.where(real, updated[1], bias)
                 if t >= first_read:
@@ -112,13 +136,18 @@ class TTTLayer(RecurrentLayer):
                     output = self.inner(weight, bias, query).output + query
                     answers.append(torch.where(real[..., None], output, 0))
                 if statistics:
-                    numbers.append(self._statistics(before, (weight, bias), k[:, t], v[:, t], updated[2]))
+                    numbers.append(
+                        self._statistics(before, (weight, bias), k[:, t], v[:, t], updated[2])
+                    )
             if read:
                 mixed = torch.stack(answers, 1).transpose(2, 3).flatten(3)  # b t p d
                 y = x[:, first_read:] + linear(self.out, layer_norm(self.out_norm, mixed))
                 outputs = torch.cat([outputs, y], 1)[:, -window:]
                 window_valid = torch.cat([window_valid, valid[:, first_read:]], 1)[:, -window:]
-            per_step = {name: torch.stack([n[name] for n in numbers], 1) for name in (numbers[0] if numbers else ())}
+            per_step = {
+                name: torch.stack([n[name] for n in numbers], 1)
+                for name in (numbers[0] if numbers else ())
+            }
             if statistics:
                 per_step["step_size"] = rate.detach().mean((2, 3, 4))
                 per_step["clipped_rates"] = (raw.detach() > self.max_rate).float().mean((2, 3))
@@ -142,22 +171,36 @@ class TTTLayer(RecurrentLayer):
         scale, shift = self.inner_norm.float().unbind(1)
         return InnerOutput(unit * (1 + scale[:, None]) + shift[:, None], unit, inverse_rms)
 
-    def learn(self, weight: Tensor, bias: Tensor, k: Tensor, v: Tensor, rate: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One gradient step on one frame: new W, new b, and the norms of both gradients [b, h, 2] before clipping."""
+    def learn(
+        self, weight: Tensor, bias: Tensor, k: Tensor, v: Tensor, rate: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One gradient step on one frame: new W, new b, and the norms of both gradients [b, h, 2]
+        before clipping.
+        """
         output, unit, inverse_rms = self.inner(weight, bias, k)
         error = (output - (v - k)) * (1 + self.inner_norm[:, 0, None].float())
-        delta = rate * inverse_rms * (error - unit * (error * unit).mean(-1, keepdim=True))  # b h p w
+        delta = (
+            rate * inverse_rms * (error - unit * (error * unit).mean(-1, keepdim=True))
+        )  # b h p w
         of_weight, of_bias = k.transpose(-1, -2) @ delta, delta.sum(-2)
         norms = torch.stack(
-            [torch.linalg.vector_norm(of_weight, dim=(-2, -1)), torch.linalg.vector_norm(of_bias, dim=-1)], -1
+            [
+                torch.linalg.vector_norm(of_weight, dim=(-2, -1)),
+                torch.linalg.vector_norm(of_bias, dim=-1),
+            ],
+            -1,
         )
-        factor = torch.where(norms > self.max_grad_norm, self.max_grad_norm / (norms + INNER_EPS), 1.0)
+        factor = torch.where(
+            norms > self.max_grad_norm, self.max_grad_norm / (norms + INNER_EPS), 1.0
+        )
         new_weight = weight.float() - of_weight * factor[..., :1, None]
         new_bias = bias.float() - of_bias * factor[..., 1:]
         return new_weight.to(weight.dtype), new_bias.to(bias.dtype), norms
 
     @torch.no_grad()
-    def _statistics(self, before: Weights, after: Weights, k: Tensor, v: Tensor, norms: Tensor) -> Statistics:
+    def _statistics(
+        self, before: Weights, after: Weights, k: Tensor, v: Tensor, norms: Tensor
+    ) -> Statistics:
         def loss(weights: Weights) -> Tensor:
             return (self.inner(*weights, k).output - (v - k)).square().mean((1, 2, 3))
 
@@ -173,7 +216,9 @@ class TTTLayer(RecurrentLayer):
 
 @MEMORIES.register("ttt")
 class TTT(RecurrentMemory):
-    """The outputs of the last budget / grid² frames, from weights that have learned from all frames before them."""
+    """The outputs of the last budget / grid² frames, from weights that have learned from all frames
+    before them.
+    """
 
     def __init__(
         self,
@@ -192,15 +237,18 @@ class TTT(RecurrentMemory):
         """See `RecurrentMemory` and `TTTLayer`.
 
         Args:
-            hidden: width of the recurrence; None is a quarter of `d_vision`, at least 64. heads: inner models.
+            hidden: width of the recurrence; None is a quarter of `d_vision`, at least 64. heads:
+                inner models.
             base_rate: inner learning rate at the start. max_rate: its ceiling, per token and head.
             max_grad_norm: ceiling of an inner gradient's norm.
         """
         require(
             0 < budget <= max_steps * grid**2,
-            f"memory.budget={budget} must lie between 1 and memory.max_steps × grid² = {max_steps * grid**2}: "
-            "TTT hands over one token for each it reads.",
+            f"memory.budget={budget} must lie between 1 and memory.max_steps × grid² ="
+            f" {max_steps * grid**2}: TTT hands over one token for each it reads.",
         )
         hidden = default_hidden(d_vision, hidden)
         layer = TTTLayer(hidden, heads, budget, grid**2, base_rate, max_rate, max_grad_norm)
-        super().__init__(d_vision, width, layer, hidden, budget, grid, max_steps=max_steps, **options)
+        super().__init__(
+            d_vision, width, layer, hidden, budget, grid, max_steps=max_steps, **options
+        )

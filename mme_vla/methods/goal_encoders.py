@@ -1,4 +1,6 @@
-"""The goal's words through an encoder that does not learn: asked once for each goal, and known by its name alone."""
+"""The goal's words through an encoder that does not learn: asked once for each goal, and known by
+its name alone.
+"""
 
 import hashlib
 from functools import cached_property
@@ -22,7 +24,9 @@ HASHED = "hashed"
 
 
 class GoalEncoder:
-    """Texts → numbers `width` wide. Nothing of it learns, and nothing is saved with a policy but its name."""
+    """Texts → numbers `width` wide. Nothing of it learns, and nothing is saved with a policy but
+    its name.
+    """
 
     def __init__(self, width: int) -> None:
         self.width = width
@@ -51,8 +55,8 @@ class ClipEncoder(GoalEncoder):
     Args:
         source: the hub's name of a CLIP, or a folder as transformers writes them.
 
-    method: what it is for. tower: its class in transformers. size, option: how its configuration and this library's
-    call the width.
+    method: what it is for. tower: its class in transformers. size, option: how its configuration
+    and this library's call the width.
     """
 
     method: ClassVar[str]
@@ -77,14 +81,15 @@ class ClipEncoder(GoalEncoder):
             tower = getattr(transformers, self.tower).from_pretrained(self.source)
         except (OSError, ValueError) as error:
             raise UserError(
-                f"The text tower {self.source} cannot be had ({str(error).splitlines()[0]}). Connect once so that it "
-                "is kept, give a folder that holds it (processor.text=<folder>), or try things out with "
-                "processor.text=hashed."
+                f"The text tower {self.source} cannot be had ({str(error).splitlines()[0]})."
+                " Connect once so that it is kept, give a folder that holds it"
+                " (processor.text=<folder>), or try things out with processor.text=hashed."
             ) from None
         width = getattr(tower.config, self.size)
         require(
             width == self.width,
-            f"{self.source} gives {width} numbers, the network reads {self.width}: set {self.option}.",
+            f"{self.source} gives {width} numbers, the network reads {self.width}: set"
+            f" {self.option}.",
         )
         return tokenizer, tower.eval().requires_grad_(False)
 
@@ -92,7 +97,8 @@ class ClipEncoder(GoalEncoder):
 class GoalProcessor(PolicyProcessor):
     """A processor whose prompt is what its encoder `text` makes of the goal; nothing else is read.
 
-    name: the processor's in `processor.json`. trusted: encoders that are taken on a checkpoint's word.
+    name: the processor's in `processor.json`. trusted: encoders that are taken on a checkpoint's
+    word.
     """
 
     name: ClassVar[str]
@@ -123,17 +129,23 @@ class GoalProcessor(PolicyProcessor):
         """
         folder = Path(folder)
         settings = read_settings(folder)
-        require(settings.pop("name", None) == cls.name, f"{folder} holds a processor of another kind of policy.")
+        require(
+            settings.pop("name", None) == cls.name,
+            f"{folder} holds a processor of another kind of policy.",
+        )
         text, stats = settings.get("text"), settings.pop("stats", None)
         if tokenizer is not None:
             settings["text"] = str(tokenizer)
         elif text not in cls.trusted:
             raise UserError(
-                f"{folder} takes its text tower from {brief(text, 200)}, which is not read on a checkpoint's word. If "
-                f"you trust it: from_pretrained(…, tokenizer={brief(text, 200)})."
+                f"{folder} takes its text tower from {brief(text, 200)}, which is not read on a"
+                " checkpoint's word. If you trust it: from_pretrained(…,"
+                f" tokenizer={brief(text, 200)})."
             )
         try:
-            options: dict[str, Any] = {"embodiment": Embodiment.from_dict(settings.pop("embodiment", {}))}
+            options: dict[str, Any] = {
+                "embodiment": Embodiment.from_dict(settings.pop("embodiment", {}))
+            }
             if stats is not None:
                 require(isinstance(stats, str), f"stats={brief(stats)} must be the name of a file.")
                 options["stats"] = NormStats.load(checked_file(folder, stats, "statistics"))

@@ -1,1 +1,3 @@
-"""nanoMME: small policies that show on a laptop what memory is good for, from demonstrations to a page of results."""
+"""nanoMME: small policies that show on a laptop what memory is good for, from demonstrations to a
+page of results.
+"""

@@ -1,7 +1,8 @@
 """Demonstrations rendered only at their decisions, and at the frames that memories read there.
 
-An episode of planned motions has a handful of decisions, known when it is over. The poses of every frame are kept; then
-the required frames are restored and rendered. That takes a second where rendering all takes ten.
+An episode of planned motions has a handful of decisions, known when it is over. The poses of every
+frame are kept; then the required frames are restored and rendered. That takes a second where
+rendering all takes ten.
 """
 
 import json
@@ -35,10 +36,11 @@ SUBGOALS = ("simple", "grounded")
 class Demonstration:
     """One episode of a task, with images of some frames.
 
-    length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its decisions.
-    subgoals: `simple` and `grounded` → what the simulator says at each decision, as it says it at test
-    time. images: camera → frame → [256, 256, 3] uint8. boundaries: frames at which a sub-task begins, of the video too;
-    None in files of earlier versions. carried_out: whether its motions were carried out one by one, see `record`.
+    length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its
+    decisions. subgoals: `simple` and `grounded` → what the simulator says at each decision, as it
+    says it at test time. images: camera → frame → [256, 256, 3] uint8. boundaries: frames at which
+    a sub-task begins, of the video too; None in files of earlier versions. carried_out: whether its
+    motions were carried out one by one, see `record`.
     """
 
     task: str
@@ -56,9 +58,22 @@ class Demonstration:
 
     def save(self, path: Path) -> None:
         """Write it as one file, which appears whole or not at all."""
-        names = ("task", "seed", "difficulty", "goal", "length", "exec_start", "subgoals", "carried_out")
+        names = (
+            "task",
+            "seed",
+            "difficulty",
+            "goal",
+            "length",
+            "exec_start",
+            "subgoals",
+            "carried_out",
+        )
         about = {name: getattr(self, name) for name in names}
-        arrays = {"states": self.states, "decisions": self.motions.decisions, "targets": self.motions.targets}
+        arrays = {
+            "states": self.states,
+            "decisions": self.motions.decisions,
+            "targets": self.motions.targets,
+        }
         if self.boundaries is not None:
             arrays["boundaries"] = self.boundaries
         for camera, taken in self.images.items():
@@ -72,14 +87,22 @@ class Demonstration:
         """Read what `save` wrote, or what of it is no image."""
         with np.load(path) as file:
             loaded_images = {
-                camera: dict(zip(file[f"{camera}_frames"].tolist(), file[f"{camera}_pictures"], strict=True))
+                camera: dict(
+                    zip(file[f"{camera}_frames"].tolist(), file[f"{camera}_pictures"], strict=True)
+                )
                 for camera in CAMERAS
                 if images and f"{camera}_frames" in file
             }
             motions = Motions(file["decisions"], file["targets"])
             about = parse_json(str(file["about"]), str(path))
             boundaries = file.get("boundaries")
-            return cls(**about, states=file["states"], motions=motions, images=loaded_images, boundaries=boundaries)
+            return cls(
+                **about,
+                states=file["states"],
+                motions=motions,
+                images=loaded_images,
+                boundaries=boundaries,
+            )
 
 
 @dataclass(frozen=True)
@@ -111,7 +134,9 @@ class Scene:
 
     @property
     def made(self) -> bool:
-        """Whether its demonstration is there; one that failed later, for other frames, does not count."""
+        """Whether its demonstration is there; one that failed later, for other frames, does not
+        count.
+        """
         return self.path.is_file() and not self.failed.is_file()
 
     @property
@@ -130,11 +155,15 @@ class Scene:
             required = width if self.acts is None else self.acts.width
             require(
                 (carried_out, width) == (self.carried_out, required),
-                f"{self.path} holds actions of {width} numbers with carried_out={carried_out}, and this command "
-                f"records {required} with carried_out={self.carried_out}: choose another output.",
+                f"{self.path} holds actions of {width} numbers with carried_out={carried_out}, and"
+                f" this command records {required} with carried_out={self.carried_out}: choose"
+                " another output.",
             )
             decisions = [file["decisions"][:: choice.every] for choice in self.choices]
-            read = [choice.read(at, about["exec_start"]) for choice, at in zip(self.choices, decisions, strict=True)]
+            read = [
+                choice.read(at, about["exec_start"])
+                for choice, at in zip(self.choices, decisions, strict=True)
+            ]
             for camera in self.cameras:
                 rendered = set(file.get(f"{camera}_frames", np.zeros(0, np.int64)).tolist())
                 if not set().union(*(read if camera == "front" else decisions)) <= rendered:
@@ -144,7 +173,15 @@ class Scene:
 
 def demonstrated(scene: Scene) -> bool:
     """Demonstrate a scene into its file; whether the demonstrator succeeded."""
-    made = record(scene.task, scene.seed, scene.difficulty, scene.choices, scene.cameras, scene.carried_out, scene.acts)
+    made = record(
+        scene.task,
+        scene.seed,
+        scene.difficulty,
+        scene.choices,
+        scene.cameras,
+        scene.carried_out,
+        scene.acts,
+    )
     if made is None:
         scene.failed.touch()
         return False
@@ -164,11 +201,13 @@ def record(
     """Demonstrate an episode; None where the demonstrator does not succeed.
 
     Args:
-        choices: what the memories that will train on it read; these cameras render the frames of all of them.
-        carried_out: render the frames while the demonstration's motions are carried out one by one, as a policy's are;
-            None too where that does not succeed. The demonstrator makes more steps between some of its motions.
-        acts: of the robot that will learn from it. Where it chooses among options, the choices stand in place of
-            motions, and the options behind the goal; None: motions.
+        choices: what the memories that will train on it read; these cameras render the frames of
+            all of them.
+        carried_out: render the frames while the demonstration's motions are carried out one by one,
+            as a policy's are; None too where that does not succeed. The demonstrator makes more
+            steps between some of its motions.
+        acts: of the robot that will learn from it. Where it chooses among options, the choices
+            stand in place of motions, and the options behind the goal; None: motions.
     """
     from mme_vla.envs.scene.placement import SceneError
 
@@ -187,10 +226,15 @@ def record(
             motions = _carry_out(taken, motions.targets, chooser)
         if motions is None:
             return None
-        frame_lists = [motions.decisions[:: choice.every] for choice in choices] or [motions.decisions]
+        frame_lists = [motions.decisions[:: choice.every] for choice in choices] or [
+            motions.decisions
+        ]
         at = {frame for frames in frame_lists for frame in frames.tolist()}
         read = at.union(
-            *(choice.read(frames, taken.video) for choice, frames in zip(choices, frame_lists, strict=False))
+            *(
+                choice.read(frames, taken.video)
+                for choice, frames in zip(choices, frame_lists, strict=False)
+            )
         )
         required = {camera: read if camera == "front" else at for camera in cameras}
         images: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
@@ -207,9 +251,19 @@ def record(
         )
         subgoals = {kind: _subgoal_texts(taken.texts, motions.decisions, kind) for kind in SUBGOALS}
         return Demonstration(
-            type(env).__name__, seed, difficulty, goal, len(taken.states), taken.video,
-            np.stack(taken.states), motions, images, subgoals, _boundaries(taken.texts), carried_out,
-        )  # fmt: skip
+            type(env).__name__,
+            seed,
+            difficulty,
+            goal,
+            len(taken.states),
+            taken.video,
+            np.stack(taken.states),
+            motions,
+            images,
+            subgoals,
+            _boundaries(taken.texts),
+            carried_out,
+        )
     finally:
         env.close()
 
@@ -217,8 +271,9 @@ def record(
 class _Taken:
     """What is noted of every frame of an episode; `video` of them come before its execution.
 
-    A snapshot of the scene is read from the simulator's own objects, without velocities: that takes a tenth of what
-    `get_state_dict` takes, and brings back marks and traces, which belong to no thing of the task.
+    A snapshot of the scene is read from the simulator's own objects, without velocities: that takes
+    a tenth of what `get_state_dict` takes, and brings back marks and traces, which belong to no
+    thing of the task.
     """
 
     def __init__(self, env: "Task") -> None:
@@ -243,7 +298,9 @@ class _Taken:
         from sapien.render import RenderBodyComponent
 
         scene = self.env.scene
-        self._entities = [actor._objs[0] for actor in scene.actors.values() if actor.px_body_type != "static"]
+        self._entities = [
+            actor._objs[0] for actor in scene.actors.values() if actor.px_body_type != "static"
+        ]
         bodies = [entity.find_component_by_type(RenderBodyComponent) for entity in self._entities]
         self._bodies = [body for body in bodies if body is not None]
         self._articulations = [each._objs[0] for each in scene.articulations.values()]
@@ -262,7 +319,10 @@ class _Taken:
 
 def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
     """What a task offers to choose from."""
-    options = [Option(choice.label, choice.action, choice.needs_point).to_dict() for choice in env.choices()]
+    options = [
+        Option(choice.label, choice.action, choice.needs_point).to_dict()
+        for choice in env.choices()
+    ]
     return read_options(options, len(chooser.choice))
 
 
@@ -284,7 +344,9 @@ def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
 
 
 def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None") -> Motions | None:
-    """Carry out motions [m, 7], or choices [m, 10], from the start to success; those it took, None if it fails."""
+    """Carry out motions [m, 7], or choices [m, 10], from the start to success; those it took, None
+    if it fails.
+    """
     from mme_vla.envs.interface import RoboMMEEnv
 
     env = RoboMMEEnv(taken.env, "waypoint" if chooser is None else "multi_choice")
@@ -294,27 +356,37 @@ def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None"
     decisions = []
     for number, target in enumerate(targets, 1):
         decisions.append(len(taken.states) - 1)
-        _, _, ended, _, info = env.step(target if chooser is None else benchmark_action(chooser, target))
+        _, _, ended, _, info = env.step(
+            target if chooser is None else benchmark_action(chooser, target)
+        )
         if ended:
             done = info["status"] == "success"
             return Motions(np.array(decisions, np.int64), targets[:number]) if done else None
     return None
 
 
-def _subgoal_texts(texts: Sequence[Mapping[str, Any]], decisions: np.ndarray, kind: str) -> list[str]:
+def _subgoal_texts(
+    texts: Sequence[Mapping[str, Any]], decisions: np.ndarray, kind: str
+) -> list[str]:
     """The subgoal at each decision; where the simulator names none, the last one stays.
 
-    At the frame that ends a video the simulator may name none yet. The next one stands there, which an environment
-    reports after its reset.
+    At the frame that ends a video the simulator may name none yet. The next one stands there, which
+    an environment reports after its reset.
     """
     named = [online_subgoal(text, kind) for text in texts]
     result: list[str] = []
     for frame in decisions:
-        result.append(named[frame] or (result[-1] if result else next(filter(None, named[frame:]), "")))
+        result.append(
+            named[frame] or (result[-1] if result else next(filter(None, named[frame:]), ""))
+        )
     return result
 
 
 def _boundaries(texts: Sequence[Mapping[str, Any]]) -> np.ndarray:
-    """Frames at which a sub-task begins: where the recorded subgoal changes, as in `data.columns`."""
+    """Frames at which a sub-task begins: where the recorded subgoal changes, as in
+    `data.columns`.
+    """
     subgoals = [text.get("simple_subgoal", text.get("simple_subgoal_online")) for text in texts]
-    return np.array([i for i, text in enumerate(subgoals) if not i or text != subgoals[i - 1]], np.int64)
+    return np.array(
+        [i for i, text in enumerate(subgoals) if not i or text != subgoals[i - 1]], np.int64
+    )

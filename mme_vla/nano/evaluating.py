@@ -1,4 +1,6 @@
-"""Rows in closed loop: policies, the floors and ceilings beside them, and the scenes that all of them see."""
+"""Rows in closed loop: policies, the floors and ceilings beside them, and the scenes that all of
+them see.
+"""
 
 import shutil
 from collections import Counter, defaultdict
@@ -18,7 +20,13 @@ from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import VIDEOS, choose_shard, evaluate, facts_of, predictor_of
+from mme_vla.evaluation.rollout.evaluation import (
+    VIDEOS,
+    choose_shard,
+    evaluate,
+    facts_of,
+    predictor_of,
+)
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
 from mme_vla.nano.demonstrations import Demonstration
@@ -36,7 +44,9 @@ from mme_vla.utils import read_json, write_json
 
 PLANNER, DEMONSTRATOR, RANDOM, FREQUENT = "planner", "demonstrator", "random", "frequent"
 ORACLE_FRAMES = "oracle_frames"
-"""The ceiling of a memory that chooses frames: its policies, which choose among those at which a sub-task began."""
+"""The ceiling of a memory that chooses frames: its policies, which choose among those at which a
+sub-task began.
+"""
 KINDS = {PLANNER: "ceiling", DEMONSTRATOR: "ceiling", RANDOM: "floor", FREQUENT: "floor"}
 ORACLE = "oracle"
 
@@ -45,9 +55,9 @@ ORACLE = "oracle"
 class Rules:
     """How episodes are run; `max_choices` and `only_possible` are nano's own.
 
-    seed: of a policy's noise. max_steps: control steps until the outcome is timeout; 0: as many as the split allows.
-    max_choices: actions until it is; None: no limit for policies, `MAX_CHOICES` for rows without a training.
-    only_possible: offer no option whose every object is out of reach.
+    seed: of a policy's noise. max_steps: control steps until the outcome is timeout; 0: as many as
+    the split allows. max_choices: actions until it is; None: no limit for policies, `MAX_CHOICES`
+    for rows without a training. only_possible: offer no option whose every object is out of reach.
     shard: which of several processes this is, `0/2` or `1/2`; None: the only one.
     """
 
@@ -91,7 +101,9 @@ class FrequentPlayer(Player):
 
 
 def frequent_moves(files: Sequence[Path], space: Any) -> dict[str, list[dict[str, Any]]]:
-    """Task → for each place in an episode the most frequent letter, and the middle of its points in pixels."""
+    """Task → for each place in an episode the most frequent letter, and the middle of its points in
+    pixels.
+    """
     made: dict[str, dict[int, list[np.ndarray]]] = defaultdict(lambda: defaultdict(list))
     for file in files:
         demonstration = Demonstration.load(file, images=False)
@@ -103,9 +115,14 @@ def frequent_moves(files: Sequence[Path], space: Any) -> dict[str, list[dict[str
         letters = table[:, list(space.choice)].argmax(1)
         best = Counter(letters.tolist()).most_common(1)[0][0]
         action = benchmark_action(space, np.median(table[letters == best], axis=0))
-        return {"choice": str(action["choice"]).lower(), "point": [float(x) for x in action["point"]]}
+        return {
+            "choice": str(action["choice"]).lower(),
+            "point": [float(x) for x in action["point"]],
+        }
 
-    return {task: [move(rows) for _, rows in sorted(places.items())] for task, places in made.items()}
+    return {
+        task: [move(rows) for _, rows in sorted(places.items())] for task, places in made.items()
+    }
 
 
 def play_episode(job: Play) -> EpisodeRecord:
@@ -125,13 +142,19 @@ def play_episode(job: Play) -> EpisodeRecord:
     finally:
         session.close()
     outcome = "fail" if record.outcome == "error" else record.outcome
-    return replace(record, outcome=outcome, error=None, extra={"refused": record.error} if record.error else {})
+    return replace(
+        record, outcome=outcome, error=None, extra={"refused": record.error} if record.error else {}
+    )
 
 
 def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
-    """Demonstrate an episode without images, and repeat the planned motions in the environment of the policies."""
+    """Demonstrate an episode without images, and repeat the planned motions in the environment of
+    the policies.
+    """
     motions = _planned(spec)
-    env = make_env(spec.task, spec.split, spec.episode, "waypoint", max_steps=max_steps, render=False)
+    env = make_env(
+        spec.task, spec.split, spec.episode, "waypoint", max_steps=max_steps, render=False
+    )
     status = "fail"
     try:
         env.reset()
@@ -145,11 +168,21 @@ def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
     finally:
         env.close()
     return EpisodeRecord(
-        PLANNER, "none", 0, spec.task, spec.episode, spec.seed, spec.difficulty,
-        status if status in ("success", "fail", "timeout") else "fail", steps, split=spec.split,
-        max_steps=max_steps, action_space="waypoint", extra={"status": status, "demonstrated": motions is not None},
+        PLANNER,
+        "none",
+        0,
+        spec.task,
+        spec.episode,
+        spec.seed,
+        spec.difficulty,
+        status if status in ("success", "fail", "timeout") else "fail",
+        steps,
+        split=spec.split,
+        max_steps=max_steps,
+        action_space="waypoint",
+        extra={"status": status, "demonstrated": motions is not None},
         scene=scene,
-    )  # fmt: skip
+    )
 
 
 def _planned(spec: EpisodeSpec) -> Motions | None:
@@ -171,7 +204,9 @@ def _planned(spec: EpisodeSpec) -> Motions | None:
 def play_all(
     name: str, folder: Path, specs: Sequence[EpisodeSpec], rules: Rules, moves: Mapping[str, Any]
 ) -> list[EpisodeRecord]:
-    """A row that nothing was trained for: plays what `folder` has no record of yet; its records of these episodes."""
+    """A row that nothing was trained for: plays what `folder` has no record of yet; its records of
+    these episodes.
+    """
     from mme_vla.envs.recording.processes import carry_out
 
     settings = {**asdict(rules), "model": name, "max_steps": rules.steps}
@@ -198,23 +233,38 @@ def run_episodes(
     video: str = "none",
     oracle: bool = False,
 ) -> list[EpisodeRecord]:
-    """Run what `folder` has no record of yet; all records. A policy that reads subgoals gets the simulator's.
+    """Run what `folder` has no record of yet; all records. A policy that reads subgoals gets the
+    simulator's.
 
-    oracle: the memory chooses among the frames at which a sub-task began, as the probe's arm of this name.
+    oracle: the memory chooses among the frames at which a sub-task began, as the probe's arm of
+    this name.
     """
     policy: Policy = MMEPolicy.from_pretrained(str(checkpoint)).eval()
     subgoals = predictor_of(policy, None if subgoal_kind(policy) is None else ORACLE)
-    settings = RolloutSettings.from_config({
-        "seed": rules.seed, "split": rules.split, "max_steps": rules.steps, "workers": rules.workers,
-        "max_actions": rules.max_choices, "only_possible": rules.only_possible, "video": video,
-    })  # fmt: skip
+    settings = RolloutSettings.from_config(
+        {
+            "seed": rules.seed,
+            "split": rules.split,
+            "max_steps": rules.steps,
+            "workers": rules.workers,
+            "max_actions": rules.max_choices,
+            "only_possible": rules.only_possible,
+            "video": video,
+        }
+    )
     facts = facts_of(policy, None, str(checkpoint), settings, None if subgoals is None else ORACLE)
     facts = replace(facts, checkpoint=checkpoint.name)
     if oracle:
         arm = read_arm(ORACLE)
         why = lacking(arm, policy, channel_of(policy), 0, boundaries=True)
-        require(why is None, f"oracle={facts.model}: it needs {why}. Name another model, or set oracle=null.")
-        policy, facts = ProbedPolicy(policy, arm).eval(), replace(facts, model=named(facts.model, arm))
+        require(
+            why is None,
+            f"oracle={facts.model}: it needs {why}. Name another model, or set oracle=null.",
+        )
+        policy, facts = (
+            ProbedPolicy(policy, arm).eval(),
+            replace(facts, model=named(facts.model, arm)),
+        )
     jobs = [Job(spec.task, spec.split, spec.episode) for spec in specs]
     done = evaluate(
         policy, jobs, folder, facts, settings, subgoals=subgoals, shard=choose_shard(rules.shard),
@@ -231,7 +281,8 @@ def evaluate_row(
     rules: Rules,
     oracle: str | None = None,
 ) -> list[EpisodeRecord]:
-    """Evaluate one training into a row's folder, which then says all about it (`config.yaml`, `trained.json`).
+    """Evaluate one training into a row's folder, which then says all about it (`config.yaml`,
+    `trained.json`).
 
     oracle: name of the row in which it is evaluated with the oracle's frames, a ceiling.
     """
@@ -239,12 +290,17 @@ def evaluate_row(
     # Only then: a folder of other weights was refused, and keeps its files.
     shutil.copy(training / CONFIG, folder / CONFIG)
     about = read_json(training / TRAINED, "a training's end")
-    write_json(folder / TRAINED, about if oracle is None else {**about, "row": oracle, "kind": "ceiling"})
+    write_json(
+        folder / TRAINED, about if oracle is None else {**about, "row": oracle, "kind": "ceiling"}
+    )
     return records
 
 
-def record_videos(checkpoint: Path, folder: Path, records: Sequence[EpisodeRecord], rules: Rules) -> list[Path]:
-    """Videos of the first success and the first failure of these records, run once more with every frame rendered.
+def record_videos(
+    checkpoint: Path, folder: Path, records: Sequence[EpisodeRecord], rules: Rules
+) -> list[Path]:
+    """Videos of the first success and the first failure of these records, run once more with every
+    frame rendered.
 
     folder: of the videos; what it has is not rendered again.
     """
@@ -253,29 +309,43 @@ def record_videos(checkpoint: Path, folder: Path, records: Sequence[EpisodeRecor
         if record is not None:
             specs = choose_episodes(record.task, [record.episode], record.split)
             place = folder / ("success" if won else "failure")
-            run_episodes(checkpoint, place, specs, replace(rules, workers=1, shard=None), video="all")
+            run_episodes(
+                checkpoint, place, specs, replace(rules, workers=1, shard=None), video="all"
+            )
     return sorted(folder.glob(f"*/{VIDEOS}/*.mp4"))
 
 
 def built_scenes(
     file: Path, tasks: str | Sequence[str], split: str, count: int, workers: int
 ) -> tuple[list[EpisodeSpec], list[str]]:
-    """The first so many episodes of each task whose scenes can be built, and which were left out and why.
+    """The first so many episodes of each task whose scenes can be built, and which were left out
+    and why.
 
     file: keeps both, so that they are looked for once.
     """
     from mme_vla.envs.recording.processes import carry_out
 
-    require(isinstance(count, int), f"episodes={count}: with replace=true write how many scenes of each task.")
-    known: dict[str, str] = read_json(file, "the scenes of a split")["tried"] if file.is_file() else {}
+    require(
+        isinstance(count, int),
+        f"episodes={count}: with replace=true write how many scenes of each task.",
+    )
+    known: dict[str, str] = (
+        read_json(file, "the scenes of a split")["tried"] if file.is_file() else {}
+    )
     source, names = environment("mme_vla"), choose_tasks(tasks)
     while True:
-        good = {task: [spec for spec in source.episodes(task, split) if known.get(_key(spec)) == ""] for task in names}
+        good = {
+            task: [spec for spec in source.episodes(task, split) if known.get(_key(spec)) == ""]
+            for task in names
+        }
         missing: list[EpisodeSpec] = []
         for task in names:
             fresh = [spec for spec in source.episodes(task, split) if _key(spec) not in known]
             lacking = max(count - len(good[task]), 0)
-            require(len(fresh) >= lacking, f"{task}: of split {split} fewer than {count} scenes can be built.")
+            require(
+                len(fresh) >= lacking,
+                f"{task}: of split {split} fewer than {count} scenes can be built.",
+            )
             missing += fresh[:lacking]
         if not missing:
             break

@@ -1,4 +1,6 @@
-"""One policy of a nano run: built, trained on demonstrations, and evaluated in closed loop; each once."""
+"""One policy of a nano run: built, trained on demonstrations, and evaluated in closed loop; each
+once.
+"""
 
 import time
 from collections import Counter
@@ -49,14 +51,18 @@ def compose_policy(
 ) -> dict[str, Any]:
     """Compose one model at nano size, as plain values, and import its plugins.
 
-    model: a file of configs/model. memories: settings of each memory by its name, used where the model has it. words:
-    overrides that all models share, such as `embodiment=robomme_waypoint_front`. extra_dirs: further trees, as
-    `--config-dir` adds them. plugins: modules that the model needs beside its own. budget: memory tokens, instead of
-    those of `memories`.
+    model: a file of configs/model. memories: settings of each memory by its name, used where the
+    model has it. words: overrides that all models share, such as
+    `embodiment=robomme_waypoint_front`. extra_dirs: further trees, as `--config-dir` adds them.
+    plugins: modules that the model needs beside its own. budget: memory tokens, instead of those of
+    `memories`.
     """
     base = compose("policy", [f"model={model}", *words], extra_dirs=extra_dirs)
     memory = None if base.memory is None else str(base.memory.name)
-    settings = {**memories.get(memory or "", {}), **({} if budget is None or memory is None else {"budget": budget})}
+    settings = {
+        **memories.get(memory or "", {}),
+        **({} if budget is None or memory is None else {"budget": budget}),
+    }
     memory_words = [f"memory.{key}={value}" for key, value in settings.items()]
     composed = compose("policy", [f"model={model}", *words, *memory_words], extra_dirs=extra_dirs)
     composed.plugins = list(dict.fromkeys([*plugins, *plugins_of(composed, model)]))
@@ -68,7 +74,10 @@ def build(config: Mapping[str, Any]) -> MMEPolicy:
     """A policy with fresh weights but for its tower, which does not learn."""
     policy = mme_of(build_from_config(OmegaConf.create(dict(config))), "nanoMME")
     if policy.augment:
-        raise UserError("policy.augment=true changes images, and nano policies learn from tokens: set it to false.")
+        raise UserError(
+            "policy.augment=true changes images, and nano policies learn from tokens: set it to"
+            " false."
+        )
     apply_finetuning(policy, freeze_vision=True)
     return policy
 
@@ -77,9 +86,10 @@ def build(config: Mapping[str, Any]) -> MMEPolicy:
 class Training:
     """One training of a row.
 
-    row: what the page calls it. config: as `compose_policy` gives it, with the training's own seed. settings, learning:
-    the sections `train` and `learning`. folder: of the run. files: demonstrations; one in `HELD_OUT` only measures.
-    store: their tokens. tower_seed: of the tower's weights where they are fresh.
+    row: what the page calls it. config: as `compose_policy` gives it, with the training's own seed.
+    settings, learning: the sections `train` and `learning`. folder: of the run. files:
+    demonstrations; one in `HELD_OUT` only measures. store: their tokens. tower_seed: of the tower's
+    weights where they are fresh.
     """
 
     row: str
@@ -93,10 +103,16 @@ class Training:
 
     @property
     def full_config(self) -> dict[str, Any]:
-        """All that the trained policy follows from, with digests of the demonstrations as `data.content`."""
+        """All that the trained policy follows from, with digests of the demonstrations as
+        `data.content`.
+        """
         acts = Embodiment.from_dict(self.config["embodiment"]).action
         content = list(content_of(tuple(self.files), tuple(acts.choice)))
-        sections = {"train": dict(self.settings), "learning": dict(self.learning), "data": {"content": content}}
+        sections = {
+            "train": dict(self.settings),
+            "learning": dict(self.learning),
+            "data": {"content": content},
+        }
         return {**self.config, **sections}
 
     @property
@@ -119,7 +135,10 @@ class Training:
         require(
             not changed,
             f"{self.folder} holds a training with other settings: "
-            + listed(f"{key} was {brief(old)}, and is {brief(new)}" for key, (old, new) in changed.items())
+            + listed(
+                f"{key} was {brief(old)}, and is {brief(new)}"
+                for key, (old, new) in changed.items()
+            )
             + ". Choose another output, or move that folder away.",
         )
         return True
@@ -137,7 +156,9 @@ def train_in_process(job: Training) -> Path:
 
 
 def _remove_drafts(folder: Path) -> None:
-    """Remove what a training left that ended before its first checkpoint; other things in it are refused later."""
+    """Remove what a training left that ended before its first checkpoint; other things in it are
+    refused later.
+    """
     drafts = folder / CHECKPOINTS
     if drafts.is_dir():
         tidy(drafts, KeepRule())
@@ -170,16 +191,35 @@ def train(job: Training) -> Path:
             copy_tower(build({**job.config, "seed": job.tower_seed}), policy)
         samples, val_set = prepared(policy, job)
         policy.config[TRAINING] = identify(full_config, full_config["data"]["content"])
-        policy.config["card"] = {"data": f"{len(job.files)} demonstrations", "recipe": dict(settings)}
+        policy.config["card"] = {
+            "data": f"{len(job.files)} demonstrations",
+            "recipe": dict(settings),
+        }
         validation = Validation(
-            val_set, val_set.collate, train_settings.val_samples, train_settings.batch_size, train_settings.seed
+            val_set,
+            val_set.collate,
+            train_settings.val_samples,
+            train_settings.batch_size,
+            train_settings.seed,
         )
         cost = measured_cost(policy, samples, train_settings.batch_size)
         trainer = Trainer(
-            policy, samples, samples.collate, validation, train_settings, run, full_config, Accelerator(cpu=True)
+            policy,
+            samples,
+            samples.collate,
+            validation,
+            train_settings,
+            run,
+            full_config,
+            Accelerator(cpu=True),
         )
-        line, loggers = ProgressLine(train_settings.steps, run.step), open_loggers(folder, {}, run.step)
-        line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(job.files)} demonstrations")
+        line, loggers = (
+            ProgressLine(train_settings.steps, run.step),
+            open_loggers(folder, {}, run.step),
+        )
+        line.say(
+            f"{trainer.describe()}; {len(samples)} decisions of {len(job.files)} demonstrations"
+        )
         updating = time.process_time()
         try:
             with line:
@@ -197,9 +237,15 @@ def train(job: Training) -> Path:
         "cpu_minutes": (time.process_time() - cpu) / 60 if not resumed else None,
     }  # fmt: skip
     learned = MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval()
-    (folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(learned.config)), encoding="utf-8")
+    (folder / CONFIG).write_text(
+        OmegaConf.to_yaml(OmegaConf.create(learned.config)), encoding="utf-8"
+    )
     write_json(
-        folder / TRAINED, summary(job, learned, len(samples.tasks)) | cost | spent | held_out(learned, val_set, folder)
+        folder / TRAINED,
+        summary(job, learned, len(samples.tasks))
+        | cost
+        | spent
+        | held_out(learned, val_set, folder),
     )
     return trainer.last_checkpoint
 
@@ -209,17 +255,27 @@ def summary(job: Training, policy: MMEPolicy, decisions: int) -> dict[str, Any]:
     identity, memory = identity_of(policy.config), policy.config.get("memory")
     integration = policy.config.get("integration")
     return {
-        "row": job.row, "kind": "policy", "trained": True, "seed": int(job.config["seed"]),
-        "steps": job.settings["steps"], "updates": job.settings["steps"], "batch_size": job.settings["batch_size"],
-        "decisions": decisions, "demonstrations": dict(Counter(file.parent.name for file in job.files)),
-        **{name: getattr(identity, name) for name in ("data", "recipe", "weights")}, "tower": job.store.tower,
-        "memory": memory["name"] if memory else None, "integration": integration["name"] if integration else None,
+        "row": job.row,
+        "kind": "policy",
+        "trained": True,
+        "seed": int(job.config["seed"]),
+        "steps": job.settings["steps"],
+        "updates": job.settings["steps"],
+        "batch_size": job.settings["batch_size"],
+        "decisions": decisions,
+        "demonstrations": dict(Counter(file.parent.name for file in job.files)),
+        **{name: getattr(identity, name) for name in ("data", "recipe", "weights")},
+        "tower": job.store.tower,
+        "memory": memory["name"] if memory else None,
+        "integration": integration["name"] if integration else None,
         "budget": policy.memory.budget if policy.memory is not None else None,
-    }  # fmt: skip
+    }
 
 
 def measured_cost(policy: MMEPolicy, samples: Decisions, batch_size: int) -> dict[str, Any]:
-    """Learned parameters, and the floating-point operations of an update and of a decision on ready tokens."""
+    """Learned parameters, and the floating-point operations of an update and of a decision on ready
+    tokens.
+    """
     batch = samples.collate([samples[i % len(samples)] for i in range(batch_size)])
     with FlopCounterMode(display=False) as update:
         policy.train()(batch)[0].backward()
@@ -234,8 +290,13 @@ def measured_cost(policy: MMEPolicy, samples: Decisions, batch_size: int) -> dic
 
 def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, Any]:
     """How a trained policy does on demonstrations that it did not learn from."""
-    losses = [(line["val/loss"], line["step"]) for line in learning_curve(folder) if "val/loss" in line]
-    best = {"val_loss": losses[-1][0] if losses else None, "best_update": min(losses)[1] if losses else None}
+    losses = [
+        (line["val/loss"], line["step"]) for line in learning_curve(folder) if "val/loss" in line
+    ]
+    best = {
+        "val_loss": losses[-1][0] if losses else None,
+        "best_update": min(losses)[1] if losses else None,
+    }
     if policy.embodiment.action.choice:
         return best | asdict(choice_errors(policy, val_set))
     return best | {"off_by_m": position_error(policy, val_set).tolist()}
@@ -243,10 +304,12 @@ def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, A
 
 @lru_cache(maxsize=1)  # all trainings of a run have the same
 def content_of(files: tuple[Path, ...], choice: tuple[int, ...]) -> tuple[str, ...]:
-    """Digests of demonstrations: of their scenes, goals, numbers of decisions and letters, and `carried_out`.
+    """Digests of demonstrations: of their scenes, goals, numbers of decisions and letters, and
+    `carried_out`.
 
-    States and poses are left out: they differ in their last bits between processors. A demonstration that ends
-    otherwise on another processor has another digest. choice: columns of an action's letters, none of motions.
+    States and poses are left out: they differ in their last bits between processors. A
+    demonstration that ends otherwise on another processor has another digest. choice: columns of an
+    action's letters, none of motions.
     """
     digests = []
     for file in files:
@@ -255,7 +318,9 @@ def content_of(files: tuple[Path, ...], choice: tuple[int, ...]) -> tuple[str, .
         letters = targets[:, list(choice)].argmax(1).tolist() if choice else None
         facts = {"decisions": len(targets), "letters": letters}
         facts |= {name: getattr(made, name) for name in ("task", "seed", "difficulty", "goal")}
-        facts |= {"carried_out": True} if made.carried_out else {}  # others keep the digest they had without it
+        facts |= (
+            {"carried_out": True} if made.carried_out else {}
+        )  # others keep the digest they had without it
         digests.append(digest(facts, 64))
     return tuple(digests)
 
@@ -266,17 +331,26 @@ def prepared(policy: MMEPolicy, job: Training) -> tuple[Decisions, Decisions]:
     measured = files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]
     learnt = [file for file in files if file not in measured] or files  # there may be one alone
     processor = policy.require_processor()
-    processor.stats = statistics((Demonstration.load(file, images=False) for file in learnt), policy)
+    processor.stats = statistics(
+        (Demonstration.load(file, images=False) for file in learnt), policy
+    )
 
     def read(some: Sequence[Path]) -> Iterator[tuple[Demonstration, FrameTokens]]:
         return ((Demonstration.load(file, images=False), job.store.read(file)) for file in some)
 
     samples = Decisions.of(
-        policy, read(learnt), learning["elsewhere"], build_transforms(learning.get("history_transforms")),
-        int(job.config["seed"]), learning["reflect"], learning["sides"],
-        oversample=learning["often"], noise=learning["noise"], token_noise=learning["blur"],
+        policy,
+        read(learnt),
+        learning["elsewhere"],
+        build_transforms(learning.get("history_transforms")),
+        int(job.config["seed"]),
+        learning["reflect"],
+        learning["sides"],
+        oversample=learning["often"],
+        noise=learning["noise"],
+        token_noise=learning["blur"],
         balanced=learning["balanced"],
-    )  # fmt: skip
+    )
     return samples, Decisions.of(policy, read(measured), learning["elsewhere"])
 
 

@@ -1,7 +1,7 @@
 """Pretraining of the nano backbone's vision tower on rendered scenes: which objects are where.
 
-For each cell of an image and each class the tower says whether an object's centre is near, and where. The labels are
-those of `scenes.py`.
+For each cell of an image and each class the tower says whether an object's centre is near, and
+where. The labels are those of `scenes.py`.
 """
 
 import logging
@@ -38,7 +38,8 @@ MATCH_DISTANCE = 3.0  # centimetres between an object and its report at most
 
 @dataclass(frozen=True)
 class PretrainSettings:
-    """steps: updates. batch_size: images each. lr: peak learning rate, on a cosine to zero after a short warm-up.
+    """steps: updates. batch_size: images each. lr: peak learning rate, on a cosine to zero after a
+    short warm-up.
 
     save_every: updates between two drafts. seed: of everything random.
     """
@@ -54,8 +55,8 @@ class PretrainSettings:
 class Scenes:
     """Images [n, 3, s, s] uint8, and the visible objects of all.
 
-    owners: [m], each object's image. classes: [m]. centres: [m, 3], metres in the world. places: [m, 2], their column
-    and row in the image, 0 … 1.
+    owners: [m], each object's image. classes: [m]. centres: [m, 3], metres in the world. places:
+    [m, 2], their column and row in the image, 0 … 1.
     """
 
     images: Tensor
@@ -77,17 +78,29 @@ class Scenes:
         table = np.concatenate(rows)
         pixels = np.stack([project(centre)[::-1] for centre in table[:, 2:]]) / SIDE
         owners, classes = (torch.from_numpy(table[:, i].astype(np.int64)) for i in (0, 1))
-        return cls(torch.cat(images), owners, classes, table[:, 2:], torch.from_numpy(pixels.astype(np.float32)))
+        return cls(
+            torch.cat(images),
+            owners,
+            classes,
+            table[:, 2:],
+            torch.from_numpy(pixels.astype(np.float32)),
+        )
 
     def weights(self) -> tuple[Tensor, Tensor]:
-        """How much each class counts in the loss, and how often each image is to be learned: what is rare, more."""
+        """How much each class counts in the loss, and how often each image is to be learned: what
+        is rare, more.
+        """
         counts = torch.bincount(self.classes, minlength=len(CLASSES)).float()
         classes = (counts.clamp(min=1) / counts.max()).rsqrt().clamp(max=8)
-        images = torch.zeros(len(self.images)).scatter_reduce(0, self.owners, classes[self.classes], "amax")
+        images = torch.zeros(len(self.images)).scatter_reduce(
+            0, self.owners, classes[self.classes], "amax"
+        )
         return classes, images.clamp(min=1)
 
     def rows(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """The objects of a batch of images [b]: each one's place in the batch, and its row in here."""
+        """The objects of a batch of images [b]: each one's place in the batch, and its
+        row in here.
+        """
         batch, rows = (images[:, None] == self.owners).nonzero().unbind(1)
         return batch, rows
 
@@ -101,25 +114,35 @@ def fresh_tower(config: TowerConfig, seed: int) -> PlaceTower:
     return tower
 
 
-def label_cells(batch: Tensor, classes: Tensor, places: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """What the tower should say: presence [b, K, g, g], 0 or 1, and places [b, K, 2, g, g] from each cell's centre.
+def label_cells(
+    batch: Tensor, classes: Tensor, places: Tensor, shape: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """What the tower should say: presence [b, K, g, g], 0 or 1, and places [b, K, 2, g, g] from
+    each cell's centre.
 
-    An object is present in the cells whose centres are less than a cell away along both axes. Where two of a class are
-    near, the nearer one counts.
+    An object is present in the cells whose centres are less than a cell away along both axes. Where
+    two of a class are near, the nearer one counts.
 
     Args:
         batch: each object's image. classes: [m]. places: column and row in the image [m, 2], 0 … 1.
         shape: images b and cells g a side.
     """
     images, side = shape
-    presence, offsets = torch.zeros(images, len(CLASSES), side, side), torch.zeros(images, len(CLASSES), 2, side, side)
+    presence, offsets = (
+        torch.zeros(images, len(CLASSES), side, side),
+        torch.zeros(images, len(CLASSES), 2, side, side),
+    )
     nearest = torch.full_like(presence, math.inf)
     where = places * side - 0.5  # in cells, from the first one's centre
     for corner in ((0, 0), (0, 1), (1, 0), (1, 1)):
         cell = where.floor().long() + torch.tensor(corner)
         inside = ((cell >= 0) & (cell < side)).all(1)
         for image, kind, (column, row), offset in zip(
-            batch[inside].tolist(), classes[inside].tolist(), cell[inside].tolist(), (where - cell)[inside], strict=True
+            batch[inside].tolist(),
+            classes[inside].tolist(),
+            cell[inside].tolist(),
+            (where - cell)[inside],
+            strict=True,
         ):
             distance = offset.square().sum()
             if distance < nearest[image, kind, row, column]:
@@ -129,8 +152,11 @@ def label_cells(batch: Tensor, classes: Tensor, places: Tensor, shape: tuple[int
     return presence, offsets
 
 
-def augmented(images: Tensor, places: Tensor, batch: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """A batch moved by the same few pixels, the edges repeated, and each image mirrored half of the time.
+def augmented(
+    images: Tensor, places: Tensor, batch: Tensor, rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """A batch moved by the same few pixels, the edges repeated, and each image mirrored half of the
+    time.
 
     Args:
         images: [b, 3, s, s]. places: [m, 2] in them, of the images `batch` [m].
@@ -142,17 +168,25 @@ def augmented(images: Tensor, places: Tensor, batch: Tensor, rng: np.random.Gene
     places = places + torch.tensor([right, down]) / side
     mirrored = torch.from_numpy(rng.random(len(images)) < 0.5)
     shifted = torch.where(mirrored[:, None, None, None], shifted.flip(-1), shifted)
-    return shifted, torch.where(mirrored[batch][:, None], torch.stack([1 - places[:, 0], places[:, 1]], 1), places)
+    return shifted, torch.where(
+        mirrored[batch][:, None], torch.stack([1 - places[:, 0], places[:, 1]], 1), places
+    )
 
 
-def tower_loss(logits: Tensor, offsets: Tensor, presence: Tensor, places: Tensor, weights: Tensor) -> Tensor:
-    """Binary cross-entropy of presences, and the absolute error of places where an object is, per labelled cell.
+def tower_loss(
+    logits: Tensor, offsets: Tensor, presence: Tensor, places: Tensor, weights: Tensor
+) -> Tensor:
+    """Binary cross-entropy of presences, and the absolute error of places where an object is, per
+    labelled cell.
 
     Args:
-        logits, offsets: of `PlaceTower.locate`. presence, places: of `label_cells`. weights: of the classes [K].
+        logits, offsets: of `PlaceTower.locate`. presence, places: of `label_cells`. weights: of the
+            classes [K].
     """
     each = weights[:, None, None] * (1 + (POSITIVE - 1) * presence)
-    cross_entropy = functional.binary_cross_entropy_with_logits(logits, presence, each, reduction="sum")
+    cross_entropy = functional.binary_cross_entropy_with_logits(
+        logits, presence, each, reduction="sum"
+    )
     labelled = weights[:, None, None] * presence
     error = labelled[:, :, None] * (offsets - places).abs()
     count = labelled.sum().clamp(min=1)
@@ -160,9 +194,14 @@ def tower_loss(logits: Tensor, offsets: Tensor, presence: Tensor, places: Tensor
 
 
 def pretrain(
-    tower: PlaceTower, files: Sequence[Path], held_out: Sequence[Path], folder: Path, settings: PretrainSettings
+    tower: PlaceTower,
+    files: Sequence[Path],
+    held_out: Sequence[Path],
+    folder: Path,
+    settings: PretrainSettings,
 ) -> Path:
-    """Train a tower on recorded scenes; a run that was interrupted continues. The path of its weights.
+    """Train a tower on recorded scenes; a run that was interrupted continues. The path of its
+    weights.
 
     Args:
         tower: with fresh weights. files: scenes to learn from. held_out: those that only measure.
@@ -199,11 +238,20 @@ def pretrain(
             done = step + 1
             if done % settings.save_every == 0 or done == settings.steps:
                 with write_atomically(draft) as path:
-                    torch.save({"tower": tower.state_dict(), "optimizer": optimizer.state_dict(), "step": done}, path)
+                    torch.save(
+                        {
+                            "tower": tower.state_dict(),
+                            "optimizer": optimizer.state_dict(),
+                            "step": done,
+                        },
+                        path,
+                    )
                 logger.info("update %d of %d, loss %.3f", done, settings.steps, loss.item())
             advance(1)
     if held_out:
-        logger.info("Held-out scenes:\n%s", report(evaluate_tower(tower, Scenes.load(sorted(held_out)))))
+        logger.info(
+            "Held-out scenes:\n%s", report(evaluate_tower(tower, Scenes.load(sorted(held_out))))
+        )
     state = {name: value.contiguous().half() for name, value in tower.state_dict().items()}
     with write_atomically(weights_file) as path:
         save_file(state, path)
@@ -211,27 +259,37 @@ def pretrain(
 
 
 def _batch_loss(
-    tower: PlaceTower, scenes: Scenes, frequencies: Tensor, weights: Tensor, settings: PretrainSettings, step: int
+    tower: PlaceTower,
+    scenes: Scenes,
+    frequencies: Tensor,
+    weights: Tensor,
+    settings: PretrainSettings,
+    step: int,
 ) -> Tensor:
     rng = np.random.default_rng([settings.seed, step])
     shares = (frequencies / frequencies.sum()).double().numpy()
     images = torch.from_numpy(rng.choice(len(shares), settings.batch_size, p=shares / shares.sum()))
     batch, rows = scenes.rows(images)
-    pixels, places = augmented(to_unit_range(scenes.images[images]), scenes.places[rows], batch, rng)
+    pixels, places = augmented(
+        to_unit_range(scenes.images[images]), scenes.places[rows], batch, rng
+    )
     logits, offsets = tower.locate(pixels.contiguous(memory_format=torch.channels_last))
-    presence, where = label_cells(batch, scenes.classes[rows], places, (len(images), logits.shape[-1]))
+    presence, where = label_cells(
+        batch, scenes.classes[rows], places, (len(images), logits.shape[-1])
+    )
     return tower_loss(logits, offsets, presence, where, weights)
 
 
-# Evaluation -----------------------------------------------------------------------------------------------------------
+# Evaluation ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class ClassResult:
     """One class on held-out scenes.
 
-    places: visible objects. reports: of the class. errors: centimetres between each object and its report, of those
-    that are found: an object and a report belong together once, the nearest first, up to `MATCH_DISTANCE`.
+    places: visible objects. reports: of the class. errors: centimetres between each object and its
+    report, of those that are found: an object and a report belong together once, the nearest first,
+    up to `MATCH_DISTANCE`.
     """
 
     places: int
@@ -242,8 +300,8 @@ class ClassResult:
 def find_objects(presence: Tensor, offsets: Tensor) -> list[tuple[float, float]]:
     """Column and row, 0 … 1, of the objects that a tower reports of one class in one image.
 
-    Cells vote for the places that they report, the surest first. Votes for nearly the same place are one object, at
-    their mean, if they come to `VOTES`.
+    Cells vote for the places that they report, the surest first. Votes for nearly the same place
+    are one object, at their mean, if they come to `VOTES`.
 
     Args:
         presence: [g, g]. offsets: [2, g, g].
@@ -265,11 +323,15 @@ def find_objects(presence: Tensor, offsets: Tensor) -> list[tuple[float, float]]
 
 
 def on_plane(place: tuple[float, float], height: float) -> np.ndarray:
-    """Where the front camera's ray through a place (column and row, 0 … 1) meets a height, x and y in metres."""
+    """Where the front camera's ray through a place (column and row, 0 … 1) meets a height, x and y
+    in metres.
+    """
     extrinsic = front_extrinsic().astype(np.float64)
     rotation, shift = extrinsic[:, :3], extrinsic[:, 3]
     eye = -rotation.T @ shift
-    ray = rotation.T @ np.linalg.solve(INTRINSIC.astype(np.float64), [place[0] * SIDE, place[1] * SIDE, 1.0])
+    ray = rotation.T @ np.linalg.solve(
+        INTRINSIC.astype(np.float64), [place[0] * SIDE, place[1] * SIDE, 1.0]
+    )
     point: np.ndarray = (eye + (height - eye[2]) / ray[2] * ray)[:2]
     return point
 
@@ -291,14 +353,21 @@ def evaluate_tower(tower: PlaceTower, scenes: Scenes) -> dict[str, ClassResult]:
         rows = (scenes.classes == number).nonzero()[:, 0]
         for image, places in enumerate(detected[number] for detected in reports):
             centres = scenes.centres[rows[scenes.owners[rows] == image].numpy()]
-            distances = [[np.linalg.norm(on_plane(place, z) - (x, y)) for place in places] for x, y, z in centres]
+            distances = [
+                [np.linalg.norm(on_plane(place, z) - (x, y)) for place in places]
+                for x, y, z in centres
+            ]
             errors += match(100 * np.array(distances).reshape(len(centres), len(places)))
-        results[name] = ClassResult(len(rows), sum(len(detected[number]) for detected in reports), np.array(errors))
+        results[name] = ClassResult(
+            len(rows), sum(len(detected[number]) for detected in reports), np.array(errors)
+        )
     return results
 
 
 def match(distances: np.ndarray) -> list[float]:
-    """The distances, up to `MATCH_DISTANCE`, of pairs of a row and a column, the nearest first, each in one pair."""
+    """The distances, up to `MATCH_DISTANCE`, of pairs of a row and a column, the nearest first,
+    each in one pair.
+    """
     errors: list[float] = []
     while distances.size and distances.min() <= MATCH_DISTANCE:
         row, column = np.unravel_index(distances.argmin(), distances.shape)
@@ -309,11 +378,16 @@ def match(distances: np.ndarray) -> list[float]:
 
 def report(results: dict[str, ClassResult]) -> str:
     """The results as rows of a Markdown table, those of classes that have places."""
-    lines = ["| class | places | found | median error | wrong reports |", "|---|---:|---:|---:|---:|"]
+    lines = [
+        "| class | places | found | median error | wrong reports |",
+        "|---|---:|---:|---:|---:|",
+    ]
     for name, result in results.items():
         if result.places:
             detected, wrong = len(result.errors), result.reports - len(result.errors)
             median = f"{np.median(result.errors):.1f} cm" if detected else ""
             shares = 100 * detected / result.places, 100 * wrong / max(result.reports, 1)
-            lines.append(f"| {name} | {result.places} | {shares[0]:.0f} % | {median} | {shares[1]:.0f} % |")
+            lines.append(
+                f"| {name} | {result.places} | {shares[0]:.0f} % | {median} | {shares[1]:.0f} % |"
+            )
     return "\n".join(lines)

@@ -1,8 +1,10 @@
-"""Rows of the board of nanoMME: a folder `<row>/<training seed>` for each training, checked once when it is read.
+"""Rows of the board of nanoMME: a folder `<row>/<training seed>` for each training, checked once
+when it is read.
 
-A folder holds `config.yaml`, `run.json`, `trained.json` and `episodes.jsonl` (or `episodes.jsonl.xz`). Each file names
-what it is of. Files of different trainings, scenes or settings are one error. `scenes.json` beside the rows says which
-scenes of the split can be built: a row has the first so many of these of each task, by default of all.
+A folder holds `config.yaml`, `run.json`, `trained.json` and `episodes.jsonl` (or
+`episodes.jsonl.xz`). Each file names what it is of. Files of different trainings, scenes or
+settings are one error. `scenes.json` beside the rows says which scenes of the split can be built: a
+row has the first so many of these of each task, by default of all.
 """
 
 from collections import Counter
@@ -35,10 +37,11 @@ _SETTINGS = {"model": "model", "split": "split", "checkpoint": "checkpoint", "se
 class Trained:
     """What `trained.json` holds; a row without a training, as of random choices, has no numbers.
 
-    row: name of the row. kind: floors and ceilings bracket the policies. trained: whether there was a training. seed,
-    recipe, data, weights: its `TrainingIdentity`. demonstrations: their number for each task. budget: memory tokens.
-    parameters: learned ones. update_s: CPU seconds of one update, with its share of validation and checkpoints.
-    update_flops: of one update. cpu_minutes: of a training that was not interrupted.
+    row: name of the row. kind: floors and ceilings bracket the policies. trained: whether there was
+    a training. seed, recipe, data, weights: its `TrainingIdentity`. demonstrations: their number
+    for each task. budget: memory tokens. parameters: learned ones. update_s: CPU seconds of one
+    update, with its share of validation and checkpoints. update_flops: of one update. cpu_minutes:
+    of a training that was not interrupted.
     """
 
     row: str
@@ -58,7 +61,11 @@ class Trained:
     @property
     def identity(self) -> TrainingIdentity | None:
         """What its records say of the training."""
-        return TrainingIdentity(self.seed, self.recipe, self.data, self.weights) if self.trained else None
+        return (
+            TrainingIdentity(self.seed, self.recipe, self.data, self.weights)
+            if self.trained
+            else None
+        )
 
 
 @dataclass(frozen=True)
@@ -81,7 +88,9 @@ class Training:
 
     @property
     def table(self) -> str:
-        """Name of the table that it belongs to, and of that table's folder: its split, and any other action space."""
+        """Name of the table that it belongs to, and of that table's folder: its split, and any
+        other action space.
+        """
         return table_of(self.records[0].split, self.action_space)
 
     @property
@@ -101,13 +110,15 @@ def rules_text(action_space: str, max_choices: int | None, only_possible: bool) 
 
 
 def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, list[Training]]:
-    """The trainings of each row in or below folders, by the row's name, in the order of their seeds.
+    """The trainings of each row in or below folders, by the row's name, in the order of their
+    seeds.
 
-    local: folders of the user, whose rows are called `<name> (yours)` where the others have the name.
+    local: folders of the user, whose rows are called `<name> (yours)` where the others have the
+    name.
 
     Raises:
-        UserError: a folder that does not keep the schema, two trainings with the same weights or different recipes in
-            one row, or rows of different scenes.
+        UserError: a folder that does not keep the schema, two trainings with the same weights or
+            different recipes in one row, or rows of different scenes.
     """
     trainings = [read_training(place) for place in _places(folders)]
     names = {training.facts.row for training in trainings}
@@ -115,21 +126,26 @@ def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, 
     rows: dict[str, list[Training]] = {}
     for training in sorted(trainings, key=lambda training: training.facts.seed):
         name = training.facts.row
-        row = rows.setdefault(f"{name} (yours)" if training.is_local and name in names else name, [])
+        row = rows.setdefault(
+            f"{name} (yours)" if training.is_local and name in names else name, []
+        )
         for earlier in row:
             _check_alike(earlier, training)
         row.append(training)
         require(
             training.rules == trainings[0].rules,
-            f"{training.folder} has {training.rules}, but {trainings[0].folder} {trainings[0].rules}. Rows of one "
-            "board have the same.",
+            f"{training.folder} has {training.rules}, but {trainings[0].folder}"
+            f" {trainings[0].rules}. Rows of one board have the same.",
         )
         scenes, expected = training.scenes, trainings[0].scenes
         if scenes != expected:
-            differing = sorted({key for key in scenes | expected if scenes.get(key) != expected.get(key)})
+            differing = sorted(
+                {key for key in scenes | expected if scenes.get(key) != expected.get(key)}
+            )
             raise UserError(
-                f"{training.folder} and {trainings[0].folder} have different scenes or step limits: "
-                f"{listed(f'{key.task} {key.episode}' for key in differing)}. Rows of one board have the same."
+                f"{training.folder} and {trainings[0].folder} have different scenes or step limits:"
+                f" {listed(f'{key.task} {key.episode}' for key in differing)}. Rows of one board"
+                " have the same."
             )
     return rows
 
@@ -138,10 +154,15 @@ def _places(folders: Iterable[Path]) -> list[Path]:
     """The folders of trainings in or below folders."""
     places: set[Path] = set()
     for folder in folders:
-        require(folder.is_dir(), f"rows={folder}: there is no such folder. Name one that holds <row>/<training seed>.")
+        require(
+            folder.is_dir(),
+            f"rows={folder}: there is no such folder. Name one that holds <row>/<training seed>.",
+        )
         names = (RUN_FILE, TRAINED, "episodes*.jsonl", "episodes*.jsonl.xz")
         below = {path.parent for name in names for path in folder.rglob(name)}
-        require(below, f"rows={folder} holds no row: no {TRAINED}, {RUN_FILE} or {RECORDS} below it.")
+        require(
+            below, f"rows={folder} holds no row: no {TRAINED}, {RUN_FILE} or {RECORDS} below it."
+        )
         places |= below
     return sorted(places)
 
@@ -150,12 +171,15 @@ def read_training(folder: Path) -> Training:
     """Read one folder.
 
     Raises:
-        UserError: a file is missing or damaged, an episode is there twice, missing or of another split, or the files
-            are not of one training.
+        UserError: a file is missing or damaged, an episode is there twice, missing or of another
+            split, or the files are not of one training.
     """
     for name in FILES:
-        require((folder / name).is_file(), f"{folder} lacks {name}. A training's folder holds {listed(FILES)} and "
-                f"{RECORDS} or {RECORDS}.xz.")  # fmt: skip
+        require(
+            (folder / name).is_file(),
+            f"{folder} lacks {name}. A training's folder holds {listed(FILES)} and "
+            f"{RECORDS} or {RECORDS}.xz.",
+        )
     facts = read_section(Trained, read_json(folder / TRAINED), f"{folder / TRAINED}", others=True)
     run = read_run(folder)
     try:
@@ -169,16 +193,23 @@ def read_training(folder: Path) -> Training:
     twice = [f"{key.task} {key.episode}" for key, count in counts.items() if count > 1]
     require(not twice, f"{folder} has episodes twice: {listed(twice)}. Keep one record of each.")
     settings = run["settings"]
-    n_choices, possible = settings.get("max_actions", settings.get("max_choices")), settings.get("only_possible", False)
+    n_choices, possible = (
+        settings.get("max_actions", settings.get("max_choices")),
+        settings.get("only_possible", False),
+    )
     rules = rules_text(records[0].action_space, n_choices, possible)
     return Training(folder, facts, _numbered(folder, records), rules)
 
 
 def _ended(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
-    """The records without the errors of episodes that were repeated, of which the last stays where all are errors."""
+    """The records without the errors of episodes that were repeated, of which the last stays where
+    all are errors.
+    """
     newest = {record.key: record for record in records if record.outcome == "error"}
     ended = {record.key for record in records if record.outcome != "error"}
-    return [r for r in records if r.outcome != "error" or (r.key not in ended and r is newest[r.key])]
+    return [
+        r for r in records if r.outcome != "error" or (r.key not in ended and r is newest[r.key])
+    ]
 
 
 def _check_identity(
@@ -189,7 +220,11 @@ def _check_identity(
     records: Sequence[EpisodeRecord],
 ) -> None:
     """Make sure that the four files are of one training."""
-    fields = [(key, field) for key, field in _SETTINGS.items() if facts.trained or key in ("model", "split")]
+    fields = [
+        (key, field)
+        for key, field in _SETTINGS.items()
+        if facts.trained or key in ("model", "split")
+    ]
     expected = {"training": facts.identity, **{field: settings.get(key) for key, field in fields}}
     if any(record.composition for record in records):
         expected["composition"] = composition_digest(config)
@@ -198,8 +233,9 @@ def _check_identity(
         for field, value in expected.items():
             require(
                 getattr(record, field) == value,
-                f"{folder}: {field} of {record.task} {record.episode} is {getattr(record, field)} in its record, but "
-                f"{value} in {source.get(field, RUN_FILE)}. These files are not of one training.",
+                f"{folder}: {field} of {record.task} {record.episode} is {getattr(record, field)}"
+                f" in its record, but {value} in {source.get(field, RUN_FILE)}. These files are not"
+                " of one training.",
             )
 
 
@@ -222,14 +258,15 @@ def _numbered(folder: Path, records: Sequence[EpisodeRecord]) -> list[EpisodeRec
             if record is not None:
                 require(
                     (record.seed, record.difficulty) == (spec.seed, spec.difficulty),
-                    f"{folder}: {task} {spec.episode} has seed {record.seed} ({record.difficulty}), but that of split "
-                    f"{split!r} has {spec.seed} ({spec.difficulty}).",
+                    f"{folder}: {task} {spec.episode} has seed {record.seed} ({record.difficulty}),"
+                    f" but that of split {split!r} has {spec.seed} ({spec.difficulty}).",
                 )
                 numbered.append(replace(record, episode=number))
     require(
         not missing and not by_key,
-        f"{folder} does not have the first {n_scenes} scenes of each task in split {split!r}: it lacks "
-        f"{listed(missing) or 'none'}, and has {listed(f'{task} {n}' for task, n in by_key) or 'none'} beside them.",
+        f"{folder} does not have the first {n_scenes} scenes of each task in split {split!r}: it"
+        f" lacks {listed(missing) or 'none'}, and has"
+        f" {listed(f'{task} {n}' for task, n in by_key) or 'none'} beside them.",
     )
     return numbered
 
@@ -237,14 +274,15 @@ def _numbered(folder: Path, records: Sequence[EpisodeRecord]) -> list[EpisodeRec
 def _check_alike(first: Training, other: Training) -> None:
     """Make sure that two trainings of a row are of one recipe, and not the same one.
 
-    Their digests of the data may differ: demonstrations recorded on another processor end otherwise here and there.
+    Their digests of the data may differ: demonstrations recorded on another processor end otherwise
+    here and there.
     """
     for name in ("kind", "recipe", "demonstrations", "budget"):
         values = [getattr(training.facts, name) for training in (first, other)]
         require(
             values[0] == values[1],
-            f"{first.folder} and {other.folder} are trainings of the row {first.facts.row}, but {name} is {values[0]} "
-            f"and {values[1]}. Give them different names of rows.",
+            f"{first.folder} and {other.folder} are trainings of the row {first.facts.row}, but"
+            f" {name} is {values[0]} and {values[1]}. Give them different names of rows.",
         )
     require(
         first.facts.seed != other.facts.seed and first.facts.weights != other.facts.weights,

@@ -1,4 +1,6 @@
-"""A run of nanoMME: demonstrations, tokens, trainings and evaluations of all rows, each as far as it is not there."""
+"""A run of nanoMME: demonstrations, tokens, trainings and evaluations of all rows, each as far as
+it is not there.
+"""
 
 import logging
 import time
@@ -31,9 +33,11 @@ STAGES = ("record", "tokens", "train", "evaluate", "all")
 
 
 def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
-    """All stages of a run, up to `stage`; the path of its page, or of the folder that holds what was made.
+    """All stages of a run, up to `stage`; the path of its page, or of the folder that holds what
+    was made.
 
-    config: as configs/nano.yaml. extra_dirs: trees of the user's own models, as `--config-dir` adds them.
+    config: as configs/nano.yaml. extra_dirs: trees of the user's own models, as `--config-dir` adds
+    them.
     """
     from mme_vla.envs.recording.processes import carry_out
     from mme_vla.nano.fitting import train_in_process
@@ -68,19 +72,30 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
         records = evaluate_all(config, results, jobs, files, rows.robot)
     if config["shard"] is not None or len(choose_tasks(config["task"])) > 1:
         for row, of_row in records.items():
-            logger.info("%s: %d of %d episodes", row, sum(record.success for record in of_row), len(of_row))
+            logger.info(
+                "%s: %d of %d episodes", row, sum(record.success for record in of_row), len(of_row)
+            )
         return results
     with minutes.of("videos"):
         videos = videos_of(config, jobs, records, folder / "videos")
-    page = write_page(folder, config, records, rows.blind, minutes.spent, videos,
-                      {row: [job.folder for job in of_row] for row, of_row in jobs.items()}, len(files))  # fmt: skip
+    page = write_page(
+        folder,
+        config,
+        records,
+        rows.blind,
+        minutes.spent,
+        videos,
+        {row: [job.folder for job in of_row] for row, of_row in jobs.items()},
+        len(files),
+    )
     print(page)
     return page
 
 
 @dataclass(frozen=True)
 class Rows:
-    """The models of a run. composed: row → its configuration. choices: at which frames memories read demonstrations.
+    """The models of a run. composed: row → its configuration. choices: at which frames memories
+    read demonstrations.
 
     blind: the row that all others are compared with.
     """
@@ -99,25 +114,37 @@ def compose_rows(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> 
     from mme_vla.nano.fitting import compose_policy
     from mme_vla.nano.learning import check_reflection
 
-    words = [f"backbone={config['with_backbone']}", f"embodiment={config['with_embodiment']}", "policy.augment=false"]
+    words = [
+        f"backbone={config['with_backbone']}",
+        f"embodiment={config['with_embodiment']}",
+        "policy.augment=false",
+    ]
     words += [f"seed={config['seed']}", *config["overrides"]]
     how = (config["memories"], words, extra_dirs, config["plugins"])
-    models = list(dict.fromkeys([*as_list(config["with_memory"]), *config["beside"], *config["also"]]))
+    models = list(
+        dict.fromkeys([*as_list(config["with_memory"]), *config["beside"], *config["also"]])
+    )
     require(models, "No row is to be trained: name one, such as model=framesamp_modul.")
     composed: dict[str, dict[str, Any]] = {}
     for model in models:
         # The floor that reads the current frame alone has the tokens of that frame, at any budget.
         for budget in [None] if model == MATCHED else as_list(config["budget"]):
             each = compose_policy(model, *how, budget=budget)
-            composed[model if budget is None or each["memory"] is None else f"{model}@{budget}"] = each
-    others = [compose_policy(model, *how) for model in config["rendered_for"] if model not in models]
+            composed[model if budget is None or each["memory"] is None else f"{model}@{budget}"] = (
+                each
+            )
+    others = [
+        compose_policy(model, *how) for model in config["rendered_for"] if model not in models
+    ]
     robot = Embodiment.from_dict(next(iter(composed.values()))["embodiment"])
     for vision in (each["backbone"].get("vision") for each in composed.values()):
         layout = vision.get("layout") if isinstance(vision, Mapping) else None
         check_reflection(config["learning"]["reflect"], robot.action, layout)
     memories = [each["memory"] for each in (*composed.values(), *others) if each["memory"]]
     choices = [FrameChoice(DECISIONS, memory, robot.action.execute) for memory in [None, *memories]]
-    blind = [row for row, each in composed.items() if each["memory"] is None and not each["subgoal_text"]]
+    blind = [
+        row for row, each in composed.items() if each["memory"] is None and not each["subgoal_text"]
+    ]
     return Rows(composed, choices, robot, next(iter(blind), None))
 
 
@@ -138,11 +165,22 @@ def trainings_of(
 
     seed, jobs = int(config["seed"]), {}
     for row, each in composed.items():
-        numbers = range(seed, seed + (config["also_trainings"] if of_also(config, row) else config["trainings"]))
+        numbers = range(
+            seed, seed + (config["also_trainings"] if of_also(config, row) else config["trainings"])
+        )
         jobs[row] = [
-            Training(row, {**each, "seed": number}, config["train"], config["learning"], folder / row / str(number),
-                     files, store, seed) for number in numbers
-        ]  # fmt: skip
+            Training(
+                row,
+                {**each, "seed": number},
+                config["train"],
+                config["learning"],
+                folder / row / str(number),
+                files,
+                store,
+                seed,
+            )
+            for number in numbers
+        ]
     return jobs
 
 
@@ -152,10 +190,15 @@ def of_also(config: Mapping[str, Any], row: str) -> bool:
 
 
 def evaluate_all(
-    config: Mapping[str, Any], folder: Path, jobs: Mapping[str, Sequence["Training"]], files: Sequence[Path],
+    config: Mapping[str, Any],
+    folder: Path,
+    jobs: Mapping[str, Sequence["Training"]],
+    files: Sequence[Path],
     robot: "Embodiment",
-) -> dict[str, list["EpisodeRecord"]]:  # fmt: skip
-    """Row → the records of all its trainings; a row's folder is `<folder>/<row>/<training seed>`."""
+) -> dict[str, list["EpisodeRecord"]]:
+    """Row → the records of all its trainings; a row's folder is
+    `<folder>/<row>/<training seed>`.
+    """
     from mme_vla.nano.evaluating import (
         DEMONSTRATOR,
         FREQUENT,
@@ -170,14 +213,21 @@ def evaluate_all(
     rules, specs = rules_of(config), episodes_of(config, folder)
     records: dict[str, list[EpisodeRecord]] = {}
     for row, of_row in jobs.items():
-        selected = episodes_of(config, folder, config["also_episodes"]) if of_also(config, row) else specs
+        selected = (
+            episodes_of(config, folder, config["also_episodes"]) if of_also(config, row) else specs
+        )
         model, at, budget = row.partition("@")
         oracle = f"{ORACLE_FRAMES}{at}{budget}" if model == config["oracle"] else None
         for name in [row] if oracle is None else [row, oracle]:
             records[name] = []
             for job in of_row:
-                place, ceiling = folder / name / str(job.config["seed"]), None if name == row else oracle
-                records[name] += evaluate_row(job.folder, job.checkpoint, place, selected, rules, ceiling)
+                place, ceiling = (
+                    folder / name / str(job.config["seed"]),
+                    None if name == row else oracle,
+                )
+                records[name] += evaluate_row(
+                    job.folder, job.checkpoint, place, selected, rules, ceiling
+                )
     if config["shard"] is None:
         by_choice = bool(robot.action.choice)
         moves = frequent_moves(files, robot.action) if by_choice else {}
@@ -195,14 +245,20 @@ def rules_of(config: Mapping[str, Any]) -> "Rules":
     return Rules(seed=config["policy_seed"], **{name: config[name] for name in names})
 
 
-def episodes_of(config: Mapping[str, Any], folder: Path, episodes: Any = None) -> list["EpisodeSpec"]:
-    """The episodes of the run; with `replace` scenes that cannot be built are replaced by later ones."""
+def episodes_of(
+    config: Mapping[str, Any], folder: Path, episodes: Any = None
+) -> list["EpisodeSpec"]:
+    """The episodes of the run; with `replace` scenes that cannot be built are replaced by later
+    ones.
+    """
     from mme_vla.nano.evaluating import built_scenes
 
     selected = config["episodes"] if episodes is None else episodes
     if not config["replace"]:
         return choose_episodes(config["task"], selected, config["split"])
-    specs, left_out = built_scenes(folder / "scenes.json", config["task"], config["split"], selected, config["workers"])
+    specs, left_out = built_scenes(
+        folder / "scenes.json", config["task"], config["split"], selected, config["workers"]
+    )
     for line in left_out:
         logger.info("left out: %s", line)
     return specs
@@ -224,7 +280,7 @@ def videos_of(
     return record_videos(of_row[0].checkpoint, folder, first, rules_of(config))
 
 
-# Demonstrations -------------------------------------------------------------------------------------------------------
+# Demonstrations -----------------------------------------------------------------------------------
 
 
 def counts_of(config: Mapping[str, Any]) -> dict[tuple[str, str], int]:
@@ -232,16 +288,19 @@ def counts_of(config: Mapping[str, Any]) -> dict[tuple[str, str], int]:
     counts: dict[tuple[str, str], int] = {}
     for task in choose_tasks(config["task"]):
         amounts = {**config["demonstrations"], **(config["demonstrations_of"] or {}).get(task, {})}
-        fits = set(amounts) <= set(DIFFICULTIES) and all(isinstance(n, int) and n >= 0 for n in amounts.values())
+        fits = set(amounts) <= set(DIFFICULTIES) and all(
+            isinstance(n, int) and n >= 0 for n in amounts.values()
+        )
         require(
             fits,
-            f"demonstrations={brief(amounts)}: write how many of each difficulty ({', '.join(DIFFICULTIES)}), such as "
-            "{easy: 100}.",
+            f"demonstrations={brief(amounts)}: write how many of each difficulty"
+            f" ({', '.join(DIFFICULTIES)}), such as {{easy: 100}}.",
         )
         counts |= {(task, level): n for level, n in amounts.items()}
     require(
         sum(counts.values()) >= 2,
-        f"demonstrations={brief(config['demonstrations'])}: it takes two, to learn from and to measure by.",
+        f"demonstrations={brief(config['demonstrations'])}: it takes two, to learn from and to"
+        " measure by.",
     )
     return counts
 
@@ -249,13 +308,17 @@ def counts_of(config: Mapping[str, Any]) -> dict[tuple[str, str], int]:
 def record_all(
     config: Mapping[str, Any], folder: Path, choices: "Sequence[FrameChoice]", robot: "Embodiment"
 ) -> list[Path]:
-    """Demonstrate until there are as many as wanted, each in a file of its own; the files, task by task.
+    """Demonstrate until there are as many as wanted, each in a file of its own; the files, task by
+    task.
 
     choices: what the memories that will train on them read. robot: the one that does.
     """
     from mme_vla.nano.demonstrations import Scene
 
-    groups, how = [], (tuple(robot.camera_names), tuple(choices), config["carried_out"], robot.action)
+    groups, how = (
+        [],
+        (tuple(robot.camera_names), tuple(choices), config["carried_out"], robot.action),
+    )
     for (task, level), required in counts_of(config).items():
         (folder / task).mkdir(parents=True, exist_ok=True)
         first = int(config["first_seed"]) + DIFFICULTIES.index(level) * SEEDS_APART
@@ -270,7 +333,9 @@ def _with_seed(scene: "Scene", seed: int) -> "Scene":
 
 @dataclass
 class Group:
-    """Scenes of one task and difficulty, of which so many are to be demonstrated. files: those that are."""
+    """Scenes of one task and difficulty, of which so many are to be demonstrated. files: those that
+    are.
+    """
 
     scenes: Iterator["Scene"]
     required: int
@@ -280,7 +345,9 @@ class Group:
 
     def next(self) -> list["Scene"]:
         """The scenes to try now."""
-        return list(islice(self.scenes, min(RETRIES - self.failed, self.required - len(self.files))))
+        return list(
+            islice(self.scenes, min(RETRIES - self.failed, self.required - len(self.files)))
+        )
 
     def take(self, tried: Sequence["Scene"]) -> None:
         """Note what came of them."""
@@ -293,22 +360,28 @@ class Group:
         if self.failed >= RETRIES:
             last = tried[-1]
             raise UserError(
-                f"{last.task}: {self.failed} {last.difficulty} scenes in a row, to seed {last.seed}, cannot be "
-                "demonstrated."
+                f"{last.task}: {self.failed} {last.difficulty} scenes in a row, to seed"
+                f" {last.seed}, cannot be demonstrated."
             )
 
 
 def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
-    """The files of the first demonstrations of each group that succeed; existing ones are not made again."""
+    """The files of the first demonstrations of each group that succeed; existing ones are not made
+    again.
+    """
     from mme_vla.data.console import progress
     from mme_vla.envs.recording.processes import carry_out
     from mme_vla.nano.demonstrations import demonstrated
 
-    with progress("record", sum(group.required for group in groups), unit="demonstrations") as advance:
+    with progress(
+        "record", sum(group.required for group in groups), unit="demonstrations"
+    ) as advance:
         while lacking := [group for group in groups if len(group.files) < group.required]:
             tried = [group.next() for group in lacking]
             # In turn, so that an interrupted run has some of every group.
-            alternating = [scene for scenes in zip_longest(*tried) for scene in scenes if scene is not None]
+            alternating = [
+                scene for scenes in zip_longest(*tried) for scene in scenes if scene is not None
+            ]
             missing = [scene for scene in alternating if not scene.tried]
             advance(sum(scene.made for scene in alternating if scene.tried))
             for made in carry_out(missing, demonstrated, workers):

@@ -1,8 +1,10 @@
-"""Images of the sixteen tasks with what is where in them: what the small vision tower learns to see from.
+"""Images of the sixteen tasks with what is where in them: what the small vision tower learns to see
+from.
 
-A scene is demonstrated once, and rendered at steps of every state that occurs: something held, pressed, marked or
-highlighted. Then its objects, the arm and the gripper are put somewhere else for each further image, without
-simulation. Labels come from the simulator's poses, and from its segmentation, which says what is visible.
+A scene is demonstrated once, and rendered at steps of every state that occurs: something held,
+pressed, marked or highlighted. Then its objects, the arm and the gripper are put somewhere else for
+each further image, without simulation. Labels come from the simulator's poses, and from its
+segmentation, which says what is visible.
 """
 
 from collections import Counter
@@ -24,18 +26,24 @@ if TYPE_CHECKING:
     from mme_vla.envs.task import Task
 
 CLEAR_COLOUR = 0.35
-"""How far the strongest channel of a cube's colour (0 … 1) stands out where the cube counts as red, green or blue."""
+"""How far the strongest channel of a cube's colour (0 … 1) stands out where the cube counts as red,
+green or blue.
+"""
 VISIBLE_PIXELS = 16
 """Of a 256 × 256 image: with fewer an object counts as hidden."""
 IN_HAND, GRASP = 0.03, (0.004, 0.03)
 """Metres from the tool's centre to a held object's, and between which a finger is then."""
 UNDER_MARK = 0.01  # metres between a disc and the mark that covers it, at most
 FIRST_STEP = 3  # of a state, at which it is rendered; then at twice the step before
-STATES = frozenset(name for name in CLASSES if name.startswith(("pressed", "mark", "highlight")) or "held" in name)
+STATES = frozenset(
+    name for name in CLASSES if name.startswith(("pressed", "mark", "highlight")) or "held" in name
+)
 
 
 class Place(NamedTuple):
-    """One object in a scene: the number of its class, its centre in the world [3], and its ids in a segmentation."""
+    """One object in a scene: the number of its class, its centre in the world [3], and its ids in a
+    segmentation.
+    """
 
     number: int
     centre: np.ndarray
@@ -44,7 +52,10 @@ class Place(NamedTuple):
 
 def find_places(env: "Task") -> list[Place]:
     """The class and the place of everything in a scene, visible or not."""
-    return [Place(CLASSES.index(name), np.asarray(centre, np.float64), ids) for name, centre, ids in _named_places(env)]
+    return [
+        Place(CLASSES.index(name), np.asarray(centre, np.float64), ids)
+        for name, centre, ids in _named_places(env)
+    ]
 
 
 def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
@@ -61,13 +72,19 @@ def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
             if isinstance(thing, Button) and pressed(thing):
                 yield "pressed button", where, ids
             if _in_gripper(env, name, where):
-                yield f"held {name}" if f"held {name}" in CLASSES else "other held object", where, ids
+                yield (
+                    f"held {name}" if f"held {name}" in CLASSES else "other held object",
+                    where,
+                    ids,
+                )
     for name, disc in lit:
         yield name, disc.position, disc.segmentation_ids
 
 
 def _visible_ids(thing: Any, lit: Sequence[Any]) -> list[int]:
-    """The ids of what shows where a thing is: of a button both parts, of a disc also the mark that covers it."""
+    """The ids of what shows where a thing is: of a button both parts, of a disc also the mark that
+    covers it.
+    """
     from mme_vla.envs.scene.articulated import Button
     from mme_vla.envs.scene.objects import Disc
     from mme_vla.envs.scene.things import distance_xy
@@ -88,7 +105,9 @@ def _class_of(thing: Any) -> str:
     if isinstance(thing, Cube):
         colour = np.array(COLOURS[thing.colour] if isinstance(thing.colour, str) else thing.colour)
         second, first = np.sort(colour)[-2:]
-        return f"{('red', 'green', 'blue')[colour.argmax()] if first - second > CLEAR_COLOUR else 'other'} cube"
+        is_clear = first - second > CLEAR_COLOUR
+        name = ("red", "green", "blue")[colour.argmax()] if is_clear else "other"
+        return f"{name} cube"
     if isinstance(thing, Disc):
         return "disc" if thing.name.startswith("disc") else "target"
     types = {Container: "container", Button: "button", Board: "board", Peg: "peg end"}
@@ -114,12 +133,20 @@ def _in_gripper(env: "Task", name: str, centre: np.ndarray) -> bool:
 
 
 def visible_places(places: Sequence[Place], segmentation: np.ndarray) -> np.ndarray:
-    """The places [m, 4] (class, x, y, z) whose objects show enough pixels in an image that holds their centre."""
-    counts = np.bincount(segmentation.ravel(), minlength=1 + max(max(place.ids) for place in places))
+    """The places [m, 4] (class, x, y, z) whose objects show enough pixels in an image that holds
+    their centre.
+    """
+    counts = np.bincount(
+        segmentation.ravel(), minlength=1 + max(max(place.ids) for place in places)
+    )
     rows = []
     for number, centre, ids in places:
         pixel = project(centre)
-        if counts[list(set(ids))].sum() >= VISIBLE_PIXELS and (pixel >= 0).all() and (pixel < SIDE).all():
+        if (
+            counts[list(set(ids))].sum() >= VISIBLE_PIXELS
+            and (pixel >= 0).all()
+            and (pixel < SIDE).all()
+        ):
             rows.append([number, *centre])
     return np.array(rows, np.float32).reshape(-1, 4)
 
@@ -152,11 +179,13 @@ class Renders:
             self.take(places)
 
 
-def record_scene(folder: Path, task: str, seed: int, difficulty: str, arrangements: int, size: int) -> Path:
+def record_scene(
+    folder: Path, task: str, seed: int, difficulty: str, arrangements: int, size: int
+) -> Path:
     """Render a scene into `folder`, unless it is there already; the path of its file.
 
-    The file has `images` [n, size, size, 3] uint8 and `places` [m, 5]: the image, the class and the centre (metres in
-    the world) of every visible object.
+    The file has `images` [n, size, size, 3] uint8 and `places` [m, 5]: the image, the class and the
+    centre (metres in the world) of every visible object.
 
     Args:
         arrangements: images with everything put elsewhere, behind those of the demonstration.
@@ -170,7 +199,9 @@ def record_scene(folder: Path, task: str, seed: int, difficulty: str, arrangemen
     env = make_task(task, render=True, seed=seed, difficulty=difficulty)
     try:
         renders = Renders(env, size)
-        Recorder(env, on_step=renders.step, render_request=RenderRequest(now=(), grounded=False)).record()
+        Recorder(
+            env, on_step=renders.step, render_request=RenderRequest(now=(), grounded=False)
+        ).record()
         if arrangements:
             env.reset()
         arm, rng = Arm(env.agent), np.random.default_rng(seed)
@@ -178,14 +209,18 @@ def record_scene(folder: Path, task: str, seed: int, difficulty: str, arrangemen
             _arrange(env, arm, rng)
             renders.take()
         with write_atomically(path) as draft, draft.open("wb") as file:
-            np.savez_compressed(file, images=np.stack(renders.images), places=np.concatenate(renders.places))
+            np.savez_compressed(
+                file, images=np.stack(renders.images), places=np.concatenate(renders.places)
+            )
     finally:
         env.close()
     return path
 
 
 def _arrange(env: "Task", arm: Any, rng: np.random.Generator) -> None:
-    """Put what can be put elsewhere, mark and highlight some of it, and move the arm, perhaps with something held."""
+    """Put what can be put elsewhere, mark and highlight some of it, and move the arm, perhaps with
+    something held.
+    """
     import torch
 
     for thing in env.things:
@@ -196,19 +231,25 @@ def _arrange(env: "Task", arm: Any, rng: np.random.Generator) -> None:
     over = near[rng.integers(len(near))] if near and rng.random() < 0.6 else None
     if over is not None:
         place = over.position + np.array([0, 0, rng.uniform(0.01, 0.2)])
-    joints = arm.ik(_pose(place) * _yaw_pose(rng.uniform(-0.8, 0.8)) * _pose(q=(0, 1, 0, 0)), env.qpos)
+    joints = arm.ik(
+        _pose(place) * _yaw_pose(rng.uniform(-0.8, 0.8)) * _pose(q=(0, 1, 0, 0)), env.qpos
+    )
     if joints is None:
         return
     grasped = not env.stick and over is not None and rng.random() < 0.5
     grasped = grasped and _class_of(over).endswith(("cube", "container"))
-    fingers = [] if env.stick else [rng.uniform(0.014, 0.021) if grasped else rng.uniform(0.03, 0.04)] * 2
+    fingers = (
+        [] if env.stick else [rng.uniform(0.014, 0.021) if grasped else rng.uniform(0.03, 0.04)] * 2
+    )
     env.agent.robot.set_qpos(torch.as_tensor(np.append(joints, fingers), dtype=torch.float32)[None])
     if grasped and over is not None:
         over.move_to(_pose(env.tcp_pose.p, over.pose.q))
 
 
 def _relocate(thing: Any, rng: np.random.Generator) -> None:
-    """Turned and, three times of ten, where it was; now and then lifted; containers out of the way half of the time."""
+    """Turned and, three times of ten, where it was; now and then lifted; containers out of the way
+    half of the time.
+    """
     name, home = _class_of(thing), thing.initial_pose
     if name == "container" and rng.random() < 0.5:
         return thing.move_away()
@@ -234,7 +275,11 @@ def _light(env: "Task", rng: np.random.Generator) -> None:
         among = bases.get(name.partition("_")[0])
         if among:
             disc, lit = Thing(name, actor), rng.random() > 0.6
-            below = among[rng.integers(len(among))].position - [0, 0, Highlight.DEPTH] if lit else BELOW_TABLE
+            below = (
+                among[rng.integers(len(among))].position - [0, 0, Highlight.DEPTH]
+                if lit
+                else BELOW_TABLE
+            )
             disc.move_to(_pose(below, disc.pose.q))
 
 

@@ -1,4 +1,6 @@
-"""Tokens of the frames of demonstrations: the tower reads each frame once, for all memories and trainings."""
+"""Tokens of the frames of demonstrations: the tower reads each frame once, for all memories and
+trainings.
+"""
 
 import hashlib
 import json
@@ -32,8 +34,8 @@ _SOME_WIDTH = 64  # what a scorer gives does not depend on the width of tokens
 class FrameTokens:
     """What the tower made of a demonstration's frames.
 
-    frames: camera → its rendered frames [n] int64, ascending. tokens: camera → [n, patches, d] float16. scores: key of
-    a frame scorer → the rows it gave for the memory camera.
+    frames: camera → its rendered frames [n] int64, ascending. tokens: camera → [n, patches, d]
+    float16. scores: key of a frame scorer → the rows it gave for the memory camera.
     """
 
     frames: dict[str, np.ndarray]
@@ -44,36 +46,64 @@ class FrameTokens:
         """The tokens [n, patches, d] of these frames."""
         known, numbers = self.frames[camera], np.asarray(frames, np.int64)
         missing = sorted(set(numbers.tolist()) - set(known.tolist()))
-        require(not missing, f"The demonstration holds no tokens of frames {missing[:5]}: they were not rendered.")
+        require(
+            not missing,
+            f"The demonstration holds no tokens of frames {missing[:5]}: they were not rendered.",
+        )
         return self.tokens[camera][torch.from_numpy(np.searchsorted(known, numbers))]
 
     def save(self, path: Path, stamp: str) -> None:
-        """Write one file, which appears whole or not at all. stamp: of the demonstration (`stamp_of`)."""
+        """Write one file, which appears whole or not at all. stamp: of the demonstration
+        (`stamp_of`).
+        """
         from safetensors.torch import save_file
 
         tensors = {f"tokens/{name}": value for name, value in self.tokens.items()}
-        tensors |= {f"frames/{name}": torch.from_numpy(value) for name, value in self.frames.items()}
+        tensors |= {
+            f"frames/{name}": torch.from_numpy(value) for name, value in self.frames.items()
+        }
         for key, rows in self.scores.items():
-            tensors |= {f"scored/{key}": torch.from_numpy(rows.frames), f"scores/{key}": torch.from_numpy(rows.values)}
+            tensors |= {
+                f"scored/{key}": torch.from_numpy(rows.frames),
+                f"scores/{key}": torch.from_numpy(rows.values),
+            }
         path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as draft:
-            save_file({name: value.contiguous() for name, value in tensors.items()}, draft, {"stamp": stamp})
+            save_file(
+                {name: value.contiguous() for name, value in tensors.items()},
+                draft,
+                {"stamp": stamp},
+            )
 
     @classmethod
     def load(cls, path: Path) -> "FrameTokens":
         """Read what `save` wrote."""
         from safetensors.torch import load_file
 
-        parts: dict[str, dict[str, Tensor]] = {"tokens": {}, "frames": {}, "scored": {}, "scores": {}}
+        parts: dict[str, dict[str, Tensor]] = {
+            "tokens": {},
+            "frames": {},
+            "scored": {},
+            "scores": {},
+        }
         for name, value in load_file(path).items():
             part, _, key = name.partition("/")
             parts[part][key] = value
-        scores = {key: FrameScores(parts["scored"][key].numpy(), rows.numpy()) for key, rows in parts["scores"].items()}
-        return cls({name: value.numpy() for name, value in parts["frames"].items()}, parts["tokens"], scores)
+        scores = {
+            key: FrameScores(parts["scored"][key].numpy(), rows.numpy())
+            for key, rows in parts["scores"].items()
+        }
+        return cls(
+            {name: value.numpy() for name, value in parts["frames"].items()},
+            parts["tokens"],
+            scores,
+        )
 
 
 @torch.no_grad()
-def tokenize(policy: MMEPolicy, demonstration: Demonstration, memories: Iterable["Memory"] = ()) -> FrameTokens:
+def tokenize(
+    policy: MMEPolicy, demonstration: Demonstration, memories: Iterable["Memory"] = ()
+) -> FrameTokens:
     """Encode all rendered frames of a demonstration.
 
     policy: with the tower. memories: those whose scorers rate its frames, beside the policy's own.
@@ -86,12 +116,18 @@ def tokenize(policy: MMEPolicy, demonstration: Demonstration, memories: Iterable
         frames[camera] = np.array(sorted(taken), np.int64)
         parts = []
         for some in np.array_split(frames[camera], -(-len(frames[camera]) // 32)):
-            views = processor.images([np.stack([taken[int(k)] for k in some])] * len(policy.embodiment.camera_names))
+            views = processor.images(
+                [np.stack([taken[int(k)] for k in some])] * len(policy.embodiment.camera_names)
+            )
             parts.append(policy.backbone.encode_images(views[:, 0].float() / 255 * 2 - 1).half())
         tokens[camera] = torch.cat(parts)
     readers = [*memories] if policy.memory is None else [policy.memory, *memories]
     images = demonstration.images.get(policy.embodiment.memory_camera, {})
-    scores = {memory.storage.scorer: _scores(memory, images) for memory in readers if memory.storage.scorer}
+    scores = {
+        memory.storage.scorer: _scores(memory, images)
+        for memory in readers
+        if memory.storage.scorer
+    }
     return FrameTokens(frames, tokens, scores)
 
 
@@ -111,16 +147,19 @@ def stamp_of(file: Path) -> str:
     """Twelve letters that name a demonstration's content and which of its frames are rendered."""
     with np.load(file) as stored:
         names = [name for name in stored if not name.endswith("_pictures")]
-        parts = b"".join(name.encode() + np.ascontiguousarray(stored[name]).tobytes() for name in names)
+        parts = b"".join(
+            name.encode() + np.ascontiguousarray(stored[name]).tobytes() for name in names
+        )
     return hashlib.sha256(parts).hexdigest()[:12]
 
 
 @dataclass(frozen=True)
 class TokenStore:
-    """The tokens of demonstrations by one tower, a file each, in a folder that is named after the tower.
+    """The tokens of demonstrations by one tower, a file each, in a folder that is named after the
+    tower.
 
-    config: of a policy with the tower, as JSON. folder: of all towers' tokens. memories: sections, as JSON, of those
-    whose scorers rate frames.
+    config: of a policy with the tower, as JSON. folder: of all towers' tokens. memories: sections,
+    as JSON, of those whose scorers rate frames.
     """
 
     config: str
@@ -130,7 +169,9 @@ class TokenStore:
     @classmethod
     def of(cls, folder: Path, configs: Sequence[Mapping[str, Any]]) -> "TokenStore":
         """The store of rows that share a tower: their composed configurations."""
-        sections = {json.dumps(config["memory"], sort_keys=True) for config in configs if config["memory"]}
+        sections = {
+            json.dumps(config["memory"], sort_keys=True) for config in configs if config["memory"]
+        }
         scored = sorted(text for text in sections if _memory(text).storage.scorer)
         return cls(json.dumps(dict(configs[0])), folder, tuple(scored))
 
@@ -149,11 +190,15 @@ class TokenStore:
         return FrameTokens.load(self.path(file))
 
     def make(self, file: Path) -> None:
-        """Encode a demonstration unless its tokens are there, of all its frames and with every score."""
+        """Encode a demonstration unless its tokens are there, of all its frames and with every
+        score.
+        """
         stamp = stamp_of(file)
         if not self._is_made(file, stamp):
             scored = map(_memory, self.memories)
-            tokenize(_policy(self.config), Demonstration.load(file), scored).save(self.path(file), stamp)
+            tokenize(_policy(self.config), Demonstration.load(file), scored).save(
+                self.path(file), stamp
+            )
 
     def _is_made(self, file: Path, stamp: str) -> bool:
         from safetensors import safe_open
@@ -162,9 +207,17 @@ class TokenStore:
         if not path.is_file():
             return False
         with safe_open(path, "pt") as tensors:
-            scored = {name.removeprefix("scores/") for name in tensors.keys() if name.startswith("scores/")}  # noqa: SIM118
+            scored = {
+                name.removeprefix("scores/")
+                for name in tensors.keys()  # noqa: SIM118
+                if name.startswith("scores/")
+            }
             required = {_memory(text).storage.scorer for text in self.memories}
-            widths = {tensors.get_slice(name).get_shape()[-1] for name in tensors.keys() if name.startswith("tokens/")}  # noqa: SIM118
+            widths = {
+                tensors.get_slice(name).get_shape()[-1]
+                for name in tensors.keys()  # noqa: SIM118
+                if name.startswith("tokens/")
+            }
             complete = widths == {_policy(self.config).backbone.vision_width} and required <= scored
             return bool(tensors.metadata().get("stamp") == stamp) and complete
 

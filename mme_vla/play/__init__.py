@@ -1,4 +1,5 @@
-"""The tasks as multiple choice: clips are shown, the next action is chosen, an oracle planner carries it out.
+"""The tasks as multiple choice: clips are shown, the next action is chosen, an oracle planner
+carries it out.
 
 Names are imported when they are used, so that `python -m mme_vla.play` can be interrupted at once.
 """
@@ -9,20 +10,45 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mme_vla.embodiment.action_space import Option
     from mme_vla.play.game import ChoiceSession, Decision, Reveal
-    from mme_vla.play.players import PLAYERS, NoChoiceError, OraclePlayer, Player, RandomPlayer, build_player
+    from mme_vla.play.players import (
+        PLAYERS,
+        NoChoiceError,
+        OraclePlayer,
+        Player,
+        RandomPlayer,
+        build_player,
+    )
     from mme_vla.play.vlm_players import GeminiPlayer, OpenAIPlayer, QwenPlayer
 
 __all__ = [
-    "PLAYERS", "ChoiceSession", "Decision", "GeminiPlayer", "NoChoiceError", "OpenAIPlayer", "Option",
-    "OraclePlayer", "Player", "QwenPlayer", "RandomPlayer", "Reveal", "build_player",
-]  # fmt: skip
+    "PLAYERS",
+    "ChoiceSession",
+    "Decision",
+    "GeminiPlayer",
+    "NoChoiceError",
+    "OpenAIPlayer",
+    "Option",
+    "OraclePlayer",
+    "Player",
+    "QwenPlayer",
+    "RandomPlayer",
+    "Reveal",
+    "build_player",
+]
 
 _HOMES = {
     name: f"mme_vla.{module}"
     for module, names in {
         "embodiment.action_space": ["Option"],
         "play.game": ["ChoiceSession", "Decision", "Reveal"],
-        "play.players": ["PLAYERS", "NoChoiceError", "OraclePlayer", "Player", "RandomPlayer", "build_player"],
+        "play.players": [
+            "PLAYERS",
+            "NoChoiceError",
+            "OraclePlayer",
+            "Player",
+            "RandomPlayer",
+            "build_player",
+        ],
         "play.vlm_players": ["GeminiPlayer", "OpenAIPlayer", "QwenPlayer"],
     }.items()
     for name in names

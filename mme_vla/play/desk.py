@@ -1,4 +1,6 @@
-"""What the page shows and does, without the web: one episode after the other, simulated in a thread of its own."""
+"""What the page shows and does, without the web: one episode after the other, simulated in a thread
+of its own.
+"""
 
 import io
 import logging
@@ -26,13 +28,14 @@ class StaleError(Exception):
 class Desk:
     """Leads one person through the episodes of a run.
 
-    Everything that touches the simulator runs in one thread, which also made it. The other methods return at once.
+    Everything that touches the simulator runs in one thread, which also made it. The other methods
+    return at once.
 
     run: whose episodes are played. participant: kept with each record.
 
     Attributes:
-        phase: `loading` (an episode is being set up), `choosing`, `moving`, `ended` (of one episode), `finished` (of
-            all), or `broken` (see `error`; `proceed` tries again).
+        phase: `loading` (an episode is being set up), `choosing`, `moving`, `ended` (of one
+            episode), `finished` (of all), or `broken` (see `error`; `proceed` tries again).
         address: where the page is served, for the log.
     """
 
@@ -45,7 +48,7 @@ class Desk:
         self._since = time.monotonic()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="simulator")
 
-    # What the person does -----------------------------------------------------------------------------------------
+    # What the person does -------------------------------------------------------------------------
 
     def begin(self) -> None:
         """Set the next episode up, or say that there is none."""
@@ -58,15 +61,20 @@ class Desk:
     def choose(self, request: Mapping[str, Any]) -> None:
         """Carry a choice out.
 
-        request: `choice` and `point`, with `session` and `decision` (how many were made before), so that a choice sent
-        twice, or from a page left open, does nothing.
+        request: `choice` and `point`, with `session` and `decision` (how many were made before), so
+        that a choice sent twice, or from a page left open, does nothing.
 
         Raises:
-            StaleError: the question is no longer asked. UserError: the choice cannot be made; nothing has happened.
+            StaleError: the question is no longer asked. UserError: the choice cannot be made;
+                nothing has happened.
         """
         session = self.session
         requested = (request.get("session"), request.get("decision"))
-        if self.phase != "choosing" or session is None or requested != (self.session_id, len(session.decisions)):
+        if (
+            self.phase != "choosing"
+            or session is None
+            or requested != (self.session_id, len(session.decisions))
+        ):
             raise StaleError("This was decided already; the page shows the present question.")
         session.check(request)
         action = {"choice": request["choice"], "point": request.get("point")}
@@ -74,28 +82,51 @@ class Desk:
         self._work(lambda: self._move(session, action))
 
     def proceed(self) -> None:
-        """Go on after the end of an episode, or try again after a breakdown; otherwise nothing happens."""
+        """Go on after the end of an episode, or try again after a breakdown; otherwise nothing
+        happens.
+        """
         session = self.session
-        if self.phase == "broken" and session is not None and session.over and session.episode in self.run.todo:
+        if (
+            self.phase == "broken"
+            and session is not None
+            and session.over
+            and session.episode in self.run.todo
+        ):
             self._work(lambda: self._after(session))  # it was played, and could not be saved
         elif self.phase in ("ended", "broken"):
             self.begin()
 
-    # What the page shows ------------------------------------------------------------------------------------------
+    # What the page shows --------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """All but the frames, as JSON takes it."""
         # The simulator's thread changes these meanwhile: each is read once.
-        run, phase, session, session_id, todo = self.run, self.phase, self.session, self.session_id, list(self.run.todo)
+        run, phase, session, session_id, todo = (
+            self.run,
+            self.phase,
+            self.session,
+            self.session_id,
+            list(self.run.todo),
+        )
         done = len(run.episodes) - len(todo)
         state: dict[str, Any] = {
-            "phase": phase, "error": self.error, "for_s": round(time.monotonic() - self._since, 1),
-            "total": len(run.episodes), "played": done, "successes": sum(record.success for record in run.records),
-            "participant": self.participant, "session": session_id,
-        }  # fmt: skip
+            "phase": phase,
+            "error": self.error,
+            "for_s": round(time.monotonic() - self._since, 1),
+            "total": len(run.episodes),
+            "played": done,
+            "successes": sum(record.success for record in run.records),
+            "participant": self.participant,
+            "session": session_id,
+        }
         if phase == "finished":
             state["summary"] = [
-                {"task": task, "successes": successes, "episodes": count, "human": paper.get("Human")}
+                {
+                    "task": task,
+                    "successes": successes,
+                    "episodes": count,
+                    "human": paper.get("Human"),
+                }
                 for task, successes, count, paper in run.summary()
             ]
         which = session.episode if session is not None else todo[0] if todo else None
@@ -104,13 +135,21 @@ class Desk:
         if session is not None and session.reveals:
             reveals, decisions = list(session.reveals), list(session.decisions)
             state |= {
-                "goal": session.goal, "status": session.status, "steps": session.steps, "problem": session.error,
-                "ended_by": session.ended_by, "max_choices": session.max_choices,
+                "goal": session.goal,
+                "status": session.status,
+                "steps": session.steps,
+                "problem": session.error,
+                "ended_by": session.ended_by,
+                "max_choices": session.max_choices,
                 "options": [vars(option) for option in session.options],
-                "reveals": [{"title": r.title, "start": r.start, "count": len(r.frames)} for r in reveals],
-                "decisions": [{"choice": d.choice, "action": d.action, "point": d.point} for d in decisions],
+                "reveals": [
+                    {"title": r.title, "start": r.start, "count": len(r.frames)} for r in reveals
+                ],
+                "decisions": [
+                    {"choice": d.choice, "action": d.action, "point": d.point} for d in decisions
+                ],
                 "video": len(reveals[0].frames) - 1,
-            }  # fmt: skip
+            }
         return state
 
     def frames(self, session_id: str, number: int) -> bytes:
@@ -120,7 +159,11 @@ class Desk:
             StaleError: another episode is on, or it has no such reveal.
         """
         session = self.session
-        if session is None or session_id != self.session_id or not 0 <= number < len(session.reveals):
+        if (
+            session is None
+            or session_id != self.session_id
+            or not 0 <= number < len(session.reveals)
+        ):
             raise StaleError("There are no such frames: another episode is on.")
         return pack_frames(session.reveals[number].frames)
 
@@ -129,7 +172,7 @@ class Desk:
         self._thread.submit(self._free)
         self._thread.shutdown(wait=True)
 
-    # In the simulator's thread ------------------------------------------------------------------------------------
+    # In the simulator's thread --------------------------------------------------------------------
 
     def _load(self) -> None:
         self._free()
@@ -156,7 +199,11 @@ class Desk:
         self.run.save(session, participant=self.participant)
         which = session.episode
         log.info(
-            "%s, episode %d: %s after %d choices", which.task, which.episode, session.status, len(session.decisions)
+            "%s, episode %d: %s after %d choices",
+            which.task,
+            which.episode,
+            session.status,
+            len(session.decisions),
         )
         return self._enter("ended")
 
@@ -182,7 +229,9 @@ class Desk:
 
 
 def pack_frames(frames: Sequence[np.ndarray]) -> bytes:
-    """Frames as JPEGs behind a table: their number and each one's size in bytes, all uint32 in little-endian order."""
+    """Frames as JPEGs behind a table: their number and each one's size in bytes, all uint32 in
+    little-endian order.
+    """
     from PIL import Image
 
     images = []

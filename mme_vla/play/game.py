@@ -1,8 +1,9 @@
-"""One episode as a sequence of choices: what has been shown, what can be chosen, what was chosen, how it ended.
+"""One episode as a sequence of choices: what has been shown, what can be chosen, what was chosen,
+how it ended.
 
-Execution videos are revealed one after the other, the next high-level action is chosen from a fixed set, with a pixel
-where it needs one, and an oracle planner carries it out (paper, "Oracle Planner and Human Study"). People, models and
-scripts play through the same object.
+Execution videos are revealed one after the other, the next high-level action is chosen from a fixed
+set, with a pixel where it needs one, and an oracle planner carries it out (paper, "Oracle Planner
+and Human Study"). People, models and scripts play through the same object.
 """
 
 import time
@@ -28,7 +29,8 @@ MAX_CHOICES = 60  # the longest episode of the benchmark needs fewer than 30
 class Reveal:
     """Frames that are shown together.
 
-    title: what they show. frames: [256, 256, 3] uint8 each, maybe none. start: place of the first in the episode.
+    title: what they show. frames: [256, 256, 3] uint8 each, maybe none. start: place of the first
+    in the episode.
     """
 
     title: str
@@ -40,8 +42,8 @@ class Reveal:
 class Decision:
     """One choice and what came of it.
 
-    choice: letter. action: its text. point: pixel [y, x] of the front image, None where it needs none.
-    frames: [first, stop) of what it revealed, in frames of the episode. status: after it.
+    choice: letter. action: its text. point: pixel [y, x] of the front image, None where it needs
+    none. frames: [first, stop) of what it revealed, in frames of the episode. status: after it.
     seconds: from the arrival of the frames to the choice. note: the player's addition.
     """
 
@@ -58,11 +60,13 @@ class ChoiceSession:
     """Plays one episode in the action space `multi_choice`.
 
     Args:
-        env: with `reset` and `step` of `mme_vla.envs` (or the official package's), in that action space.
+        env: with `reset` and `step` of `mme_vla.envs` (or the official package's), in that action
+            space.
         episode: which one it is.
-        images: whether the player reads them; without, the environment need not render, and frames are black.
-        max_choices: choices after which the episode counts as timed out; a choice may move nothing at all, so the
-            environment's own limit on steps might never be reached.
+        images: whether the player reads them; without, the environment need not render, and frames
+            are black.
+        max_choices: choices after which the episode counts as timed out; a choice may move nothing
+            at all, so the environment's own limit on steps might never be reached.
         clock: seconds that only grow.
 
     Example:
@@ -84,7 +88,9 @@ class ChoiceSession:
         self.env, self.episode, self.max_choices, self.images = env, episode, max_choices, images
         self.goal, self.status, self.error = "", "not started", ""
         self.ended_by = ""
-        """What ended the episode where it was not the environment: `max_choices`, or a player's reason."""
+        """What ended the episode where it was not the environment: `max_choices`, or a player's
+        reason.
+        """
         self.options: tuple[Option, ...] = ()
         self.reveals: list[Reveal] = []
         self.decisions: list[Decision] = []
@@ -92,10 +98,12 @@ class ChoiceSession:
         self._begun = clock()
         self._simulated = self._policy_seconds = 0.0
 
-    # Playing ------------------------------------------------------------------------------------------------------
+    # Playing --------------------------------------------------------------------------------------
 
     def start(self) -> Reveal:
-        """Reset the environment, which shows the conditioning video, if any, and then the present frame."""
+        """Reset the environment, which shows the conditioning video, if any, and then the present
+        frame.
+        """
         require(not self.reveals, "This session has begun; make a new one for another episode.")
         started = self._clock()
         observation, info = self.env.reset()
@@ -115,8 +123,8 @@ class ChoiceSession:
     def choose(self, action: Mapping[str, Any], note: Mapping[str, Any] | None = None) -> Reveal:
         """Carry out an option.
 
-        action: {"choice": letter, "point": [y, x]}; the point is read only where the option needs one. note: what to
-        keep with the decision.
+        action: {"choice": letter, "point": [y, x]}; the point is read only where the option needs
+        one. note: what to keep with the decision.
 
         Returns:
             The frames of the motion; none where nothing moved, or the environment could not do it.
@@ -133,7 +141,15 @@ class ChoiceSession:
         self._take(frames, info, option.action)
         span = (first, first + len(frames))
         self.decisions.append(
-            Decision(option.label, option.action, point, span, self.status, round(seconds, 3), dict(note or {}))
+            Decision(
+                option.label,
+                option.action,
+                point,
+                span,
+                self.status,
+                round(seconds, 3),
+                dict(note or {}),
+            )
         )
         if not self.over and len(self.decisions) >= self.max_choices:
             self.give_up("timeout", "max_choices")
@@ -158,14 +174,16 @@ class ChoiceSession:
         return option, checked_point(action.get("point"), option) if option.needs_point else None
 
     def give_up(self, outcome: str, reason: str) -> None:
-        """End the episode without the environment. outcome: what it counts as. reason: why, kept in the record."""
+        """End the episode without the environment. outcome: what it counts as. reason: why, kept in
+        the record.
+        """
         if outcome not in OUTCOMES or self.over:
             raise ValueError(f"An episode that is {self.status} cannot end with {outcome!r}.")
         self.status, self.ended_by = outcome, reason
         if outcome == "error":
             self.error = reason
 
-    # What there is to see -----------------------------------------------------------------------------------------
+    # What there is to see -------------------------------------------------------------------------
 
     @property
     def over(self) -> bool:
@@ -188,20 +206,45 @@ class ChoiceSession:
         return sum(len(reveal.frames) for reveal in self.reveals[1:])
 
     def record(
-        self, model: str, checkpoint: int | str = 0, model_seed: int = 0, max_steps: int = 1300, **extra: Any
+        self,
+        model: str,
+        checkpoint: int | str = 0,
+        model_seed: int = 0,
+        max_steps: int = 1300,
+        **extra: Any,
     ) -> EpisodeRecord:
         """The episode as evaluation keeps it, its decisions in `extra`."""
-        require(self.over, f"The episode is not over ({self.status}); there is nothing to record yet.")
+        require(
+            self.over, f"The episode is not over ({self.status}); there is nothing to record yet."
+        )
         which = self.episode
         ended = {"ended_by": self.ended_by} if self.ended_by else {}
         return EpisodeRecord(
-            model=model, checkpoint=checkpoint, model_seed=model_seed, max_steps=max_steps, action_space="multi_choice",
-            task=which.task, episode=which.episode, seed=which.seed, difficulty=which.difficulty, split=which.split,
+            model=model,
+            checkpoint=checkpoint,
+            model_seed=model_seed,
+            max_steps=max_steps,
+            action_space="multi_choice",
+            task=which.task,
+            episode=which.episode,
+            seed=which.seed,
+            difficulty=which.difficulty,
+            split=which.split,
             scene=getattr(self.env, "scene_digest", NO_VALUES),
-            outcome=self.status, steps=self.steps, error=self.error or None,
-            seconds=Seconds(round(self._simulated, 3), round(self._policy_seconds, 3), round(self._clock() -
-            self._begun, 3)), extra={"decisions": [asdict(decision) for decision in self.decisions], **ended, **extra},
-        )  # fmt: skip
+            outcome=self.status,
+            steps=self.steps,
+            error=self.error or None,
+            seconds=Seconds(
+                round(self._simulated, 3),
+                round(self._policy_seconds, 3),
+                round(self._clock() - self._begun, 3),
+            ),
+            extra={
+                "decisions": [asdict(decision) for decision in self.decisions],
+                **ended,
+                **extra,
+            },
+        )
 
     def close(self) -> None:
         """Free the environment."""
@@ -220,7 +263,11 @@ class ChoiceSession:
             self.goal = goal if isinstance(goal, str) else str(goal[0])
         if "available_multi_choices" in info:
             self.options = tuple(
-                Option(str(option["label"]).lower(), str(option["action"]), bool(option["need_parameter"]))
+                Option(
+                    str(option["label"]).lower(),
+                    str(option["action"]),
+                    bool(option["need_parameter"]),
+                )
                 for option in info["available_multi_choices"]
                 if option.get("possible", True)
             )
@@ -240,6 +287,8 @@ def checked_point(point: Any, option: Option) -> tuple[float, float]:
     elif values.shape != (2,) or not np.isfinite(values).all():
         problem = f"needs two numbers as its point, a pixel's row and column; got {point!r}"
     elif not ((values >= 0) & (values < SIDE)).all():
-        problem = f"needs a point of the image, and {point} lies outside of the image: 0 to {SIDE - 1}"
+        problem = (
+            f"needs a point of the image, and {point} lies outside of the image: 0 to {SIDE - 1}"
+        )
     require(not problem, f"{what} {problem}.")
     return float(values[0]), float(values[1])

@@ -21,11 +21,13 @@ class NoChoiceError(Exception):
 
 
 class Player:
-    """The interface of every player. A subclass implements `choose`, and overrides the rest where it needs to.
+    """The interface of every player. A subclass implements `choose`, and overrides the rest where
+    it needs to.
 
     Attributes:
         model: what its records are filed under.
-        needs_images: whether it reads images; for one that does not, nothing is rendered, which is much faster.
+        needs_images: whether it reads images; for one that does not, nothing is rendered, which is
+            much faster.
     """
 
     model = "player"
@@ -78,7 +80,9 @@ class RandomPlayer(Player):
     def start(self, session: ChoiceSession) -> None:
         """Draw anew for each episode, whichever were played before."""
         which = session.episode
-        self._draws = np.random.default_rng([self.seed, zlib.crc32(which.task.encode()), which.seed])
+        self._draws = np.random.default_rng(
+            [self.seed, zlib.crc32(which.task.encode()), which.seed]
+        )
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
         option = session.options[self._draws.integers(len(session.options))]
@@ -88,9 +92,11 @@ class RandomPlayer(Player):
 
 @PLAYERS.register("oracle")
 class OraclePlayer(Player):
-    """Knows the task's own script: the option that carries out the current sub-task, on the object it is about.
+    """Knows the task's own script: the option that carries out the current sub-task, on the object
+    it is about.
 
-    The upper bound of the protocol: what it fails at, planning or the rules of multi-choice failed at.
+    The upper bound of the protocol: what it fails at, planning or the rules of multi-choice failed
+    at.
     """
 
     model = "oracle"
@@ -101,7 +107,9 @@ class OraclePlayer(Player):
 
         task = getattr(session.env, "task", None)
         if task is None:
-            raise UserError("player=oracle reads the script of this library's tasks: use it with env=mme_vla.")
+            raise UserError(
+                "player=oracle reads the script of this library's tasks: use it with env=mme_vla."
+            )
         try:
             choice, text = oracle_choice(task)
         except OracleStuckError as error:

@@ -1,4 +1,6 @@
-"""A run of episodes: which ones, where their records go, which are still to be played, and how they compare."""
+"""A run of episodes: which ones, where their records go, which are still to be played, and how they
+compare.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,8 +21,8 @@ def make_session(
 ) -> ChoiceSession:
     """The simulator for one episode.
 
-    episode: which one. env: name of the environment. max_steps, max_choices: when it has timed out. images: whether the
-    player reads them; the official environment renders in any case.
+    episode: which one. env: name of the environment. max_steps, max_choices: when it has timed out.
+    images: whether the player reads them; the official environment renders in any case.
     """
     from mme_vla.envs import make_env
 
@@ -69,8 +71,14 @@ class PlayRun:
         self.episodes = list(episodes)
         keys = {(which.task, which.episode) for which in self.episodes}
         # Folders below hold runs of their own.
-        there = [record for path in sorted(folder.glob("episodes*.jsonl")) for record in read_records(path)]
-        self.records = [record for record in merge(there, "last") if (record.task, record.episode) in keys]
+        there = [
+            record
+            for path in sorted(folder.glob("episodes*.jsonl"))
+            for record in read_records(path)
+        ]
+        self.records = [
+            record for record in merge(there, "last") if (record.task, record.episode) in keys
+        ]
         done = finished(self.records, retry_errors)
         self.todo = [which for which in self.episodes if (which.task, which.episode) not in done]
 
@@ -79,7 +87,13 @@ class PlayRun:
         identity = self.identity
         return self._keep(
             session.episode,
-            session.record(identity.model, identity.checkpoint, identity.model_seed, identity.max_steps, **extra),
+            session.record(
+                identity.model,
+                identity.checkpoint,
+                identity.model_seed,
+                identity.max_steps,
+                **extra,
+            ),
         )
 
     def save_error(
@@ -87,8 +101,8 @@ class PlayRun:
     ) -> EpisodeRecord:
         """Write that an episode could not be played to its end.
 
-        which: the episode. reason: what broke. session: as far as it came; None where it could not even be made. extra:
-        more to keep with the record.
+        which: the episode. reason: what broke. session: as far as it came; None where it could not
+        even be made. extra: more to keep with the record.
         """
         if session is not None:
             if not session.over:
@@ -96,12 +110,22 @@ class PlayRun:
             return self.save(session, **extra)
         identity = self.identity
         record = EpisodeRecord(
-            model=identity.model, checkpoint=identity.checkpoint, model_seed=identity.model_seed,
-            max_steps=identity.max_steps, action_space="multi_choice", task=which.task, episode=which.episode,
-            seed=which.seed, difficulty=which.difficulty, split=which.split, outcome="error", steps=0, error=reason,
+            model=identity.model,
+            checkpoint=identity.checkpoint,
+            model_seed=identity.model_seed,
+            max_steps=identity.max_steps,
+            action_space="multi_choice",
+            task=which.task,
+            episode=which.episode,
+            seed=which.seed,
+            difficulty=which.difficulty,
+            split=which.split,
+            outcome="error",
+            steps=0,
+            error=reason,
             scene=NOT_BUILT,
             extra={"decisions": [], "ended_by": reason, **extra},
-        )  # fmt: skip
+        )
         return self._keep(which, record)
 
     def _keep(self, which: EpisodeSpec, record: EpisodeRecord) -> EpisodeRecord:
@@ -112,7 +136,8 @@ class PlayRun:
         return record
 
     def summary(self) -> list[tuple[str, int, int, dict[str, float]]]:
-        """(task, successes, episodes, the paper's rates by method in percent), tasks in the paper's order.
+        """(task, successes, episodes, the paper's rates by method in percent), tasks in the paper's
+        order.
 
         The user's own tasks come last, without rates.
         """

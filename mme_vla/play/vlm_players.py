@@ -1,4 +1,6 @@
-"""Vision-language models that play: Qwen3-VL on this machine, and a foundation model behind Google's API."""
+"""Vision-language models that play: Qwen3-VL on this machine, and a foundation model behind
+Google's API.
+"""
 
 import math
 import re
@@ -32,26 +34,36 @@ image: the candidate nearest to it is taken.
 
 A point is [row, column], both from 0 (top, left) to 1000 (bottom, right).
 End your answer with one JSON object and nothing after it: {"choice": "<letter>", "point": [row, column]}. \
-Leave "point" as null for options without [point]."""
+Leave "point" as null for options without [point]."""  # noqa: E501
 
 
 def option_list(options: Sequence[Option]) -> str:
     """`a: pick up the cube [point]`, one a line."""
-    return "\n".join(f"{option.label}: {option.action}{' [point]' if option.needs_point else ''}" for option in options)
+    return "\n".join(
+        f"{option.label}: {option.action}{' [point]' if option.needs_point else ''}"
+        for option in options
+    )
 
 
 def choice_text(decision: Decision) -> str:
     """A past decision in words: `a: pick up the cube at [442, 617]`."""
     point = decision.point
-    place = "" if point is None else " at [{}, {}]".format(*(to_thousandths(int(value), SIDE) for value in point))
+    place = (
+        ""
+        if point is None
+        else " at [{}, {}]".format(*(to_thousandths(int(value), SIDE) for value in point))
+    )
     return f"{decision.choice}: {decision.action}{place}"
 
 
-def full_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[str, bool]], complaint: str = "") -> str:
+def full_question(
+    goal: str, options: Sequence[Option], clips: Sequence[tuple[str, bool]], complaint: str = ""
+) -> str:
     """One question that tells the whole episode, `<video>` and `<image>` where images go.
 
-    goal: the task in words. clips: what each clip that was shown is, in order, and whether it has frames. complaint:
-    why the last reply to the same question could not be used; empty the first time.
+    goal: the task in words. clips: what each clip that was shown is, in order, and whether it has
+    frames. complaint: why the last reply to the same question could not be used; empty the first
+    time.
     """
     lines = [f"The task: {goal}"]
     lines += [f"{title}: {VIDEO if frames else 'nothing moved.'}" for title, frames in clips]
@@ -65,7 +77,9 @@ def full_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[st
 def opening(goal: str, options: Sequence[Option], video: bool) -> str:
     """The first question of a conversation."""
     introduction = (
-        "The video comes before you act; the image is the present one." if video else "This is the present image."
+        "The video comes before you act; the image is the present one."
+        if video
+        else "This is the present image."
     )
     return f"The task: {goal}\n{introduction}\nOptions:\n{option_list(options)}\nWhat next?"
 
@@ -73,9 +87,14 @@ def opening(goal: str, options: Sequence[Option], video: bool) -> str:
 def following(decision: Decision, options: Sequence[Option], changed: bool) -> str:
     """A later question of a conversation."""
     description = (
-        "the video shows it, the image is the present one" if changed else "nothing moved; this is the present image"
+        "the video shows it, the image is the present one"
+        if changed
+        else "nothing moved; this is the present image"
     )
-    return f"You chose {choice_text(decision)}; {description}.\nOptions:\n{option_list(options)}\nWhat next?"
+    return (
+        f"You chose {choice_text(decision)}; {description}.\nOptions:\n{option_list(options)}\nWhat"
+        " next?"
+    )
 
 
 def retry_message(reason: str) -> str:
@@ -105,21 +124,35 @@ def parse_choice(reply: str, options: Sequence[Option]) -> dict[str, Any]:
     elif label is None:
         problem = 'the answer has no "choice"'
     elif option is None:
-        problem = f"there is no option {brief(letter)}; the options are {', '.join(o.label for o in options)}"
+        problem = (
+            f"there is no option {brief(letter)}; the options are"
+            f" {', '.join(o.label for o in options)}"
+        )
     elif option.needs_point:
         problem = _misfit(fields.get("point"), option)
     if problem is not None or option is None:
         raise MalformedReply(problem)
-    point = [min(to_pixels(value, SIDE), SIDE - 1) for value in fields["point"]] if option.needs_point else None
+    point = (
+        [min(to_pixels(value, SIDE), SIDE - 1) for value in fields["point"]]
+        if option.needs_point
+        else None
+    )
     return {"choice": label, "point": point}
 
 
 def _misfit(point: Any, option: Option) -> str | None:
     if not isinstance(point, list) or len(point) != 2:
         return f'option {option.label} needs "point": [row, column]'
-    if any(isinstance(v, bool) or not isinstance(v, int | float) or v != v or abs(v) == math.inf for v in point):
+    if any(
+        isinstance(v, bool) or not isinstance(v, int | float) or v != v or abs(v) == math.inf
+        for v in point
+    ):
         return "a point is made of two numbers"
-    return None if all(0 <= value <= THOUSAND for value in point) else f"a point lies within 0 and {THOUSAND}"
+    return (
+        None
+        if all(0 <= value <= THOUSAND for value in point)
+        else f"a point lies within 0 and {THOUSAND}"
+    )
 
 
 def _parsed(text: str) -> dict[str, Any]:
@@ -133,7 +166,8 @@ def _parsed(text: str) -> dict[str, Any]:
 class ModelPlayer(Player):
     """A model that makes each choice, with retries where its reply cannot be used.
 
-    model: its name. tries: replies that may be unusable in a row; then the episode counts as failed.
+    model: its name. tries: replies that may be unusable in a row; then the episode counts as
+    failed.
     """
 
     def __init__(self, model: str, tries: int = 3) -> None:
@@ -159,7 +193,10 @@ class ModelPlayer(Player):
                 complaint = retry_message(str(error))
             else:
                 return action, {"answers": replies}
-        raise NoChoiceError("fail", f"{self.tries} replies in a row could not be used; the last one: {replies[-1]!r}")
+        raise NoChoiceError(
+            "fail",
+            f"{self.tries} replies in a row could not be used; the last one: {replies[-1]!r}",
+        )
 
     def ask(self, session: ChoiceSession, complaint: str) -> str:
         """The model's reply to the present question, verbatim.
@@ -184,10 +221,12 @@ class QwenPlayer(ModelPlayer):
     """Reads the whole episode anew at each decision: a clip for each motion, and the present image.
 
     Args:
-        model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for none.
+        model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for
+            none.
         tries: replies that may be unusable in a row. max_new_tokens: longest reply.
         clip_frames: most frames of a clip that the model reads.
-        device, dtype: where and how it runs. vlm: a model that is loaded already, instead of all these.
+        device, dtype: where and how it runs. vlm: a model that is loaded already, instead of all
+            these.
     """
 
     def __init__(
@@ -203,10 +242,14 @@ class QwenPlayer(ModelPlayer):
     ) -> None:
         super().__init__(model if adapter is None else f"{model}+{adapter}", tries)
         if clip_frames < 2 or clip_frames % 2:
-            raise UserError(f"player.clip_frames={clip_frames} must be even and at least 2: frames are read in pairs.")
+            raise UserError(
+                f"player.clip_frames={clip_frames} must be even and at least 2: frames are read in"
+                " pairs."
+            )
         self.max_new_tokens, self.clip_frames = max_new_tokens, clip_frames
         self.vlm = vlm or VLM.load(model, adapter, device=device, dtype=dtype, batch_size=1)
-        # The processor would shrink the frames of a clip that has more of them than the subgoal predictors read.
+        # The processor would shrink the frames of a clip that has more of them than the subgoal
+        # predictors read.
         area = TOKEN_SIDE**2
         most = clip_frames * VIDEO_TOKENS * area
         self.vlm.processor.video_processor.size = {"shortest_edge": 4 * area, "longest_edge": most}
@@ -230,7 +273,12 @@ class QwenPlayer(ModelPlayer):
             titled_clips.append((f"You chose {choice_text(decision)}", list(reveal.frames)))
         clips = [(title, bool(frames)) for title, frames in titled_clips]
         user = full_question(session.goal, session.options, clips, complaint)
-        return Question(SYSTEM, user, [session.frame], [self._clip(frames) for _, frames in titled_clips if frames])
+        return Question(
+            SYSTEM,
+            user,
+            [session.frame],
+            [self._clip(frames) for _, frames in titled_clips if frames],
+        )
 
     def _clip(self, frames: list[np.ndarray]) -> Clip:
         indices = sample_video(len(frames), most=self.clip_frames)
@@ -242,7 +290,8 @@ class GeminiPlayer(ModelPlayer):
     """One conversation an episode: each turn brings the frames since the last decision.
 
     tries: replies that may be unusable in a row. client: an object with google-genai's
-    `client.models.generate_content`; None makes one. settings: keys of `mme_vla.subgoal.models.connection.Settings`.
+    `client.models.generate_content`; None makes one. settings: keys of
+    `mme_vla.subgoal.models.connection.Settings`.
     """
 
     provider = "gemini"
@@ -263,7 +312,8 @@ class GeminiPlayer(ModelPlayer):
             reply = self.api.ask(SYSTEM, [*self._conversation, message])
         except ApiFailure as failure:
             self.usage.problems[failure.problem] += 1
-            # A refusal counts as a failure of the model; an episode with a network error is repeated by `retry_errors`.
+            # A refusal counts as a failure of the model; an episode with a network error is
+            # repeated by `retry_errors`.
             outcome = "error" if failure.problem == "failed" else "fail"
             raise NoChoiceError(outcome, f"no answer ({failure.problem}): {failure}") from None
         self._conversation += [message, ("model", [reply.text])]
@@ -281,7 +331,8 @@ class GeminiPlayer(ModelPlayer):
 
 @PLAYERS.register("openai")
 class OpenAIPlayer(GeminiPlayer):
-    """The same conversation with any endpoint of OpenAI's chat completions; videos are shown as images.
+    """The same conversation with any endpoint of OpenAI's chat completions; videos are shown as
+    images.
 
     client: an object with openai's `client.chat.completions.create`; None makes one.
     settings: keys of `mme_vla.subgoal.models.connection.OpenAISettings`.

@@ -14,17 +14,22 @@ from mme_vla.serving.settings import is_local, listen
 from mme_vla.utils import parse_json
 
 log = logging.getLogger("mme_vla.play")
-PAGE = {"": "index.html"} | {name: name for name in ("play.css", "play.js", "player.js", "icon.svg")}
+PAGE = {"": "index.html"} | {
+    name: name for name in ("play.css", "play.js", "player.js", "icon.svg")
+}
 KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 MOST = 4096  # bytes of a request's body
 ARRIVAL_S = 10  # seconds that headers may take, and a body
 HEADERS = (
-    (b"content-security-policy", b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
-                                 b"connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"),
+    (
+        b"content-security-policy",
+        b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
+        b"connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    ),
     (b"x-content-type-options", b"nosniff"),
     (b"referrer-policy", b"no-referrer"),
     (b"cache-control", b"no-store"),
-)  # fmt: skip
+)
 
 
 def require_page() -> None:
@@ -36,8 +41,8 @@ def require_page() -> None:
 def make_app(desk: Desk, local: bool = True) -> Any:
     """The ASGI application; the desk begins when it starts.
 
-    local: accept only requests that name this machine as their host, so that no foreign page a browser has open can
-    reach the desk under a name of its own.
+    local: accept only requests that name this machine as their host, so that no foreign page a
+    browser has open can reach the desk under a name of its own.
     """
     require_page()
     from starlette.applications import Starlette
@@ -61,7 +66,9 @@ def make_app(desk: Desk, local: bool = True) -> Any:
     async def frames(request: Request) -> Response:
         path_params = request.path_params
         try:
-            packed = await asyncio.to_thread(desk.frames, path_params["session"], path_params["number"])
+            packed = await asyncio.to_thread(
+                desk.frames, path_params["session"], path_params["number"]
+            )
         except StaleError as error:
             return refuse(404, str(error))
         return Response(packed, media_type="application/octet-stream")
@@ -115,14 +122,19 @@ def make_app(desk: Desk, local: bool = True) -> Any:
 
 
 def _guarded(app: Any, local: bool) -> Any:
-    """Refuse foreign host names, add the headers that keep the page to itself, and hang up on bodies not read."""
+    """Refuse foreign host names, add the headers that keep the page to itself, and hang up on
+    bodies not read.
+    """
 
     async def guarded(scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] != "http":
             return await app(scope, receive, send)
 
         headers = dict(scope["headers"])
-        unread = b"transfer-encoding" in headers or headers.get(b"content-length", b"0").strip(b"0") != b""
+        unread = (
+            b"transfer-encoding" in headers
+            or headers.get(b"content-length", b"0").strip(b"0") != b""
+        )
 
         async def reading() -> Any:
             nonlocal unread
@@ -138,7 +150,11 @@ def _guarded(app: Any, local: bool) -> Any:
 
         if local and not is_local(_host_of(scope)):
             await send_with_headers(
-                {"type": "http.response.start", "status": 421, "headers": [(b"content-type", b"text/plain")]}
+                {
+                    "type": "http.response.start",
+                    "status": 421,
+                    "headers": [(b"content-type", b"text/plain")],
+                }
             )
             return await send_with_headers(
                 {"type": "http.response.body", "body": b"This page is for this machine only.\n"}
@@ -149,20 +165,26 @@ def _guarded(app: Any, local: bool) -> Any:
 
 
 def _host_of(scope: Any) -> str:
-    named = next((value for name, value in scope["headers"] if name == b"host"), b"").decode("latin-1")
+    named = next((value for name, value in scope["headers"] if name == b"host"), b"").decode(
+        "latin-1"
+    )
     if named.startswith("["):
         return named[1:].partition("]")[0]
     return named.partition(":")[0]
 
 
 def make_server(desk: Desk, local: bool = True) -> Any:
-    """A `uvicorn.Server`; its `run(sockets=[…])` returns after SIGINT, SIGTERM, or `should_exit`."""
+    """A `uvicorn.Server`; its `run(sockets=[…])` returns after SIGINT, SIGTERM, or
+    `should_exit`.
+    """
     app = make_app(desk, local)
     import uvicorn
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
     class TimedProtocol(H11Protocol):
-        """HTTP/1.1 that waits `ARRIVAL_S` for the headers of a request; uvicorn's waits without end."""
+        """HTTP/1.1 that waits `ARRIVAL_S` for the headers of a request; uvicorn's waits without
+        end.
+        """
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
@@ -182,8 +204,17 @@ def make_server(desk: Desk, local: bool = True) -> Any:
             if self.cycle.response_complete:  # no further request has come already
                 self._head = self.loop.call_later(ARRIVAL_S, self.transport.abort)
 
-    return uvicorn.Server(uvicorn.Config(app, http=TimedProtocol, log_level="warning", access_log=False, ws="none",
-                                         lifespan="on", timeout_graceful_shutdown=5))  # fmt: skip
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            http=TimedProtocol,
+            log_level="warning",
+            access_log=False,
+            ws="none",
+            lifespan="on",
+            timeout_graceful_shutdown=5,
+        )
+    )
 
 
 def serve(desk: Desk, host: str, port: int) -> None:

@@ -1,4 +1,6 @@
-"""What `Policy.act` does, step by step: observations to a chunk, and the chunk to actions of the embodiment."""
+"""What `Policy.act` does, step by step: observations to a chunk, and the chunk to actions of the
+embodiment.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,8 +22,8 @@ if TYPE_CHECKING:
 class SelectedActions:
     """What a policy chose for n episodes.
 
-    batch: of `Policy.observation`. chunk: [n, h, a], in the network's units. actions: float32 [n, h, w], as the
-    embodiment executes them, without the steps of a chunk that lie in the past.
+    batch: of `Policy.observation`. chunk: [n, h, a], in the network's units. actions: float32 [n,
+    h, w], as the embodiment executes them, without the steps of a chunk that lie in the past.
     """
 
     batch: Any
@@ -37,7 +39,8 @@ def choose_actions(
     """Choose the next chunk for episodes in one batch, with each episode's own noise.
 
     Args:
-        predict: from the batch of `Policy.observation` and its noise to the normalised chunk [n, h, a].
+        predict: from the batch of `Policy.observation` and its noise to the normalised chunk [n, h,
+            a].
     """
     processor, space = policy.require_processor(), policy.embodiment.action
     processor.require_stats()  # before the noise or memory of an episode changes
@@ -47,7 +50,11 @@ def choose_actions(
     policy.eval()
     try:
         chunk = predict(batch, noise).float().cpu()
-        stored = policy.write_notes(batch, episodes) if isinstance(policy, WritesNotes) else [{} for _ in episodes]
+        stored = (
+            policy.write_notes(batch, episodes)
+            if isinstance(policy, WritesNotes)
+            else [{} for _ in episodes]
+        )
     finally:
         policy.train(was_training)
     absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))

@@ -1,4 +1,6 @@
-"""`Policy`: the interface that training, evaluation, serving and weights use. Capabilities are in `capabilities.py`."""
+"""`Policy`: the interface that training, evaluation, serving and weights use. Capabilities are in
+`capabilities.py`.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,12 +26,13 @@ if TYPE_CHECKING:
 
 
 class Policy(nn.Module):
-    """A policy: a loss to train, chunks to sample, episodes to act in, parameters to fine-tune, a folder to save to.
+    """A policy: a loss to train, chunks to sample, episodes to act in, parameters to fine-tune, a
+    folder to save to.
 
-    A subclass registers in `POLICIES` (`policy.name` of a configuration), sets the attributes below, and implements
-    what raises NotImplementedError. Its processor defines the batches. Random numbers are passed in
-    (`training_noise`, `sampling_noise`), so that training resumes bit for bit, and the noise of an episode does not
-    depend on its batch.
+    A subclass registers in `POLICIES` (`policy.name` of a configuration), sets the attributes
+    below, and implements what raises NotImplementedError. Its processor defines the batches. Random
+    numbers are passed in (`training_noise`, `sampling_noise`), so that training resumes bit for
+    bit, and the noise of an episode does not depend on its batch.
     """
 
     memory: MemoryModule | None
@@ -39,7 +42,9 @@ class Policy(nn.Module):
     compute_dtype: torch.dtype = torch.float32
     """Matrix products run in it, under autocast."""
     horizon: int
-    """Steps of a chunk. The first `processor.samples.window - 1` lie in the past and are not executed."""
+    """Steps of a chunk. The first `processor.samples.window - 1` lie in the past and are not
+    executed.
+    """
     action_dim: int
     """Width of a chunk inside the network; the embodiment's own actions are its first columns."""
 
@@ -65,22 +70,27 @@ class Policy(nn.Module):
         """
         if self.processor is None:
             raise UserError(
-                "This policy was built without a processor, so it can run batches but no raw data: build it with "
-                "build_policy() or load it with from_pretrained()."
+                "This policy was built without a processor, so it can run batches but no raw data:"
+                " build it with build_policy() or load it with from_pretrained()."
             )
         return self.processor
 
     # Training
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
-        """Sample the random numbers for the losses of `count` samples, on the CPU: each value [count, …]."""
+        """Sample the random numbers for the losses of `count` samples, on the CPU: each value
+        [count, …].
+        """
         return {}
 
-    def forward(self, batch: Any, noise: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(
+        self, batch: Any, noise: Mapping[str, Tensor] | None = None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of a batch, and metrics to log (detached).
 
         Args:
-            batch: with `actions`. noise: of `training_noise`, on the policy's device; sampled by default.
+            batch: with `actions`. noise: of `training_noise`, on the policy's device; sampled by
+                default.
         """
         raise NotImplementedError
 
@@ -90,11 +100,14 @@ class Policy(nn.Module):
         """Sample the random numbers for one chunk, on the CPU, without a batch axis."""
         return {}
 
-    def sample_actions(self, batch: Any, noise: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
+    def sample_actions(
+        self, batch: Any, noise: Mapping[str, Tensor] | None = None, steps: int | None = None
+    ) -> Tensor:
         """Sample a normalised chunk [b, h, a].
 
         Args:
-            noise: of `sampling_noise`, with a batch axis, on the policy's device; sampled by default.
+            noise: of `sampling_noise`, with a batch axis, on the policy's device; sampled by
+                default.
             steps: of an iterative sampler; its default by default.
         """
         raise NotImplementedError
@@ -106,11 +119,12 @@ class Policy(nn.Module):
         return Episode(self, goal, seed)
 
     def act(self, episodes: Episode | Sequence[Episode], steps: int | None = None) -> np.ndarray:
-        """Choose the next chunk for one episode or for many in one batch, adding nothing to their memories.
+        """Choose the next chunk for one episode or for many in one batch, adding nothing to their
+        memories.
 
         Returns:
-            float32 [n, h, w], or [h, w] for one episode: actions as the embodiment executes them, without the steps
-            of a chunk that lie in the past.
+            float32 [n, h, w], or [h, w] for one episode: actions as the embodiment executes them,
+            without the steps of a chunk that lie in the past.
         """
         if isinstance(episodes, Episode):
             single: np.ndarray = self.act([episodes], steps)[0]
@@ -122,8 +136,8 @@ class Policy(nn.Module):
         if not supports_rtc and any(e.action_prefix is not None for e in episodes):
             name = self.config.get("name", type(self).__name__)
             raise UserError(
-                f"{name} does not support real-time chunking, which needs a flow policy such as π0.5. Leave out "
-                "set_action_prefix()."
+                f"{name} does not support real-time chunking, which needs a flow policy such as"
+                " π0.5. Leave out set_action_prefix()."
             )
         waiting = episodes
 
@@ -133,25 +147,38 @@ class Policy(nn.Module):
         return choose_actions(self, waiting, predict).actions
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
-        """The current observations of episodes, as a batch of the processor's kind on the policy's device."""
+        """The current observations of episodes, as a batch of the processor's kind on the policy's
+        device.
+        """
         raise NotImplementedError
 
     def predict_chunk(
-        self, batch: Any, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Any,
+        episodes: Sequence[Episode],
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
-        """Sample a normalised chunk [n, h, a] for an `observation`, with the memories of the episodes."""
+        """Sample a normalised chunk [n, h, a] for an `observation`, with the memories of the
+        episodes.
+        """
         raise NotImplementedError
 
     # Folders
 
     @classmethod
     def from_config(
-        cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
+        cls,
+        config: Mapping[str, Any],
+        processor: "PolicyProcessor | None" = None,
+        *,
+        fresh_backbone: bool = True,
     ) -> Self:
         """Build from plain sections.
 
         Args:
-            fresh_backbone: False if a checkpoint is loaded next: the backbone's weights are not initialised.
+            fresh_backbone: False if a checkpoint is loaded next: the backbone's weights are not
+                initialised.
         """
         raise NotImplementedError
 
@@ -173,14 +200,17 @@ class Policy(nn.Module):
         `Policy.from_pretrained` loads every kind of policy, a subclass only its own.
 
         Args:
-            source: a folder (of a checkpoint; of a run, for its newest checkpoint; `…/latest`, for the newest run), or
-                `owner/name` of a hub repository.
+            source: a folder (of a checkpoint; of a run, for its newest checkpoint; `…/latest`, for
+                the newest run), or `owner/name` of a hub repository.
             device: where to put the weights.
-            dtype: of the weights. `bfloat16` halves the memory, for inference: compute is then bfloat16 too, and no
-                weight requires a gradient. `auto`: bfloat16 on a GPU if the policy is made for it, else float32.
+            dtype: of the weights. `bfloat16` halves the memory, for inference: compute is then
+                bfloat16 too, and no weight requires a gradient. `auto`: bfloat16 on a GPU if the
+                policy is made for it, else float32.
             revision: branch, tag or commit of the repository. token: for private repositories.
-            trust_plugins: import the modules that the checkpoint names under `plugins`. They run code of its author.
-            tokenizer: in place of the checkpoint's own, which is fetched from the hub only if it is π0.5's.
+            trust_plugins: import the modules that the checkpoint names under `plugins`. They run
+                code of its author.
+            tokenizer: in place of the checkpoint's own, which is fetched from the hub only if it is
+                π0.5's.
             policy: overrides of the `policy` section, such as `compute_dtype="bfloat16"`.
 
         Raises:
@@ -188,7 +218,14 @@ class Policy(nn.Module):
         """
         where, trust = {"revision": revision, "token": token}, trust_plugins
         return load_policy(
-            cls, source, device=device, dtype=dtype, trust_plugins=trust, tokenizer=tokenizer, options=policy, **where
+            cls,
+            source,
+            device=device,
+            dtype=dtype,
+            trust_plugins=trust,
+            tokenizer=tokenizer,
+            options=policy,
+            **where,
         )
 
     def save_pretrained(
@@ -198,8 +235,8 @@ class Policy(nn.Module):
 
         Args:
             dtype: of the stored weights: `float32` or `bfloat16`.
-            card: facts for the model card, kept in the configuration: `data` (text), `recipe`, `results` (tables),
-                `license`, `base_model`, `datasets` (ids on the hub).
+            card: facts for the model card, kept in the configuration: `data` (text), `recipe`,
+                `results` (tables), `license`, `base_model`, `datasets` (ids on the hub).
         """
         save_policy(self, Path(folder), dtype=dtype, card=card)
 
@@ -214,12 +251,14 @@ class Policy(nn.Module):
         dtype: str = "float32",
         card: Mapping[str, Any] | None = None,
     ) -> str:
-        """Store the policy on the Hugging Face Hub, as `save_pretrained` writes it; return the repository's address.
+        """Store the policy on the Hugging Face Hub, as `save_pretrained` writes it; return the
+        repository's address.
 
         Args:
             repo_id: `owner/name`; created if it does not exist. private: only if it is created now.
             token: a write token; the one stored by `hf auth login` by default.
-            revision: the branch to commit to. message: of the commit. dtype, card: as for `save_pretrained`.
+            revision: the branch to commit to. message: of the commit. dtype, card: as for
+                `save_pretrained`.
         """
         options = {"private": private, "token": token, "revision": revision, "message": message}
         return push_to_hub(self, repo_id, dtype=dtype, card=card, **options)

@@ -1,4 +1,6 @@
-"""`build_policy`: from a variant's name to a policy, through the same YAML files the commands use."""
+"""`build_policy`: from a variant's name to a policy, through the same YAML files the
+commands use.
+"""
 
 import copy
 from collections.abc import Mapping, Set
@@ -27,7 +29,8 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
     """The memory of a configuration.
 
     Args:
-        d_vision: width of a vision token. grid: side of a view's token grid. width: of the memory's own tokens.
+        d_vision: width of a vision token. grid: side of a view's token grid. width: of the memory's
+            own tokens.
     """
     memory: Memory = MEMORIES.build(section, d_vision=d_vision, width=width)
     check_grid(memory, grid)
@@ -35,11 +38,14 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
 
 
 def check_grid(memory: MemoryModule, views: int) -> None:
-    """Raise an error unless views of views×views tokens can be pooled to the grid that the memory stores."""
+    """Raise an error unless views of views×views tokens can be pooled to the grid that the memory
+    stores.
+    """
     if views % memory.storage.grid:
         sides = ", ".join(str(side) for side in range(1, views + 1) if views % side == 0)
         raise UserError(
-            f"memory.grid={memory.storage.grid}: the backbone's {views}×{views} tokens a view pool to {sides} a side."
+            f"memory.grid={memory.storage.grid}: the backbone's {views}×{views} tokens a view pool"
+            f" to {sides} a side."
         )
 
 
@@ -51,16 +57,22 @@ def check_integrated(
     if has_tokens != (integration.memory_width > 0):
         if memory is not None and not has_tokens:
             raise UserError(
-                f"The memory {config['memory']['name']!r} produces no tokens with these settings. Set integration=none "
-                "or memory.states=true."
+                f"The memory {config['memory']['name']!r} produces no tokens with these settings."
+                " Set integration=none or memory.states=true."
             )
-        mismatch = "an integration without a memory" if memory is None else "a memory without an integration"
-        raise UserError(f"This configuration names {mismatch}; name both, or neither for the memoryless policy.")
+        mismatch = (
+            "an integration without a memory"
+            if memory is None
+            else "a memory without an integration"
+        )
+        raise UserError(
+            f"This configuration names {mismatch}; name both, or neither for the memoryless policy."
+        )
     reads_cache = "cache" in extension_points(type(integration))
     require(
         reads_cache == isinstance(memory, CacheMemory),
-        "A memory of keys and values needs an integration that reads them (`Integration.past`), and the other way "
-        "round: set integration to one that goes with the memory.",
+        "A memory of keys and values needs an integration that reads them (`Integration.past`), and"
+        " the other way round: set integration to one that goes with the memory.",
     )
     if memory is None:
         return
@@ -72,25 +84,32 @@ def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) ->
     """Make sure that the backbone reads past views if the memory gives them."""
     if past_view_spec(memory) is not None and "past" not in supports:
         raise UserError(
-            f"The memory {config['memory']['name']!r} gives the vision tower past views along with the current ones, "
-            f"and the tower of the backbone {config['backbone']['name']!r} sees one image at a time. Take another "
-            "memory, a backbone that hosts `past` (pi05), or past states alone (memory.views=false)."
+            f"The memory {config['memory']['name']!r} gives the vision tower past views along with"
+            f" the current ones, and the tower of the backbone {config['backbone']['name']!r} sees"
+            " one image at a time. Take another memory, a backbone that hosts `past` (pi05), or"
+            " past states alone (memory.views=false)."
         )
 
 
-def check_positions(config: Mapping[str, Any], integration: Integration, memory: Memory, supports: Set[str]) -> None:
-    """Make sure that positions in time are possible: the tokens have a time, and the backbone takes positions."""
+def check_positions(
+    config: Mapping[str, Any], integration: Integration, memory: Memory, supports: Set[str]
+) -> None:
+    """Make sure that positions in time are possible: the tokens have a time, and the backbone takes
+    positions.
+    """
     if integration.memory_position != "time":
         return
     if not memory.timed:
         raise UserError(
-            f"integration.memory_position=time: the tokens of the memory {config['memory']['name']!r} have no time "
-            "each. Take memory_position=slot, or a memory that is `timed`."
+            "integration.memory_position=time: the tokens of the memory"
+            f" {config['memory']['name']!r} have no time each. Take memory_position=slot, or a"
+            " memory that is `timed`."
         )
     if "blocks" in extension_points(type(integration)) and "positions" not in supports:
         raise UserError(
-            f"integration.memory_position=time: the backbone {config['backbone']['name']!r} has no place for blocks at "
-            "positions of their own. Take memory_position=slot, or integration=modulator where it hosts that."
+            f"integration.memory_position=time: the backbone {config['backbone']['name']!r} has no"
+            " place for blocks at positions of their own. Take memory_position=slot, or"
+            " integration=modulator where it hosts that."
         )
 
 
@@ -106,11 +125,13 @@ def build_policy(
 
     Args:
         name: a file of `configs/model`, such as `tokendrop_expert`.
-        device: where to build; `meta` builds shapes only, at any size and at once, without processor.
+        device: where to build; `meta` builds shapes only, at any size and at once, without
+            processor.
         seed: of the fresh weights.
         config_dir: a folder of your own YAML files, searched beside the library's.
-        overrides: a string selects a group's file (`backbone="pi05"`), a mapping sets keys below a section
-            (`memory={"budget": 256}`), anything else sets a value; `memory=["framesamp", "ttt"]` joins memories.
+        overrides: a string selects a group's file (`backbone="pi05"`), a mapping sets keys below a
+            section (`memory={"budget": 256}`), anything else sets a value;
+            `memory=["framesamp", "ttt"]` joins memories.
 
     Returns:
         The policy in eval mode.
@@ -129,7 +150,10 @@ def build_policy(
 
 def policy_words(name: str, overrides: Mapping[str, Any]) -> list[str]:
     """Write what `build_policy` takes as Hydra overrides."""
-    return [f"model={name}", *(word for key, value in overrides.items() for word in words(key, value))]
+    return [
+        f"model={name}",
+        *(word for key, value in overrides.items() for word in words(key, value)),
+    ]
 
 
 def build_from_config(
@@ -139,10 +163,12 @@ def build_from_config(
     seed: int | None = None,
     fresh_backbone: bool = True,
 ) -> Policy:
-    """Build the policy a composed configuration describes; other sections (data, train, …) are ignored.
+    """Build the policy a composed configuration describes; other sections (data, train, …) are
+    ignored.
 
     Args:
-        fresh_backbone: False if a checkpoint is loaded next: the backbone's weights are not initialised.
+        fresh_backbone: False if a checkpoint is loaded next: the backbone's weights are not
+            initialised.
     """
     import_plugins(plugins_of(config, "the configuration"))
     container = OmegaConf.to_container(with_embodiment(config), resolve=True)
@@ -154,12 +180,16 @@ def build_from_config(
     processor = None if bare else build_processor(sections)
     with torch.random.fork_rng(devices=[]), shapes_only() if bare else torch.device(device):
         torch.manual_seed(container.get("seed", 42) if seed is None else seed)
-        policy: Policy = policy_class(sections).from_config(sections, processor, fresh_backbone=fresh_backbone)
+        policy: Policy = policy_class(sections).from_config(
+            sections, processor, fresh_backbone=fresh_backbone
+        )
     return policy.eval()
 
 
 def with_embodiment(config: DictConfig) -> DictConfig:
-    """The configuration with the embodiment of `env`, unless another than the default is selected."""
+    """The configuration with the embodiment of `env`, unless another than the default
+    is selected.
+    """
     name = config.get("env")
     if name is None or config.embodiment.name != ROBOMME_JOINT.name:
         return config
@@ -181,19 +211,22 @@ def check_token_budget(sections: Mapping[str, Any]) -> None:
     reads = PROMPTS[sections["processor"].get("prompt", "plain")].reads_subgoal
     subgoal = sections["processor"].get("subgoal_length") if reads else 0
     if subgoal is None:
-        raise UserError(f"token_budget={budget} needs a limit of the subgoal too: set processor.subgoal_length.")
+        raise UserError(
+            f"token_budget={budget} needs a limit of the subgoal too: set processor.subgoal_length."
+        )
     require(
         memory + subgoal <= budget,
-        f"memory.budget={memory} and processor.subgoal_length={subgoal} make {memory + subgoal} tokens, more than "
-        f"token_budget={budget}: lower one of them, or raise token_budget.",
+        f"memory.budget={memory} and processor.subgoal_length={subgoal} make {memory + subgoal}"
+        f" tokens, more than token_budget={budget}: lower one of them, or raise token_budget.",
     )
 
 
 def build_processor(sections: Mapping[str, Any]) -> PolicyProcessor:
     if not sections.get("processor"):
         raise UserError(
-            f"No processor goes with the backbone {sections['backbone'].get('name')!r}: under `defaults` of its file "
-            "write `/processor@_global_.processor: tiny`, or the name of a configs/processor file of your own."
+            f"No processor goes with the backbone {sections['backbone'].get('name')!r}: under"
+            " `defaults` of its file write `/processor@_global_.processor: tiny`, or the name of a"
+            " configs/processor file of your own."
         )
     kind: type[PolicyProcessor] = PROCESSORS[sections["processor"].get("name", DEFAULT_PROCESSOR)]
     return kind.from_sections(sections)

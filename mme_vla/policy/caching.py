@@ -1,4 +1,6 @@
-"""Episodes of policies whose memory stores keys and values: written once a chunk, after the chunk stands."""
+"""Episodes of policies whose memory stores keys and values: written once a chunk, after the chunk
+stands.
+"""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -14,10 +16,12 @@ from mme_vla.types import KeysValues
 
 
 class CachingEpisode(Episode):
-    """An episode with stored keys and values, which a probe can read and replace (`WritableMemory`).
+    """An episode with stored keys and values, which a probe can read and replace
+    (`WritableMemory`).
 
-    cache: what the next chunk reads, oldest first. made: what the backbone made of the last chunk's prefix. staged:
-    what is stored once that chunk stands. A chunk that fails or is sampled again replaces both, and writes nothing.
+    cache: what the next chunk reads, oldest first. made: what the backbone made of the last chunk's
+    prefix. staged: what is stored once that chunk stands. A chunk that fails or is sampled again
+    replaces both, and writes nothing.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -50,7 +54,9 @@ class CachingEpisode(Episode):
 
 
 def stack_caches(episodes: Sequence[Episode]) -> KeysValues | None:
-    """Stored keys and values of running episodes, padded to one length; None before the first chunk of all."""
+    """Stored keys and values of running episodes, padded to one length; None before the first chunk
+    of all.
+    """
     caches = [episode.cache for episode in episodes if isinstance(episode, CachingEpisode)]
     return KeysValues.stack([[values for _, values in cache] for cache in caches])
 

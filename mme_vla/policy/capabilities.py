@@ -42,7 +42,10 @@ class HasVisionMemory(Protocol):
 def with_vision_memory(policy: object) -> HasVisionMemory:
     """The policy, if it stores vision tokens."""
     if not isinstance(policy, HasVisionMemory):
-        raise UserError(f"{type(policy).__name__} stores no vision tokens of past frames: it lacks encode_frames().")
+        raise UserError(
+            f"{type(policy).__name__} stores no vision tokens of past frames: it lacks"
+            " encode_frames()."
+        )
     return policy
 
 
@@ -69,10 +72,14 @@ def frames_read(policy: object, steps: np.ndarray, exec_start: int) -> np.ndarra
 
 @runtime_checkable
 class PreparesChunks(Protocol):
-    """Can compute parts of an episode's next chunk while the robot moves; no action changes by it."""
+    """Can compute parts of an episode's next chunk while the robot moves; no action
+    changes by it.
+    """
 
     def prepare(self, episode: "Episode") -> bool:
-        """Do one part; return whether more remain. A recurrent memory reads its next list of frames so."""
+        """Do one part; return whether more remain. A recurrent memory reads its next list of frames
+        so.
+        """
         ...
 
 
@@ -81,7 +88,9 @@ class AugmentsImages(Protocol):
     """Augments the images of training samples."""
 
     def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
-        """Random numbers [count, …] on the CPU for the images of `count` samples, beside `training_noise`'s."""
+        """Random numbers [count, …] on the CPU for the images of `count` samples, beside
+        `training_noise`'s.
+        """
         ...
 
 
@@ -90,13 +99,17 @@ class WritesNotes(Protocol):
     """Writes notes, which its own prompts have from the next decision on (`Episode.notes`)."""
 
     def write_notes(self, batch: Any, episodes: "Sequence[Episode]") -> Sequence[Mapping[str, str]]:
-        """One line by name for each episode at an `observation`; an empty mapping writes nothing."""
+        """One line by name for each episode at an `observation`; an empty mapping
+        writes nothing.
+        """
         ...
 
 
 @runtime_checkable
 class WeighsLosses(Protocol):
-    """Learns from auxiliary losses, labels and weighted samples (`Batch.weight`, `Batch.labels`)."""
+    """Learns from auxiliary losses, labels and weighted samples (`Batch.weight`,
+    `Batch.labels`).
+    """
 
     loss_weights: Mapping[str, float]
     """Weights of auxiliary losses by name; training sets it from `train.losses`."""
@@ -112,7 +125,9 @@ class CompilesSampling(Protocol):
         ...
 
     def compile_sampling(self, layers: bool = False) -> None:
-        """Compile the sampler of a policy whose weights are final; see `MMEPolicy.compile_sampling`."""
+        """Compile the sampler of a policy whose weights are final; see
+        `MMEPolicy.compile_sampling`.
+        """
         ...
 
 
@@ -121,7 +136,9 @@ class ComparesSizes(Protocol):
     """Compares the sizes of its processor with those of its network."""
 
     def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        """Size → its value in the processor and in the network; a checkpoint in which they differ is damaged."""
+        """Size → its value in the processor and in the network; a checkpoint in which they differ
+        is damaged.
+        """
         ...
 
 
@@ -168,7 +185,9 @@ class CountsCost(Protocol):
     """Can be run without content, to count FLOPs and memory."""
 
     def full_batch(self, device: torch.device | str = "cpu") -> Any:
-        """A batch of one at its fullest: every view, the longest prompt, a full memory, actions to learn from."""
+        """A batch of one at its fullest: every view, the longest prompt, a full memory, actions to
+        learn from.
+        """
         ...
 
     def warm_up_vision(self) -> None:
@@ -180,7 +199,8 @@ class CountsCost(Protocol):
 class MemoryEntries:
     """One store of a writable memory.
 
-    entries: (time, content) in the order they are read. now: the current time, in the unit of these times.
+    entries: (time, content) in the order they are read. now: the current time, in the unit of these
+    times.
     """
 
     name: str
@@ -206,5 +226,7 @@ class WritableMemory(Protocol):
         ...
 
     def resume_from(self, twin: "Episode") -> None:
-        """Continue after a chunk that was sampled for a copy by `with_entries`, with this episode's own entries."""
+        """Continue after a chunk that was sampled for a copy by `with_entries`, with this episode's
+        own entries.
+        """
         ...

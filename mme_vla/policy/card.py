@@ -1,4 +1,6 @@
-"""The model card that lies beside saved weights: what the policy is, and what is known of its training."""
+"""The model card that lies beside saved weights: what the policy is, and what is known of its
+training.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,8 +16,9 @@ CARD_FILE = "README.md"
 def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
     """Write a card from a policy's configuration.
 
-    Its section `card` may hold `data` (words), `recipe` and `results` (name → value); what is absent is said to be. For
-    the hub's front matter also `license`, `base_model` and `datasets` (ids on the hub).
+    Its section `card` may hold `data` (words), `recipe` and `results` (name → value); what is
+    absent is said to be. For the hub's front matter also `license`, `base_model` and `datasets`
+    (ids on the hub).
 
     Raises:
         UserError: `recipe` or `results` is no mapping.
@@ -25,31 +28,58 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
         value = known.get(key) or {}
         require(
             isinstance(value, Mapping),
-            f"card[{key!r}]={brief(value)} must map names to values, such as {{'success (%)': 54.0}}.",
+            f"card[{key!r}]={brief(value)} must map names to values, such as {{'success (%)':"
+            " 54.0}.",
         )
     backbone = config.get("backbone") or {}
     rows = {
         "memory": _part(config.get("memory")),
         "integration": _part(config.get("integration")),
-        "backbone": backbone.get("name", "pi05") + (f", {backbone['depth']} layers" if "depth" in backbone else ""),
+        "backbone": (
+            backbone.get("name", "pi05")
+            + (f", {backbone['depth']} layers" if "depth" in backbone else "")
+        ),
         "robot": str((config.get("embodiment") or {}).get("name", "robomme_joint")),
-        "action chunk": f"{backbone.get('horizon', '?')} steps of {backbone.get('action_dim', '?')} numbers",
+        "action chunk": (
+            f"{backbone.get('horizon', '?')} steps of {backbone.get('action_dim', '?')} numbers"
+        ),
         "parameters": f"{sum(p.numel() for p in policy.parameters()) / 1e6:.1f} M",
     }
     if config.get("adapters"):
         rows["adapters"] = f"LoRA, rank {config['adapters'].get('rank')}, not merged"
-    return "\n".join([
-        "---", front_matter(name, known), "---", "",
-        f"# {name}", "",
-        f"A policy of the MME-VLA library (`{type(policy).__name__}`)"
-        + (" with a memory of the episode." if config.get("memory") else " without memory."), "",
-        *_table(rows), "",
-        "## Use", "",
-        "```python", *example(config), "```", "",
-        "## Data", "", str(known.get("data") or "Not recorded."), "",
-        "## Recipe", "", *(_table(known["recipe"]) if known.get("recipe") else ["Not recorded."]), "",
-        "## Results", "", *(_table(known["results"]) if known.get("results") else ["Not recorded."]), "",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "---",
+            front_matter(name, known),
+            "---",
+            "",
+            f"# {name}",
+            "",
+            f"A policy of the MME-VLA library (`{type(policy).__name__}`)"
+            + (" with a memory of the episode." if config.get("memory") else " without memory."),
+            "",
+            *_table(rows),
+            "",
+            "## Use",
+            "",
+            "```python",
+            *example(config),
+            "```",
+            "",
+            "## Data",
+            "",
+            str(known.get("data") or "Not recorded."),
+            "",
+            "## Recipe",
+            "",
+            *(_table(known["recipe"]) if known.get("recipe") else ["Not recorded."]),
+            "",
+            "## Results",
+            "",
+            *(_table(known["results"]) if known.get("results") else ["Not recorded."]),
+            "",
+        ]
+    )
 
 
 def example(config: Mapping[str, Any]) -> list[str]:
@@ -60,12 +90,17 @@ def example(config: Mapping[str, Any]) -> list[str]:
     if robot.readings:
         lines += [
             "depth = np.full((1, 256, 256, 1), 500, np.int16)  # in millimetres",
-            "pose = np.eye(3, 4, dtype=np.float32)[None]  # from the world to the camera, in OpenCV's axes",
+            (
+                "pose = np.eye(3, 4, dtype=np.float32)[None]  # from the world to the camera, in"
+                " OpenCV's axes"
+            ),
         ]
         frames |= {name: "depth" if name.endswith("_depth") else "pose" for name in robot.readings}
     options: list[str] = []
     if robot.action.choice:
-        options = ['episode.options = [Option("a", "press the button")]  # those of the environment']
+        options = [
+            'episode.options = [Option("a", "press the button")]  # those of the environment'
+        ]
     return [
         "import numpy as np",
         "from mme_vla import Policy",
@@ -76,13 +111,17 @@ def example(config: Mapping[str, Any]) -> list[str]:
         *options,
         *lines,
         f"frames = {{{', '.join(f'"{name}": {value}' for name, value in frames.items())}}}",
-        f"episode.observe(frames, np.zeros((1, {robot.state.width}), np.float32))  # and the robot's state",
+        (
+            f"episode.observe(frames, np.zeros((1, {robot.state.width}), np.float32))  # and the"
+            " robot's state"
+        ),
         "chunk = policy.act(episode)  # the next actions",
     ]
 
 
 def front_matter(name: str, known: Mapping[str, Any]) -> str:
-    """What the hub reads of a card, as YAML: written by its own library, so that `no` or `2026-11-21` stay names.
+    """What the hub reads of a card, as YAML: written by its own library, so that `no` or
+    `2026-11-21` stay names.
 
     Numbers among the results, such as success rates, become its model index.
     """
@@ -95,7 +134,11 @@ def front_matter(name: str, known: Mapping[str, Any]) -> str:
     }
     results = [
         EvalResult(
-            task_type="robotics", dataset_type="robomme", dataset_name="RoboMME", metric_type=key, metric_value=value
+            task_type="robotics",
+            dataset_type="robomme",
+            dataset_name="RoboMME",
+            metric_type=key,
+            metric_value=value,
         )
         for key, value in numbers.items()
     ]
@@ -115,7 +158,9 @@ def front_matter(name: str, known: Mapping[str, Any]) -> str:
 def _part(section: Mapping[str, Any] | None) -> str:
     if not section or section.get("name") in (None, "none"):
         return "none"
-    options = ", ".join(f"{key} {value}" for key, value in section.items() if key != "name" and value is not None)
+    options = ", ".join(
+        f"{key} {value}" for key, value in section.items() if key != "name" and value is not None
+    )
     return f"{section['name']} ({options})" if options else str(section["name"])
 
 

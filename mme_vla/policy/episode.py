@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ActionPrefix:
-    """Actions [n, w] float32 as the robot takes them, of which the first `delay` are executed before the next chunk."""
+    """Actions [n, w] float32 as the robot takes them, of which the first `delay` are executed
+    before the next chunk.
+    """
 
     actions: np.ndarray
     delay: int
@@ -54,21 +56,31 @@ class Episode:
         self._policy, self._robot = policy, policy.embodiment
         self._generator = torch.Generator().manual_seed(seed)
         self._recent: list[tuple[Tensor | None, Tensor]] = []
-        """Images (None: not rendered) and states of the observation's window, the current frame last."""
+        """Images (None: not rendered) and states of the observation's window, the current frame
+        last.
+        """
         self._video_over = False
         self.goal = checked_text(goal, "the goal")
         self.subgoal: str | None = None
         """The current language subgoal, for policies whose prompt has one; set it before `act`."""
         self.notes: dict[str, str] = {}
-        """The notes of prompts that read some, by name; a policy that writes notes replaces its own at each `act`."""
+        """The notes of prompts that read some, by name; a policy that writes notes replaces its own
+        at each `act`.
+        """
         self.written: list[dict[str, Any]] = []
         """What the policy wrote: for each decision its frame, and the lines by name."""
         self.options: tuple[Option, ...] = ()
         """The options of policies that choose among some; set them before `act`."""
         memory = policy.memory
-        self.history = None if memory is None else start_history(memory, with_vision_memory(policy).encode_frames)
+        self.history = (
+            None
+            if memory is None
+            else start_history(memory, with_vision_memory(policy).encode_frames)
+        )
         if self.history is not None and uses_proprio(memory):
-            self.history.motion = lambda frames: torch.stack([self._motion_of_frames[int(frame)] for frame in frames])
+            self.history.motion = lambda frames: torch.stack(
+                [self._motion_of_frames[int(frame)] for frame in frames]
+            )
             self.history.state_width = policy.embodiment.state.width
         self.stream = start_stream(memory)
         """State of a streaming memory between two `act`s."""
@@ -77,7 +89,9 @@ class Episode:
         spec = past_view_spec(memory)
         self._past = None if spec is None else PastImages(spec)
         self.n_observed_frames = 0
-        self._motion_of_frames: list[Tensor] = []  # rows [w], one a frame, if the memory reads motion
+        self._motion_of_frames: list[
+            Tensor
+        ] = []  # rows [w], one a frame, if the memory reads motion
         self._chunk: np.ndarray | None = None
         self.action_prefix: ActionPrefix | None = None
         """See `set_action_prefix`."""
@@ -91,31 +105,39 @@ class Episode:
         actions: np.ndarray | None = None,
         rendered: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        """Take frames in order, each once, the current one last; the conditioning video comes first.
+        """Take frames in order, each once, the current one last; the conditioning video comes
+        first.
 
         Args:
             frames: of every camera by its name (`front` and `wrist`), each [t, H, W, 3] uint8.
             states: [t, s].
             is_demo: whether the frames belong to the conditioning video; one bool, or [t].
-            actions: [t, w] absolute actions that led to these frames; by default the first t of the last chunk, one
-                action a frame. If an action is a motion of many frames, any number of them: [n, w].
-            rendered: by camera the indices, ascending, of the t frames that `frames` shows, if not all are rendered.
-                `act` needs the last one of every camera, a memory those of its `frames_read`.
+            actions: [t, w] absolute actions that led to these frames; by default the first t of the
+                last chunk, one action a frame. If an action is a motion of many frames, any number
+                of them: [n, w].
+            rendered: by camera the indices, ascending, of the t frames that `frames` shows, if not
+                all are rendered. `act` needs the last one of every camera, a memory those of its
+                `frames_read`.
 
         Raises:
-            UserError: a missing camera, a wrong dtype or shape, or a video frame after execution has begun.
+            UserError: a missing camera, a wrong dtype or shape, or a video frame after execution
+                has begun.
         """
         # All checks come first: after an error the same frames can be observed again.
         images = {name: self._checked_view(frames, name) for name in self._robot.camera_names}
         states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
         count, width = len(states) if states.ndim else 0, self._robot.state.width
-        even = all(len(view) == (count if rendered is None else len(rendered[name])) for name, view in images.items())
+        even = all(
+            len(view) == (count if rendered is None else len(rendered[name]))
+            for name, view in images.items()
+        )
         if states.shape != (count, width) or not even or demo.shape not in ((), (count,)):
             counts = ", ".join(f"{len(view)} {name}" for name, view in images.items())
             raise UserError(
-                f"observe() needs as many {width}-number states and is_demo flags as images of every camera: got "
-                f"{counts}, states of shape {states.shape} and is_demo of {demo.shape}."
+                f"observe() needs as many {width}-number states and is_demo flags as images of"
+                f" every camera: got {counts}, states of shape {states.shape} and is_demo of"
+                f" {demo.shape}."
             )
         if count == 0:
             return
@@ -148,28 +170,41 @@ class Episode:
         actions: np.ndarray | None = None,
         states: np.ndarray | None = None,
     ) -> None:
-        """Add frames to memory alone, for a client that sends past frames and the current view apart.
+        """Add frames to memory alone, for a client that sends past frames and the current view
+        apart.
 
-        `add_frames`, then `set_view` at the last of them, is what `observe` does for a policy that reads one view.
+        `add_frames`, then `set_view` at the last of them, is what `observe` does for a policy that
+        reads one view.
 
         Args:
             frames: of the memory camera, [t, H, W, 3] uint8, in order, each once.
-            is_demo, actions: as for `observe`. states: [t, s]; only a memory of the robot's own motion needs them.
+            is_demo, actions: as for `observe`. states: [t, s]; only a memory of the robot's own
+                motion needs them.
 
         Raises:
-            UserError: a wrong dtype or shape, a video frame after execution has begun, a memory that needs states, or
-                one that reads past images of every camera.
+            UserError: a wrong dtype or shape, a video frame after execution has begun, a memory
+                that needs states, or one that reads past images of every camera.
         """
         self._require_single_view()
         camera = self._robot.memory_camera
         frames = self._checked_view({camera: frames}, camera)
         demo = np.asarray(is_demo, bool)
-        require(demo.shape in ((), (len(frames),)), f"is_demo must be one flag or {len(frames)}; got {demo.shape}.")
+        require(
+            demo.shape in ((), (len(frames),)),
+            f"is_demo must be one flag or {len(frames)}; got {demo.shape}.",
+        )
         if states is not None and np.shape(states) != (len(frames), self._robot.state.width):
-            raise UserError(f"states must be [{len(frames)}, {self._robot.state.width}]; got {list(np.shape(states))}.")
+            raise UserError(
+                f"states must be [{len(frames)}, {self._robot.state.width}]; got"
+                f" {list(np.shape(states))}."
+            )
         if len(frames):
             proprio = None if states is None else finite_array(states, "states")
-            self._take(FrameBatch.of(frames), *self._checked_course(len(frames), demo, actions), states=proprio)
+            self._take(
+                FrameBatch.of(frames),
+                *self._checked_course(len(frames), demo, actions),
+                states=proprio,
+            )
 
     def set_view(self, views: Mapping[str, np.ndarray], state: np.ndarray) -> None:
         """Set the current view and state, adding nothing to memory.
@@ -178,19 +213,26 @@ class Episode:
             views: of every camera by its name, [H, W, 3] uint8. state: [s].
 
         Raises:
-            UserError: images or a state of another form, or a memory that reads past images of every camera.
+            UserError: images or a state of another form, or a memory that reads past images of
+                every camera.
         """
         self._require_single_view()
         state = finite_array(state, "the state")
         width, names = self._robot.state.width, self._robot.camera_names
         require(
-            state.shape == (width,), f"set_view() needs a state of {width} finite numbers, got shape {state.shape}."
+            state.shape == (width,),
+            f"set_view() needs a state of {width} finite numbers, got shape {state.shape}.",
         )
         if lacking := [name for name in names if name not in views]:
-            raise UserError(f"set_view() needs an image of {', '.join(lacking)} too; got {', '.join(views) or 'none'}.")
+            raise UserError(
+                f"set_view() needs an image of {', '.join(lacking)} too; got"
+                f" {', '.join(views) or 'none'}."
+            )
         processor = self._policy.require_processor()
         check_reach(state, None if processor.stats is None else processor.stats.state, "the state")
-        self._set_window([(processor.images([views[name] for name in names]), torch.from_numpy(state.copy()))])
+        self._set_window(
+            [(processor.images([views[name] for name in names]), torch.from_numpy(state.copy()))]
+        )
 
     def gather_selection(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
@@ -204,7 +246,9 @@ class Episode:
             UserError: the policy has no memory, or no frame was observed.
         """
         if self.history is None:
-            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
+            raise UserError(
+                "This policy has no memory, so it stores no vision tokens of past frames."
+            )
         self._require_observation()
         return self.history
 
@@ -226,7 +270,8 @@ class Episode:
 
     @property
     def window(self) -> tuple[Tensor, Tensor]:
-        """Views [t, v, 3, s, s] uint8 and states [t, s] of the observation's window, the current frame last.
+        """Views [t, v, 3, s, s] uint8 and states [t, s] of the observation's window, the current
+        frame last.
 
         The oldest frame is repeated until the execution has as many.
 
@@ -253,18 +298,24 @@ class Episode:
     @property
     def prompt(self) -> Any:
         """The processor's encoding of goal and subgoal."""
-        processor, state = self._policy.require_processor(), self._recent[-1][1] if self._recent else None
+        processor, state = (
+            self._policy.require_processor(),
+            self._recent[-1][1] if self._recent else None,
+        )
         goal = self._robot.action.worded(checked_goal(self.goal), self.options)
         notes = {"notes": self.notes} if processor.prompt_spec.notes else {}
-        return processor.prompt(goal, subgoal=self.subgoal, state=state, past_actions=self._executed, **notes)
+        return processor.prompt(
+            goal, subgoal=self.subgoal, state=state, past_actions=self._executed, **notes
+        )
 
     def set_action_prefix(self, actions: np.ndarray, delay: int = 0) -> None:
-        """Make the next chunk, and it alone, continue actions that the robot executes meanwhile (real-time chunking).
+        """Make the next chunk, and it alone, continue actions that the robot executes meanwhile
+        (real-time chunking).
 
         Args:
-            actions: [n, w], as the embodiment executes them: the remaining ones of the chunk before, the current one
-                first. delay: how many of them are executed before the next chunk is there; these count in full, the
-                others less and less.
+            actions: [n, w], as the embodiment executes them: the remaining ones of the chunk
+                before, the current one first. delay: how many of them are executed before the next
+                chunk is there; these count in full, the others less and less.
 
         Raises:
             UserError: actions of another form, more than a chunk, or a delay beyond them.
@@ -279,11 +330,15 @@ class Episode:
             UserError: the policy has no memory that numbers frames.
         """
         if self.history is None:
-            raise UserError("The clock of this policy cannot restart: it has no memory that numbers frames.")
+            raise UserError(
+                "The clock of this policy cannot restart: it has no memory that numbers frames."
+            )
         self.history.restart_clock()
 
     def begun(self, frames: Sequence[int], exec_start: int) -> None:
-        """Note the frames at which sub-tasks began, if the environment reports them; only probes use it."""
+        """Note the frames at which sub-tasks began, if the environment reports them; only probes
+        use it.
+        """
 
     def acted(self, chunk: np.ndarray, notes: Mapping[str, str] | None = None) -> None:
         """Take the chunk [h, w] of the policy, and the notes it wrote.
@@ -305,7 +360,9 @@ class Episode:
         self._generator.set_state(state)
 
     def draw(self) -> dict[str, Tensor]:
-        """Sample the next chunk's random numbers from this episode's own generator, independent of batching."""
+        """Sample the next chunk's random numbers from this episode's own generator, independent of
+        batching.
+        """
         return self._policy.sampling_noise(self._generator)
 
     @property
@@ -319,40 +376,56 @@ class Episode:
     def _require_single_view(self) -> None:
         require(
             self._past is None,
-            "This policy's vision tower reads past images of every camera: use `Episode.observe`, not past frames "
-            "of one camera and the current view apart.",
+            "This policy's vision tower reads past images of every camera: use `Episode.observe`,"
+            " not past frames of one camera and the current view apart.",
         )
 
     def _checked_course(
         self, count: int, demo: np.ndarray, actions: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Flags [count] of the next frames and the actions that led to the execution frames among them."""
+        """Flags [count] of the next frames and the actions that led to the execution frames among
+        them.
+        """
         demo = np.broadcast_to(demo, (count,))
         require(
             not (demo.any() and (self._video_over or (np.diff(demo.astype(int)) > 0).any())),
-            "A conditioning-video frame came after the first execution frame; the video goes first.",
+            "A conditioning-video frame came after the first execution frame; the video goes"
+            " first.",
         )
         return demo, self._executed_now(int((~demo).sum()), actions)
 
     def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
-        """The actions that led to the last `count` frames; by default the next ones of the chunk."""
+        """The actions that led to the last `count` frames; by default the next ones of
+        the chunk.
+        """
         space = self._robot.action
         if actions is None:
-            return self._no_actions if self._chunk is None or space.frames is None else self._chunk[:count]
+            return (
+                self._no_actions
+                if self._chunk is None or space.frames is None
+                else self._chunk[:count]
+            )
         values = finite_array(actions, "actions")
         if space.frames is None and values.ndim:
             count = len(values)
         executed = values[max(len(values) - count, 0) :] if values.ndim else values
         require(
             executed.shape == (count, space.width),
-            f"actions must be [{count}, {space.width}], one for each execution frame; got {executed.shape}.",
+            f"actions must be [{count}, {space.width}], one for each execution frame; got"
+            f" {executed.shape}.",
         )
         return executed
 
     def _take(
-        self, frames: FrameBatch, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None = None
+        self,
+        frames: FrameBatch,
+        demo: np.ndarray,
+        executed: np.ndarray,
+        states: np.ndarray | None = None,
     ) -> None:
-        """Append checked frames of the memory camera to the history, and the actions that led to them."""
+        """Append checked frames of the memory camera to the history, and the actions that led to
+        them.
+        """
         if self.history is not None:
             motion = self._motion(demo, executed, states)
             self.history.take(frames, with_vision_memory(self._policy).encode_frames)
@@ -366,16 +439,21 @@ class Episode:
         self._video_over = self._video_over or not bool(demo[-1])
         self.n_observed_frames += len(demo)
 
-    def _motion(self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None) -> list[Tensor]:
+    def _motion(
+        self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None
+    ) -> list[Tensor]:
         """Rows of motion of the next frames, if the memory reads them."""
         if not uses_proprio(self._memory):
             return []
         if states is None:
             raise UserError(
-                "This policy's memory reads the robot's own states and actions: give past frames with their states "
-                "(`Episode.observe`), not as images alone."
+                "This policy's memory reads the robot's own states and actions: give past frames"
+                " with their states (`Episode.observe`), not as images alone."
             )
-        actions, known = np.zeros((len(demo), self._robot.action.width), np.float32), np.zeros(len(demo), bool)
+        actions, known = (
+            np.zeros((len(demo), self._robot.action.width), np.float32),
+            np.zeros(len(demo), bool),
+        )
         if self._robot.action.frames is not None:
             rows = np.flatnonzero(~demo)[: len(executed)]
             actions[rows], known[rows] = executed[: len(rows)], True
@@ -384,25 +462,37 @@ class Episode:
     def _prepared_images(self, views: Mapping[str, FrameBatch], frame: int) -> Tensor | None:
         """The views of a frame as the network takes them; None unless all cameras rendered it."""
         images = [image for view in views.values() if (image := view.image(frame)) is not None]
-        return self._policy.require_processor().images(images) if len(images) == len(views) else None
+        return (
+            self._policy.require_processor().images(images) if len(images) == len(views) else None
+        )
 
     def _set_window(self, frames: Sequence[tuple[Tensor | None, Tensor]]) -> None:
         self._recent = [*self._recent, *frames][-self._policy.require_processor().samples.window :]
 
     def _require_rendered(self, images: Tensor | None) -> Tensor:
         if images is None:
-            raise UserError("The current frame was not rendered: observe() an image of every camera before act().")
+            raise UserError(
+                "The current frame was not rendered: observe() an image of every camera before"
+                " act()."
+            )
         return images
 
     def _require_observation(self) -> None:
-        require(self._recent, "No frame was observed yet: call observe() with the current frame before act().")
+        require(
+            self._recent,
+            "No frame was observed yet: call observe() with the current frame before act().",
+        )
 
     def _checked_view(self, frames: Mapping[str, np.ndarray], view: str) -> np.ndarray:
-        require(view in frames, f"This policy needs images of the camera {view!r}; got {sorted(frames)}.")
+        require(
+            view in frames,
+            f"This policy needs images of the camera {view!r}; got {sorted(frames)}.",
+        )
         array = np.asarray(frames[view])
         require(
             array.ndim == 4 and array.shape[-1] == 3 and array.dtype == np.uint8,
-            f"Camera {view!r} must be uint8 [t, height, width, 3]; got {array.dtype} {array.shape}.",
+            f"Camera {view!r} must be uint8 [t, height, width, 3]; got {array.dtype}"
+            f" {array.shape}.",
         )
         return array
 
@@ -412,18 +502,23 @@ def checked_prefix(actions: np.ndarray, delay: int, horizon: int, width: int) ->
     values = finite_array(actions, "the actions of the prefix")
     require(
         values.ndim == 2 and values.shape[1] == width and 1 <= len(values) <= horizon,
-        f"set_action_prefix() needs 1 to {horizon} actions of {width} numbers, got shape {values.shape}.",
+        f"set_action_prefix() needs 1 to {horizon} actions of {width} numbers, got shape"
+        f" {values.shape}.",
     )
     right = isinstance(delay, int) and not isinstance(delay, bool) and 0 <= delay <= len(values)
     require(
         right,
-        f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)}, the actions given.",
+        f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)}, the"
+        " actions given.",
     )
     return ActionPrefix(values, delay)
 
 
 def prefix_overlap(
-    prefixes: Sequence[ActionPrefix | None], states: Tensor, processor: "PolicyProcessor", action_dim: int
+    prefixes: Sequence[ActionPrefix | None],
+    states: Tensor,
+    processor: "PolicyProcessor",
+    action_dim: int,
 ) -> Overlap | None:
     """The normalised prefixes of n episodes at raw states [n, s]; None if none has one."""
     if all(prefix is None for prefix in prefixes):

@@ -1,8 +1,9 @@
-"""Which parameters of a policy learn: all of them, the action side, or low-rank adapters (configs/finetune).
+"""Which parameters of a policy learn: all of them, the action side, or low-rank adapters
+(configs/finetune).
 
-`Policy.finetune_spec` maps parameters to components. Of π0.5, from the outside in: `vision` (tower and
-projector), `vlm` (token embedding and VLM expert), `action` (action expert, its final norm, action and time heads) and
-`memory` (memory, integration, and the memory's own expert).
+`Policy.finetune_spec` maps parameters to components. Of π0.5, from the outside in: `vision` (tower
+and projector), `vlm` (token embedding and VLM expert), `action` (action expert, its final norm,
+action and time heads) and `memory` (memory, integration, and the memory's own expert).
 """
 
 import re
@@ -29,7 +30,8 @@ ADAPTER = "default"  # peft's name of the one adapter a policy carries
 class FineTuneSpec:
     """How a policy can be fine-tuned.
 
-    components: name → pattern of the parameters' names, in order; the first match counts, the last pattern must match
+    components: name → pattern of the parameters' names, in order; the first match counts, the last
+    pattern must match
         the remaining ones. Usual names are `vision`, `vlm`, `action` and `memory`.
     lora_targets: linear layers that LoRA wraps by default, by the end of their name.
     full_train: modules that train in full beside the adapters, by the end of their name.
@@ -48,7 +50,10 @@ class FineTuneSpec:
         for component, pattern in self.components.items():
             if re.match(pattern, name):
                 return component
-        raise ValueError(f"No component has the parameter {name!r}; the last pattern must match the remaining names.")
+        raise ValueError(
+            f"No component has the parameter {name!r}; the last pattern must match the remaining"
+            " names."
+        )
 
 
 def apply_finetuning(
@@ -70,17 +75,19 @@ def apply_finetuning(
     Load weights to start from before this: adapters rename the matrices they wrap.
 
     Args:
-        mode: `full`: everything. `expert_only`: the parts `action` and `memory`. `lora`: low-rank adapters on
-            `targets`, and in full what `train` names.
-        freeze_vision: leave the vision tower as it is in every mode; needed where a memory reads cached tokens.
+        mode: `full`: everything. `expert_only`: the parts `action` and `memory`. `lora`: low-rank
+            adapters on `targets`, and in full what `train` names.
+        freeze_vision: leave the vision tower as it is in every mode; needed where a memory reads
+            cached tokens.
         rank, alpha, dropout: of the adapters: W + (alpha / rank)·B·A.
-        init: distribution of A: `uniform` (Kaiming), or `gaussian` of deviation 1 / rank; B begins at zero.
-        targets: linear layers and convolutions, by the end of their name: `experts.vlm.qkv` is that matrix in every
-            layer. By default those the policy names (`Policy.finetune_spec`).
-        train: with `lora`, what learns in full beside them: parts, or ends of module names such as `action_out`. By
-            default the memory and the policy's heads.
-        frozen_dtype: `bfloat16` holds what is not trained at half the size, as the released training does; it rounds
-            those weights, and requires compute in bfloat16.
+        init: distribution of A: `uniform` (Kaiming), or `gaussian` of deviation 1 / rank; B begins
+            at zero.
+        targets: linear layers and convolutions, by the end of their name: `experts.vlm.qkv` is that
+            matrix in every layer. By default those the policy names (`Policy.finetune_spec`).
+        train: with `lora`, what learns in full beside them: parts, or ends of module names such as
+            `action_out`. By default the memory and the policy's heads.
+        frozen_dtype: `bfloat16` holds what is not trained at half the size, as the released
+            training does; it rounds those weights, and requires compute in bfloat16.
         seed: of A, which the state of PyTorch's own generators does not change.
 
     Returns:
@@ -92,7 +99,9 @@ def apply_finetuning(
     train = ("memory", *spec.full_train) if train is None else train
     if mode == "lora":
         in_full = _named(policy, train)  # before anything is changed
-        add_adapters(policy, rank=rank, alpha=alpha, dropout=dropout, init=init, targets=targets, seed=seed)
+        add_adapters(
+            policy, rank=rank, alpha=alpha, dropout=dropout, init=init, targets=targets, seed=seed
+        )
     for name, parameter in policy.named_parameters():
         part = spec.component_of(name)
         if mode == "full":
@@ -100,7 +109,11 @@ def apply_finetuning(
         elif mode == "expert_only":
             learns = part in ("action", "memory")
         else:
-            learns = ".lora_" in name or any(name.startswith(f"{module}.") for module in in_full) or part in train
+            learns = (
+                ".lora_" in name
+                or any(name.startswith(f"{module}.") for module in in_full)
+                or part in train
+            )
         fixed = spec.frozen is not None and re.match(spec.frozen, name) is not None
         parameter.requires_grad_(learns and not fixed and not (part == "vision" and freeze_vision))
     cast_frozen(policy, frozen_dtype)
@@ -109,8 +122,8 @@ def apply_finetuning(
         counts[spec.component_of(name)] += parameter.numel() if parameter.requires_grad else 0
     require(
         any(counts.values()),
-        f"finetune.mode={mode} with freeze_vision={freeze_vision} leaves no parameter of this policy to train; choose "
-        f"another of {', '.join(MODES)}.",
+        f"finetune.mode={mode} with freeze_vision={freeze_vision} leaves no parameter of this"
+        f" policy to train; choose another of {', '.join(MODES)}.",
     )
     return counts
 
@@ -118,22 +131,27 @@ def apply_finetuning(
 def warn_of_frozen_random_weights(mode: str) -> None:
     """Warn that a mode that freezes most weights begins with random ones.
 
-    With `lora` nothing of the experts can learn then: the gates of fresh adaptive norms are zero and frozen, so that no
-    adapter behind them gets a gradient.
+    With `lora` nothing of the experts can learn then: the gates of fresh adaptive norms are zero
+    and frozen, so that no adapter behind them gets a gradient.
     """
     if mode == "full":
         return
-    effect = "its adapters get no gradient behind gates that are zero, and" if mode == "lora" else "it"
+    effect = (
+        "its adapters get no gradient behind gates that are zero, and" if mode == "lora" else "it"
+    )
     warnings.warn(
-        f"finetune={mode} without init_from: weights that stay as they are are random, so {effect} can learn next to "
-        "nothing. Name weights to start from (init_from=…), or train everything (finetune=full).",
+        f"finetune={mode} without init_from: weights that stay as they are are random, so {effect}"
+        " can learn next to nothing. Name weights to start from (init_from=…), or train everything"
+        " (finetune=full).",
         stacklevel=2,
     )
 
 
 def copy_tower(source: "Policy", policy: "Policy") -> None:
     """Give a policy the vision tower of another of the same composition."""
-    of_vision = {name: value for name, value in source.named_parameters() if _is_vision(source, name)}
+    of_vision = {
+        name: value for name, value in source.named_parameters() if _is_vision(source, name)
+    }
     with torch.no_grad():
         for name, value in policy.named_parameters():
             if name in of_vision:
@@ -149,9 +167,12 @@ def check_frozen_dtype(policy: "Policy", name: str | None) -> None:
     if name is None:
         return
     require(
-        not (dtype_of(name, "finetune.frozen_dtype") != torch.float32 and policy.compute_dtype == torch.float32),
-        f"finetune.frozen_dtype={name} rounds weights that policy.compute_dtype=float32 would not: set "
-        "policy.compute_dtype=bfloat16 too, or leave frozen_dtype at null.",
+        not (
+            dtype_of(name, "finetune.frozen_dtype") != torch.float32
+            and policy.compute_dtype == torch.float32
+        ),
+        f"finetune.frozen_dtype={name} rounds weights that policy.compute_dtype=float32 would not:"
+        " set policy.compute_dtype=bfloat16 too, or leave frozen_dtype at null.",
     )
 
 
@@ -173,12 +194,17 @@ def add_adapters(
     targets: Sequence[str] | None = None,
     seed: int = 42,
 ) -> None:
-    """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again."""
-    has_adapters = policy.config.get("adapters") and any(".lora_" in name for name, _ in policy.named_parameters())
+    """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load
+    again.
+    """
+    has_adapters = policy.config.get("adapters") and any(
+        ".lora_" in name for name, _ in policy.named_parameters()
+    )
     require(not has_adapters, "This policy has adapters already: merge_adapters() first.")
     require(
         rank >= 1 and alpha > 0 and 0 <= dropout < 1,
-        f"finetune: rank={rank}, alpha={alpha}, dropout={dropout}: need rank ≥ 1, alpha > 0, dropout in [0, 1).",
+        f"finetune: rank={rank}, alpha={alpha}, dropout={dropout}: need rank ≥ 1, alpha > 0,"
+        " dropout in [0, 1).",
     )
     check_choice("finetune.init", init, INITS)
     targets = list(policy.finetune_spec.lora_targets if targets is None else targets)
@@ -187,16 +213,28 @@ def add_adapters(
         from peft import LoraConfig, inject_adapter_in_model
     except ImportError:
         raise missing_extra("LoRA", "vlm") from None
-    options: dict[str, Any] = {"lora_alpha": alpha, "target_modules": target_modules, "init_lora_weights": INITS[init]}
+    options: dict[str, Any] = {
+        "lora_alpha": alpha,
+        "target_modules": target_modules,
+        "init_lora_weights": INITS[init],
+    }
     config = LoraConfig(r=rank, lora_dropout=dropout, **options)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         inject_adapter_in_model(config, policy, ADAPTER)
-    policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "init": init, "targets": targets}
+    policy.config["adapters"] = {
+        "rank": rank,
+        "alpha": alpha,
+        "dropout": dropout,
+        "init": init,
+        "targets": targets,
+    }
 
 
 def merge_adapters(policy: "Policy") -> None:
-    """Fold the adapters into the matrices they wrap: a plain policy again, every parameter trainable."""
+    """Fold the adapters into the matrices they wrap: a plain policy again, every parameter
+    trainable.
+    """
     from peft.tuners.tuners_utils import BaseTunerLayer
 
     for name, module in list(policy.named_modules()):
@@ -209,63 +247,85 @@ def merge_adapters(policy: "Policy") -> None:
         parameter.requires_grad_(True)
 
 
-def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | None) -> dict[str, Tensor]:
-    """Fold the adapters of saved weights, as `merge_adapters` does of a policy; without adapters nothing changes."""
-    merged = {name.replace(".base_layer.", "."): tensor for name, tensor in tensors.items() if ".lora_" not in name}
+def merge_state(
+    tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | None
+) -> dict[str, Tensor]:
+    """Fold the adapters of saved weights, as `merge_adapters` does of a policy; without adapters
+    nothing changes.
+    """
+    merged = {
+        name.replace(".base_layer.", "."): tensor
+        for name, tensor in tensors.items()
+        if ".lora_" not in name
+    }
     if not adapters:
         return merged
     try:
         scale = adapters["alpha"] / adapters["rank"]
         for name, down in tensors.items():
             if f".lora_A.{ADAPTER}." in name:
-                up, target = tensors[name.replace(".lora_A.", ".lora_B.")], name.replace(f".lora_A.{ADAPTER}.", ".")
+                up, target = (
+                    tensors[name.replace(".lora_A.", ".lora_B.")],
+                    name.replace(f".lora_A.{ADAPTER}.", "."),
+                )
                 weight = merged[target]
-                # A convolution's A is [r, in, k, k] and its B [out, r, 1, 1]: the product of their rows and columns.
+                # A convolution's A is [r, in, k, k] and its B [out, r, 1, 1]: the product of their
+                # rows and columns.
                 product = (up.float().flatten(1) @ down.float().flatten(1)).view_as(weight)
                 merged[target] = (weight.float() + scale * product).to(weight.dtype)
     except (KeyError, TypeError, ZeroDivisionError, RuntimeError) as error:
         reason = brief(str(error), 200, quote=False)
-        raise UserError(f"A checkpoint's adapters {brief(adapters)} do not fit its weights ({reason}).") from error
+        raise UserError(
+            f"A checkpoint's adapters {brief(adapters)} do not fit its weights ({reason})."
+        ) from error
     return merged
 
 
 def _targets(policy: "Policy", targets: Sequence[str]) -> list[str]:
     """Full names of the layers that the targets mean (what is the memory's learns in full)."""
     spec = policy.finetune_spec
-    linear = [name for name, module in policy.named_modules() if isinstance(module, nn.Linear | nn.Conv2d)]
+    linear = [
+        name for name, module in policy.named_modules() if isinstance(module, nn.Linear | nn.Conv2d)
+    ]
     layers = [name for name in linear if spec.component_of(f"{name}.") != "memory"]
     selected: list[str] = []
     for target in targets:
         matching = [name for name in layers if f".{name}".endswith(f".{target}")]
         if not matching:
             raise UserError(
-                f"finetune.targets: no linear layer of the policy's other parts ends in {target!r}. "
-                + _near(target, layers)
+                "finetune.targets: no linear layer of the policy's other parts ends in"
+                f" {target!r}. " + _near(target, layers)
             )
         past = spec.lora_exclude
         unreachable = [name for name in matching if past is not None and re.search(past, name)]
         if unreachable:
             raise UserError(
-                f"finetune.targets: {target!r} means {unreachable[0]}, whose weight is used in float32 past any "
-                "adapter: it would never act. Train it in full (finetune.train), or leave it."
+                f"finetune.targets: {target!r} means {unreachable[0]}, whose weight is used in"
+                " float32 past any adapter: it would never act. Train it in full (finetune.train),"
+                " or leave it."
             )
         selected += matching
     if not selected:
         raise UserError(
-            f"finetune.targets is empty: LoRA needs layers to adapt, such as {', '.join(spec.lora_targets[:2])}."
+            "finetune.targets is empty: LoRA needs layers to adapt, such as"
+            f" {', '.join(spec.lora_targets[:2])}."
         )
     return sorted(set(selected))
 
 
 def _named(policy: "Policy", train: Sequence[str]) -> list[str]:
     """Full names of the modules that `train` means; parts are left to the caller."""
-    modules, components = [name for name, _ in policy.named_modules() if name], policy.finetune_spec.components
+    modules, components = (
+        [name for name, _ in policy.named_modules() if name],
+        policy.finetune_spec.components,
+    )
     selected: list[str] = []
     for entry in train:
         matching = [name for name in modules if f".{name}".endswith(f".{entry}")]
         if not matching and entry not in components:
             raise UserError(
-                f"finetune.train: {entry!r} is no part and no module. {_near(entry, [*components, *modules])}"
+                f"finetune.train: {entry!r} is no part and no module."
+                f" {_near(entry, [*components, *modules])}"
             )
         selected += [] if entry in components else matching
     return selected

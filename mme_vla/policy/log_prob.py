@@ -1,4 +1,6 @@
-"""Log-probabilities for policy gradients: of choices, and of the path of a flow that is sampled in Gaussian steps."""
+"""Log-probabilities for policy gradients: of choices, and of the path of a flow that is sampled in
+Gaussian steps.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -48,8 +50,8 @@ def sample_path(
     Args:
         deviation: σ of each step's noise, in units of normalised actions.
         steps: Euler steps; the head's own number by default.
-        generator: of the noise, on the CPU. noise: the start x_0 [b, h, a]; sampled by default. increments: the steps'
-            noise ε [b, k, h, a]; likewise.
+        generator: of the noise, on the CPU. noise: the start x_0 [b, h, a]; sampled by default.
+            increments: the steps' noise ε [b, k, h, a]; likewise.
         memory: memory tokens; by default those of `batch.history`.
     """
     if deviation < 0:
@@ -60,7 +62,9 @@ def sample_path(
     if noise is None:
         noise = torch.randn(count, policy.horizon, policy.action_dim, generator=generator)
     if increments is None:
-        increments = torch.randn(count, steps, policy.horizon, policy.action_dim, generator=generator)
+        increments = torch.randn(
+            count, steps, policy.horizon, policy.action_dim, generator=generator
+        )
     increments = increments.to(policy.device)
     predict = _predictor(policy, batch, steps, memory)
     with policy.autocast():
@@ -69,11 +73,14 @@ def sample_path(
     return SamplePath(states, deviation, log_prob)
 
 
-def path_log_prob(policy: MMEPolicy, batch: Batch, path: SamplePath, memory: MemoryTokens | None = None) -> Tensor:
+def path_log_prob(
+    policy: MMEPolicy, batch: Batch, path: SamplePath, memory: MemoryTokens | None = None
+) -> Tensor:
     """Log-density [b] of a path under the policy as it is now, with gradient.
 
     Args:
-        batch: what the path was sampled for. memory: memory tokens; by default those of `batch.history`.
+        batch: what the path was sampled for. memory: memory tokens; by default those of
+            `batch.history`.
     """
     if not path.deviation:
         raise UserError("A path without noise has no density: sample it with deviation > 0.")
@@ -89,17 +96,21 @@ def log_prob(
     memory: MemoryTokens | None = None,
     execute: int | None = None,
 ) -> Tensor:
-    """Log-probability [b] of choices under the policy as it is now, with gradient; for `backbone.head.name=choice`.
+    """Log-probability [b] of choices under the policy as it is now, with gradient; for
+    `backbone.head.name=choice`.
 
     Args:
         batch: what the policy saw; `batch.options` are the letters that were offered.
         chunk: the sampled chunk [b, h, a] in the network's units; `batch.actions` by default.
         memory: memory tokens; by default those of `batch.history`.
-        execute: steps of the chunk that are executed, and count; the embodiment's number by default.
+        execute: steps of the chunk that are executed, and count; the embodiment's number by
+            default.
     """
     head = _head(policy)
     if not isinstance(head, ChoiceHead):
-        raise UserError("log_prob() needs backbone.head.name=choice; for chunks of a flow use path_log_prob().")
+        raise UserError(
+            "log_prob() needs backbone.head.name=choice; for chunks of a flow use path_log_prob()."
+        )
     chunk = batch.actions if chunk is None else chunk
     if chunk is None:
         raise UserError("log_prob() needs a chunk, or batch.actions.")
@@ -119,7 +130,10 @@ def _flow_head(policy: MMEPolicy) -> FlowHead:
 
 def _head(policy: MMEPolicy) -> FlowHead:
     if not isinstance(policy.backbone, HasFlowHead):
-        raise UserError(f"Log-probabilities require a flow backbone; {type(policy.backbone).__name__} has no FlowHead.")
+        raise UserError(
+            f"Log-probabilities require a flow backbone; {type(policy.backbone).__name__} has no"
+            " FlowHead."
+        )
     return policy.backbone.head
 
 
@@ -129,7 +143,9 @@ def _predictor(
     """The network's output by the index of a step. Observation and memory are read once."""
     times = _head(policy).times(steps, policy.device)
     with policy.autocast():
-        memory = policy.encode_memory(policy.conditioned_history(batch)) if memory is None else memory
+        memory = (
+            policy.encode_memory(policy.conditioned_history(batch)) if memory is None else memory
+        )
         batch = policy.prepare_images(batch)
         assert isinstance(policy.backbone, HasFlowHead)
         predict = policy.backbone.predictor(batch, policy.inject(batch, memory))

@@ -51,7 +51,9 @@ if TYPE_CHECKING:
 
 @POLICIES.register("mme")
 class MMEPolicy(MMEModel, NetworkPolicy):
-    """One composition of backbone, memory and integration, as a policy. No method depends on the variant."""
+    """One composition of backbone, memory and integration, as a policy. No method depends on the
+    variant.
+    """
 
     acts_in_bfloat16 = True
     _sampler: CapturedSampling | None = None
@@ -75,10 +77,16 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         Args:
             processor, config, compute_dtype, history_dtype, augment: as for `NetworkPolicy`.
             attention: backend: `auto`, `sdpa`, `flex` or `varlen` (docs/evidence/hardware.md).
-            float32_products: how a GPU multiplies in recurrent memories, which compute in float32: `ieee` or `tf32`.
+            float32_products: how a GPU multiplies in recurrent memories, which compute in float32:
+                `ieee` or `tf32`.
         """
         NetworkPolicy.__init__(
-            self, processor, config, compute_dtype=compute_dtype, history_dtype=history_dtype, augment=augment
+            self,
+            processor,
+            config,
+            compute_dtype=compute_dtype,
+            history_dtype=history_dtype,
+            augment=augment,
         )
         self.backbone, self.memory, self.integration = backbone, memory, integration
         self._set_backends(attention, checked_products(float32_products))
@@ -91,8 +99,8 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             self.backbone.set_attention_backend(attention)
         elif check_backend(attention) != "auto":
             raise UserError(
-                f"policy.attention={attention}: {type(self.backbone).__name__} has one attention backend; leave it at "
-                "auto."
+                f"policy.attention={attention}: {type(self.backbone).__name__} has one attention"
+                " backend; leave it at auto."
             )
         for module in self.modules():
             if isinstance(module, MatmulPrecision):
@@ -100,11 +108,17 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     @classmethod
     def from_config(
-        cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
+        cls,
+        config: Mapping[str, Any],
+        processor: "PolicyProcessor | None" = None,
+        *,
+        fresh_backbone: bool = True,
     ) -> Self:
-        """Build from plain sections `backbone`, `memory`, `integration`, `policy`; each `name` is a registry's key.
+        """Build from plain sections `backbone`, `memory`, `integration`, `policy`; each `name` is a
+        registry's key.
 
-        With `fresh_backbone=False` no weight of the backbone itself is initialised: a checkpoint is loaded next.
+        With `fresh_backbone=False` no weight of the backbone itself is initialised: a checkpoint is
+        loaded next.
 
         Raises:
             UserError: an unknown name or option, or sizes that do not fit together.
@@ -112,13 +126,18 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         backbone_cls, sizes = read_backbone(config["backbone"])
         embodiment_of(config)  # raises an error before anything is built
         section = config.get("integration")
-        if section and (unsupported := extension_points(INTEGRATIONS[section.get("name")]) - backbone_cls.supports):
+        if section and (
+            unsupported := extension_points(INTEGRATIONS[section.get("name")])
+            - backbone_cls.supports
+        ):
             raise UserError(
-                f"The backbone {config['backbone']['name']!r} has no place for {listed(sorted(unsupported))} of the "
-                f"integration {section['name']!r}; it hosts {listed(sorted(backbone_cls.supports))}. Choose another "
-                "integration or backbone."
+                f"The backbone {config['backbone']['name']!r} has no place for"
+                f" {listed(sorted(unsupported))} of the integration {section['name']!r}; it hosts"
+                f" {listed(sorted(backbone_cls.supports))}. Choose another integration or backbone."
             )
-        integration: Integration = INTEGRATIONS.build(section, sizes) if section else Integration(sizes)
+        integration: Integration = (
+            INTEGRATIONS.build(section, sizes) if section else Integration(sizes)
+        )
         experts = integration.extra_experts()
         with nullcontext() if fresh_backbone else shapes_only():
             backbone = backbone_cls(sizes, experts)
@@ -128,7 +147,9 @@ class MMEPolicy(MMEModel, NetworkPolicy):
                 backbone.init_experts(list(experts))
         memory: MemoryModule | None = None
         if config.get("memory"):
-            memory = build_memory(config["memory"], backbone.vision_width, backbone.grid, integration.memory_width)
+            memory = build_memory(
+                config["memory"], backbone.vision_width, backbone.grid, integration.memory_width
+            )
         cls._check_parts(config, integration, memory, backbone_cls.supports)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
 
@@ -137,8 +158,14 @@ class MMEPolicy(MMEModel, NetworkPolicy):
     # Training
 
     def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
-        """While training with augmentation `changes` [n, …]: random numbers that change a sample's images."""
-        return {"changes": self._sample_augmentation(count, generator)} if self.training and self.augment else {}
+        """While training with augmentation `changes` [n, …]: random numbers that change a sample's
+        images.
+        """
+        return (
+            {"changes": self._sample_augmentation(count, generator)}
+            if self.training and self.augment
+            else {}
+        )
 
     def forward(  # type: ignore[override]  # returns metrics too, as all policies do
         self,
@@ -151,16 +178,20 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
         Args:
             batch: with `actions`.
-            noise: as `training_noise` makes it; of a flow also its noise [b, h, a] alone, with the times beside it.
+            noise: as `training_noise` makes it; of a flow also its noise [b, h, a] alone, with the
+                times beside it.
             time: flow times [b], if `noise` is a tensor.
             memory: memory tokens; by default those of `batch.history`.
 
         Returns:
-            The loss and its metrics. Auxiliary losses are `losses/<name>`, unweighted. The memory's own begin with
-            `memory/` and are present while `memory.reporting`.
+            The loss and its metrics. Auxiliary losses are `losses/<name>`, unweighted. The memory's
+            own begin with `memory/` and are present while `memory.reporting`.
         """
         if batch.actions is None:
-            raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
+            raise ValueError(
+                "forward() computes a loss: batch.actions must hold the recorded chunk (it is"
+                " None)."
+            )
         values = named_noise(noise, time=time)
         if set(self.training_noise(0, torch.default_generator)) - set(values):
             values = self.training_noise(len(batch.actions), torch.default_generator) | values
@@ -179,28 +210,45 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         reported = {} if memory is None else memory.metrics
         return loss, metrics | {f"memory/{name}": value for name, value in reported.items()}
 
-    def velocity(self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None) -> Tensor:
-        """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times [b], in one pass."""
+    def velocity(
+        self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None
+    ) -> Tensor:
+        """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times
+        [b], in one pass.
+        """
         with self.autocast():
-            memory = self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
+            memory = (
+                self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
+            )
             injection = self.inject(self.prepare_images(batch), memory)
             return self.backbone.velocity(injection, x_t, time)  # type: ignore[operator]
 
     def recompute(self, mode: Recompute) -> None:
         if not isinstance(self.backbone, Recomputes):
             name = type(self.backbone).__name__
-            raise UserError(f"train.recompute: {name} does not inherit from mme_vla.speed.Recomputes. Set it to false.")
+            raise UserError(
+                f"train.recompute: {name} does not inherit from mme_vla.speed.Recomputes. Set it to"
+                " false."
+            )
         self.backbone.recompute(mode)
 
     def compile(self, **options: Any) -> None:
-        """Compile the backbone's tower and layers in place, each by itself, and the recurrence of a memory."""
+        """Compile the backbone's tower and layers in place, each by itself, and the recurrence of a
+        memory.
+        """
         self.backbone.compile(**options)
         if isinstance(self.memory, CompilableMemory):
             self.memory.compile(**options)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        """The backbone's groups. Memory and integration are in none: they are small, and compute in float32."""
-        return self.backbone.shard_groups() if isinstance(self.backbone, Sharded) else backbone_groups(self.backbone)
+        """The backbone's groups. Memory and integration are in none: they are small, and compute in
+        float32.
+        """
+        return (
+            self.backbone.shard_groups()
+            if isinstance(self.backbone, Sharded)
+            else backbone_groups(self.backbone)
+        )
 
     def _sample_augmentation(self, count: int, generator: torch.Generator) -> Tensor:
         """Random numbers of the augmentation of `count` training samples, [count, …] on the CPU."""
@@ -209,7 +257,11 @@ class MMEPolicy(MMEModel, NetworkPolicy):
     def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
         """Views in [−1, 1], augmented as the cameras of the embodiment say."""
         unit = super().transform_images(images, None)
-        return unit if augmentation is None else augment_views(unit, self.embodiment.augmentations, augmentation)
+        return (
+            unit
+            if augmentation is None
+            else augment_views(unit, self.embodiment.augmentations, augmentation)
+        )
 
     # Sampling
 
@@ -225,9 +277,11 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         """A normalised chunk [b, h, a].
 
         Args:
-            noise: as `sampling_noise` makes it, with a batch axis; of a flow also its noise [b, h, a] alone.
+            noise: as `sampling_noise` makes it, with a batch axis; of a flow also its noise [b, h,
+                a] alone.
             steps: Euler steps of a flow; 10 by default, as released.
-            generator: source of new noise, on the CPU. memory: memory tokens; by default those of `batch.history`.
+            generator: source of new noise, on the CPU. memory: memory tokens; by default those of
+                `batch.history`.
         """
         if noise is None:
             source = torch.default_generator if generator is None else generator
@@ -244,13 +298,17 @@ class MMEPolicy(MMEModel, NetworkPolicy):
     @property
     def compiles_sampling(self) -> bool:
         """Whether the backbone's sampler can be compiled."""
-        return isinstance(self.backbone, CapturableSampling) and not isinstance(self.memory, CacheMemory)
+        return isinstance(self.backbone, CapturableSampling) and not isinstance(
+            self.memory, CacheMemory
+        )
 
     def compile_sampling(self, layers: bool = False) -> None:
-        """Speed up sampling with fixed weights; chunks are equal up to the rounding of other kernels.
+        """Speed up sampling with fixed weights; chunks are equal up to the rounding of other
+        kernels.
 
-        What depends on the flow time alone is computed once and kept. On a GPU a chunk becomes one CUDA graph for each
-        batch size, captured when it first occurs; here for one episode and every length of prompt.
+        What depends on the flow time alone is computed once and kept. On a GPU a chunk becomes one
+        CUDA graph for each batch size, captured when it first occurs; here for one episode and
+        every length of prompt.
 
         Args:
             layers: compile the tower and the layers too, which takes a minute or more at full size.
@@ -260,7 +318,9 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         """
         if not isinstance(self.backbone, CapturableSampling):
             name = type(self.backbone).__name__
-            raise UserError(f"The backbone {name} has no sampler that can be compiled: leave sampling=eager.")
+            raise UserError(
+                f"The backbone {name} has no sampler that can be compiled: leave sampling=eager."
+            )
         self.backbone.compile_sampling()
         if layers:
             self.backbone.compile(dynamic=False)
@@ -271,10 +331,14 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             return
         full = self.full_batch(self.device)
         for length in range(16, self._prompt_length() + 16, 16):
-            cut = replace(full, prompt=full.prompt[:, :length], prompt_mask=full.prompt_mask[:, :length])
+            cut = replace(
+                full, prompt=full.prompt[:, :length], prompt_mask=full.prompt_mask[:, :length]
+            )
             self.sample_actions(cut)
 
-    def _sample(self, batch: Batch, memory: MemoryTokens | None, noise: Mapping[str, Tensor], steps: int) -> Tensor:
+    def _sample(
+        self, batch: Batch, memory: MemoryTokens | None, noise: Mapping[str, Tensor], steps: int
+    ) -> Tensor:
         return self.sample(batch, noise, steps, memory)
 
     # Episodes
@@ -300,7 +364,11 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         return batch.without_prompt_padding().sent(self.device)
 
     def predict_chunk(
-        self, batch: Batch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Batch,
+        episodes: Sequence[Episode],
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
         """A chunk for the batch of `observation`, with the episodes' memories."""
         memory = self._memory_tokens(episodes, batch)
@@ -321,7 +389,8 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         with self.autocast():
             histories = [
                 PromptConditionedHistory(
-                    e.required_history(), partial(self._condition_one, batch.prompt[i], batch.prompt_mask[i])
+                    e.required_history(),
+                    partial(self._condition_one, batch.prompt[i], batch.prompt_mask[i]),
                 )
                 for i, e in enumerate(episodes)
             ]
@@ -340,7 +409,10 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         with self.autocast():
             prepared = self.prepare_images(batch)
             ids = self.backbone.write(prepared, self.inject(prepared, memory)).tolist()
-        lines = (tokenizer.decode([token for token in row if 0 < token < tokenizer.vocab_size]) for row in ids)
+        lines = (
+            tokenizer.decode([token for token in row if 0 < token < tokenizer.vocab_size])
+            for row in ids
+        )
         return [{self.backbone.note: " ".join(line.split())} for line in lines]
 
     @torch.no_grad()
@@ -352,7 +424,11 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray:
         """What the memory reads; nothing without one."""
-        return np.zeros(0, np.int64) if self.memory is None else self.memory.frames_read(steps, exec_start)
+        return (
+            np.zeros(0, np.int64)
+            if self.memory is None
+            else self.memory.frames_read(steps, exec_start)
+        )
 
     def _condition_one(self, prompt: Tensor, prompt_mask: Tensor, tokens: Tensor) -> Tensor:
         """Stored tokens [n, d_vision] of one episode, read with its prompt [l]."""
@@ -366,20 +442,30 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         return pool_grid(self.backbone.encode_images(images), grid, pooling)
 
     def full_batch(self, device: torch.device | str = "cpu") -> Batch:
-        """A batch of one without content: all views, the longest prompt without padding, and a memory that is full."""
-        size, views, length = self.backbone.image_size, len(self.embodiment.cameras), self._prompt_length()
+        """A batch of one without content: all views, the longest prompt without padding, and a
+        memory that is full.
+        """
+        size, views, length = (
+            self.backbone.image_size,
+            len(self.embodiment.cameras),
+            self._prompt_length(),
+        )
         return Batch(
             images=torch.zeros(1, views, 3, size, size, dtype=torch.uint8, device=device),
             image_mask=torch.ones(1, views, dtype=torch.bool, device=device),
             prompt=torch.full((1, length), 5, device=device),
             prompt_mask=torch.ones(1, length, dtype=torch.bool, device=device),
-            history=None if self.memory is None else full_history(self.memory, self.backbone.vision_width, device),
+            history=None
+            if self.memory is None
+            else full_history(self.memory, self.backbone.vision_width, device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
             past=full_past(past_view_spec(self.memory), views, size, device),
         )
 
     def _prompt_length(self) -> int:
-        return int(self.config["processor"]["prompt_length"]) + self.embodiment.action.options_length
+        return (
+            int(self.config["processor"]["prompt_length"]) + self.embodiment.action.options_length
+        )
 
     def warm_up_vision(self) -> None:
         size = self.backbone.image_size
@@ -388,20 +474,27 @@ class MMEPolicy(MMEModel, NetworkPolicy):
     def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
         processor = self.require_processor()
         sizes = {
-            name: (getattr(processor, name), getattr(self.backbone, name)) for name in ("image_size", "action_dim")
+            name: (getattr(processor, name), getattr(self.backbone, name))
+            for name in ("image_size", "action_dim")
         }
         return {**sizes, "horizon": (processor.embodiment.action.horizon, self.backbone.horizon)}
 
     @property
     def finetune_spec(self) -> FineTuneSpec:
-        """The backbone's components in its order; memory, integration and its experts are the component `memory`."""
+        """The backbone's components in its order; memory, integration and its experts are the
+        component `memory`.
+        """
         backbone = self.backbone
-        components = {name: rf"backbone\.(?:{pattern})" for name, pattern in backbone.parts().items()}
+        components = {
+            name: rf"backbone\.(?:{pattern})" for name, pattern in backbone.parts().items()
+        }
         experts = f"|{components['memory']}" if "memory" in components else ""
         components["memory"] = rf"memory\.|integration\.{experts}"
         if not isinstance(backbone, HasLoraTargets):
             return FineTuneSpec(components)
-        return FineTuneSpec(components, backbone.lora_targets, backbone.heads, backbone.lora_exclude)
+        return FineTuneSpec(
+            components, backbone.lora_targets, backbone.heads, backbone.lora_exclude
+        )
 
 
 def mme_of(policy: Policy, what: str) -> MMEPolicy:

@@ -1,4 +1,6 @@
-"""`NetworkPolicy`: what policies of one network share: precision, memory tokens and stored frames."""
+"""`NetworkPolicy`: what policies of one network share: precision, memory tokens and
+stored frames.
+"""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +24,9 @@ if TYPE_CHECKING:
 
 
 def processor_for[P](kind: type[P], processor: object, names: str) -> P | None:
-    """The processor, which must be of the kind that a policy needs; `names` are those of its configurations."""
+    """The processor, which must be of the kind that a policy needs; `names` are those of its
+    configurations.
+    """
     if processor is None or isinstance(processor, kind):
         return processor
     raise UserError(f"This policy needs its own processor: set processor={names}.")
@@ -31,8 +35,8 @@ def processor_for[P](kind: type[P], processor: object, names: str) -> P | None:
 class MemoryTower(NamedTuple):
     """The vision tower whose tokens a memory stores.
 
-    pooled_tokens: images as the tower takes them, side of the grid, pooling → tokens [n, grid², width].
-    settings: what else its tokens depend on, for the fingerprint.
+    pooled_tokens: images as the tower takes them, side of the grid, pooling → tokens [n, grid²,
+    width]. settings: what else its tokens depend on, for the fingerprint.
     """
 
     tower: nn.Module
@@ -44,8 +48,8 @@ class MemoryTower(NamedTuple):
 class NetworkPolicy(Policy, Recomputes, Sharded):
     """A policy of one network.
 
-    A subclass sets its modules and `memory`, and implements `memory_tower` if it has a memory, `processor_sizes`, and
-    what `Policy` requires.
+    A subclass sets its modules and `memory`, and implements `memory_tower` if it has a memory,
+    `processor_sizes`, and what `Policy` requires.
     """
 
     acts_in_bfloat16: ClassVar[bool] = False
@@ -65,7 +69,8 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
         Args:
             processor: needed for episodes and data; the network alone runs on batches without it.
             config: what `from_config` was given; saved with the weights.
-            compute_dtype: `bfloat16` runs matrix products under autocast over the float32 master weights.
+            compute_dtype: `bfloat16` runs matrix products under autocast over the float32 master
+                weights.
             history_dtype: dtype of stored vision tokens; bfloat16 as released.
             augment: augment the current views while training.
         """
@@ -80,7 +85,9 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
         return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
 
     def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        """Size → its value in the processor and in the network; a checkpoint in which they differ is damaged."""
+        """Size → its value in the processor and in the network; a checkpoint in which they differ
+        is damaged.
+        """
         return {}
 
     # Memory
@@ -93,7 +100,9 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
     def require_memory(self) -> MemoryModule:
         """Return the memory, or raise a `UserError`."""
         if self.memory is None:
-            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
+            raise UserError(
+                "This policy has no memory, so it stores no vision tokens of past frames."
+            )
         return self.memory
 
     def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
@@ -109,7 +118,10 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
         if self.memory is None:
             return None
         with self.autocast():
-            histories, streams = [e.required_history() for e in episodes], [e.stream for e in episodes]
+            histories, streams = (
+                [e.required_history() for e in episodes],
+                [e.stream for e in episodes],
+            )
             return encode_histories(self.memory, histories, streams)
 
     @torch.no_grad()
@@ -130,16 +142,22 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
         storage, source, device = self.require_memory().storage, self.memory_tower, self.device
         processor = self.require_processor()
         assert isinstance(processor, HasMemoryImages)
-        empty = torch.zeros(0, storage.grid**2, source.width, dtype=self.history_dtype, device=device)
+        empty = torch.zeros(
+            0, storage.grid**2, source.width, dtype=self.history_dtype, device=device
+        )
         encoded = [empty]
         for start in range(0, len(frames), batch_size):
             images = processor.memory_images(frames[start : start + batch_size], device=device)
             with self.autocast():
-                encoded.append(source.pooled_tokens(images, storage.grid, storage.pooling).to(empty))
+                encoded.append(
+                    source.pooled_tokens(images, storage.grid, storage.pooling).to(empty)
+                )
         return torch.cat(encoded)
 
     def vision_fingerprint(self) -> str:
-        """Hash the memory's vision tower, its dtype and the settings that a cache of its tokens depends on."""
+        """Hash the memory's vision tower, its dtype and the settings that a cache of its tokens
+        depends on.
+        """
         source = self.memory_tower
         digest = hashlib.sha256(str(self.compute_dtype).encode())
         for name, tensor in sorted(source.tower.state_dict().items()):

@@ -1,4 +1,6 @@
-"""Where a run of training lies on disk: its checkpoints, the newest of them, and what `latest` means."""
+"""Where a run of training lies on disk: its checkpoints, the newest of them, and what `latest`
+means.
+"""
 
 import re
 from importlib.resources import files
@@ -14,7 +16,11 @@ _STEP = re.compile(r"step_(\d+)")
 
 def checkpoints_in(folder: Path) -> list[Path]:
     """The finished checkpoints in a `checkpoints` folder, oldest step first."""
-    folders = [path for path in folder.glob("step_*") if _STEP.fullmatch(path.name) and (path / STATE).is_file()]
+    folders = [
+        path
+        for path in folder.glob("step_*")
+        if _STEP.fullmatch(path.name) and (path / STATE).is_file()
+    ]
     return sorted(folders, key=step_of)
 
 
@@ -38,26 +44,35 @@ def training_name(number: int) -> str:
 
 
 def trainings_in(folder: Path) -> list[Path]:
-    """The run folders of the trainings of one recipe in `folder` that wrote a checkpoint, in their order."""
+    """The run folders of the trainings of one recipe in `folder` that wrote a checkpoint, in their
+    order.
+    """
     runs = [path for path in folder.glob("training_*") if _TRAINING.fullmatch(path.name)]
     runs = [path for path in runs if checkpoints_in(path / CHECKPOINTS)]
     return sorted(runs, key=lambda path: int(path.name.removeprefix("training_")))
 
 
 def newest_write(run: Path) -> int:
-    """When a run, or one of its trainings, wrote a checkpoint last, in nanoseconds; 0 without a checkpoint."""
+    """When a run, or one of its trainings, wrote a checkpoint last, in nanoseconds; 0 without a
+    checkpoint.
+    """
     stored = [checkpoints_in(one / CHECKPOINTS) for one in (run, *trainings_in(run))]
-    return max((checkpoints[-1].stat().st_mtime_ns for checkpoints in stored if checkpoints), default=0)
+    return max(
+        (checkpoints[-1].stat().st_mtime_ns for checkpoints in stored if checkpoints), default=0
+    )
 
 
 LATEST = "latest"
-"""`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder is called so."""
+"""`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder
+is called so.
+"""
 SHIPPED = ("nano", "nano16")
 """The checkpoints that ship with the library, folders of `mme_vla/assets` (docs/train/nano.md)."""
 
 
 def find_run(path: Path) -> Path:
-    """`path`, the newest run where it ends in `latest`, or the checkpoint that ships under this name (`SHIPPED`).
+    """`path`, the newest run where it ends in `latest`, or the checkpoint that ships under this
+    name (`SHIPPED`).
 
     A file or folder of that name goes first.
     """
@@ -68,54 +83,69 @@ def find_run(path: Path) -> Path:
     if path.name != LATEST:
         return path
     runs = [run for run in path.parent.glob("*") if newest_write(run)]
-    require(runs, f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name another.")
+    require(
+        runs,
+        f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name"
+        " another.",
+    )
     return max(runs, key=lambda run: (newest_write(run), run.name))
 
 
 def resolve_checkpoint(path: Path) -> Path:
-    """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints` folder (then the newest).
+    """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints`
+    folder (then the newest).
 
-    A path that ends in `latest` means the newest run of its folder, and a name of `SHIPPED` that checkpoint.
+    A path that ends in `latest` means the newest run of its folder, and a name of `SHIPPED` that
+    checkpoint.
     """
     newest = newest_checkpoint(path)
     if newest != path or (path / "config.json").is_file():
         return newest
     if trainings := trainings_in(path):
         raise UserError(
-            f"{path} holds {len(trainings)} trainings of one recipe: name one of them, such as {trainings[0]}. "
-            "mme-vla evaluate and results take all of them."
+            f"{path} holds {len(trainings)} trainings of one recipe: name one of them, such as"
+            f" {trainings[0]}. mme-vla evaluate and results take all of them."
         )
     if _is_released(path):
         raise UserError(
-            f"{path} is a checkpoint of the released code, in another format. Convert it, then name the new folder: "
-            f"mme-vla weights {path} {str(path).removesuffix('.zip')}_converted (with model=<model> "
-            "where no history_config.txt names the variant)."
+            f"{path} is a checkpoint of the released code, in another format. Convert it, then name"
+            f" the new folder: mme-vla weights {path} {str(path).removesuffix('.zip')}_converted"
+            " (with model=<model> where no history_config.txt names the variant)."
         )
     require(
         str(path) not in SHIPPED,
-        f"The folder {path} holds no checkpoint, and hides the one that ships under this name: rename it, or run the "
-        "command in another folder.",
+        f"The folder {path} holds no checkpoint, and hides the one that ships under this name:"
+        " rename it, or run the command in another folder.",
     )
     raise UserError(
-        f"No checkpoint at {path}: expected a folder such as outputs/<model>/<date>/checkpoints/step_000500, "
-        "or the run folder above it."
+        f"No checkpoint at {path}: expected a folder such as"
+        " outputs/<model>/<date>/checkpoints/step_000500, or the run folder above it."
     )
 
 
 def _is_released(path: Path) -> bool:
-    """Whether `path` is laid out as a run of the released code, a step of one, its arrays, or the zip of a step."""
+    """Whether `path` is laid out as a run of the released code, a step of one, its arrays, or the
+    zip of a step.
+    """
     steps = [path, *(step for step in path.glob("*") if step.stem.isdigit())]
-    return any(step.suffix == ".zip" or step.name == "params" or (step / "params").is_dir() for step in steps)
+    return any(
+        step.suffix == ".zip" or step.name == "params" or (step / "params").is_dir()
+        for step in steps
+    )
 
 
 def newest_checkpoint(path: Path) -> Path:
-    """The newest checkpoint of a run, of its `checkpoints` folder or of a name of `find_run`; else `path` itself."""
+    """The newest checkpoint of a run, of its `checkpoints` folder or of a name of `find_run`; else
+    `path` itself.
+    """
     path = find_run(path)
     checkpoints = checkpoints_in(path) or checkpoints_in(path / CHECKPOINTS)
     return checkpoints[-1] if checkpoints else path
 
 
 def locate_checkpoint(source: str | Path) -> str:
-    """The checkpoint folder that `source` names; `source` itself where it is none on this machine, but on the hub."""
+    """The checkpoint folder that `source` names; `source` itself where it is none on this machine,
+    but on the hub.
+    """
     path = find_run(Path(source).expanduser())
     return str(resolve_checkpoint(path)) if path.exists() else str(source)

@@ -21,7 +21,13 @@ from mme_vla.policy.capabilities import ComparesSizes
 from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
 from mme_vla.policy.run_folders import newest_checkpoint
-from mme_vla.policy.tensor_files import assign_tensors, dtype_of, list_weight_files, load_tensors, save_tensors
+from mme_vla.policy.tensor_files import (
+    assign_tensors,
+    dtype_of,
+    list_weight_files,
+    load_tensors,
+    save_tensors,
+)
 from mme_vla.policy.training_identity import KEY as TRAINING
 from mme_vla.policy.training_identity import weights_digest
 from mme_vla.registry import POLICIES
@@ -32,17 +38,27 @@ if TYPE_CHECKING:
 
 
 def composition_digest(config: Mapping[str, Any]) -> str:
-    """Twelve letters that are equal for two policies exactly if they are composed alike, sizes included.
+    """Twelve letters that are equal for two policies exactly if they are composed alike, sizes
+    included.
 
     Args:
-        config: of a policy, as it is saved with the weights. Where its tokenizer lies, what it was trained on and in
-            which precision it computes do not count; nor do keys that are not set, so that a later option with an
-            empty default changes no digest. The robot counts where it is not RoboMME's Panda in joint space.
+        config: of a policy, as it is saved with the weights. Where its tokenizer lies, what it was
+            trained on and in which precision it computes do not count; nor do keys that are not
+            set, so that a later option with an empty default changes no digest. The robot counts
+            where it is not RoboMME's Panda in joint space.
     """
-    settings = flat({key: config.get(key) for key in (*DECISIVE, "backbone")}) | of_policy(config.get("policy") or {})
-    settings = {key: value for key, value in settings.items() if value is not None and key != "processor.tokenizer"}
+    settings = flat({key: config.get(key) for key in (*DECISIVE, "backbone")}) | of_policy(
+        config.get("policy") or {}
+    )
+    settings = {
+        key: value
+        for key, value in settings.items()
+        if value is not None and key != "processor.tokenizer"
+    }
     robot = embodiment_of(config)
-    if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):  # which configurations did not use to name
+    if robot != ROBOMME_JOINT.with_horizon(
+        robot.action.horizon
+    ):  # which configurations did not use to name
         settings |= flat({"embodiment": robot.to_dict()})
     return digest(settings, 12)
 
@@ -72,8 +88,8 @@ def policy_class_for[P](requested: type[P], config: Mapping[str, Any], source: s
     if issubclass(kind, requested):
         return kind
     raise UserError(
-        f"{source} holds a {policy_name(config)!r} policy, which is no {requested.__name__}: load it with "
-        "Policy.from_pretrained(), which knows every kind."
+        f"{source} holds a {policy_name(config)!r} policy, which is no {requested.__name__}: load"
+        " it with Policy.from_pretrained(), which knows every kind."
     )
 
 
@@ -107,19 +123,25 @@ _PLACE = re.compile(rf"({_REPOSITORY.pattern})((?:/[\w-][\w. -]*)*)")
 
 
 def local_folder(source: str | Path, revision: str | None = None, token: str | None = None) -> Path:
-    """Return `source` if it exists on disk, else the downloaded snapshot of the hub repository of that name.
+    """Return `source` if it exists on disk, else the downloaded snapshot of the hub repository of
+    that name.
 
-    A folder of a training run means its newest checkpoint, and `latest` for the newest run beside it.
+    A folder of a training run means its newest checkpoint, and `latest` for the newest run beside
+    it.
 
     Args:
-        source: a path, or `owner/name` of a hub repository, or `owner/name/folder` of one in it: no other is fetched.
+        source: a path, or `owner/name` of a hub repository, or `owner/name/folder` of one in it: no
+            other is fetched.
         revision: branch, tag or commit of the repository; its main branch by default.
         token: for private repositories; the one stored by `hf auth login` by default.
     """
     path = newest_checkpoint(Path(source).expanduser())
     place = _PLACE.fullmatch(str(source))
     if path.exists() or place is None:
-        require(revision is None, f"revision={revision!r} names a state of a hub repository, but {source} is a path.")
+        require(
+            revision is None,
+            f"revision={revision!r} names a state of a hub repository, but {source} is a path.",
+        )
         return path
     import httpx
     from huggingface_hub import snapshot_download
@@ -130,25 +152,46 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
         if not within:
             return Path(snapshot_download(repository, revision=revision, token=token))
         patterns = [within, f"{within}/*"]
-        root = Path(snapshot_download(repository, revision=revision, token=token, allow_patterns=patterns))
-        require((root / within).exists(), f"The hub repository {repository} has nothing called {within!r}.")
+        root = Path(
+            snapshot_download(repository, revision=revision, token=token, allow_patterns=patterns)
+        )
+        require(
+            (root / within).exists(),
+            f"The hub repository {repository} has nothing called {within!r}.",
+        )
         return root / within
-    except (HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled, httpx.HTTPError, OSError) as error:
+    except (
+        HfHubHTTPError,
+        LocalEntryNotFoundError,
+        OfflineModeIsEnabled,
+        httpx.HTTPError,
+        OSError,
+    ) as error:
         at = "" if revision is None else f" at revision {revision!r}"
         reason = str(error).strip().splitlines()
         raise UserError(
-            f"{source} is not a path on this machine, and the hub repository of that name{at} could not be fetched "
-            f"({type(error).__name__}: {reason[0] if reason else 'no answer'}). Check the name, the network, and for a "
-            "private or gated repository your token (hf auth login)."
+            f"{source} is not a path on this machine, and the hub repository of that name{at} could"
+            f" not be fetched ({type(error).__name__}: {reason[0] if reason else 'no answer'})."
+            " Check the name, the network, and for a private or gated repository your token (hf"
+            " auth login)."
         ) from error
 
 
 def push_folder(
-    folder: Path, repo_id: str, *, private: bool, token: str | None, revision: str | None, message: str
+    folder: Path,
+    repo_id: str,
+    *,
+    private: bool,
+    token: str | None,
+    revision: str | None,
+    message: str,
 ) -> str:
-    """Create the repository if need be, upload the folder's files as one commit, and return its address."""
+    """Create the repository if need be, upload the folder's files as one commit, and return its
+    address.
+    """
     require(
-        _REPOSITORY.fullmatch(repo_id), f"repo_id={repo_id!r} must read owner/name, such as my-group/framesamp-modul."
+        _REPOSITORY.fullmatch(repo_id),
+        f"repo_id={repo_id!r} must read owner/name, such as my-group/framesamp-modul.",
     )
     import huggingface_hub
     from huggingface_hub.errors import HfHubHTTPError
@@ -158,9 +201,13 @@ def push_folder(
         address = api.create_repo(repo_id, private=private, exist_ok=True)
         if revision is not None:
             api.create_branch(repo_id, branch=revision, exist_ok=True)
-        api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message=message, revision=revision)
+        api.upload_folder(
+            repo_id=repo_id, folder_path=folder, commit_message=message, revision=revision
+        )
     except HfHubHTTPError as error:
-        raise UserError(f"The hub refused to store {repo_id}: {error}. Is the token allowed to write there?") from error
+        raise UserError(
+            f"The hub refused to store {repo_id}: {error}. Is the token allowed to write there?"
+        ) from error
     return str(address)
 
 
@@ -168,17 +215,31 @@ CONFIG = "config.json"
 
 
 SECTIONS = (
-    "name", "plugins", "embodiment", "backbone", "memory", "integration", "policy", "processor", "subgoal_text",
+    "name",
+    "plugins",
+    "embodiment",
+    "backbone",
+    "memory",
+    "integration",
+    "policy",
+    "processor",
+    "subgoal_text",
     "token_budget",
-)  # fmt: skip
+)
 """Parts of a configuration that build a policy."""
 KNOWN_SECTIONS = (*SECTIONS, "adapters", TRAINING, "card")
-"""What `config.json` may hold: also adapters, the training that the policy came from, and texts for its card."""
+"""What `config.json` may hold: also adapters, the training that the policy came from, and texts for
+its card.
+"""
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Read `config.json` of a checkpoint, as plain values: nothing in it is resolved or imported."""
-    config: dict[str, Any] = read_json(checked_file(folder, CONFIG), "a policy's configuration", limit=2**20)
+    """Read `config.json` of a checkpoint, as plain values: nothing in it is resolved
+    or imported.
+    """
+    config: dict[str, Any] = read_json(
+        checked_file(folder, CONFIG), "a policy's configuration", limit=2**20
+    )
     return config
 
 
@@ -191,11 +252,15 @@ def save_policy(
         policy.config["card"] = {**policy.config.get("card", {}), **card}
     save_tensors(policy.state_dict(), folder, dtype=kind)
     settings = save_settings(policy, folder)
-    write_sums(folder, [*settings, *list_weight_files(folder)])  # without the card, which people edit
+    write_sums(
+        folder, [*settings, *list_weight_files(folder)]
+    )  # without the card, which people edit
 
 
 def save_settings(policy: "Policy", folder: Path) -> list[str]:
-    """Write all files of a checkpoint but the weights; return the names of those that get checksums."""
+    """Write all files of a checkpoint but the weights; return the names of those that get
+    checksums.
+    """
     (folder / CONFIG).write_text(json.dumps(policy.config, indent=2, ensure_ascii=False) + "\n")
     (folder / CARD_FILE).write_text(model_card(policy, policy.config))
     return [CONFIG, *(policy.processor.save(folder) if policy.processor is not None else [])]
@@ -234,15 +299,22 @@ def load_policy[P: "Policy"](
     """
     from mme_vla.processing.base import load_processor
 
-    target_dtype, folder = None if dtype == "auto" else dtype_of(dtype), local_folder(source, revision, token)
-    require((folder / CONFIG).is_file(), f"No policy at {source}: it lacks {CONFIG}, which save_pretrained() writes.")
+    target_dtype, folder = (
+        None if dtype == "auto" else dtype_of(dtype),
+        local_folder(source, revision, token),
+    )
+    require(
+        (folder / CONFIG).is_file(),
+        f"No policy at {source}: it lacks {CONFIG}, which save_pretrained() writes.",
+    )
     config = read_config(folder)
     if isinstance(config.get(TRAINING), dict):
         config[TRAINING] = {**config[TRAINING], "weights": weights_digest(folder)}
     require(
         "backbone" in config,
-        f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
-        "are read by mme_vla.weights.load_weights() and converted by mme-vla weights.",
+        f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of"
+        " other formats are read by mme_vla.weights.load_weights() and converted by mme-vla"
+        " weights.",
     )
     for key in config:
         check_known(f"section in {folder / CONFIG}:", key, KNOWN_SECTIONS)
@@ -268,7 +340,8 @@ def build_saved[P: "Policy"](
     """Build what the configuration of a checkpoint describes, on meta, adapters included.
 
     Args:
-        config: plain sections. source: where they are from, for messages. options: overrides of the section `policy`.
+        config: plain sections. source: where they are from, for messages. options: overrides of the
+            section `policy`.
     """
     section = config.get("policy", {})
     require(isinstance(section, dict), f"{source}: policy={brief(section)} must be a section.")
@@ -285,7 +358,8 @@ def build_saved[P: "Policy"](
             raise  # it may be in the user's own code
         reason = brief(f"{type(error).__name__}: {error}", 300, quote=False)
         raise UserError(
-            f"{source} describes no policy that can be built ({reason}). It is damaged, or of a newer version."
+            f"{source} describes no policy that can be built ({reason}). It is damaged, or of a"
+            " newer version."
         ) from error
     return built
 
@@ -293,8 +367,9 @@ def build_saved[P: "Policy"](
 def recompute_buffers(policy: "Policy") -> None:
     """Compute the tensors of a policy built on meta that constructors make and no file holds.
 
-    These are buffers registered with `persistent=False`, and tensors kept as plain attributes. A module with
-    `reset_buffers()` computes its own; for the others the policy is built a second time.
+    These are buffers registered with `persistent=False`, and tensors kept as plain attributes. A
+    module with `reset_buffers()` computes its own; for the others the policy is built a second
+    time.
     """
     for module in policy.modules():
         if callable(reset := getattr(module, "reset_buffers", None)):
@@ -321,14 +396,14 @@ def check_processor(policy: "Policy", source: str) -> None:
     robot = embodiment_of(policy.config)
     require(
         not (policy.config.get("embodiment") is not None and robot != processor.embodiment),
-        f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the configuration of "
-        f"{brief(robot.name)}, or they describe it differently. The files are from two checkpoints, or one was "
-        "changed.",
+        f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the"
+        f" configuration of {brief(robot.name)}, or they describe it differently. The files are"
+        " from two checkpoints, or one was changed.",
     )
     sizes = policy.processor_sizes() if isinstance(policy, ComparesSizes) else {}
     for name, (actual, expected) in sizes.items():
         require(
             actual == expected,
-            f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
-            "from two checkpoints, or one was changed.",
+            f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The"
+            " files are from two checkpoints, or one was changed.",
         )

@@ -1,9 +1,10 @@
 """`Scheduler`: the order of policy calls for the server and for rollouts.
 
-Episodes bring frames, which are read in pieces, and then wait for actions, sampled for many at once. One round reads
-the new frames of episodes with at most one piece left, then samples one batch of actions, then reads pieces of long
-videos for as long as the round took so far, at least one. Episodes that replan at the same time share a batch, and long
-and short readers each get half of the time. When nothing waits, a round prepares a part of a later batch.
+Episodes bring frames, which are read in pieces, and then wait for actions, sampled for many at
+once. One round reads the new frames of episodes with at most one piece left, then samples one batch
+of actions, then reads pieces of long videos for as long as the round took so far, at least one.
+Episodes that replan at the same time share a batch, and long and short readers each get half of the
+time. When nothing waits, a round prepares a part of a later batch.
 """
 
 import time
@@ -39,7 +40,9 @@ class Act[A]:
 
 @dataclass(frozen=True)
 class Prepare[L]:
-    """Prepare a part of this one's next chunk; add it to `Scheduler.later` again if more remains."""
+    """Prepare a part of this one's next chunk; add it to `Scheduler.later` again if
+    more remains.
+    """
 
     work: L
 

@@ -18,33 +18,46 @@ _HEADER_LIMIT = 16 * 2**20  # bytes; the header of the largest policy here, 1,00
 
 
 def save_tensors(
-    tensors: Mapping[str, Tensor], folder: Path, max_shard_size: str = "5GB", dtype: torch.dtype | None = None
+    tensors: Mapping[str, Tensor],
+    folder: Path,
+    max_shard_size: str = "5GB",
+    dtype: torch.dtype | None = None,
 ) -> None:
-    """Write tensors to `folder` as safetensors, in shards with an index where they exceed `max_shard_size`.
+    """Write tensors to `folder` as safetensors, in shards with an index where they exceed
+    `max_shard_size`.
 
     `dtype` is what floating-point tensors are stored in; by default each keeps its own.
     """
     from huggingface_hub import save_torch_state_dict
 
     folder.mkdir(parents=True, exist_ok=True)
-    on_cpu = {name: cast(tensor.detach(), dtype).cpu().contiguous() for name, tensor in tensors.items()}
+    on_cpu = {
+        name: cast(tensor.detach(), dtype).cpu().contiguous() for name, tensor in tensors.items()
+    }
     save_torch_state_dict(on_cpu, folder, max_shard_size=max_shard_size)
 
 
 def load_tensors(folder: Path) -> dict[str, Tensor]:
-    """Read a folder's `model.safetensors`, or the shards its index names (memory-mapped until used)."""
+    """Read a folder's `model.safetensors`, or the shards its index names (memory-mapped until
+    used).
+    """
     return read_files(folder, weight_files(folder))
 
 
 def read_files(folder: Path, files: Iterable[Path]) -> dict[str, Tensor]:
-    """Read safetensors files of a folder as one table. Where it has checksums, they must list and fit each file."""
+    """Read safetensors files of a folder as one table. Where it has checksums, they must list and
+    fit each file.
+    """
     files = list(files)
     check_sums(folder, [file.relative_to(folder).as_posix() for file in files])
     tensors: dict[str, Tensor] = {}
     for file in files:
         loaded = read_safetensors(file)
         twice = sorted(set(loaded) & set(tensors))
-        require(not twice, f"{file} holds tensors that another file of {folder} holds too: {listed(twice)}.")
+        require(
+            not twice,
+            f"{file} holds tensors that another file of {folder} holds too: {listed(twice)}.",
+        )
         tensors |= loaded
     return tensors
 
@@ -53,58 +66,80 @@ def weight_files(folder: Path) -> list[Path]:
     """The safetensors files that hold a folder's weights.
 
     Raises:
-        UserError: there are none, there are two sets of them, or the index is none or not what was written.
+        UserError: there are none, there are two sets of them, or the index is none or not what was
+            written.
     """
     if (folder / INDEX).is_file():
         return [inside(folder, name, "weights") for name in require_one_set(folder)]
     if (folder / WEIGHTS).is_file():
         return [inside(folder, WEIGHTS, "weights")]
-    raise UserError(f"No weights in {folder}: expected {WEIGHTS} or {INDEX}. Is this a checkpoint folder?")
+    raise UserError(
+        f"No weights in {folder}: expected {WEIGHTS} or {INDEX}. Is this a checkpoint folder?"
+    )
 
 
 def require_one_set(folder: Path) -> list[str]:
     """The files that a folder's index names, once nothing else in it could be meant as its weights.
 
     Raises:
-        UserError: the index is none, or there is a single file of weights beside it that it does not name.
+        UserError: the index is none, or there is a single file of weights beside it that it does
+            not name.
     """
-    table = read_json(checked_file(folder, INDEX), "an index of safetensors files").get("weight_map")
+    table = read_json(checked_file(folder, INDEX), "an index of safetensors files").get(
+        "weight_map"
+    )
     names = set(table.values()) if isinstance(table, dict) else set()
     texts = names and all(isinstance(name, str) for name in names)
-    require(texts, f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`.")
+    require(
+        texts, f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`."
+    )
     require(
         WEIGHTS in names or not (folder / WEIGHTS).is_file(),
-        f"{folder} holds both {WEIGHTS} and {INDEX}, which names other files: it is not clear which are its "
-        "weights. Remove the one that does not belong to it, such as the rest of an earlier download.",
+        f"{folder} holds both {WEIGHTS} and {INDEX}, which names other files: it is not clear which"
+        " are its weights. Remove the one that does not belong to it, such as the rest of an"
+        " earlier download.",
     )
     return sorted(names)
 
 
 def list_weight_files(folder: Path) -> list[str]:
-    """The names, relative to a folder, of the files that are read as its weights: an index, if there is one, first."""
+    """The names, relative to a folder, of the files that are read as its weights: an index, if
+    there is one, first.
+    """
     files = [file.relative_to(folder).as_posix() for file in weight_files(folder)]
     return [INDEX, *files] if (folder / INDEX).is_file() else files
 
 
 _TRANSFORMERS = (
-    "*.json", "*.jinja", "*.model", "merges.txt", "vocab.txt", "*.safetensors", "pytorch_model*.bin",
+    "*.json",
+    "*.jinja",
+    "*.model",
+    "merges.txt",
+    "vocab.txt",
+    "*.safetensors",
+    "pytorch_model*.bin",
     "adapter_model.bin",
-)  # fmt: skip
+)
 
 
 def check_transformers_folder(source: str | Path) -> None:
     """Check a folder before transformers or PEFT read it; a name on the hub is none.
 
-    Which of its files they read is theirs to decide: where there is a `SHA256SUMS`, it must list all that they may.
+    Which of its files they read is theirs to decide: where there is a `SHA256SUMS`, it must list
+    all that they may.
 
     Raises:
-        UserError: a file is damaged, missing or not listed, or the folder holds two sets of weights.
+        UserError: a file is damaged, missing or not listed, or the folder holds two sets of
+            weights.
     """
     folder = Path(source)
     if folder.is_dir():
         if (folder / INDEX).is_file():
             require_one_set(folder)
-        check_sums(folder, sorted({file.name for pattern in _TRANSFORMERS for file in folder.glob(pattern)}))
+        check_sums(
+            folder,
+            sorted({file.name for pattern in _TRANSFORMERS for file in folder.glob(pattern)}),
+        )
 
 
 def read_safetensors(file: Path) -> dict[str, Tensor]:
@@ -114,7 +149,13 @@ def read_safetensors(file: Path) -> dict[str, Tensor]:
     check_header(file)
     try:
         return load_file(file)
-    except (SafetensorError, OSError, ValueError, KeyError, RuntimeError) as error:  # KeyError: a dtype torch has not
+    except (
+        SafetensorError,
+        OSError,
+        ValueError,
+        KeyError,
+        RuntimeError,
+    ) as error:  # KeyError: a dtype torch has not
         raise UserError(
             f"{file} is damaged or not a safetensors file: {brief(str(error), 300, quote=False)}"
         ) from error
@@ -129,16 +170,20 @@ def check_header(file: Path) -> None:
             header = int.from_bytes(opened.read(8), "little")
     except OSError as error:
         label = brief(str(file), 300, quote=False)  # an index may give a name of any length
-        raise UserError(f"{label} cannot be read as a safetensors file: {error.strerror or error}.") from None
+        raise UserError(
+            f"{label} cannot be read as a safetensors file: {error.strerror or error}."
+        ) from None
     require(
         header <= min(_HEADER_LIMIT, about.st_size - 8),
-        f"{file} is damaged or not a safetensors file: its header would have {header:,} bytes, the file has "
-        f"{about.st_size:,}, and headers have at most {_HEADER_LIMIT:,}.",
+        f"{file} is damaged or not a safetensors file: its header would have {header:,} bytes, the"
+        f" file has {about.st_size:,}, and headers have at most {_HEADER_LIMIT:,}.",
     )
 
 
 def cast(tensor: Tensor, dtype: torch.dtype | None) -> Tensor:
-    """Bring a floating-point tensor to `dtype` (None: leave it); whole numbers and complex ones stay as they are."""
+    """Bring a floating-point tensor to `dtype` (None: leave it); whole numbers and complex ones
+    stay as they are.
+    """
     return tensor if dtype is None or not tensor.is_floating_point() else tensor.to(dtype)
 
 
@@ -163,10 +208,16 @@ def check_fit(
     ]
     problems = [
         f"{len(names):,} {what}:\n  {listed(names, 5)}"
-        for what, names in (("missing", missing), ("unexpected", unexpected), ("misshapen", misshapen))
+        for what, names in (
+            ("missing", missing),
+            ("unexpected", unexpected),
+            ("misshapen", misshapen),
+        )
         if names
     ]
-    require(not problems, f"The weights in {source} do not fit this policy.\n" + "\n".join(problems))
+    require(
+        not problems, f"The weights in {source} do not fit this policy.\n" + "\n".join(problems)
+    )
 
 
 def check_values(tensors: Mapping[str, Tensor], source: str) -> None:
@@ -174,15 +225,17 @@ def check_values(tensors: Mapping[str, Tensor], source: str) -> None:
     broken = [name for name, tensor in tensors.items() if not _finite(tensor)]
     require(
         not broken,
-        f"{source} holds NaN or infinities in {len(broken):,} tensors: {listed(sorted(broken), 5)}. Its actions "
-        "would mean nothing: the training diverged or the file is damaged; take an earlier checkpoint.",
+        f"{source} holds NaN or infinities in {len(broken):,} tensors: {listed(sorted(broken), 5)}."
+        " Its actions would mean nothing: the training diverged or the file is damaged; take an"
+        " earlier checkpoint.",
     )
 
 
 def assign_tensors(
     module: nn.Module, tensors: Mapping[str, Tensor], source: str, dtype: torch.dtype | None = None
 ) -> None:
-    """Give a module (on meta or not) these tensors as its parameters; nothing may be missing, left over or misshapen.
+    """Give a module (on meta or not) these tensors as its parameters; nothing may be missing, left
+    over or misshapen.
 
     `dtype` is what floating-point tensors are brought to; by default each keeps its own.
     """
@@ -191,16 +244,19 @@ def assign_tensors(
     check_kinds(tensors, state, source)
     check_values(tensors, source)
     trainable = {name: p.requires_grad for name, p in module.named_parameters()}
-    module.load_state_dict({name: cast(t, dtype) for name, t in tensors.items()}, strict=True, assign=True)
+    module.load_state_dict(
+        {name: cast(t, dtype) for name, t in tensors.items()}, strict=True, assign=True
+    )
     for name, parameter in module.named_parameters():
         parameter.requires_grad_(trainable[name])
 
 
 def take_memory(module: nn.Module) -> None:
-    """Move those of a module's tensors that lie in a memory-mapped file into memory that torch allots.
+    """Move those of a module's tensors that lie in a memory-mapped file into memory that torch
+    allots.
 
-    Files place tensors at any multiple of a few bytes, and matrix products round differently from there: what continues
-    from a file would differ in the last bits from what never stopped.
+    Files place tensors at any multiple of a few bytes, and matrix products round differently from
+    there: what continues from a file would differ in the last bits from what never stopped.
     """
     for tensor in (*module.parameters(), *module.buffers()):
         if tensor.device.type == "cpu":
@@ -208,18 +264,25 @@ def take_memory(module: nn.Module) -> None:
 
 
 def check_kinds(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], source: str) -> None:
-    """Make sure that tensors are of the kind of number (real, whole, complex) that those of the same name are."""
+    """Make sure that tensors are of the kind of number (real, whole, complex) that those of the
+    same name are.
+    """
     wrong = [
         f"{name}: {str(tensor.dtype).removeprefix('torch.')} instead of "
         f"{str(expected[name].dtype).removeprefix('torch.')}"
         for name, tensor in tensors.items()
         if name in expected and _kind(tensor) != _kind(expected[name])
     ]
-    require(not wrong, f"The weights in {source} are of another kind of number: {listed(sorted(wrong), 5)}.")
+    require(
+        not wrong,
+        f"The weights in {source} are of another kind of number: {listed(sorted(wrong), 5)}.",
+    )
 
 
 def replace_folder(built: Path, target: Path) -> None:
-    """Put a finished folder in place of `target` in one rename, so that no reader sees half of it."""
+    """Put a finished folder in place of `target` in one rename, so that no reader sees
+    half of it.
+    """
     old = target.with_name(f".{target.name}.old")  # `<name>.old` may be a copy of the user's
     shutil.rmtree(old, ignore_errors=True)
     if target.exists():

@@ -1,4 +1,6 @@
-"""What tells one training from another: its seed, and digests of its recipe, its data and its weights."""
+"""What tells one training from another: its seed, and digests of its recipe, its data and its
+weights.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -15,19 +17,37 @@ NONE = "none"
 """What `init_from` says for random weights."""
 _RECIPE = ("train", "finetune", "learning", "init_from")
 _POLICY = ("augment", "compute_dtype", "stage", "subtask_weight")
-_DATA = ("action_offset", "mask_padding", "jitter", "history_transforms", "weights", "texts", "narrow_ranges")
+_DATA = (
+    "action_offset",
+    "mask_padding",
+    "jitter",
+    "history_transforms",
+    "weights",
+    "texts",
+    "narrow_ranges",
+)
 _NO_EFFECT = (
-    "train.log_every", "train.val_every", "train.val_samples", "train.save_every", "train.keep", "train.parallel",
-    "train.prefetch_gb", "train.workers", "train.open_loop_chunks", "train.device", "train.seed",
-)  # fmt: skip
+    "train.log_every",
+    "train.val_every",
+    "train.val_samples",
+    "train.save_every",
+    "train.keep",
+    "train.parallel",
+    "train.prefetch_gb",
+    "train.workers",
+    "train.open_loop_chunks",
+    "train.device",
+    "train.seed",
+)
 
 
 @dataclass(frozen=True)
 class TrainingIdentity:
     """The training that a checkpoint is of.
 
-    seed: of fresh weights, data order and noise. recipe: digest of the settings that change an update. data: digest of
-    the contents of the datasets and of their split. weights: digest of a checkpoint's weights.
+    seed: of fresh weights, data order and noise. recipe: digest of the settings that change an
+    update. data: digest of the contents of the datasets and of their split. weights: digest of a
+    checkpoint's weights.
     """
 
     seed: Annotated[int, Range(-(2**63), 2**63)] | None = None
@@ -37,7 +57,8 @@ class TrainingIdentity:
 
 
 def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any]:
-    """The identity of a training before it has weights, as plain values for the policy's configuration.
+    """The identity of a training before it has weights, as plain values for the policy's
+    configuration.
 
     Args:
         config: the plain configuration of a training. content: fingerprints of its datasets.
@@ -52,15 +73,21 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
     recipe = {
         key: value
         for key, value in flat(settings).items()
-        if value not in (None, [], {}) and not any(f"{key}.".startswith(f"{free}.") for free in _NO_EFFECT)
+        if value not in (None, [], {})
+        and not any(f"{key}.".startswith(f"{free}.") for free in _NO_EFFECT)
     }
-    split = {"content": list(content), **{key: data.get(key) for key in ("val_fraction", "val_episodes")}}
+    split = {
+        "content": list(content),
+        **{key: data.get(key) for key in ("val_fraction", "val_episodes")},
+    }
     identity = TrainingIdentity(int(config["seed"]), digest(recipe, 12), digest(split, 12))
     return {key: value for key, value in asdict(identity).items() if value is not None}
 
 
 def identity_of(config: Mapping[str, Any]) -> TrainingIdentity | None:
-    """The training that a policy's configuration names; None where it was not trained, or by an earlier version."""
+    """The training that a policy's configuration names; None where it was not trained, or by an
+    earlier version.
+    """
     section = config.get(KEY)
     return None if section is None else read_section(TrainingIdentity, section, KEY)
 
@@ -77,7 +104,9 @@ def weights_digest(folder: Path) -> str | None:
 
 
 def _start(source: str) -> str:
-    """What weights to start from are called in a recipe: their digest, or the end of their path or hub name."""
+    """What weights to start from are called in a recipe: their digest, or the end of their path or
+    hub name.
+    """
     from mme_vla.policy.run_folders import newest_checkpoint
 
     return weights_digest(newest_checkpoint(Path(source).expanduser())) or Path(source).name

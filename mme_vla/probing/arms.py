@@ -19,9 +19,22 @@ from mme_vla.registry import HISTORY_TRANSFORMS, INTERVENTIONS
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 DEFAULT_ARMS = (
-    "drop:all", "nodemo", "swap", "shuffle", "recent", "oracle", "delay:16", "delay:64", "delay:256", "pause",
-    "distract:1", "distract:3", "subgoal_swap", "subgoal_delay", "subgoal_count",
-)  # fmt: skip
+    "drop:all",
+    "nodemo",
+    "swap",
+    "shuffle",
+    "recent",
+    "oracle",
+    "delay:16",
+    "delay:64",
+    "delay:256",
+    "pause",
+    "distract:1",
+    "distract:3",
+    "subgoal_swap",
+    "subgoal_delay",
+    "subgoal_count",
+)
 """The default arms, as far as the policy and the data allow them."""
 
 
@@ -47,12 +60,16 @@ class Arm:
         return "entries" in self.needs
 
     def only(self, moment: Moment) -> np.ndarray | None:
-        """The frames that may be remembered; of several such interventions those that all of them allow."""
+        """The frames that may be remembered; of several such interventions those that all of them
+        allow.
+        """
         allowed = [frames for part in self.parts if (frames := part.only(moment)) is not None]
         if not allowed:
             return None
         both: np.ndarray = reduce(np.intersect1d, allowed)
-        require(len(both), f"{self.name} leaves no frame to remember: its parts allow different ones.")
+        require(
+            len(both), f"{self.name} leaves no frame to remember: its parts allow different ones."
+        )
         return both
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
@@ -61,7 +78,9 @@ class Arm:
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         """The subgoal that the policy reads instead."""
-        return reduce(lambda subgoal_text, part: part.say(subgoal_text, moment), self.parts, subgoal)
+        return reduce(
+            lambda subgoal_text, part: part.say(subgoal_text, moment), self.parts, subgoal
+        )
 
     def dial(self) -> float | None:
         """Where the arm stands on its dial, if it is one intervention with a number for one."""
@@ -76,12 +95,19 @@ UNPROBED = Arm("unprobed")
 
 
 def read_arm(spec: Any) -> Arm:
-    """An arm from a word such as `drop:2` or `nodemo+shuffle`, or from `{name: drop, count: 2, which: oldest}`."""
+    """An arm from a word such as `drop:2` or `nodemo+shuffle`, or from
+    `{name: drop, count: 2, which: oldest}`.
+    """
     if isinstance(spec, Mapping):
         options = ",".join(f"{key}={value}" for key, value in spec.items() if key != "name")
-        return Arm(f"{spec.get('name')}({options})" if options else str(spec.get("name")), (_build(spec),))
+        return Arm(
+            f"{spec.get('name')}({options})" if options else str(spec.get("name")), (_build(spec),)
+        )
     if not isinstance(spec, str) or not spec:
-        raise UserError(f"with={brief(spec)}: write words such as drop:2 or nodemo+shuffle, or {{name: drop, …}}.")
+        raise UserError(
+            f"with={brief(spec)}: write words such as drop:2 or nodemo+shuffle, or {{name: drop,"
+            " …}."
+        )
     return Arm(spec, tuple(_read_part(word) for word in spec.split("+")))
 
 
@@ -93,7 +119,11 @@ def _read_part(word: str) -> Intervention:
     if name in HISTORY_TRANSFORMS and dial is not None and _NUMBER.fullmatch(value):
         return _build({"name": name, dial: float(value) if "." in value else int(value)})
     if dial is None or (value != "all" and not value.removeprefix("-").isdecimal()):
-        allowed = f"{name}:<{dial}>, a whole number, or all where it counts" if dial else f"{name}, which has no dial"
+        allowed = (
+            f"{name}:<{dial}>, a whole number, or all where it counts"
+            if dial
+            else f"{name}, which has no dial"
+        )
         raise UserError(f"{word!r}: write {allowed}.")
     return _build({"name": name, dial: None if value == "all" else int(value)})
 
@@ -123,7 +153,9 @@ def read_arms(specs: Any) -> list[Arm]:
     return arms
 
 
-def lacking(arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool) -> str | None:
+def lacking(
+    arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool
+) -> str | None:
     """What an arm needs and lacks, for a message; None where it can be probed.
 
     recordings: recorded episodes to take from. boundaries: whether sub-tasks are recorded.
@@ -149,7 +181,9 @@ def lacking(arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boun
 def choose_arms(
     specs: Any, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool
 ) -> tuple[list[Arm], list[str]]:
-    """The arms of `specs`; by default those of `DEFAULT_ARMS` that policy and data allow, and why not the others."""
+    """The arms of `specs`; by default those of `DEFAULT_ARMS` that policy and data allow, and why
+    not the others.
+    """
     arms, left_out = [], []
     for arm in read_arms(DEFAULT_ARMS if specs is None else specs):
         why = lacking(arm, policy, channel, recordings, boundaries=boundaries)
@@ -158,7 +192,10 @@ def choose_arms(
         elif specs is None:
             left_out.append(f"{arm.name} was left out: it needs {why}.")
         else:
-            raise UserError(f"with={arm.name} needs {why}; {policy.config.get('name', 'this policy')} has none here.")
+            raise UserError(
+                f"with={arm.name} needs {why}; {policy.config.get('name', 'this policy')} has none"
+                " here."
+            )
     return arms, left_out
 
 

@@ -23,8 +23,8 @@ from mme_vla.types import HistoryTokens
 class Entry:
     """One entry of a memory: a frame's tokens, a row of a bank.
 
-    time: in frames that the policy observed (in chunks, for banks that count those). content: what it holds; only the
-    channel it came from can read it.
+    time: in frames that the policy observed (in chunks, for banks that count those). content: what
+    it holds; only the channel it came from can read it.
     """
 
     time: int
@@ -33,9 +33,11 @@ class Entry:
 
 @dataclass(frozen=True)
 class Remembered:
-    """The entries of one store, in the order they are read; None where an intervention took one away.
+    """The entries of one store, in the order they are read; None where an intervention took one
+    away.
 
-    now: the current time, on the clock of the entries' times. name: which store, for policies that have several.
+    now: the current time, on the clock of the entries' times. name: which store, for policies that
+    have several.
     """
 
     entries: tuple[Entry | None, ...]
@@ -58,7 +60,10 @@ class Remembered:
     def without(self, slots: Sequence[int]) -> "Remembered":
         """The same with these slots empty."""
         gone = set(slots)
-        return replace(self, entries=tuple(None if i in gone else entry for i, entry in enumerate(self.entries)))
+        return replace(
+            self,
+            entries=tuple(None if i in gone else entry for i, entry in enumerate(self.entries)),
+        )
 
     def rearranged(self, slots: Sequence[int], contents: Sequence[Any]) -> "Remembered":
         """The same with other contents at these slots; times stay."""
@@ -70,13 +75,19 @@ class Remembered:
         return replace(self, entries=tuple(new))
 
     def changed(self, other: "Remembered") -> list[int]:
-        """Ages of the entries that are otherwise in `other`: taken away, of another content, or at another time."""
+        """Ages of the entries that are otherwise in `other`: taken away, of another content, or at
+        another time.
+        """
         pairs = enumerate(zip(self.entries, other.entries, strict=True))
-        return [self.age(slot) for slot, (mine, its) in pairs if mine is not its and mine is not None]
+        return [
+            self.age(slot) for slot, (mine, its) in pairs if mine is not its and mine is not None
+        ]
 
 
 def same_progress(slots: Sequence[int], count: int) -> np.ndarray:
-    """For each of some slots in a row, the slot of another store of `count` entries that stands as far along."""
+    """For each of some slots in a row, the slot of another store of `count` entries that stands as
+    far along.
+    """
     return np.linspace(0, max(count - 1, 0), max(len(slots), 1)).round().astype(int)[: len(slots)]
 
 
@@ -86,17 +97,22 @@ Place = tuple[History, int]  # A frame of a history
 class OnlyFrames(History):
     """A history in which some stored frames follow one another as if there had been no others.
 
-    What the memory then chooses is a choice among these; `frames` says which frame each of its numbers means.
+    What the memory then chooses is a choice among these; `frames` says which frame each of its
+    numbers means.
     """
 
     def __init__(self, full: History, frames: np.ndarray) -> None:
-        """Take the stored frames `frames` [m], ascending, at least one; the last means the current one."""
+        """Take the stored frames `frames` [m], ascending, at least one; the last means the current
+        one.
+        """
         every = full.spec.keep_every
         self._length = len(frames) if every == 1 else max((len(frames) - 1) * every, 1)
         self._stored = full.spec.stored_frames(self._length)
         self.frames = dict(zip(self._stored.tolist(), frames.tolist(), strict=True))
         earlier = int((frames < full.exec_start).sum())
-        super().__init__(full.spec, int(self._stored[earlier]) if earlier < len(frames) else self._length)
+        super().__init__(
+            full.spec, int(self._stored[earlier]) if earlier < len(frames) else self._length
+        )
         self._full_history = full
 
     def __len__(self) -> int:
@@ -153,10 +169,12 @@ class MemorySnapshot:
 
 
 class Channel:
-    """One way to what a policy remembers; this one for a policy without a memory that a probe can reach.
+    """One way to what a policy remembers; this one for a policy without a memory that a probe can
+    reach.
 
-    clock: what the times of its entries count; None where they have none. sees_pauses: whether frames at which nothing
-    is decided reach this memory. chooses: whether the memory chooses among frames, so that it can be given fewer.
+    clock: what the times of its entries count; None where they have none. sees_pauses: whether
+    frames at which nothing is decided reach this memory. chooses: whether the memory chooses among
+    frames, so that it can be given fewer.
     """
 
     clock: str | None = None
@@ -166,18 +184,30 @@ class Channel:
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
 
-    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
-        """What is remembered at `step` (by default now), choosing among the frames `only` where they are given."""
+    def read(
+        self, episode: Episode, step: int | None = None, only: np.ndarray | None = None
+    ) -> MemorySnapshot:
+        """What is remembered at `step` (by default now), choosing among the frames `only` where
+        they are given.
+        """
         return MemorySnapshot(())
 
-    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Any:
+    def counterfactual(
+        self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]
+    ) -> Any:
         """What `predict_chunk` takes for an episode that remembers `stores` instead."""
         return episode
 
     def predict_chunk(
-        self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Any,
+        remembering: Sequence[Any],
+        draws: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
-        """Normalised chunks [n, h, a] for a batch of n episodes, through what `counterfactual` made of them."""
+        """Normalised chunks [n, h, a] for a batch of n episodes, through what `counterfactual` made
+        of them.
+        """
         return self._policy.predict_chunk(batch, remembering, draws, steps)
 
     def commit(self, episode: Episode, remembering: Any) -> None:
@@ -185,7 +215,8 @@ class Channel:
 
 
 class SelectionChannel(Channel):
-    """Memories that choose stored tokens (`Memory.select`): perceptual, recurrent and joined ones; an entry is a frame.
+    """Memories that choose stored tokens (`Memory.select`): perceptual, recurrent and joined ones;
+    an entry is a frame.
 
     They may stand behind any network whose batch has a `history`.
     """
@@ -196,7 +227,9 @@ class SelectionChannel(Channel):
         super().__init__(policy)
         self._memory = with_vision_memory(policy).require_memory()
 
-    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
+    def read(
+        self, episode: Episode, step: int | None = None, only: np.ndarray | None = None
+    ) -> MemorySnapshot:
         full = episode.required_history()
         now = len(full) - 1 if step is None else step
         assert only is None or step is None, "choosing among some frames is for the current one"
@@ -207,7 +240,9 @@ class SelectionChannel(Channel):
         entries = tuple(Entry(names.get(frame, frame), (view, frame)) for frame in frames)
         return MemorySnapshot((Remembered(entries, now),), (view, at, frames))
 
-    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> HistoryTokens:
+    def counterfactual(
+        self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]
+    ) -> HistoryTokens:
         view, at, frames = snapshot.source
         slots = dict(zip(frames, stores[0].entries, strict=True))
         places = {frame: entry.content for frame, entry in slots.items() if entry is not None}
@@ -219,11 +254,18 @@ class SelectionChannel(Channel):
             mask[its] = entry is not None
         mask_3d = mask[:, None]
         return HistoryTokens(
-            tokens.features.masked_fill(~mask_3d, 0), positions.masked_fill(~mask_3d, 0), mask, tokens.step
+            tokens.features.masked_fill(~mask_3d, 0),
+            positions.masked_fill(~mask_3d, 0),
+            mask,
+            tokens.step,
         )
 
     def predict_chunk(
-        self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Any,
+        remembering: Sequence[Any],
+        draws: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
         batch = replace(batch, history=stack_history(remembering, self._policy.device))
         return self._policy.sample_actions(batch, draws, steps)
@@ -238,17 +280,28 @@ class WritableChannel(Channel):
         super().__init__(policy)
         self.clock = clock
 
-    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
+    def read(
+        self, episode: Episode, step: int | None = None, only: np.ndarray | None = None
+    ) -> MemorySnapshot:
         assert isinstance(episode, WritableMemory)
         stores = [
-            Remembered(tuple(Entry(time, content) for time, content in store.entries), store.now, store.name)
+            Remembered(
+                tuple(Entry(time, content) for time, content in store.entries),
+                store.now,
+                store.name,
+            )
             for store in episode.writable_memory()
         ]
         return MemorySnapshot(tuple(stores))
 
-    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Any:
+    def counterfactual(
+        self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]
+    ) -> Any:
         assert isinstance(episode, WritableMemory)
-        entries = [[(entry.time, entry.content) for entry in store.entries if entry is not None] for store in stores]
+        entries = [
+            [(entry.time, entry.content) for entry in store.entries if entry is not None]
+            for store in stores
+        ]
         return episode.with_entries(entries)
 
     def commit(self, episode: Episode, remembering: Any) -> None:
@@ -261,4 +314,8 @@ def channel_of(policy: Policy) -> Channel:
     if policy.memory is not None and not isinstance(policy.memory, CacheMemory):
         return SelectionChannel(policy)
     episode = policy.start_episode("")
-    return WritableChannel(policy, episode.memory_clock) if isinstance(episode, WritableMemory) else Channel(policy)
+    return (
+        WritableChannel(policy, episode.memory_clock)
+        if isinstance(episode, WritableMemory)
+        else Channel(policy)
+    )

@@ -1,7 +1,8 @@
-"""Demonstrations with the frames that show what their outcome depends on, as the simulator knows them.
+"""Demonstrations with the frames that show what their outcome depends on, as the simulator knows
+them.
 
-A task names the facts that a frame shows (`Task.evidence`): cubes that lie open, a swap, a highlight, a visit that is
-counted, a key pose of the video.
+A task names the facts that a frame shows (`Task.evidence`): cubes that lie open, a swap, a
+highlight, a visit that is counted, a key pose of the video.
 """
 
 from collections.abc import Container, Mapping
@@ -26,9 +27,9 @@ KEY_POSE = 16
 class EvidenceEpisode:
     """One demonstrated episode.
 
-    length: frames. exec_start: the first execution frame. facts: name → frames that show it, ascending. boundaries:
-    frames at which a sub-task begins. states: [length, 8] float32. images: frame → [256, 256, 3] uint8 of the front
-    camera, for frames that were rendered.
+    length: frames. exec_start: the first execution frame. facts: name → frames that show it,
+    ascending. boundaries: frames at which a sub-task begins. states: [length, 8] float32. images:
+    frame → [256, 256, 3] uint8 of the front camera, for frames that were rendered.
     """
 
     task: str
@@ -41,8 +42,11 @@ class EvidenceEpisode:
     images: Mapping[int, np.ndarray]
 
 
-def record_evidence(spec: EpisodeSpec, rendered: Container[int] = frozenset()) -> EvidenceEpisode | None:
-    """Demonstrate an episode of a split; None where the scene cannot be built or the demonstrator does not succeed.
+def record_evidence(
+    spec: EpisodeSpec, rendered: Container[int] = frozenset()
+) -> EvidenceEpisode | None:
+    """Demonstrate an episode of a split; None where the scene cannot be built or the demonstrator
+    does not succeed.
 
     rendered: frames whose image is wanted. Without any an episode takes about a second.
     """
@@ -64,7 +68,11 @@ def record_evidence(spec: EpisodeSpec, rendered: Container[int] = frozenset()) -
         for i in range(len(ended), env.progress.index):
             ended[i] = frame
         in_video = step.info["is_video_demo"]  # the arm is elsewhere once the execution begins
-        recent = {i: subtasks[i] for i, at in ended.items() if frame - at < KEY_POSE and subtasks[i].video <= in_video}
+        recent = {
+            i: subtasks[i]
+            for i, at in ended.items()
+            if frame - at < KEY_POSE and subtasks[i].video <= in_video
+        }
         for fact in env.evidence(recent):
             facts.setdefault(fact, []).append(frame)
         if step.info["is_subgoal_boundary"]:
@@ -86,5 +94,12 @@ def record_evidence(spec: EpisodeSpec, rendered: Container[int] = frozenset()) -
     named = {name: np.array(frames, np.int64) for name, frames in facts.items()}
     stacked = np.stack(states)
     return EvidenceEpisode(
-        spec.task, spec.episode, len(states), video, named, np.array(boundaries, np.int64), stacked, images
+        spec.task,
+        spec.episode,
+        len(states),
+        video,
+        named,
+        np.array(boundaries, np.int64),
+        stacked,
+        images,
     )

@@ -1,6 +1,7 @@
 """What a probe changes in a policy's frames, memory or subgoal: each a small class with a dial.
 
-One of your own is a class registered with `register("intervention", name)` in a module that `plugins` names.
+One of your own is a class registered with `register("intervention", name)` in a module that
+`plugins` names.
 """
 
 import re
@@ -26,7 +27,10 @@ NEEDS = {
     "pauses": "a memory that sees frames at which nothing is decided",
     "subgoal": "a policy that reads subgoals",
     "recordings": "recorded episodes to take from: name them with recordings=…",
-    "boundaries": "sub-tasks whose beginnings are told: by recordings with subgoals, in closed loop by env=mme_vla",
+    "boundaries": (
+        "sub-tasks whose beginnings are told: by recordings with subgoals, in closed loop by"
+        " env=mme_vla"
+    ),
 }
 """What an intervention can need, for messages."""
 
@@ -39,10 +43,11 @@ def _nothing(name: str) -> Remembered:
 class Moment:
     """What an intervention may know of the current step.
 
-    rng: of this episode, this step and this intervention alone. now: the current frame, as observed. stored: stored
-    frames up to now, ascending. boundaries: frames at which a sub-task began. subgoals: earlier ones, the current
-    one last. donor: the store of a name of another episode that is as far along. donor_subgoal: the subgoal there.
-    weigh: for each slot of a store, by how much the chunk changes without it.
+    rng: of this episode, this step and this intervention alone. now: the current frame, as
+    observed. stored: stored frames up to now, ascending. boundaries: frames at which a sub-task
+    began. subgoals: earlier ones, the current one last. donor: the store of a name of another
+    episode that is as far along. donor_subgoal: the subgoal there. weigh: for each slot of a store,
+    by how much the chunk changes without it.
     """
 
     rng: np.random.Generator
@@ -56,7 +61,8 @@ class Moment:
 
 
 class Intervention:
-    """Changes nothing. A subclass overrides what it changes; a dataclass, so that its options are its fields.
+    """Changes nothing. A subclass overrides what it changes; a dataclass, so that its options are
+    its fields.
 
     dial: the option that `name:value` sets. needs: of `NEEDS`, without which it is refused.
     """
@@ -99,8 +105,8 @@ class Shuffle(Intervention):
 class Drop(Intervention):
     """Some entries are taken away; the others keep slot and time.
 
-    count: how many; None takes all. which: the `oldest`, the `newest`, at `random`, or the most `used`, those whose
-    absence changes the chunk most (an attention that any integration has).
+    count: how many; None takes all. which: the `oldest`, the `newest`, at `random`, or the most
+    `used`, those whose absence changes the chunk most (an attention that any integration has).
     """
 
     count: PositiveInt | None = 1
@@ -117,7 +123,8 @@ class Drop(Intervention):
 @INTERVENTIONS.register("swap")
 @dataclass(frozen=True)
 class Swap(Intervention):
-    """Entries hold what an entry of another recorded episode holds that is as far along; times stay.
+    """Entries hold what an entry of another recorded episode holds that is as far along; times
+    stay.
 
     count: how many, at random; None swaps all.
     """
@@ -132,7 +139,11 @@ class Swap(Intervention):
             return store
         # Paired over all entries, so that a part of them is swapped as it would be among all.
         their = dict(
-            zip(occupied, np.array(donor.occupied)[same_progress(occupied, len(donor.occupied))].tolist(), strict=True)
+            zip(
+                occupied,
+                np.array(donor.occupied)[same_progress(occupied, len(donor.occupied))].tolist(),
+                strict=True,
+            )
         )
         count = len(occupied) if self.count is None else min(self.count, len(occupied))
         slots = sorted(moment.rng.permutation(occupied)[:count].tolist())
@@ -142,7 +153,8 @@ class Swap(Intervention):
 @INTERVENTIONS.register("delay")
 @dataclass(frozen=True)
 class Delay(Intervention):
-    """All entries seem to be from `frames` later, the current one too: a clock that runs ahead. Negative: behind.
+    """All entries seem to be from `frames` later, the current one too: a clock that runs ahead.
+    Negative: behind.
 
     Of banks that count chunks, so many chunks.
     """
@@ -152,7 +164,9 @@ class Delay(Intervention):
     needs: ClassVar = frozenset({"entries", "clock"})
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
-        shifted = [None if e is None else replace(e, time=e.time + self.frames) for e in store.entries]
+        shifted = [
+            None if e is None else replace(e, time=e.time + self.frames) for e in store.entries
+        ]
         return replace(store, entries=tuple(shifted))
 
 
@@ -173,7 +187,9 @@ class Recent(Intervention):
 @INTERVENTIONS.register("oracle")
 @dataclass(frozen=True)
 class Oracle(Intervention):
-    """The memory chooses among the frames at which a sub-task began, the last of the video and the newest."""
+    """The memory chooses among the frames at which a sub-task began, the last of the video and the
+    newest.
+    """
 
     needs: ClassVar = frozenset({"entries", "choice", "boundaries"})
 
@@ -186,7 +202,9 @@ class Oracle(Intervention):
 @INTERVENTIONS.register("pause")
 @dataclass(frozen=True)
 class Pause(Intervention):
-    """One frame is repeated `frames` times more: `repeat_frame`. `at`: which, from the first execution frame on."""
+    """One frame is repeated `frames` times more: `repeat_frame`. `at`: which, from the first
+    execution frame on.
+    """
 
     frames: NonNegativeInt = 64
     at: NonNegativeInt = 0
@@ -199,7 +217,9 @@ class Pause(Intervention):
 
 @dataclass(frozen=True)
 class Transform(Intervention):
-    """A history transform (`mme_vla.memory.transforms`), as training applies it, on the frames of a running episode."""
+    """A history transform (`mme_vla.memory.transforms`), as training applies it, on the frames of a
+    running episode.
+    """
 
     transform: HistoryTransform
 
@@ -227,14 +247,21 @@ class Transform(Intervention):
                 contents.append(rows.reshape(content.shape))
             else:  # a frame of a history
                 view, frame = content
-                contents.append((views.setdefault(id(view), _Perturbed(view, self.transform, moment.rng)), frame))
+                contents.append(
+                    (
+                        views.setdefault(id(view), _Perturbed(view, self.transform, moment.rng)),
+                        frame,
+                    )
+                )
         return store.rearranged(slots, contents)
 
 
 class _Perturbed(History):
     """A history whose tokens a transform perturbs as they are gathered."""
 
-    def __init__(self, source: History, transform: HistoryTransform, rng: np.random.Generator) -> None:
+    def __init__(
+        self, source: History, transform: HistoryTransform, rng: np.random.Generator
+    ) -> None:
         super().__init__(source.spec, source.exec_start)
         self._source, self._transform, self._rng = source, transform, rng
 
@@ -292,9 +319,22 @@ def _ranked(store: Remembered, which: str, moment: Moment) -> list[int]:
     return orders[which]()
 
 
-_ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
+_ORDINALS = (
+    "first",
+    "second",
+    "third",
+    "fourth",
+    "fifth",
+    "sixth",
+    "seventh",
+    "eighth",
+    "ninth",
+    "tenth",
+)
 _NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
-_COUNT = re.compile(rf"<[^>]*>|\b(?:{'|'.join((*_ORDINALS, *_NUMBERS))}|\d+)\b")  # points are read, and left alone
+_COUNT = re.compile(
+    rf"<[^>]*>|\b(?:{'|'.join((*_ORDINALS, *_NUMBERS))}|\d+)\b"
+)  # points are read, and left alone
 
 
 @INTERVENTIONS.register("subgoal_swap")
@@ -318,13 +358,19 @@ class SubgoalDelay(Intervention):
     needs: ClassVar = frozenset({"subgoal"})
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
-        return moment.subgoals[max(len(moment.subgoals) - 1 - self.decisions, 0)] if moment.subgoals else subgoal
+        return (
+            moment.subgoals[max(len(moment.subgoals) - 1 - self.decisions, 0)]
+            if moment.subgoals
+            else subgoal
+        )
 
 
 @INTERVENTIONS.register("subgoal_count")
 @dataclass(frozen=True)
 class SubgoalCount(Intervention):
-    """Every count in the subgoal is wrong by `by`: `for the first time` becomes `for the second time`."""
+    """Every count in the subgoal is wrong by `by`: `for the first time` becomes
+    `for the second time`.
+    """
 
     by: int = 1
     dial: ClassVar = "by"

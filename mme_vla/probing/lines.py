@@ -1,4 +1,6 @@
-"""The JSON lines of a probe: one a step and arm, one an entry, and one where a recorded episode is done."""
+"""The JSON lines of a probe: one a step and arm, one an entry, and one where a recorded episode is
+done.
+"""
 
 import json
 import os
@@ -18,8 +20,9 @@ LINES = "offline*.jsonl"  # The files of all shards
 class MomentLine:
     """An arm at a step of a recorded episode.
 
-    phase: number of the sub-task, 0 for the first; subgoal: its text. dial: the arm's value of its dial.
-    entries: how many there were. touched: ages of those that the arm changed. change, spread, distance: see `Change`.
+    phase: number of the sub-task, 0 for the first; subgoal: its text. dial: the arm's value of its
+    dial. entries: how many there were. touched: ages of those that the arm changed. change, spread,
+    distance: see `Change`.
     """
 
     recording: str
@@ -44,7 +47,8 @@ class MomentLine:
 class EntryLine:
     """How the chunk changes without one entry.
 
-    slot: its index; time: its frame; age: frames since then. video: whether it is from the conditioning video.
+    slot: its index; time: its frame; age: frames since then. video: whether it is from the
+    conditioning video.
     """
 
     recording: str
@@ -68,13 +72,20 @@ class DoneLine:
 
 
 Line = MomentLine | EntryLine
-_KINDS: dict[str, type[Line | DoneLine]] = {"moment": MomentLine, "entry": EntryLine, "done": DoneLine}
+_KINDS: dict[str, type[Line | DoneLine]] = {
+    "moment": MomentLine,
+    "entry": EntryLine,
+    "done": DoneLine,
+}
 _NAMES = {kind: name for name, kind in _KINDS.items()}
 
 
 def append(path: Path, lines: Iterable[Line], recording: str) -> None:
     """Add all lines of a recorded episode at once, and that it is done."""
-    rows = [with_checksum({"kind": _NAMES[type(line)], **asdict(line)}) for line in [*lines, DoneLine(recording)]]
+    rows = [
+        with_checksum({"kind": _NAMES[type(line)], **asdict(line)})
+        for line in [*lines, DoneLine(recording)]
+    ]
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as file:
         content = path.read_bytes()
@@ -87,7 +98,9 @@ def append(path: Path, lines: Iterable[Line], recording: str) -> None:
 
 
 def _complete_length(content: bytes) -> int:
-    """How many bytes there are up to the last recorded episode that is done: what follows was cut off."""
+    """How many bytes there are up to the last recorded episode that is done: what follows was cut
+    off.
+    """
     start = content.rfind(b'{"kind":"done"')
     if start < 0:
         return 0
@@ -102,7 +115,9 @@ def _complete_length(content: bytes) -> int:
 
 
 def read(path: Path) -> tuple[list[Line], set[str]]:
-    """The lines of recorded episodes that are done, and which these are; nothing where there is no file."""
+    """The lines of recorded episodes that are done, and which these are; nothing where there is no
+    file.
+    """
     pending: dict[str, list[Line]] = {}
     done: dict[str, list[Line]] = {}
     for line in read_lines(path, _from_dict, "lines of a probe") if path.exists() else []:

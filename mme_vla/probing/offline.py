@@ -1,4 +1,6 @@
-"""A probe on recorded episodes: how the chunk that a policy would choose changes with what it remembers."""
+"""A probe on recorded episodes: how the chunk that a policy would choose changes with what it
+remembers.
+"""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -26,10 +28,12 @@ from mme_vla.utils import FolderLock
 
 @dataclass(frozen=True)
 class Change:
-    """What became of a chunk, in normalised actions (1: half of what the training data span), root mean square.
+    """What became of a chunk, in normalised actions (1: half of what the training data span), root
+    mean square.
 
-    change: mean distance of two chunks of the same noise. spread: mean distance of two chunks that differ in noise
-    alone, unprobed. distance: energy distance of the two distributions, 0 where they are one.
+    change: mean distance of two chunks of the same noise. spread: mean distance of two chunks that
+    differ in noise alone, unprobed. distance: energy distance of the two distributions, 0 where
+    they are one.
     """
 
     change: float
@@ -40,7 +44,11 @@ class Change:
 def compare_chunks(before: Tensor, after: Tensor) -> Change:
     """Compare chunks [n, h, w] before and after an intervention, row by row of the same noise."""
     first, second = (x.double().flatten(1).numpy() for x in (before, after))
-    across, within, inside = _distances(first, second), _distances(first, first), _distances(second, second)
+    across, within, inside = (
+        _distances(first, second),
+        _distances(first, first),
+        _distances(second, second),
+    )
     energy = 2 * across.mean() - within.mean() - inside.mean()
     return Change(float(np.diagonal(across).mean()), std_of(within), float(max(energy, 0.0)))
 
@@ -59,8 +67,9 @@ def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 class OfflineSettings:
     """Settings of a probe on recorded episodes.
 
-    draws: chunks sampled at each step, of the same noise in every arm. moments: most steps of an episode.
-    scan: whether each entry is left out by itself. flow_steps: of the sampler; None for the policy's own.
+    draws: chunks sampled at each step, of the same noise in every arm. moments: most steps of an
+    episode. scan: whether each entry is left out by itself. flow_steps: of the sampler; None for
+    the policy's own.
     """
 
     seed: NonNegativeInt = 42
@@ -81,8 +90,8 @@ def probe_offline(
 ) -> list[Line]:
     """Probe every recorded episode that the file holds no lines of yet; all its lines, old and new.
 
-    recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the lines. after: called
-    after each episode with 1.
+    recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the
+    lines. after: called after each episode with 1.
     """
     donors = DonorEpisodes(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None
     with FolderLock(path.parent, "probe", f".{path.stem}.lock"):
@@ -126,7 +135,10 @@ class _Moments:
     def _shared_noise(self) -> dict[int, list[Noise]]:
         generator = torch.Generator().manual_seed(self._seed)
         count = self._settings.draws
-        return {step: [self._policy.sampling_noise(generator) for _ in range(count)] for step in self._steps}
+        return {
+            step: [self._policy.sampling_noise(generator) for _ in range(count)]
+            for step in self._steps
+        }
 
     def _watch(self, arms: list[ProbedPolicy]) -> list[Line]:
         """Run the episode once for arms with the same feed."""
@@ -140,12 +152,16 @@ class _Moments:
             recording.show(episode, n_observed, step + 1, required)
             n_observed = step + 1
             episode.boundaries = episode.numbers(np.array(sorted(self._boundaries), np.int64))
-            episode.subgoal = None if self._subgoal_kind is None else recording.subgoal(step, self._subgoal_kind)
+            episode.subgoal = (
+                None if self._subgoal_kind is None else recording.subgoal(step, self._subgoal_kind)
+            )
             episode.subgoals.append(episode.subgoal)
             for probed in arms:
                 result += self._probe(probed, episode, step)
             episode.inner.subgoal = episode.subgoal
-            self._policy.act([episode.inner], self._settings.flow_steps)  # banks are written where chunks are chosen
+            self._policy.act(
+                [episode.inner], self._settings.flow_steps
+            )  # banks are written where chunks are chosen
         return result
 
     def _probe(self, probed: ProbedPolicy, episode: ProbedEpisode, step: int) -> list[Line]:
@@ -156,31 +172,60 @@ class _Moments:
         if arm is UNPROBED:
             self._baseline[step] = probed.ask(episode, snapshot, [edited], draws, steps)[0]
             return self._scan(probed, episode, snapshot, step) if self._settings.scan else []
-        change = compare_chunks(self._baseline[step], probed.ask(episode, snapshot, [edited], draws, steps)[0])
+        change = compare_chunks(
+            self._baseline[step], probed.ask(episode, snapshot, [edited], draws, steps)[0]
+        )
         stores = snapshot.stores
         touched = [age for old, new in zip(stores, edited, strict=True) for age in old.changed(new)]
-        return [MomentLine(
-            self._recording.name, self._recording.task, step, self._phase(step), self._recording.subgoal(step) or "",
-            arm.name, arm.dial(), sum(map(len, stores)), touched, **asdict(change),
-        )]  # fmt: skip
+        return [
+            MomentLine(
+                self._recording.name,
+                self._recording.task,
+                step,
+                self._phase(step),
+                self._recording.subgoal(step) or "",
+                arm.name,
+                arm.dial(),
+                sum(map(len, stores)),
+                touched,
+                **asdict(change),
+            )
+        ]
 
-    def _scan(self, probed: ProbedPolicy, episode: ProbedEpisode, snapshot: MemorySnapshot, step: int) -> list[Line]:
+    def _scan(
+        self, probed: ProbedPolicy, episode: ProbedEpisode, snapshot: MemorySnapshot, step: int
+    ) -> list[Line]:
         """The change that each entry's absence makes, one at a time."""
         stores, places = snapshot.stores, []
         for i, store in enumerate(stores):
             places += [(i, slot) for slot in store.occupied]
         if not places:
             return []
-        variants = [[*stores[:i], stores[i].without([slot]), *stores[i + 1 :]] for i, slot in places]
-        chunks = probed.ask(episode, snapshot, variants, self._draws[step], self._settings.flow_steps)
+        variants = [
+            [*stores[:i], stores[i].without([slot]), *stores[i + 1 :]] for i, slot in places
+        ]
+        chunks = probed.ask(
+            episode, snapshot, variants, self._draws[step], self._settings.flow_steps
+        )
         result: list[Line] = []
         for (i, slot), chunk in zip(places, chunks, strict=True):
             change, entry = compare_chunks(self._baseline[step], chunk), stores[i].entries[slot]
             assert entry is not None
-            result.append(EntryLine(
-                self._recording.name, self._recording.task, step, self._phase(step), stores[i].name, slot, entry.time,
-                stores[i].age(slot), entry.time < self._recording.exec_start, change.change, change.spread,
-            ))  # fmt: skip
+            result.append(
+                EntryLine(
+                    self._recording.name,
+                    self._recording.task,
+                    step,
+                    self._phase(step),
+                    stores[i].name,
+                    slot,
+                    entry.time,
+                    stores[i].age(slot),
+                    entry.time < self._recording.exec_start,
+                    change.change,
+                    change.spread,
+                )
+            )
         return result
 
     def _phase(self, step: int) -> int:
@@ -189,6 +234,8 @@ class _Moments:
 
     def _required_frames(self, arms: Sequence[ProbedPolicy]) -> np.ndarray | None:
         """Frames that any of these arms reads; None for all."""
-        parts = [probed.frames_read(np.array(self._steps), self._recording.exec_start) for probed in arms]
+        parts = [
+            probed.frames_read(np.array(self._steps), self._recording.exec_start) for probed in arms
+        ]
         known = [part for part in parts if part is not None]
         return np.unique(np.concatenate(known)) if len(known) == len(parts) else None

@@ -1,4 +1,6 @@
-"""A policy under an arm of a probe: its frames, its memory or its subgoal are changed, its weights are not."""
+"""A policy under an arm of a probe: its frames, its memory or its subgoal are changed, its weights
+are not.
+"""
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +25,8 @@ from mme_vla.types import Noise, stack_noise
 class ProbedEpisode(FedEpisode):
     """A fed episode that a probe follows.
 
-    recording: the recorded episode, if it is one. subgoals: those that were set at each chunk so far.
+    recording: the recorded episode, if it is one. subgoals: those that were set at each chunk so
+    far.
     """
 
     recording: Recording | None = None
@@ -46,11 +49,15 @@ class DonorEpisode:
         self._policy = policy
 
     def store_of(self, episode: ProbedEpisode) -> Callable[[str], Remembered]:
-        """The store of a name, as many execution frames in as `episode` is; of banks, as it was in the end."""
+        """The store of a name, as many execution frames in as `episode` is; of banks, as it was in
+        the end.
+        """
 
         def store(name: str) -> Remembered:
             step = self._step(episode) if self._channel.chooses else None
-            stores = {store.name: store for store in self._channel.read(self._observed(), step).stores}
+            stores = {
+                store.name: store for store in self._channel.read(self._observed(), step).stores
+            }
             return stores[name]
 
         return store
@@ -69,14 +76,21 @@ class DonorEpisode:
         if self._episode is None:
             recording, policy = self.recording, self._policy
             running, observed = policy.start_episode(recording.goal), 0
-            # A bank is written where chunks are chosen; stored frames can be read at any step afterwards.
-            stops = [] if self._channel.chooses else recording.decisions(policy.embodiment.action.execute, None)
+            # A bank is written where chunks are chosen; stored frames can be read at any step
+            # afterwards.
+            stops = (
+                []
+                if self._channel.chooses
+                else recording.decisions(policy.embodiment.action.execute, None)
+            )
             for stop in stops:
                 recording.show(running, observed, stop + 1)
                 observed = stop + 1
                 running.subgoal = recording.subgoal(stop, self._subgoal_kind)
                 policy.act([running])
-            recording.show(running, observed, recording.length, stored_frames(policy, recording.length))
+            recording.show(
+                running, observed, recording.length, stored_frames(policy, recording.length)
+            )
             self._episode = running
         return self._episode
 
@@ -97,7 +111,9 @@ class DonorEpisodes:
         return self._donors[donor.name]
 
 
-def others(recordings: Sequence[Recording], exclude: Recording | None, goal: str) -> list[Recording]:
+def others(
+    recordings: Sequence[Recording], exclude: Recording | None, goal: str
+) -> list[Recording]:
     """The other episodes, those whose goals have the most words in common first."""
     words = set(goal.split())
 
@@ -120,7 +136,8 @@ class ProbedPolicy(FedPolicy):
     ) -> None:
         """Wrap a policy.
 
-        sessions: recorded episodes to observe before each, as many as the arm needs. donors: to take contents from.
+        sessions: recorded episodes to observe before each, as many as the arm needs. donors: to
+        take contents from.
         """
         super().__init__(inner, arm.feed, sessions)
         self.arm, self.channel, self.donors = arm, channel_of(inner), donors
@@ -137,7 +154,11 @@ class ProbedPolicy(FedPolicy):
         # Which frames are left to choose from is known only then.
         displayed = self.feed.displayed(steps, exec_start, self.before)
         stored = stored_frames(self.inner, int(displayed.max()) + 1)
-        return reads if stored is None else np.union1d(reads, self.feed.source_frames(stored, exec_start, self.before))
+        return (
+            reads
+            if stored is None
+            else np.union1d(reads, self.feed.source_frames(stored, exec_start, self.before))
+        )
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         for episode in map(_probed, episodes):
@@ -146,33 +167,49 @@ class ProbedPolicy(FedPolicy):
         return self.inner.observation([_probed(episode).inner for episode in episodes])
 
     def predict_chunk(
-        self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Any,
+        episodes: Sequence[Episode],
+        draws: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
         if not self.arm.edits:
             return super().predict_chunk(batch, episodes, draws, steps)
         mine, remembering = [_probed(episode) for episode in episodes], []
         for i, episode in enumerate(mine):
-            snapshot, stores = self.snapshot(episode, {name: value[i] for name, value in draws.items()})
+            snapshot, stores = self.snapshot(
+                episode, {name: value[i] for name, value in draws.items()}
+            )
             remembering.append(self.channel.counterfactual(episode.inner, snapshot, stores))
         chunk = self.channel.predict_chunk(batch, remembering, draws, steps)
         for episode, its in zip(mine, remembering, strict=True):
             self.channel.commit(episode.inner, its)
         return chunk
 
-    def snapshot(self, episode: ProbedEpisode, sampled: Noise | None = None) -> tuple[MemorySnapshot, list[Remembered]]:
+    def snapshot(
+        self, episode: ProbedEpisode, sampled: Noise | None = None
+    ) -> tuple[MemorySnapshot, list[Remembered]]:
         """What is remembered among the frames that may be, and what the arm makes of it."""
         moment = self.moment(episode)
         snapshot = self.channel.read(episode.inner, only=self.arm.only(moment))
         edited = []
         for place, store in enumerate(snapshot.stores):
-            weigh = None if sampled is None else partial(self._weigh, episode, snapshot, place, sampled)
-            edited.append(self.arm.edit(store, self.moment(episode, weigh)))  # the same chance for each store
+            weigh = (
+                None if sampled is None else partial(self._weigh, episode, snapshot, place, sampled)
+            )
+            edited.append(
+                self.arm.edit(store, self.moment(episode, weigh))
+            )  # the same chance for each store
         return snapshot, edited
 
     def moment(self, episode: ProbedEpisode, weigh: Any = None) -> Moment:
         """What the arm may know now."""
         now = max(episode.inner.n_observed_frames - 1, 0)
-        stored = np.zeros(0, np.int64) if self.memory is None else self.memory.storage.stored_frames(now + 1)
+        stored = (
+            np.zeros(0, np.int64)
+            if self.memory is None
+            else self.memory.storage.stored_frames(now + 1)
+        )
         rng = np.random.default_rng([episode.seed, now, zlib.crc32(self.arm.name.encode())])
         known: dict[str, Any] = {}
         if self.donors is not None:
@@ -181,7 +218,12 @@ class ProbedPolicy(FedPolicy):
         return Moment(rng, now, stored, episode.boundaries, episode.subgoals, weigh=weigh, **known)
 
     def _weigh(
-        self, episode: ProbedEpisode, snapshot: MemorySnapshot, place: int, sampled: Noise, store: Remembered
+        self,
+        episode: ProbedEpisode,
+        snapshot: MemorySnapshot,
+        place: int,
+        sampled: Noise,
+        store: Remembered,
     ) -> np.ndarray:
         """By how much a chunk changes without each slot of a store."""
         slots = store.occupied
@@ -202,20 +244,28 @@ class ProbedPolicy(FedPolicy):
         steps: int | None = None,
         batch: int = 64,
     ) -> Tensor:
-        """Normalised chunks [variants, draws, h, w] as they are executed, adding nothing to the episode's memory.
+        """Normalised chunks [variants, draws, h, w] as they are executed, adding nothing to the
+        episode's memory.
 
-        variants: what is remembered, store by store. draws: the random numbers that all variants share. batch: most
-        chunks that are chosen at once.
+        variants: what is remembered, store by store. draws: the random numbers that all variants
+        share. batch: most chunks that are chosen at once.
         """
         chunks = []
         pairs = [(variant, sampled) for variant in variants for sampled in draws]
-        ready = {id(variant): self.channel.counterfactual(episode.inner, snapshot, variant) for variant in variants}
+        ready = {
+            id(variant): self.channel.counterfactual(episode.inner, snapshot, variant)
+            for variant in variants
+        }
         for start in range(0, len(pairs), batch):
             part = pairs[start : start + batch]
             observation = self.inner.observation([episode.inner] * len(part))
             stacked = stack_noise([sampled for _, sampled in part])
             chunks.append(
-                self.channel.predict_chunk(observation, [ready[id(v)] for v, _ in part], stacked, steps).float().cpu()
+                self.channel.predict_chunk(
+                    observation, [ready[id(v)] for v, _ in part], stacked, steps
+                )
+                .float()
+                .cpu()
             )
         action = self.embodiment.action
         stacked_chunks = torch.cat(chunks).unflatten(0, (len(variants), len(draws)))

@@ -38,7 +38,8 @@ AGES = (0, 16, 32, 64, 128, 256, 512)  # Where the bins of an entry's age begin,
 class Effect:
     """The effect of an arm, or an entry, over some steps.
 
-    change, spread, distance: means, as in `Change`. beyond: share of steps at which the change exceeds the spread.
+    change, spread, distance: means, as in `Change`. beyond: share of steps at which the change
+    exceeds the spread.
     """
 
     moments: int
@@ -58,9 +59,12 @@ def effect(lines: Sequence[MomentLine] | Sequence[EntryLine]) -> Effect:
     changes, spreads = np.array([x.change for x in lines]), np.array([x.spread for x in lines])
     distances = [x.distance for x in lines if isinstance(x, MomentLine)]
     return Effect(
-        len(lines), float(changes.mean()), float(spreads.mean()), float(np.mean(distances)) if distances else 0.0,
+        len(lines),
+        float(changes.mean()),
+        float(spreads.mean()),
+        float(np.mean(distances)) if distances else 0.0,
         float((changes > spreads).mean()),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -74,18 +78,28 @@ class Findings:
     def of(cls, lines: Iterable[Line]) -> "Findings":
         """Sort the lines."""
         every = list(lines)
-        return cls([x for x in every if isinstance(x, MomentLine)], [x for x in every if isinstance(x, EntryLine)])
+        return cls(
+            [x for x in every if isinstance(x, MomentLine)],
+            [x for x in every if isinstance(x, EntryLine)],
+        )
 
     def arms(self) -> dict[str, Effect]:
         """The effect of every arm, in the order in which they came."""
-        return {name: effect(lines) for name, lines in _grouped(self.moments, lambda line: line.arm).items()}
+        return {
+            name: effect(lines)
+            for name, lines in _grouped(self.moments, lambda line: line.arm).items()
+        }
 
     def families(self) -> dict[str, list[tuple[float, Effect]]]:
-        """Interventions of which several places of the dial were probed: dial and effect, ascending."""
+        """Interventions of which several places of the dial were probed: dial and effect,
+        ascending.
+        """
         dials: dict[str, dict[float, list[MomentLine]]] = {}
         for line in self.moments:
             if line.dial is not None:
-                dials.setdefault(line.arm.partition(":")[0], {}).setdefault(line.dial, []).append(line)
+                dials.setdefault(line.arm.partition(":")[0], {}).setdefault(line.dial, []).append(
+                    line
+                )
         return {
             name: [(dial, effect(lines)) for dial, lines in sorted(dial_lines.items())]
             for name, dial_lines in dials.items()
@@ -93,27 +107,48 @@ class Findings:
         }
 
     def decay(self, video: bool) -> list[tuple[float, Effect]]:
-        """Mean age and effect of the entries of each bin of age, those of the video or of the execution."""
+        """Mean age and effect of the entries of each bin of age, those of the video or of the
+        execution.
+        """
         mine = [entry for entry in self.entries if entry.video == video]
         bins = _grouped(mine, lambda entry: int(np.searchsorted(AGES, entry.age, "right")))
-        return [(float(np.mean([e.age for e in lines])), effect(lines)) for _, lines in sorted(bins.items())]
+        return [
+            (float(np.mean([e.age for e in lines])), effect(lines))
+            for _, lines in sorted(bins.items())
+        ]
 
     def reach(self) -> float | None:
-        """How far back what matters lies: mean age of the entries, weighted by their change; None without entries."""
+        """How far back what matters lies: mean age of the entries, weighted by their change; None
+        without entries.
+        """
         weights = np.array([entry.change for entry in self.entries])
-        return float(np.average([e.age for e in self.entries], weights=weights)) if weights.sum() > 0 else None
+        return (
+            float(np.average([e.age for e in self.entries], weights=weights))
+            if weights.sum() > 0
+            else None
+        )
 
     def from_video(self) -> float | None:
-        """The share of all entries' changes that those of the conditioning video make; None without entries."""
+        """The share of all entries' changes that those of the conditioning video make; None without
+        entries.
+        """
         total = sum(entry.change for entry in self.entries)
-        return sum(entry.change for entry in self.entries if entry.video) / total if total > 0 else None
+        return (
+            sum(entry.change for entry in self.entries if entry.video) / total
+            if total > 0
+            else None
+        )
 
     def matters_most(self) -> dict[str, list[EntryLine]]:
-        """For each task the step at which a single entry mattered most: all entries of that step."""
+        """For each task the step at which a single entry mattered most: all entries of
+        that step.
+        """
         strongest: dict[str, list[EntryLine]] = {}
         moments = _grouped(self.entries, lambda e: (e.task, e.recording, e.step))
         for (task, *_), lines in moments.items():
-            if task not in strongest or max(e.change for e in lines) > max(e.change for e in strongest[task]):
+            if task not in strongest or max(e.change for e in lines) > max(
+                e.change for e in strongest[task]
+            ):
                 strongest[task] = lines
         return strongest
 
@@ -129,7 +164,9 @@ def show(effect_of: Effect | None) -> str:
     """A change as a table has it: the change, and how many of the policy's own spread that is."""
     if effect_of is None:
         return "–"
-    return f"{effect_of.change:.3f}" + ("" if effect_of.times is None else f" ({effect_of.times:.1f}×)")
+    return f"{effect_of.change:.3f}" + (
+        "" if effect_of.times is None else f" ({effect_of.times:.1f}×)"
+    )
 
 
 def arms_table(findings: Findings) -> Table:
@@ -140,9 +177,28 @@ def arms_table(findings: Findings) -> Table:
         ages = [age for line in lines for age in line.touched]
         touched = f"{np.mean(ages):.0f}" if ages else "–"
         times = "–" if effect_of.times is None else f"{effect_of.times:.1f}×"
-        rows.append([name, str(effect_of.moments), touched, f"{effect_of.change:.3f}", f"{effect_of.spread:.3f}", times,
-                     f"{100 * effect_of.beyond:.0f} %", f"{effect_of.distance:.3f}"])  # fmt: skip
-    columns = ("arm", "moments", "age touched", "change", "own spread", "times that", "beyond it", "energy distance")
+        rows.append(
+            [
+                name,
+                str(effect_of.moments),
+                touched,
+                f"{effect_of.change:.3f}",
+                f"{effect_of.spread:.3f}",
+                times,
+                f"{100 * effect_of.beyond:.0f} %",
+                f"{effect_of.distance:.3f}",
+            ]
+        )
+    columns = (
+        "arm",
+        "moments",
+        "age touched",
+        "change",
+        "own spread",
+        "times that",
+        "beyond it",
+        "energy distance",
+    )
     return Table("What each intervention does to the chunk", columns, rows)
 
 
@@ -154,7 +210,11 @@ def phases_table(findings: Findings) -> Table:
     for name in findings.arms():
         cells = []
         for place in places:
-            lines = [line for line in findings.moments if line.arm == name and (line.task, line.phase) == place]
+            lines = [
+                line
+                for line in findings.moments
+                if line.arm == name and (line.task, line.phase) == place
+            ]
             cells.append(show(effect(lines) if lines else None))
         rows.append([name, *cells])
     return Table("By task and sub-task", ("arm", *named), rows)
@@ -168,22 +228,43 @@ def checkpoints_table(findings: dict[str, Findings]) -> Table:
         cells = [show(arms.get(arm)) for arm, _ in MEASURES.values()]
         rows.append([name, *cells, "–" if reach is None else f"{reach:.0f}",
                      "–" if video is None else f"{100 * video:.0f} %"])  # fmt: skip
-    return Table("What is taken from memory", ("checkpoint", *MEASURES, "reach (frames)", "from the video"), rows)
+    return Table(
+        "What is taken from memory",
+        ("checkpoint", *MEASURES, "reach (frames)", "from the video"),
+        rows,
+    )
 
 
-_ON = {"distract": "episodes before one's own", "delay": "frames that the clock runs ahead",
-       "pause": "still frames", "recent": "frames that may be remembered", "drop": "entries taken away"}  # fmt: skip
+_ON = {
+    "distract": "episodes before one's own",
+    "delay": "frames that the clock runs ahead",
+    "pause": "still frames",
+    "recent": "frames that may be remembered",
+    "drop": "entries taken away",
+}
 
 
 def effects(findings: Findings) -> str:
     """A bar an arm: the mean change of the chunk; the line is the policy's own spread."""
     arms = findings.arms()
     with figure((10.4, 3.4)) as (canvas, (axes,)):
-        axes.bar(range(len(arms)), [arm_effect.change for arm_effect in arms.values()], 0.7, color=COLOURS[0])
+        axes.bar(
+            range(len(arms)),
+            [arm_effect.change for arm_effect in arms.values()],
+            0.7,
+            color=COLOURS[0],
+        )
         ends = [(i - 0.42, i + 0.42) for i in range(len(arms))]
-        axes.hlines([arm_effect.spread for arm_effect in arms.values()], *zip(*ends, strict=True), color=COLOURS[1],
-                    lw=2, label="the policy's own spread")  # fmt: skip
-        axes.set_xticks(range(len(arms)), list(arms), rotation=25, ha="right", rotation_mode="anchor")
+        axes.hlines(
+            [arm_effect.spread for arm_effect in arms.values()],
+            *zip(*ends, strict=True),
+            color=COLOURS[1],
+            lw=2,
+            label="the policy's own spread",
+        )
+        axes.set_xticks(
+            range(len(arms)), list(arms), rotation=25, ha="right", rotation_mode="anchor"
+        )
         axes.set_ylabel("change of the chunk")
         legend(canvas, axes, 3)
         return svg(canvas)
@@ -196,7 +277,14 @@ def decay(findings: Findings) -> str:
             points = findings.decay(video)
             mine = [e for e in findings.entries if e.video == video]
             if mine:
-                axes.scatter([e.age for e in mine], [e.change for e in mine], s=8, color=colour, alpha=0.25, lw=0)
+                axes.scatter(
+                    [e.age for e in mine],
+                    [e.change for e in mine],
+                    s=8,
+                    color=colour,
+                    alpha=0.25,
+                    lw=0,
+                )
                 means = [point.change for _, point in points]
                 axes.plot([age for age, _ in points], means, "-o", color=colour, ms=5, label=name)
         stds = [entry.spread for entry in findings.entries]
@@ -213,7 +301,13 @@ def dials(findings: Findings) -> dict[str, str]:
     figures = {}
     for name, points in findings.families().items():
         with figure((5.6, 3.0)) as (canvas, (axes,)):
-            axes.plot([0, *(x for x, _ in points)], [0, *(f.change for _, f in points)], "-o", color=COLOURS[0], ms=5)
+            axes.plot(
+                [0, *(x for x, _ in points)],
+                [0, *(f.change for _, f in points)],
+                "-o",
+                color=COLOURS[0],
+                ms=5,
+            )
             axes.axhline(points[0][1].spread, color=COLOURS[1], lw=1, ls="--")
             axes.set_xlabel(_ON.get(name, name))
             axes.set_ylabel("change of the chunk")
@@ -225,13 +319,15 @@ def dials(findings: Findings) -> dict[str, str]:
 PAGE, TABLE, IMAGES = "page.html", "table.md", "remembered"
 VIDEO, EXECUTION, NOW = (122, 162, 205), (233, 148, 62), (200, 40, 40)
 UNITS = (
-    "Change: root mean square distance of two chunks of the same noise, in normalised actions (1 is half of what the "
-    "training data span). In brackets: how many times what chunks differ by that differ in noise alone."
+    "Change: root mean square distance of two chunks of the same noise, in normalised actions (1 is"
+    " half of what the training data span). In brackets: how many times what chunks differ by that"
+    " differ in noise alone."
 )
 
 
 def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image":
-    """The frames remembered at a step, each with its age and how the chunk changes without it; the current one last.
+    """The frames remembered at a step, each with its age and how the chunk changes without it; the
+    current one last.
 
     lines: of one step. recording: theirs.
     """
@@ -245,7 +341,9 @@ def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image
 
 
 def write_images(findings: Findings, recordings: Sequence[Recording], folder: Path) -> list[Path]:
-    """Render the step of each task at which an entry mattered most; entries that are frames alone."""
+    """Render the step of each task at which an entry mattered most; entries that are
+    frames alone.
+    """
     by_name = {recording.name: recording for recording in recordings}
     paths = []
     for task, lines in findings.matters_most().items():
@@ -263,7 +361,11 @@ def write_images(findings: Findings, recordings: Sequence[Recording], folder: Pa
 
 
 def write_page(
-    folder: Path, name: str, findings: Findings, comparisons: Sequence[Comparison] = (), notes: Sequence[str] = ()
+    folder: Path,
+    name: str,
+    findings: Findings,
+    comparisons: Sequence[Comparison] = (),
+    notes: Sequence[str] = (),
 ) -> Path:
     """Write `page.html` and `table.md` into the probe's folder."""
     sections, tables = [], []
@@ -272,8 +374,13 @@ def write_page(
         curves = [(f"Over the dial: {dial}", curve, "Dashed: the policy's own spread.")
                   for dial, curve in dials(findings).items()]  # fmt: skip
         if findings.entries:
-            curves.insert(0, ("Decay with distance", decay(findings), "Each entry left out by itself."))
-        sections += [Section("In short", tables=tables[:1], caption=UNITS), Section("Interventions", effects(findings))]
+            curves.insert(
+                0, ("Decay with distance", decay(findings), "Each entry left out by itself.")
+            )
+        sections += [
+            Section("In short", tables=tables[:1], caption=UNITS),
+            Section("Interventions", effects(findings)),
+        ]
         sections += [Section(title, curve, caption=caption, half=i < len(curves) - len(curves) % 2)
                      for i, (title, curve, caption) in enumerate(curves)]  # fmt: skip
         sections += [Section(table.title, tables=[table]) for table in tables[1:]]
@@ -283,9 +390,13 @@ def write_page(
     verdicts = [comparison.verdict for comparison in comparisons]
     if comparisons:
         tables.append(comparison_table(comparisons))
-        sections.append(Section("In closed loop", tables=tables[-1:], caption="; ".join(verdicts) + "."))
+        sections.append(
+            Section("In closed loop", tables=tables[-1:], caption="; ".join(verdicts) + ".")
+        )
     page = html_page(f"What {name} takes from its memory", sections, notes=notes)
-    text = render("probe.md", name=name, tables=map(to_markdown, tables), verdicts=verdicts, notes=notes)
+    text = render(
+        "probe.md", name=name, tables=map(to_markdown, tables), verdicts=verdicts, notes=notes
+    )
     for file, content in ((PAGE, page), (TABLE, text)):
         with write_atomically(folder / file) as draft:
             draft.write_text(content, encoding="utf-8")

@@ -1,4 +1,6 @@
-"""A whole probe: on recorded episodes, in closed loop, and the page about both. Repeated, it resumes."""
+"""A whole probe: on recorded episodes, in closed loop, and the page about both. Repeated, it
+resumes.
+"""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -43,13 +45,15 @@ from mme_vla.subgoal import SubgoalPredictor
 
 OFFLINE, ONLINE = "offline", "online"  # Folders of the lines and of the closed loop
 NO_DATA = (
-    "A probe on recorded episodes needs some: recordings=<dataset>. Those of the benchmark are made by "
-    "`mme-vla record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false online=true "
-    "probes in closed loop alone."
+    "A probe on recorded episodes needs some: recordings=<dataset>. Those of the benchmark are made"
+    " by `mme-vla record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false"
+    " online=true probes in closed loop alone."
 )
 
 
-IN_CLOSED_LOOP = "event=…: events act in closed loop: add online=true to the command, or tasks=… in Python."
+IN_CLOSED_LOOP = (
+    "event=…: events act in closed loop: add online=true to the command, or tasks=… in Python."
+)
 
 
 @dataclass(frozen=True)
@@ -97,47 +101,87 @@ def run_probe(
     if plan.recordings:
         has_boundaries = all(recording.tells_subtasks for recording in plan.recordings)
         names = {recording.name for recording in plan.lend}
-        n_donors = len(names) - any(recording.name in names for recording in plan.recordings)  # never the probed one
+        n_donors = len(names) - any(
+            recording.name in names for recording in plan.recordings
+        )  # never the probed one
         arms, notes = choose_arms(plan.arms, policy, channel, n_donors, boundaries=has_boundaries)
         _on_recordings(policy, arms, plan, folder / OFFLINE, facts, show_progress)
     if plan.jobs:
         has_boundaries = base is make_env and settings.env == "mme_vla"
-        arms, left_out = choose_arms(plan.arms, policy, channel, len(plan.lend), boundaries=has_boundaries)
+        arms, left_out = choose_arms(
+            plan.arms, policy, channel, len(plan.lend), boundaries=has_boundaries
+        )
         notes += [f"In closed loop {note}" for note in left_out if note not in notes]
         donors = DonorEpisodes(policy, channel, plan.lend) if plan.lend else None
         for arm in [UNPROBED, *arms]:
-            probed = policy if arm is UNPROBED else ProbedPolicy(policy, arm, plan.lend, donors).eval()
+            probed = (
+                policy if arm is UNPROBED else ProbedPolicy(policy, arm, plan.lend, donors).eval()
+            )
             evaluate(
-                probed, plan.jobs, folder / ONLINE / slug(arm.name), replace(facts, model=named(facts.model, arm)),
-                settings, subgoals=subgoals, shard=plan.shard, source=plan.source, base=base,
-                notes={"arm": arm.name}, show_progress=show_progress,
-            )  # fmt: skip
+                probed,
+                plan.jobs,
+                folder / ONLINE / slug(arm.name),
+                replace(facts, model=named(facts.model, arm)),
+                settings,
+                subgoals=subgoals,
+                shard=plan.shard,
+                source=plan.source,
+                base=base,
+                notes={"arm": arm.name},
+                show_progress=show_progress,
+            )
         if plan.events:
-            evaluate_events(policy, plan.jobs, folder / ONLINE / slug(UNPROBED.name), facts, settings, plan.events,
-                            subgoals=subgoals, shard=plan.shard, source=plan.source, base=base,
-                            notes={"arm": UNPROBED.name}, show_progress=show_progress)  # fmt: skip
+            evaluate_events(
+                policy,
+                plan.jobs,
+                folder / ONLINE / slug(UNPROBED.name),
+                facts,
+                settings,
+                plan.events,
+                subgoals=subgoals,
+                shard=plan.shard,
+                source=plan.source,
+                base=base,
+                notes={"arm": UNPROBED.name},
+                show_progress=show_progress,
+            )
     findings = Findings.of(lines.read_all(folder / OFFLINE))
     records = read_folders(find_records([folder / ONLINE])) if (folder / ONLINE).is_dir() else []
     comparisons = _paired(records, facts.split, facts.model)
     notes += idle_events(records)
     notes += [note for comparison in comparisons for note in comparison.gaps]
     write_images(findings, plan.recordings, folder)
-    return Probe(findings, comparisons, notes, write_page(folder, facts.model, findings, comparisons, notes))
+    return Probe(
+        findings, comparisons, notes, write_page(folder, facts.model, findings, comparisons, notes)
+    )
 
 
 def _on_recordings(
-    policy: Policy, arms: Sequence[Arm], plan: ProbePlan, folder: Path, facts: RunFacts, show_progress: bool
+    policy: Policy,
+    arms: Sequence[Arm],
+    plan: ProbePlan,
+    folder: Path,
+    facts: RunFacts,
+    show_progress: bool,
 ) -> None:
     policy.require_processor().require_stats()
     claim_run(folder, _settings(policy, plan, facts, arms))
     shard = plan.shard
     local = list(plan.recordings)[shard.index :: shard.count]
-    path = folder / ("offline.jsonl" if shard.count == 1 else f"offline-{shard.index}of{shard.count}.jsonl")
-    with progress("probe", len(local), unit="episodes") if show_progress else nullcontext(lambda _: None) as advance:
+    path = folder / (
+        "offline.jsonl" if shard.count == 1 else f"offline-{shard.index}of{shard.count}.jsonl"
+    )
+    with (
+        progress("probe", len(local), unit="episodes")
+        if show_progress
+        else nullcontext(lambda _: None) as advance
+    ):
         probe_offline(policy, arms, local, plan.lend, path, plan.offline, advance)
 
 
-def _settings(policy: Policy, plan: ProbePlan, facts: RunFacts, arms: Sequence[Arm]) -> dict[str, Any]:
+def _settings(
+    policy: Policy, plan: ProbePlan, facts: RunFacts, arms: Sequence[Arm]
+) -> dict[str, Any]:
     """What decides the lines, as `run.json` keeps it."""
     sources = {id(r.source): r.source for r in [*plan.recordings, *plan.lend]}
     return {
@@ -155,7 +199,10 @@ def probed_folder(folder: Path) -> Findings:
     """What a finished probe's folder holds."""
     findings = Findings.of(lines.read_all(folder / OFFLINE))
     if not findings.moments:
-        raise UserError(f"{folder} holds no probe on recorded episodes: no {OFFLINE}/offline.jsonl with lines in it.")
+        raise UserError(
+            f"{folder} holds no probe on recorded episodes: no {OFFLINE}/offline.jsonl with lines"
+            " in it."
+        )
     return findings
 
 
@@ -181,15 +228,19 @@ def probe(
 
     Args:
         policy: one with statistics; or a folder or hub repository to load one from.
-        recordings: recorded episodes: folders of datasets, as for the command. Without them the closed loop is probed.
-        arms: interventions, such as `["shuffle", "drop:2", "nodemo+delay:64"]`; by default all that are possible.
+        recordings: recorded episodes: folders of datasets, as for the command. Without them the
+            closed loop is probed.
+        arms: interventions, such as `["shuffle", "drop:2", "nodemo+delay:64"]`; by default all that
+            are possible.
         output: the probe's folder, for its lines and its page.
         tasks, episodes: of the closed loop, as for `evaluate`; None leaves it out.
         seed: of noise and of random choices.
         draws: chunks sampled at each step. moments: most steps of an episode.
         subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
-        name: what lines and records call the policy. base: makes an environment with the benchmark's interface.
-        show_progress: whether a progress bar is shown. event: further arms of the closed loop, as for `evaluate`.
+        name: what lines and records call the policy. base: makes an environment with the
+            benchmark's interface.
+        show_progress: whether a progress bar is shown. event: further arms of the closed loop, as
+            for `evaluate`.
         settings: of `RolloutSettings`, such as `workers=2`.
 
     Returns:
@@ -203,17 +254,32 @@ def probe(
     arms_of_events = event_arms(event)
     require(tasks is not None or not arms_of_events, IN_CLOSED_LOOP)
     loaded, source = load(policy)
-    recorded = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
-    jobs = [] if tasks is None else choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
+    recorded = (
+        [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
+    )
+    jobs = (
+        []
+        if tasks is None
+        else choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
+    )
     if jobs and base is make_env:
         environment(run_settings.env).check_installed()
     predictor = predictor_of(loaded, subgoal)
-    facts = facts_of(loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None)
+    facts = facts_of(
+        loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None
+    )
     offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
     plan = ProbePlan(arms, recorded, recorded, jobs, offline, source=source, events=arms_of_events)
     folder = Path(output).expanduser()
     return run_probe(
-        loaded.eval(), plan, folder, facts, run_settings, subgoals=predictor, base=base, show_progress=show_progress
+        loaded.eval(),
+        plan,
+        folder,
+        facts,
+        run_settings,
+        subgoals=predictor,
+        base=base,
+        show_progress=show_progress,
     )
 
 
@@ -223,7 +289,8 @@ def named(model: str, arm: Arm) -> str:
 
 
 def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Comparison]:
-    """Each arm against the unprobed run, over the episodes that both have, corrected for their number.
+    """Each arm against the unprobed run, over the episodes that both have, corrected for their
+    number.
 
     model: the unprobed one's name.
     """
@@ -232,7 +299,12 @@ def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Co
         return []
     protocol = Protocol(tasks, episodes=1 + max(record.episode for record in records))
     methods = aggregate(records, protocol, split).methods
-    baseline = next((method for method in methods if method.model == model and method.event is None), None)
+    baseline = next(
+        (method for method in methods if method.model == model and method.event is None), None
+    )
     if baseline is None:
         return []
-    return compare_all([(m, baseline) for m in methods if m is not baseline and common_episodes(m, baseline)], protocol)
+    return compare_all(
+        [(m, baseline) for m in methods if m is not baseline and common_episodes(m, baseline)],
+        protocol,
+    )

@@ -1,6 +1,8 @@
-"""Score of writing: whether the frames that a memory keeps are those that show what an episode's outcome depends on.
+"""Score of writing: whether the frames that a memory keeps are those that show what an episode's
+outcome depends on.
 
-Nothing is trained and no policy acts: the memory selects along demonstrated episodes (`evidence.py`).
+Nothing is trained and no policy acts: the memory selects along demonstrated episodes
+(`evidence.py`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,16 +37,17 @@ class TokensReadError(UserError):
     """A memory reads vision tokens to choose, and there are none."""
 
 
-# Definitions ----------------------------------------------------------------------------------------------------------
+# Definitions --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class EpisodeWriting:
     """What a memory kept along one episode, against the frames that show its facts.
 
-    precision: share of the kept frames that show a fact. recall: share of the facts so far of which a frame is kept.
-    Both are means over the steps of the execution. chance_precision, chance_recall: the expectation for as many frames
-    at random. lags: of each fact that was kept at some step, frames from its first frame to the first such step.
+    precision: share of the kept frames that show a fact. recall: share of the facts so far of which
+    a frame is kept. Both are means over the steps of the execution. chance_precision,
+    chance_recall: the expectation for as many frames at random. lags: of each fact that was kept at
+    some step, frames from its first frame to the first such step.
     """
 
     precision: float
@@ -71,13 +74,19 @@ def harmonic_mean(a: float, b: float) -> float:
 
 
 def score_episode(
-    selection: Selection, facts: Mapping[str, np.ndarray], length: int, exec_start: int, stride: int = STRIDE
+    selection: Selection,
+    facts: Mapping[str, np.ndarray],
+    length: int,
+    exec_start: int,
+    stride: int = STRIDE,
 ) -> EpisodeWriting | None:
-    """Score a selection along one episode; None where no fact has been visible at any step of the execution.
+    """Score a selection along one episode; None where no fact has been visible at any step of the
+    execution.
 
     Args:
         selection: the frames selected at a step. facts: name → frames that show it, ascending.
-        length: of the episode. exec_start: its first execution frame. stride: frames between two steps.
+        length: of the episode. exec_start: its first execution frame. stride: frames between two
+            steps.
     """
     visible = np.zeros((len(facts), length), bool)
     for row, frames in zip(visible, facts.values(), strict=True):
@@ -95,8 +104,13 @@ def score_episode(
         if step >= exec_start:
             count = len(frames)
             shows = float(selected.any(0).mean()) if count else 0.0
-            missed = [comb(step + 1 - int(row.sum()), count) / comb(step + 1, count) for row in past[begun]]
-            rows.append((shows, selected[begun].any(1).mean(), past.any(0).mean(), 1 - np.mean(missed)))
+            missed = [
+                comb(step + 1 - int(row.sum()), count) / comb(step + 1, count)
+                for row in past[begun]
+            ]
+            rows.append(
+                (shows, selected[begun].any(1).mean(), past.any(0).mean(), 1 - np.mean(missed))
+            )
     if not rows:
         return None
     lags = (retained - first)[retained >= 0].tolist()
@@ -111,28 +125,46 @@ class Writing:
     tasks: dict[str, list[EpisodeWriting]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """`tasks` and `mean`: rows of `precision`, `recall`, `score`, `chance`, `lag`, `held`, `facts` and `episodes`.
+        """`tasks` and `mean`: rows of `precision`, `recall`, `score`, `chance`, `lag`, `held`,
+        `facts` and `episodes`.
 
-        lag: mean, in frames; None where no fact was kept. held: share of the facts that were kept at some step.
+        lag: mean, in frames; None where no fact was kept. held: share of the facts that were kept
+        at some step.
         """
         rows = {task: _row(episodes) for task, episodes in self.tasks.items()}
         mean: dict[str, Any] = {}
         for name in next(iter(rows.values()), {}):
             values = [row[name] for row in rows.values() if row[name] is not None]
-            total = sum(values) if name in ("facts", "episodes") else float(np.mean(values)) if values else None
+            total = (
+                sum(values)
+                if name in ("facts", "episodes")
+                else float(np.mean(values))
+                if values
+                else None
+            )
             mean[name] = total
         return {"tasks": rows, "mean": mean}
 
 
 def _row(episodes: Sequence[EpisodeWriting]) -> dict[str, Any]:
     names = ("precision", "recall", "score", "chance")
-    means = {name: float(np.mean([getattr(episode, name) for episode in episodes])) for name in names}
-    lags, facts = [lag for episode in episodes for lag in episode.lags], sum(episode.facts for episode in episodes)
+    means = {
+        name: float(np.mean([getattr(episode, name) for episode in episodes])) for name in names
+    }
+    lags, facts = (
+        [lag for episode in episodes for lag in episode.lags],
+        sum(episode.facts for episode in episodes),
+    )
     lag = float(np.mean(lags)) if lags else None
-    return means | {"lag": lag, "held": len(lags) / facts, "facts": facts, "episodes": len(episodes)}
+    return means | {
+        "lag": lag,
+        "held": len(lags) / facts,
+        "facts": facts,
+        "episodes": len(episodes),
+    }
 
 
-# Selections -----------------------------------------------------------------------------------------------------------
+# Selections ---------------------------------------------------------------------------------------
 
 
 def oracle_selection(episode: EvidenceEpisode) -> Selection:
@@ -152,11 +184,17 @@ def random_selection(episode: EvidenceEpisode) -> Selection:
 
 
 def boundary_selection(episode: EvidenceEpisode) -> Selection:
-    """The frames at which sub-tasks begin, and the newest: what the probe's `oracle` lets a memory choose from."""
+    """The frames at which sub-tasks begin, and the newest: what the probe's `oracle` lets a memory
+    choose from.
+    """
     return lambda step: np.union1d(episode.boundaries[episode.boundaries <= step], [step])[-FRAMES:]
 
 
-REFERENCES = {"oracle": oracle_selection, "random": random_selection, "boundaries": boundary_selection}
+REFERENCES = {
+    "oracle": oracle_selection,
+    "random": random_selection,
+    "boundaries": boundary_selection,
+}
 """Selections without a memory, by name."""
 
 
@@ -165,7 +203,8 @@ class TokenlessHistory(CachedHistory):
 
     def gather(self, indices: np.ndarray) -> torch.Tensor:
         raise TokensReadError(
-            "This memory reads vision tokens to choose its frames: name a checkpoint that has it with --checkpoint."
+            "This memory reads vision tokens to choose its frames: name a checkpoint that has it"
+            " with --checkpoint."
         )
 
 
@@ -179,7 +218,8 @@ def selected_frames(memory: MemoryModule, history: History, step: int) -> np.nda
     """
     if not memory.timed:
         raise UserError(
-            f"{type(memory).__name__} makes a state of all frames that it reads and keeps none: score one that selects."
+            f"{type(memory).__name__} makes a state of all frames that it reads and keeps none:"
+            " score one that selects."
         )
     if memory.capacity <= memory.budget:
         return np.unique(memory.select(history, step)[:, 0])
@@ -189,7 +229,9 @@ def selected_frames(memory: MemoryModule, history: History, step: int) -> np.nda
 
 
 def reads_tokens(memory: MemoryModule) -> bool:
-    """Whether a memory reads vision tokens to choose its frames, tried on an episode of `LONGEST` frames."""
+    """Whether a memory reads vision tokens to choose its frames, tried on an episode of `LONGEST`
+    frames.
+    """
     stored = memory.storage.stored_frames(LONGEST)
     history = TokenlessHistory(memory.storage, np.zeros(0), stored, LONGEST)
     history.motion, history.state_width = torch.zeros(LONGEST, 8).__getitem__, 8
@@ -201,7 +243,9 @@ def reads_tokens(memory: MemoryModule) -> bool:
 
 
 def required_frames(memory: MemoryModule) -> frozenset[int]:
-    """The frames that have to be rendered for a memory to select: scored ones, and all stored if it reads tokens."""
+    """The frames that have to be rendered for a memory to select: scored ones, and all stored if it
+    reads tokens.
+    """
     frames = frames_scored(memory, LONGEST)
     if reads_tokens(memory):
         frames = np.union1d(frames, memory.storage.stored_frames(LONGEST))
@@ -209,23 +253,33 @@ def required_frames(memory: MemoryModule) -> frozenset[int]:
 
 
 def memory_selection(
-    memory: MemoryModule, episode: EvidenceEpisode, states: torch.Tensor, policy: "MMEPolicy | None" = None
+    memory: MemoryModule,
+    episode: EvidenceEpisode,
+    states: torch.Tensor,
+    policy: "MMEPolicy | None" = None,
 ) -> Selection:
     """What a memory keeps along an episode.
 
     Args:
-        states: of the robot, normalised [t, s]. policy: makes the tokens; None where the memory reads none to choose.
+        states: of the robot, normalised [t, s]. policy: makes the tokens; None where the memory
+            reads none to choose.
     """
     stored, scorer = memory.storage.stored_frames(episode.length), make_scorer(memory)
-    rows = {} if scorer is None else {t: scorer(t, episode.images[t]) for t in sorted(episode.images)}
+    rows = (
+        {} if scorer is None else {t: scorer(t, episode.images[t]) for t in sorted(episode.images)}
+    )
     values = {t: row for t, row in rows.items() if row is not None}
-    scores = FrameScores(np.array(list(values)), np.stack(list(values.values()))) if values else None
+    scores = (
+        FrameScores(np.array(list(values)), np.stack(list(values.values()))) if values else None
+    )
     context = memory.storage, stored, episode.length, scores, episode.exec_start
     history: CachedHistory
     if policy is None:
         history = TokenlessHistory(context[0], np.zeros(0), *context[1:])
     else:
-        tokens = policy.encode_frames(np.stack([episode.images[t] for t in stored.tolist()])).float()
+        tokens = policy.encode_frames(
+            np.stack([episode.images[t] for t in stored.tolist()])
+        ).float()
         history = CachedHistory(context[0], tokens.cpu().numpy(), *context[1:])
     history.motion, history.state_width = states.__getitem__, states.shape[1]
     return lambda step: selected_frames(memory, history, step)
@@ -243,8 +297,9 @@ def score_writing(
     Args:
         selector: a memory, or a name of `REFERENCES`.
         episodes: with the images of `required_frames`.
-        policy: the memory's own. Its statistics normalise states, and its vision tower makes tokens where the memory
-            reads them to choose. Without it the statistics are those of the episodes.
+        policy: the memory's own. Its statistics normalise states, and its vision tower makes tokens
+            where the memory reads them to choose. Without it the statistics are those of the
+            episodes.
         stride: frames between two steps.
 
     Raises:
@@ -257,7 +312,9 @@ def score_writing(
     if policy is None:
         normalised = normalised_states(raw)
     else:
-        normalised = normalize(torch.from_numpy(raw), policy.require_processor().require_stats().state)
+        normalised = normalize(
+            torch.from_numpy(raw), policy.require_processor().require_stats().state
+        )
     states = normalised.split([episode.length for episode in episodes])
     tower = policy if isinstance(selector, MemoryModule) and reads_tokens(selector) else None
     for episode, motion in zip(episodes, states, strict=True):
@@ -272,21 +329,33 @@ def score_writing(
 
 
 def writing_table(results: Mapping[str, Writing]) -> str:
-    """Two Markdown tables: the means of each memory, and the score of each in every task with chance behind it.
+    """Two Markdown tables: the means of each memory, and the score of each in every task with
+    chance behind it.
 
     Memories that were scored on no episode are left out.
     """
     rows = {name: writing.to_dict() for name, writing in results.items() if writing.tasks}
-    lines = ["| memory | score | chance | precision | recall | lag | held |", "|---|---:|---:|---:|---:|---:|---:|"]
+    lines = [
+        "| memory | score | chance | precision | recall | lag | held |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
     for name, row in rows.items():
         mean = row["mean"]
-        shares = " | ".join(f"{mean[key]:.2f}" for key in ("score", "chance", "precision", "recall"))
+        shares = " | ".join(
+            f"{mean[key]:.2f}" for key in ("score", "chance", "precision", "recall")
+        )
         lag = "" if mean["lag"] is None else f"{mean['lag']:.0f}"
         lines.append(f"| `{name}` | {shares} | {lag} | {mean['held']:.2f} |")
     tasks = list(dict.fromkeys(task for row in rows.values() for task in row["tasks"]))
-    lines += ["", f"| task | {' | '.join(f'`{name}`' for name in rows)} |", "|---|" + "---:|" * len(rows)]
+    lines += [
+        "",
+        f"| task | {' | '.join(f'`{name}`' for name in rows)} |",
+        "|---|" + "---:|" * len(rows),
+    ]
     for task in tasks:
         cells = [row["tasks"].get(task) for row in rows.values()]
-        texts = ("" if cell is None else f"{cell['score']:.2f} ({cell['chance']:.2f})" for cell in cells)
+        texts = (
+            "" if cell is None else f"{cell['score']:.2f} ({cell['chance']:.2f})" for cell in cells
+        )
         lines.append(f"| {task} | {' | '.join(texts)} |")
     return "\n".join(lines) + "\n"

@@ -30,10 +30,11 @@ DEFAULT = "pi05"
 class Sample:
     """One training step as it is recorded, with the frames of the window before it.
 
-    views: camera → images [t, H, W, 3] uint8, in the embodiment's order, the current one last. states: [t, s].
-    goal: the task in words; subgoal: its current part, where the policy reads one.
-    past_actions: [n, w] the robot's own actions right before the chunk. actions: [h, w] the chunk, absolute.
-    notes: texts of the prompt's notes by name. written: the lines that the policy should write at this step.
+    views: camera → images [t, H, W, 3] uint8, in the embodiment's order, the current one last.
+    states: [t, s]. goal: the task in words; subgoal: its current part, where the policy reads one.
+    past_actions: [n, w] the robot's own actions right before the chunk. actions: [h, w] the chunk,
+    absolute. notes: texts of the prompt's notes by name. written: the lines that the policy should
+    write at this step.
     """
 
     views: Mapping[str, np.ndarray]
@@ -51,12 +52,13 @@ class SampleSpec:
     """What a training sample and an observation consist of.
 
     kind: `steps` of an execution, or `keyframes` with depth.
-    window: frames of an observation, the current one last; before the episode's start its first frame is repeated.
-    consecutive: the frames of the window follow each other; else they are those at which the policy acted.
-    full_chunks_only: leave out steps with fewer recorded actions ahead than a chunk has.
-    group_size: steps of one episode in a sample; more than 1 for policies that train on sequences.
-    cameras: whose images an item holds, in the embodiment's order; None for all.
-    history: from a step to the frames of the memory camera that an item holds, the current one last; the other cameras
+    window: frames of an observation, the current one last; before the episode's start its first
+    frame is repeated. consecutive: the frames of the window follow each other; else they are those
+    at which the policy acted. full_chunks_only: leave out steps with fewer recorded actions ahead
+    than a chunk has. group_size: steps of one episode in a sample; more than 1 for policies that
+    train on sequences. cameras: whose images an item holds, in the embodiment's order; None for
+    all. history: from a step to the frames of the memory camera that an item holds, the current one
+    last; the other cameras
         then have the current image alone. None for the window of all cameras.
     """
 
@@ -75,9 +77,9 @@ class PromptSpec:
 
     encoder: what turns text into numbers, for reports. name: of the prompt format, for messages.
     reads_subgoal: whether the prompt has a subgoal. past_actions: executed actions in it.
-    fingerprint: equal for two processors only if text means the same numbers to both; None if that needs no check.
-    notes: names of the notes in it; such a processor's `prompt` takes them as `notes`. writes: those that the policy
-    learns to write.
+    fingerprint: equal for two processors only if text means the same numbers to both; None if that
+    needs no check. notes: names of the notes in it; such a processor's `prompt` takes them as
+    `notes`. writes: those that the policy learns to write.
     """
 
     encoder: str
@@ -93,11 +95,12 @@ class PromptSpec:
 class StatsSpec:
     """What normalisation statistics are computed from.
 
-    horizon: chunk steps of each observation, relative if the embodiment says so; None for the full chunk.
-    every: every execution step once, in the data's order; else shuffled batches without an incomplete last one, as the
+    horizon: chunk steps of each observation, relative if the embodiment says so; None for the full
+    chunk. every: every execution step once, in the data's order; else shuffled batches without an
+    incomplete last one, as the
         released code of π0.5 does.
-    extremes: keep the smallest and largest values too. exact: quantiles of all rows, not of a histogram.
-    bounds: what becomes −1 and 1, `quantiles` or `extremes`.
+    extremes: keep the smallest and largest values too. exact: quantiles of all rows, not of a
+    histogram. bounds: what becomes −1 and 1, `quantiles` or `extremes`.
     video: include the steps of the conditioning video.
     """
 
@@ -112,8 +115,8 @@ class StatsSpec:
 class PolicyProcessor:
     """Everything between raw data and one kind of network, saved with every checkpoint.
 
-    Training, evaluation and serving share it. A subclass registers in `PROCESSORS`, sets `embodiment` (then `stats`),
-    and implements what raises NotImplementedError.
+    Training, evaluation and serving share it. A subclass registers in `PROCESSORS`, sets
+    `embodiment` (then `stats`), and implements what raises NotImplementedError.
     """
 
     embodiment: Embodiment
@@ -138,8 +141,9 @@ class PolicyProcessor:
             widths = len(stats.state), len(stats.actions)
             require(
                 widths == (robot.state.width, robot.action.width),
-                f"Statistics of {widths[0]}-number states and {widths[1]}-number actions are not those of "
-                f"{robot.name!r}, which has {robot.state.width} and {robot.action.width}: give this robot's.",
+                f"Statistics of {widths[0]}-number states and {widths[1]}-number actions are not"
+                f" those of {robot.name!r}, which has {robot.state.width} and {robot.action.width}:"
+                " give this robot's.",
             )
         self._stats = stats
 
@@ -147,15 +151,17 @@ class PolicyProcessor:
         """Return the statistics, or raise a `UserError`."""
         if self._stats is None:
             raise UserError(
-                "States and actions need normalisation statistics, and this processor has none. Training computes them "
-                "from its data; otherwise set processor.stats to a norm_stats.json (one is in every checkpoint)."
+                "States and actions need normalisation statistics, and this processor has none."
+                " Training computes them from its data; otherwise set processor.stats to a"
+                " norm_stats.json (one is in every checkpoint)."
             )
         return self._stats
 
     # Observations
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Images of all cameras in the embodiment's order, [H, W, 3] or [n, H, W, 3] each, as the network takes them.
+        """Images of all cameras in the embodiment's order, [H, W, 3] or [n, H, W, 3] each, as the
+        network takes them.
 
         Returns:
             uint8 [v, 3, s, s'], or [n, v, 3, s, s'].
@@ -184,27 +190,33 @@ class PolicyProcessor:
         raise NotImplementedError
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
-        """The network's chunk [..., h, a] at raw states [..., s] as actions [..., h, w] that the robot executes."""
+        """The network's chunk [..., h, a] at raw states [..., s] as actions [..., h, w] that the
+        robot executes.
+        """
         raise NotImplementedError
 
     # Batches
 
     def item(self, sample: Any) -> dict[str, Any]:
-        """One training sample without a batch axis, for `collate`: of a `Sample`, or of a run of keyframes."""
+        """One training sample without a batch axis, for `collate`: of a `Sample`, or of a run of
+        keyframes.
+        """
         raise NotImplementedError
 
     def collate(self, items: Sequence[dict[str, Any]]) -> Any:
         """Items as the batch that the policy reads: an object with `to`.
 
-        An item may also hold `history` (a memory's selection), `action_mask` [h], `weight` [] and `labels` (by name),
-        which the dataset adds.
+        An item may also hold `history` (a memory's selection), `action_mask` [h], `weight` [] and
+        `labels` (by name), which the dataset adds.
         """
         raise NotImplementedError
 
     # Folders
 
     def to_config(self) -> dict[str, Any]:
-        """Describe this processor as `processor.json` does; file names are relative to the folder `save` wrote."""
+        """Describe this processor as `processor.json` does; file names are relative to the folder
+        `save` wrote.
+        """
         raise NotImplementedError
 
     def save(self, folder: Path | str) -> list[str]:
@@ -232,17 +244,24 @@ class PolicyProcessor:
 class HasMemoryImages(Protocol):
     """A processor for networks whose memory stores vision tokens."""
 
-    def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
-        """Resize memory frames [n, H, W, 3] uint8 for the vision tower, on `device` if one is given."""
+    def memory_images(
+        self, frames: np.ndarray | Tensor, device: torch.device | str | None = None
+    ) -> Tensor:
+        """Resize memory frames [n, H, W, 3] uint8 for the vision tower, on `device` if one is
+        given.
+        """
         ...
 
 
-def motion_rows(processor: PolicyProcessor, states: np.ndarray, actions: np.ndarray, known: np.ndarray) -> Tensor:
+def motion_rows(
+    processor: PolicyProcessor, states: np.ndarray, actions: np.ndarray, known: np.ndarray
+) -> Tensor:
     """What a memory of the robot's own motion reads of t frames: [t, s + w + 1] float32.
 
     Args:
-        states: [t, s] raw. actions: [t, w] absolute, each the one that led to its frame. known: bool [t], False where
-            no action of the robot led to the frame; the values in `actions` are ignored there.
+        states: [t, s] raw. actions: [t, w] absolute, each the one that led to its frame. known:
+            bool [t], False where no action of the robot led to the frame; the values in `actions`
+            are ignored there.
 
     Returns:
         [state | action relative to it | known], normalised; actions are 0 where they are not known.
@@ -252,15 +271,21 @@ def motion_rows(processor: PolicyProcessor, states: np.ndarray, actions: np.ndar
     done = torch.from_numpy(np.asarray(actions, np.float32))
     is_known = torch.from_numpy(np.asarray(known, np.float32))[:, None]
     relative = processor.embodiment.action.to_relative(done[:, None], proprio)[:, 0]
-    return torch.cat([normalize(proprio, stats.state), normalize(relative, stats.actions) * is_known, is_known], 1)
+    return torch.cat(
+        [normalize(proprio, stats.state), normalize(relative, stats.actions) * is_known, is_known],
+        1,
+    )
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
     """Read `processor.json` of a checkpoint."""
     require(
-        (folder / CONFIG_FILE).is_file(), f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library."
+        (folder / CONFIG_FILE).is_file(),
+        f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library.",
     )
-    settings: dict[str, Any] = read_json(checked_file(folder, CONFIG_FILE), "a processor's settings", limit=2**20)
+    settings: dict[str, Any] = read_json(
+        checked_file(folder, CONFIG_FILE), "a processor's settings", limit=2**20
+    )
     return settings
 
 
@@ -272,7 +297,9 @@ def load_processor(folder: Path | str, tokenizer: Path | str | None = None) -> P
 
 
 def collate(items: Sequence[dict[str, Any]]) -> Batch:
-    """Stack items of one dataset into a `Batch`, without the prompt padding that none of them uses."""
+    """Stack items of one dataset into a `Batch`, without the prompt padding that none
+    of them uses.
+    """
 
     def stack(name: str) -> Tensor:
         return torch.stack([item[name] for item in items])
@@ -283,14 +310,19 @@ def collate(items: Sequence[dict[str, Any]]) -> Batch:
         image_mask=torch.ones(images.shape[:2], dtype=torch.bool),
         prompt=stack("prompt"),
         prompt_mask=stack("prompt_mask"),
-        history=stack_history([item["history"] for item in items]) if "history" in items[0] else None,
+        history=stack_history([item["history"] for item in items])
+        if "history" in items[0]
+        else None,
         actions=stack("actions"),
         action_mask=stack("action_mask") if "action_mask" in items[0] else None,
         state=stack("state"),
         past=stack_past([item.get("past") for item in items]),
         weight=stack("weight") if "weight" in items[0] else None,
         labels=Labels(
-            {name: torch.stack([item["labels"][name] for item in items]) for name in items[0].get("labels", ())}
+            {
+                name: torch.stack([item["labels"][name] for item in items])
+                for name in items[0].get("labels", ())
+            }
         ),
     )
     return batch.without_prompt_padding()

@@ -1,7 +1,8 @@
 """Images between camera and vision tower: two resize paths, as released.
 
-The current observation goes through Pillow on uint8; memory frames go through an antialiased float resize.
-The two differ by rounding only, yet the released weights were trained with exactly this pair.
+The current observation goes through Pillow on uint8; memory frames go through an antialiased float
+resize. The two differ by rounding only, yet the released weights were trained with exactly this
+pair.
 """
 
 import math
@@ -18,7 +19,8 @@ from mme_vla.types import FrameBatch, PastViews
 
 
 def resize_with_pad_uint8(frames: np.ndarray, size: tuple[int, int] | int) -> np.ndarray:
-    """Resize with Pillow's bilinear filter, keeping the aspect ratio, on a black canvas: the path of current views.
+    """Resize with Pillow's bilinear filter, keeping the aspect ratio, on a black canvas: the path
+    of current views.
 
     Args:
         frames: [..., H, W, 3] uint8.
@@ -39,13 +41,16 @@ def resize_with_pad_uint8(frames: np.ndarray, size: tuple[int, int] | int) -> np
     inner_h, inner_w, top, left = _fit(frames.shape[-3], frames.shape[-2], height, width)
     canvas = np.zeros((*frames.shape[:-3], height, width, 3), np.uint8)
     for index in np.ndindex(frames.shape[:-3]):
-        resized = Image.fromarray(frames[index]).resize((inner_w, inner_h), Image.Resampling.BILINEAR)
+        resized = Image.fromarray(frames[index]).resize(
+            (inner_w, inner_h), Image.Resampling.BILINEAR
+        )
         canvas[index][top : top + inner_h, left : left + inner_w] = np.asarray(resized)
     return canvas
 
 
 def resize_with_pad(images: Tensor, size: tuple[int, int] | int) -> Tensor:
-    """Resize with an antialiased bilinear filter, keeping the aspect ratio: the path of memory frames.
+    """Resize with an antialiased bilinear filter, keeping the aspect ratio: the path of memory
+    frames.
 
     Args:
         images: [n, H, W, 3], uint8 or float in [-1, 1].
@@ -55,7 +60,8 @@ def resize_with_pad(images: Tensor, size: tuple[int, int] | int) -> Tensor:
         [n, 3, h, w] float32 in [-1, 1], on the device of `images`.
     """
     require(
-        images.ndim == 4 and images.shape[-1] == 3, f"Expected images [n, height, width, 3], got {list(images.shape)}."
+        images.ndim == 4 and images.shape[-1] == 3,
+        f"Expected images [n, height, width, 3], got {list(images.shape)}.",
     )
     require(
         not (images.dtype != torch.uint8 and not images.is_floating_point()),
@@ -63,11 +69,15 @@ def resize_with_pad(images: Tensor, size: tuple[int, int] | int) -> Tensor:
     )
     height, width = _pair(size)
     channels_first = images.movedim(-1, 1)
-    source = to_unit_range(channels_first) if images.dtype == torch.uint8 else channels_first.float()
+    source = (
+        to_unit_range(channels_first) if images.dtype == torch.uint8 else channels_first.float()
+    )
     if source.shape[-2:] == (height, width):
         return source.contiguous()
     inner_h, inner_w, top, left = _fit(source.shape[-2], source.shape[-1], height, width)
-    resized = functional.interpolate(source, (inner_h, inner_w), mode="bilinear", antialias=True, align_corners=False)
+    resized = functional.interpolate(
+        source, (inner_h, inner_w), mode="bilinear", antialias=True, align_corners=False
+    )
     borders = (left, width - inner_w - left, top, height - inner_h - top)
     return functional.pad(resized.clamp(-1, 1), borders, value=-1.0)
 
@@ -81,15 +91,20 @@ def to_unit_range(images: Tensor) -> Tensor:
 def as_uint8_frames(image: np.ndarray | Tensor) -> np.ndarray:
     """Bring one image, or a stack of them, into the form the resize expects: uint8, channels last.
 
-    Accepts uint8, or float in [0, 1] (mapped by truncating 255·x, as released), with the channels last or first.
+    Accepts uint8, or float in [0, 1] (mapped by truncating 255·x, as released), with the channels
+    last or first.
     """
     array = image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
     require(
-        array.ndim in (3, 4), f"Expected an image [H, W, 3] or a stack [n, H, W, 3], got shape {list(array.shape)}."
+        array.ndim in (3, 4),
+        f"Expected an image [H, W, 3] or a stack [n, H, W, 3], got shape {list(array.shape)}.",
     )
     if array.shape[-1] != 3 and array.shape[-3] == 3:
         array = np.moveaxis(array, -3, -1)
-    require(array.shape[-1] == 3, f"Expected RGB images (three channels first or last), got shape {list(array.shape)}.")
+    require(
+        array.shape[-1] == 3,
+        f"Expected RGB images (three channels first or last), got shape {list(array.shape)}.",
+    )
     if np.issubdtype(array.dtype, np.floating):
         low, high = (array.min(), array.max()) if array.size else (0, 0)
         require(
@@ -97,7 +112,10 @@ def as_uint8_frames(image: np.ndarray | Tensor) -> np.ndarray:
             f"Float images must lie in [0, 1], got values from {low:g} to {high:g}: divide by 255.",
         )
         return (255 * array).astype(np.uint8)
-    require(array.dtype == np.uint8, f"Expected images as uint8, or as float in [0, 1]; got {array.dtype}.")
+    require(
+        array.dtype == np.uint8,
+        f"Expected images as uint8, or as float in [0, 1]; got {array.dtype}.",
+    )
     return array
 
 
@@ -106,7 +124,9 @@ def _pair(size: tuple[int, int] | int) -> tuple[int, int]:
 
 
 def _fit(source_h: int, source_w: int, height: int, width: int) -> tuple[int, int, int, int]:
-    """Say how large the image becomes inside (height, width) and where it sits: (h, w, top, left)."""
+    """Say how large the image becomes inside (height, width) and where it sits: (h, w,
+    top, left).
+    """
     ratio = max(source_w / width, source_h / height)
     inner_h, inner_w = int(source_h / ratio), int(source_w / ratio)
     return inner_h, inner_w, (height - inner_h) // 2, (width - inner_w) // 2
@@ -117,7 +137,9 @@ Prepare = Callable[[Sequence[np.ndarray]], Tensor]
 
 
 class PastImages:
-    """An episode's recent images, as far back as a memory reads past views; prepared only when they are read."""
+    """An episode's recent images, as far back as a memory reads past views; prepared only when they
+    are read.
+    """
 
     def __init__(self, spec: PastViewSpec) -> None:
         self.spec = spec
@@ -130,7 +152,11 @@ class PastImages:
         self._count += next(iter(views.values())).length
         oldest = self._count - 1 - self.spec.span
         for frame in range(max(oldest, first), self._count):
-            images = [image.copy() for view in views.values() if (image := view.image(frame - first)) is not None]
+            images = [
+                image.copy()
+                for view in views.values()
+                if (image := view.image(frame - first)) is not None
+            ]
             if len(images) == len(views):
                 self._frames[frame] = images
         self._frames = {frame: images for frame, images in self._frames.items() if frame >= oldest}
@@ -143,15 +169,18 @@ class PastImages:
         lacking = [frame for frame in frames.tolist() if frame not in self._frames]
         if lacking:
             raise UserError(
-                f"This policy looks back at the frames {lacking[:5]}, which were not rendered by every camera: observe "
-                "all images of the frames in `frames_read`."
+                f"This policy looks back at the frames {lacking[:5]}, which were not rendered by"
+                " every camera: observe all images of the frames in `frames_read`."
             )
         stored = [self._frames[frame] for frame in frames.tolist()]
         return [np.stack(of_camera) for of_camera in zip(*stored, strict=True)]
 
 
 def past_views(
-    spec: PastViewSpec, step: int, read: Callable[[np.ndarray], Sequence[np.ndarray]], prepare: Prepare
+    spec: PastViewSpec,
+    step: int,
+    read: Callable[[np.ndarray], Sequence[np.ndarray]],
+    prepare: Prepare,
 ) -> PastViews:
     """Past views of a step, unbatched; where there is no such frame yet, masked black images.
 
@@ -175,27 +204,37 @@ def stack_past(items: Sequence[PastViews | None]) -> PastViews | None:
     if not present:
         return None
     return PastViews(
-        torch.stack([item.images for item in present]), torch.stack([item.mask for item in present]), present[0].every
+        torch.stack([item.images for item in present]),
+        torch.stack([item.mask for item in present]),
+        present[0].every,
     )
 
 
-def full_past(spec: PastViewSpec | None, views: int, size: int, device: torch.device | str) -> PastViews | None:
+def full_past(
+    spec: PastViewSpec | None, views: int, size: int, device: torch.device | str
+) -> PastViews | None:
     """Past views of a batch of one, all there and without content."""
     if spec is None:
         return None
     images = torch.zeros(1, spec.frames - 1, views, 3, size, size, dtype=torch.uint8, device=device)
-    return PastViews(images, torch.ones(images.shape[:2], dtype=torch.bool, device=device), spec.every)
+    return PastViews(
+        images, torch.ones(images.shape[:2], dtype=torch.bool, device=device), spec.every
+    )
 
 
 CROP = 0.95  # side of the crop, rounded down to whole pixels: 212 of 224
 ROTATION = math.radians(5)
 JITTER_PROBABILITY = 0.5
 BRIGHTNESS, CONTRAST, HUE = 0.3, 0.4, 0.1
-NUMBERS = 7  # random numbers a sample: place of the crop (2), angle, brightness, contrast, hue, whether it is coloured
+# random numbers a sample: place of the crop (2), angle, brightness, contrast, hue, whether it is
+# coloured
+NUMBERS = 7
 
 
 def augmentation_draws(count: int, generator: torch.Generator | None = None) -> Tensor:
-    """The random numbers of `count` samples, uniform [count, 7] on the CPU: none depends on which cameras there are."""
+    """The random numbers of `count` samples, uniform [count, 7] on the CPU: none depends on which
+    cameras there are.
+    """
     return torch.rand(count, NUMBERS, generator=generator)
 
 
@@ -207,7 +246,8 @@ def augment_views(images: Tensor, augmentations: Sequence[str], draws: Tensor) -
 
     Args:
         images: [b, v, 3, s, s] float in [-1, 1].
-        augmentations: what is done to each of the v views: `all`, `colour` (neither cropped nor rotated) or `none`.
+        augmentations: what is done to each of the v views: `all`, `colour` (neither cropped nor
+            rotated) or `none`.
         draws: [b, 7] as `augmentation_draws` makes them, on that device.
 
     Returns:
@@ -218,10 +258,16 @@ def augment_views(images: Tensor, augmentations: Sequence[str], draws: Tensor) -
         f"Expected square images [b, v, 3, s, s], got {list(images.shape)}.",
     )
     if images.shape[1] != len(augmentations):
-        raise UserError(f"Got {images.shape[1]} views but {len(augmentations)} cameras are described.")
+        raise UserError(
+            f"Got {images.shape[1]} views but {len(augmentations)} cameras are described."
+        )
     symmetric = draws[:, :6] * 2 - 1
     offset, angle = symmetric[:, :2], symmetric[:, 2] * ROTATION
-    brightness, contrast, hue = symmetric[:, 3] * BRIGHTNESS, symmetric[:, 4] * CONTRAST, symmetric[:, 5] * HUE
+    brightness, contrast, hue = (
+        symmetric[:, 3] * BRIGHTNESS,
+        symmetric[:, 4] * CONTRAST,
+        symmetric[:, 5] * HUE,
+    )
     jittered = (draws[:, 6] < JITTER_PROBABILITY)[:, None, None, None]
 
     pixels = (images.float() + 1) / 2  # in [0, 1] the zero fill of the resampling is black
@@ -243,17 +289,24 @@ def crop_and_rotate(pixels: Tensor, offset: Tensor, angle: Tensor) -> Tensor:
 
     Args:
         pixels: [b, v, 3, s, s] in [0, 1].
-        offset: [b, 2] in [-1, 1]; where the crop lies between its extreme places, (x, y), sub-pixel.
+        offset: [b, 2] in [-1, 1]; where the crop lies between its extreme places, (x, y),
+            sub-pixel.
         angle: [b] radians.
     """
     batch, views, _, size, _ = pixels.shape
     scale = int(CROP * size) / size
     cos, sin = scale * angle.cos(), scale * angle.sin()
     shift = (1 - scale) * offset
-    rows = torch.stack([torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)], 1)
+    rows = torch.stack(
+        [torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)], 1
+    )
     grid = functional.affine_grid(rows, [batch, 1, size, size], align_corners=False)
-    stacked = pixels.flatten(1, 2)  # the views of a sample move together: as channels they share one grid
-    warped = functional.grid_sample(stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    stacked = pixels.flatten(
+        1, 2
+    )  # the views of a sample move together: as channels they share one grid
+    warped = functional.grid_sample(
+        stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False
+    )
     return warped.unflatten(1, (views, 3))
 
 
@@ -268,12 +321,17 @@ def jitter_colours(pixels: Tensor, brightness: Tensor, contrast: Tensor, hue: Te
     """
     brightness, contrast, hue = (x[:, None, None, None] for x in (brightness, contrast, hue))
     h, s, value = rgb_to_hsv(pixels)
-    value = torch.where(brightness < 0, value * (1 + brightness), value * (1 - brightness) + brightness)
-    # A line of slope k through the middle, continued by lines of slope 1/k that end in black and in white.
+    value = torch.where(
+        brightness < 0, value * (1 + brightness), value * (1 - brightness) + brightness
+    )
+    # A line of slope k through the middle, continued by lines of slope 1/k that end in black and in
+    # white.
     k = torch.tan((contrast + 1) * (math.pi / 4))
     knee = k / (2 * (1 + k))
     middle = k * (value - 0.5) + 0.5
-    value = torch.where(value < knee, value / k, torch.where(value > 1 - knee, (value - 1) / k + 1, middle))
+    value = torch.where(
+        value < knee, value / k, torch.where(value > 1 - knee, (value - 1) / k + 1, middle)
+    )
     return hsv_to_rgb(h + hue, s, value)
 
 

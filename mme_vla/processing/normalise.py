@@ -1,4 +1,6 @@
-"""Normalisation of states and actions by quantiles or by extremes, and the running statistics it needs."""
+"""Normalisation of states and actions by quantiles or by extremes, and the running statistics it
+needs.
+"""
 
 import json
 from collections.abc import Mapping
@@ -39,8 +41,9 @@ class QuantileStats:
             return self.q01, self.q99
         if self.min is None or self.max is None:
             raise UserError(
-                "This policy normalises by the smallest and largest values, and these statistics hold none (min, max): "
-                "compute them from its data, or give the stats.json of its own training."
+                "This policy normalises by the smallest and largest values, and these statistics"
+                " hold none (min, max): compute them from its data, or give the stats.json of its"
+                " own training."
             )
         return self.min, self.max
 
@@ -58,20 +61,31 @@ class QuantileStats:
                 if field.name in ("min", "max"):
                     continue
                 keys = listed(sorted(data))
-                raise UserError(f"Normalisation statistics for {name!r} lack {field.name!r}; they hold {keys}.")
+                raise UserError(
+                    f"Normalisation statistics for {name!r} lack {field.name!r}; they hold {keys}."
+                )
             try:
                 array = np.asarray(data[field.name], dtype=np.float64)
             except (TypeError, ValueError, OverflowError):
                 array = np.full(1, np.nan)
             if array.ndim != 1 or not np.isfinite(array).all():
-                raise UserError(f"{name}.{field.name} must be a list of finite numbers, got {brief(data[field.name])}.")
+                raise UserError(
+                    f"{name}.{field.name} must be a list of finite numbers, got"
+                    f" {brief(data[field.name])}."
+                )
             arrays[field.name] = array
         if len({len(array) for array in arrays.values()}) > 1:
-            raise UserError(f"{name}: the lists have different lengths { {k: len(v) for k, v in arrays.items()} }.")
+            raise UserError(
+                f"{name}: the lists have different lengths"
+                f" { {k: len(v) for k, v in arrays.items()} }."
+            )
         for low, high in (("q01", "q99"), ("min", "max")):
             if high in arrays and low in arrays:
                 ordered = (arrays[low] <= arrays[high]).all()
-                require(ordered, f"{name}: {high} lies below {low} in a dimension; the statistics are damaged.")
+                require(
+                    ordered,
+                    f"{name}: {high} lies below {low} in a dimension; the statistics are damaged.",
+                )
         return cls(**arrays)
 
 
@@ -83,7 +97,12 @@ class NormStats:
     actions: QuantileStats
 
     @classmethod
-    def unit(cls, state_width: int, action_width: int, ranges: Mapping[int, tuple[float, float]] | None = None) -> Self:
+    def unit(
+        cls,
+        state_width: int,
+        action_width: int,
+        ranges: Mapping[int, tuple[float, float]] | None = None,
+    ) -> Self:
         """Statistics that leave numbers about as they are: −1 and 1 stay.
 
         Args:
@@ -94,7 +113,11 @@ class NormStats:
             low, high = -np.ones(width), np.ones(width)
             for place, ends in given.items():
                 low[place], high[place] = ends
-            sides.append(QuantileStats((low + high) / 2, (high - low) / 2, low, high, low.copy(), high.copy()))
+            sides.append(
+                QuantileStats(
+                    (low + high) / 2, (high - low) / 2, low, high, low.copy(), high.copy()
+                )
+            )
         return cls(*sides)
 
     def to_dict(self) -> dict[str, Any]:
@@ -105,12 +128,17 @@ class NormStats:
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """Read the layout of openpi's `norm_stats.json`."""
         inner = data.get("norm_stats")
-        if not isinstance(inner, dict) or not all(isinstance(inner.get(key), dict) for key in ("state", "actions")):
+        if not isinstance(inner, dict) or not all(
+            isinstance(inner.get(key), dict) for key in ("state", "actions")
+        ):
             raise UserError(
-                'Normalisation statistics must look like {"norm_stats": {"state": {…}, "actions": {…}}}; '
-                f"got the keys {listed(sorted(inner if isinstance(inner, dict) else data))}."
+                'Normalisation statistics must look like {"norm_stats": {"state": {…},'
+                ' "actions": {…}}}; got the keys'
+                f" {listed(sorted(inner if isinstance(inner, dict) else data))}."
             )
-        return cls(**{key: QuantileStats.from_dict(inner[key], key) for key in ("state", "actions")})
+        return cls(
+            **{key: QuantileStats.from_dict(inner[key], key) for key in ("state", "actions")}
+        )
 
     def save(self, path: Path | str) -> None:
         Path(path).write_text(json.dumps(self.to_dict(), indent=2) + "\n")
@@ -127,7 +155,8 @@ class NormStats:
 
 
 def normalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tensor:
-    """Map [q01, q99] to [-1, 1] in the first `len(stats)` dimensions of x [..., d]; the others pass.
+    """Map [q01, q99] to [-1, 1] in the first `len(stats)` dimensions of x [..., d]; the others
+    pass.
 
     Nothing is clipped. With `by="extremes"` it is [min, max] that is mapped.
     """
@@ -149,14 +178,17 @@ def unnormalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tenso
 def _range(x: Tensor, stats: QuantileStats, by: str) -> tuple[Tensor, Tensor]:
     require(x.is_floating_point(), f"Only floating-point values can be normalised, got {x.dtype}.")
     require(
-        x.shape[-1] >= len(stats), f"Statistics of {len(stats)} dimensions do not fit values of shape {list(x.shape)}."
+        x.shape[-1] >= len(stats),
+        f"Statistics of {len(stats)} dimensions do not fit values of shape {list(x.shape)}.",
     )
     low, high = stats.bounds(by)
     return x.new_tensor(low), x.new_tensor(high - low + EPSILON)
 
 
 class ExactStats:
-    """Statistics of all rows at once, which it keeps: quantiles with linear interpolation, as numpy's."""
+    """Statistics of all rows at once, which it keeps: quantiles with linear interpolation, as
+    numpy's.
+    """
 
     def __init__(self) -> None:
         self._rows: list[np.ndarray] = []
@@ -166,7 +198,9 @@ class ExactStats:
         self._rows.append(np.asarray(x, np.float64).reshape(-1, x.shape[-1]))
 
     def result(self, extremes: bool = False) -> QuantileStats:
-        """Return the statistics of everything so far, with `extremes` also the smallest and the largest value."""
+        """Return the statistics of everything so far, with `extremes` also the smallest and the
+        largest value.
+        """
         count = sum(map(len, self._rows))
         require(count >= 2, f"Statistics need at least two rows, got {count}.")
         rows = np.concatenate(self._rows)
@@ -176,14 +210,17 @@ class ExactStats:
 
 
 FEWEST_BINS = 50
-"""Of a running histogram between the two quantiles; with fewer a quantile is off by more than 2 % of the range."""
+"""Of a running histogram between the two quantiles; with fewer a quantile is off by more than 2 %
+of the range.
+"""
 
 
 class _Magnitudes:
-    """A histogram of one number whose bins grow with the distance from a centre: one part in 512 of each power of two.
+    """A histogram of one number whose bins grow with the distance from a centre: one part in 512 of
+    each power of two.
 
-    Its bins are the same whatever comes later, so one value far away costs the others nothing. They are found by
-    taking numbers apart, not by a logarithm, so they are the same on every machine.
+    Its bins are the same whatever comes later, so one value far away costs the others nothing. They
+    are found by taking numbers apart, not by a logarithm, so they are the same on every machine.
     """
 
     PARTS, LEAST, MOST = 256, -60, 132  # bins of a power of two, and the powers: 1e-18 to 5e39
@@ -200,21 +237,27 @@ class _Magnitudes:
         distances = values - self._centre
         mantissas, powers = np.frexp(np.abs(distances))
         parts = ((2 * mantissas - 1) * self.PARTS).astype(np.int64)
-        bins = (np.clip(powers, self.LEAST, self.MOST - 1) - self.LEAST) * self.PARTS + np.maximum(parts, 0)
+        bins = (np.clip(powers, self.LEAST, self.MOST - 1) - self.LEAST) * self.PARTS + np.maximum(
+            parts, 0
+        )
         np.add.at(self._above, bins[distances > 0], 1)
         np.add.at(self._below, bins[distances < 0], 1)
         self._at_centre += int((distances == 0).sum())
         self._count += len(values)
 
     def quantile(self, q: float) -> float:
-        """The quantile as numpy's, between the two values nearest to it, each the middle of its bin."""
+        """The quantile as numpy's, between the two values nearest to it, each the middle of its
+        bin.
+        """
         below = np.concatenate([self._below[::-1], [self._at_centre], self._above]).cumsum()
         rank = q * (self._count - 1)
         low, high = (self._value(below, int(side)) for side in (np.floor(rank), np.ceil(rank)))
         return low + (high - low) * (rank - np.floor(rank))
 
     def _value(self, below: np.ndarray, rank: int) -> float:
-        """About the value of a rank from 0; below: counts of values up to each bin, from the lowest on."""
+        """About the value of a rank from 0; below: counts of values up to each bin, from the lowest
+        on.
+        """
         place = int(np.searchsorted(below, rank, side="right")) - len(self._below)
         if place == 0:
             return self._centre
@@ -226,13 +269,15 @@ class _Magnitudes:
 class RunningStats:
     """Mean, deviation and quantiles of a stream too long to keep, in one pass.
 
-    Quantiles come from one histogram per dimension, laid over the range seen so far. When the range grows, every old
-    bin's count moves to the new bin that holds its left edge. A quantile q is the left edge of the first bin at which
-    the cumulative count reaches q·n. All as released, so that the same data give the same `norm_stats.json`: also that
-    a first bin whose edge lies a hair outside the new range loses its count, so quantiles are approximate.
+    Quantiles come from one histogram per dimension, laid over the range seen so far. When the range
+    grows, every old bin's count moves to the new bin that holds its left edge. A quantile q is the
+    left edge of the first bin at which the cumulative count reaches q·n. All as released, so that
+    the same data give the same `norm_stats.json`: also that a first bin whose edge lies a hair
+    outside the new range loses its count, so quantiles are approximate.
 
-    One value far away makes all bins wide, and the others fall into one. Where fewer than `FEWEST_BINS` lie between the
-    quantiles, they are taken from a second histogram (`_Magnitudes`), whose bins nothing widens.
+    One value far away makes all bins wide, and the others fall into one. Where fewer than
+    `FEWEST_BINS` lie between the quantiles, they are taken from a second histogram (`_Magnitudes`),
+    whose bins nothing widens.
     """
 
     def __init__(self, bins: int = BINS) -> None:
@@ -254,7 +299,10 @@ class RunningStats:
         rows = rows.reshape(-1, rows.shape[-1])
         if not len(rows):
             return
-        require(np.isfinite(rows).all(), "Statistics need finite values, but the data contain NaN or infinity.")
+        require(
+            np.isfinite(rows).all(),
+            "Statistics need finite values, but the data contain NaN or infinity.",
+        )
         low, high = rows.min(0), rows.max(0)
         if self._count == 0:
             self._mean, self._square = np.zeros((2, rows.shape[1]))
@@ -264,7 +312,9 @@ class RunningStats:
             self._counts = np.zeros((rows.shape[1], self._bins))
             self._magnitudes = [_Magnitudes(centre) for centre in np.median(rows, axis=0)]
         elif rows.shape[1] != len(self._mean):
-            raise UserError(f"Rows of {rows.shape[1]} numbers cannot join statistics of {len(self._mean)}.")
+            raise UserError(
+                f"Rows of {rows.shape[1]} numbers cannot join statistics of {len(self._mean)}."
+            )
         elif (low < self._low).any() or (high > self._high).any():
             self._low, self._high = np.minimum(low, self._low), np.maximum(high, self._high)
             self._rebin()
@@ -278,7 +328,9 @@ class RunningStats:
             magnitudes.update(column)
 
     def result(self, extremes: bool = False) -> QuantileStats:
-        """Return the statistics of everything so far, with `extremes` also the smallest and the largest value."""
+        """Return the statistics of everything so far, with `extremes` also the smallest and the
+        largest value.
+        """
         require(self._count >= 2, f"Statistics need at least two rows, got {self._count}.")
         std = np.sqrt(np.maximum(self._square - self._mean**2, 0))
         ends = (self._low.copy(), self._high.copy()) if extremes else ()
@@ -315,15 +367,21 @@ def narrow_numbers(stats: QuantileStats, least: np.ndarray, greatest: np.ndarray
     return np.flatnonzero(reach > NARROW_RANGES * (stats.q99 - stats.q01 + EPSILON)).tolist()
 
 
-def widened(stats: QuantileStats, places: list[int], least: np.ndarray, greatest: np.ndarray) -> QuantileStats:
-    """The same statistics, q01 and q99 of these numbers moved out to the extremes [d] of their values."""
+def widened(
+    stats: QuantileStats, places: list[int], least: np.ndarray, greatest: np.ndarray
+) -> QuantileStats:
+    """The same statistics, q01 and q99 of these numbers moved out to the extremes [d] of their
+    values.
+    """
     low, high = stats.q01.copy(), stats.q99.copy()
     low[places] = np.minimum(low[places], least[places])
     high[places] = np.maximum(high[places], greatest[places])
     return replace(stats, q01=low, q99=high)
 
 
-REACH = 100  # multiples of the widest range; a broken driver says 1e30, a robot never leaves its joints' limits by that
+# multiples of the widest range; a broken driver says 1e30, a robot never leaves its joints' limits
+# by that
+REACH = 100
 
 
 def finite_array(values: object, what: str) -> np.ndarray:
@@ -333,14 +391,18 @@ def finite_array(values: object, what: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         raise UserError(f"{what} must be numbers, got {brief(values)}.") from None
     if not np.isfinite(array).all():
-        raise UserError(f"{what} must be finite numbers, got {brief(array[~np.isfinite(array)][:4].tolist())}.")
+        raise UserError(
+            f"{what} must be finite numbers, got {brief(array[~np.isfinite(array)][:4].tolist())}."
+        )
     return array
 
 
 def check_reach(values: np.ndarray, stats: QuantileStats | None, what: str) -> None:
-    """Refuse values [..., d] that lie further from the middle than `REACH` times the widest range q01…q99.
+    """Refuse values [..., d] that lie further from the middle than `REACH` times the widest range
+    q01…q99.
 
-    The widest range of all dimensions counts, so that one which hardly moved in training (a gripper) may move.
+    The widest range of all dimensions counts, so that one which hardly moved in training (a
+    gripper) may move.
     """
     if stats is None or values.shape[-1] != len(stats):
         return
@@ -350,6 +412,7 @@ def check_reach(values: np.ndarray, stats: QuantileStats | None, what: str) -> N
         place = tuple(int(i) for i in np.argwhere(beyond)[0])
         d = place[-1]
         raise UserError(
-            f"{what} has {values[place]:.4g} for number {d + 1} of {values.shape[-1]}; in the training data it lies "
-            f"within {stats.q01[d]:.4g} and {stats.q99[d]:.4g}. Check the driver and the units (radians)."
+            f"{what} has {values[place]:.4g} for number {d + 1} of {values.shape[-1]}; in the"
+            f" training data it lies within {stats.q01[d]:.4g} and {stats.q99[d]:.4g}. Check the"
+            " driver and the units (radians)."
         )

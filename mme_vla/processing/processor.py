@@ -12,7 +12,15 @@ from torch import Tensor
 from mme_vla.backbone.building import shape_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, check_choice, check_integer, did_you_mean, listed, require
+from mme_vla.errors import (
+    UserError,
+    brief,
+    check_choice,
+    check_integer,
+    did_you_mean,
+    listed,
+    require,
+)
 from mme_vla.processing.base import (
     CONFIG_FILE,
     STATS_FILE,
@@ -41,7 +49,10 @@ from mme_vla.types import Batch
 from mme_vla.utils import Sums, checked_file, inside
 
 TOKENIZER_FILE = "tokenizer.model"
-OLD_VIEWS = ["base_0_rgb", "left_wrist_0_rgb"]  # what processors named before robots could be chosen: front and wrist
+OLD_VIEWS = [
+    "base_0_rgb",
+    "left_wrist_0_rgb",
+]  # what processors named before robots could be chosen: front and wrist
 
 
 def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) -> dict[str, Any]:
@@ -54,27 +65,36 @@ def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) ->
     known = {*arguments, "tokenizer_fingerprint", "views"}
     for key in settings:
         if key not in known:
-            raise UserError(f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}")
+            raise UserError(
+                f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}"
+            )
     for key in ("image_size", "tokenizer"):
-        require(key in settings, f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.")
+        require(
+            key in settings,
+            f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.",
+        )
     PROMPTS[str(settings.get("prompt", "plain"))]  # checks the name before any file is read
     fingerprint, stats = settings.pop("tokenizer_fingerprint", None), settings.pop("stats", None)
     if (views := settings.pop("views", OLD_VIEWS)) != OLD_VIEWS:
-        raise UserError(f"processor.views={brief(views)}: cameras are named in the section 'embodiment' now.")
+        raise UserError(
+            f"processor.views={brief(views)}: cameras are named in the section 'embodiment' now."
+        )
     if (robot := settings.pop("embodiment", None)) is not None:
         settings["embodiment"] = Embodiment.from_dict(robot)
     tokenizer = Tokenizer.load(settings.pop("tokenizer"))
     require(
         not (fingerprint is not None and tokenizer.fingerprint != fingerprint),
-        f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but {brief(fingerprint)} "
-        "was used in training: its ids would mean other words. Give the file that was used.",
+        f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but"
+        f" {brief(fingerprint)} was used in training: its ids would mean other words. Give the file"
+        " that was used.",
     )
     stats = None if stats is None else NormStats.load(stats)
     return {**settings, "tokenizer": tokenizer, "stats": stats}
 
 
 def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]:
-    """Read `processor.json` of a checkpoint; check that its files are in the folder, and their checksums.
+    """Read `processor.json` of a checkpoint; check that its files are in the folder, and their
+    checksums.
 
     Args:
         tokenizer: in place of the one it names.
@@ -89,30 +109,41 @@ def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]
 
 
 def saved_file(folder: Path, name: Any, what: str) -> Path:
-    """The path of a file that a checkpoint names in itself; where the folder has checksums, it must have one."""
-    require(isinstance(name, str), f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.")
+    """The path of a file that a checkpoint names in itself; where the folder has checksums, it must
+    have one.
+    """
+    require(
+        isinstance(name, str),
+        f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.",
+    )
     return checked_file(folder, name, what)
 
 
 def saved_tokenizer(folder: Path, name: Any) -> str | Path:
-    """Which tokenizer a checkpoint means: one that ships, a file of its own, or π0.5's on the hub; no other address."""
+    """Which tokenizer a checkpoint means: one that ships, a file of its own, or π0.5's on the hub;
+    no other address.
+    """
     if name in (SAMPLE, PALIGEMMA):
         return str(name)
     if isinstance(name, str) and name.startswith(HUB):
         if (folder / TOKENIZER_FILE).is_file():
-            Sums(folder).check(TOKENIZER_FILE)  # it may be added later: its fingerprint is in processor.json
+            Sums(folder).check(
+                TOKENIZER_FILE
+            )  # it may be added later: its fingerprint is in processor.json
             return inside(folder, TOKENIZER_FILE, "tokenizer")
         raise UserError(
-            f"{folder} takes its tokenizer from the network, at {brief(name, 200)}, which is not fetched on a "
-            f"checkpoint's word. If you trust it: from_pretrained(…, tokenizer={brief(name, 200)}), or download that "
-            f"file into the folder as {TOKENIZER_FILE}."
+            f"{folder} takes its tokenizer from the network, at {brief(name, 200)}, which is not"
+            " fetched on a checkpoint's word. If you trust it: from_pretrained(…,"
+            f" tokenizer={brief(name, 200)}), or download that file into the folder as"
+            f" {TOKENIZER_FILE}."
         )
     return saved_file(folder, name, "tokenizer")
 
 
 @PROCESSORS.register("pi05")
 class Processor(PolicyProcessor):
-    """Converts raw images, text, states and actions into the network's inputs, and its chunks into actions.
+    """Converts raw images, text, states and actions into the network's inputs, and its chunks into
+    actions.
 
     Args:
         image_size: s; side of the square images the vision tower takes, in pixels.
@@ -122,10 +153,11 @@ class Processor(PolicyProcessor):
         subgoal_length: longest subgoal in it, in tokens; None for no limit of its own.
         action_dim: a; width of the network's actions, the robot's own padded with zeros.
         horizon: h; steps in a chunk; None for the embodiment's.
-        embodiment: the robot: its cameras, in the order the network sees them, its state and its actions.
+        embodiment: the robot: its cameras, in the order the network sees them, its state and its
+            actions.
         stats: normalisation statistics; without them everything works but states and actions.
-        goal_case: `lower` spells every goal and subgoal as in training; `given` leaves them, as the benchmark's robots
-            and checkpoints from before there was a choice do.
+        goal_case: `lower` spells every goal and subgoal as in training; `given` leaves them, as the
+            benchmark's robots and checkpoints from before there was a choice do.
     """
 
     def __init__(
@@ -175,8 +207,9 @@ class Processor(PolicyProcessor):
         vocab_size = sections["backbone"].get("vocab_size")
         require(
             not (vocab_size is not None and processor.tokenizer.vocab_size > vocab_size),
-            f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "
-            f"backbone.vocab_size={vocab_size}: choose the processor that goes with the backbone.",
+            f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size}"
+            f" entries but backbone.vocab_size={vocab_size}: choose the processor that goes with"
+            " the backbone.",
         )
         return processor
 
@@ -184,9 +217,14 @@ class Processor(PolicyProcessor):
     def prompt_spec(self) -> PromptSpec:
         kind, tokenizer = self.prompt_format, self.tokenizer
         return PromptSpec(
-            tokenizer.spec, self.prompt_name, kind.reads_subgoal, kind.past_actions, tokenizer.fingerprint,
-            tuple(kind.notes), tuple(kind.writes),
-        )  # fmt: skip
+            tokenizer.spec,
+            self.prompt_name,
+            kind.reads_subgoal,
+            kind.past_actions,
+            tokenizer.fingerprint,
+            tuple(kind.notes),
+            tuple(kind.writes),
+        )
 
     @property
     def longest_prompt(self) -> int:
@@ -197,23 +235,39 @@ class Processor(PolicyProcessor):
         """Resize the current images of all cameras with Pillow, as released.
 
         Args:
-            views: one entry a camera in the order of the embodiment's: [H, W, 3], or [n, H, W, 3] for n observations;
-                uint8, or float in [0, 1].
+            views: one entry a camera in the order of the embodiment's: [H, W, 3], or [n, H, W, 3]
+                for n observations; uint8, or float in [0, 1].
 
         Returns:
             [v, 3, s, s] uint8, or [n, v, 3, s, s].
         """
         names = self.embodiment.camera_names
-        require(len(views) == len(names), f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
+        require(
+            len(views) == len(names),
+            f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.",
+        )
         resized = [resize_with_pad_uint8(as_uint8_frames(view), self.image_size) for view in views]
         if len({view.shape for view in resized}) > 1:
-            raise UserError(f"All views need as many images, got shapes {[list(view.shape) for view in resized]}.")
-        return torch.from_numpy(np.ascontiguousarray(np.moveaxis(np.stack(resized, axis=-4), -1, -3)))
+            raise UserError(
+                "All views need as many images, got shapes"
+                f" {[list(view.shape) for view in resized]}."
+            )
+        return torch.from_numpy(
+            np.ascontiguousarray(np.moveaxis(np.stack(resized, axis=-4), -1, -3))
+        )
 
-    def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
-        """Resize memory frames [n, H, W, 3] uint8 to [n, 3, s, s] float32 in [-1, 1], on `device` if one is given."""
+    def memory_images(
+        self, frames: np.ndarray | Tensor, device: torch.device | str | None = None
+    ) -> Tensor:
+        """Resize memory frames [n, H, W, 3] uint8 to [n, 3, s, s] float32 in [-1, 1], on `device`
+        if one is given.
+        """
         # A copy where the array is read-only (memory-mapped), which PyTorch cannot share safely.
-        array = frames if isinstance(frames, Tensor) else torch.from_numpy(np.require(frames, requirements=["C", "W"]))
+        array = (
+            frames
+            if isinstance(frames, Tensor)
+            else torch.from_numpy(np.require(frames, requirements=["C", "W"]))
+        )
         return resize_with_pad(array.to(device) if device is not None else array, self.image_size)
 
     def prompt(
@@ -230,8 +284,8 @@ class Processor(PolicyProcessor):
             goal: the task in words.
             subgoal: the language subgoal; formats that do not use one ignore it.
             state: [s] raw state; formats that do not use it ignore it.
-            past_actions: [n, w] absolute actions executed so far, oldest first; formats that do not use them ignore
-                them, the others read the last ones, relative to `state`.
+            past_actions: [n, w] absolute actions executed so far, oldest first; formats that do not
+                use them ignore them, the others read the last ones, relative to `state`.
             notes: texts by name; those that the format reads and are not there are empty.
 
         Returns:
@@ -242,14 +296,17 @@ class Processor(PolicyProcessor):
             normalised = normalize(_float(state), self.require_stats().state).numpy()
         count = self.prompt_format.past_actions
         if count and state is not None and past_actions is not None:
-            recent = self.embodiment.action.to_relative(_float(past_actions)[-count:], _float(state))
+            recent = self.embodiment.action.to_relative(
+                _float(past_actions)[-count:], _float(state)
+            )
             past = normalize(recent, self.require_stats().actions).numpy()
         goal = spelled(checked_text(goal, "the goal"), self.goal_case)
         if subgoal is not None and self.prompt_format.reads_subgoal:
             subgoal = spelled(checked_text(subgoal, "the subgoal"), self.goal_case)
             subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
         texts = {
-            name: checked_text((notes or {}).get(name, ""), f"the note {name!r}") for name in self.prompt_format.notes
+            name: checked_text((notes or {}).get(name, ""), f"the note {name!r}")
+            for name in self.prompt_format.notes
         }
         inputs = PromptInput(goal, subgoal, normalised, past, texts)
         return encode_prompt(self.prompt_format, self.tokenizer, inputs, self.longest_prompt)
@@ -262,7 +319,8 @@ class Processor(PolicyProcessor):
             state: [s] raw state at the observation.
 
         Returns:
-            [h, action_dim] float32: relative where the embodiment says so, quantile-normalised, padded with zeros.
+            [h, action_dim] float32: relative where the embodiment says so, quantile-normalised,
+            padded with zeros.
         """
         stats = self.require_stats()
         chunk, state = _float(chunk), _float(state)
@@ -290,10 +348,16 @@ class Processor(PolicyProcessor):
         return self.embodiment.action.to_absolute(relative, state.to(relative))
 
     def item(self, sample: Sample) -> dict[str, Any]:
-        """Images [v, 3, s, s], prompt ids and mask [l], raw state [s] and normalised actions [h, action_dim]."""
+        """Images [v, 3, s, s], prompt ids and mask [l], raw state [s] and normalised actions [h,
+        action_dim].
+        """
         state = sample.states[-1]
         prompt, prompt_mask = self.prompt(
-            sample.goal, sample.subgoal, state=state, past_actions=sample.past_actions, notes=sample.notes
+            sample.goal,
+            sample.subgoal,
+            state=state,
+            past_actions=sample.past_actions,
+            notes=sample.notes,
         )
         return {
             "images": self.images([frames[-1] for frames in sample.views.values()]),
@@ -338,14 +402,17 @@ class Processor(PolicyProcessor):
         """Build a processor.
 
         Args:
-            config: the constructor's arguments by name, some in words: `tokenizer` as `Tokenizer.load` takes it,
-                `stats` as the path of a `norm_stats.json` or None, `embodiment` as `Embodiment.to_dict` writes it (left
-                out: RoboMME's Panda, as before). `tokenizer_fingerprint`, if given, is checked.
+            config: the constructor's arguments by name, some in words: `tokenizer` as
+                `Tokenizer.load` takes it, `stats` as the path of a `norm_stats.json` or None,
+                `embodiment` as `Embodiment.to_dict` writes it (left out: RoboMME's Panda, as
+                before). `tokenizer_fingerprint`, if given, is checked.
         """
         return cls(**constructor_settings(config, inspect.signature(cls).parameters))
 
     def save(self, folder: Path | str) -> list[str]:
-        """Write `processor.json`, the statistics, and the tokenizer unless it is on the hub; the names of the files."""
+        """Write `processor.json`, the statistics, and the tokenizer unless it is on the hub; the
+        names of the files.
+        """
         saved = super().save(folder)
         if self.to_config()["tokenizer"] == TOKENIZER_FILE:
             self.tokenizer.save(Path(folder) / TOKENIZER_FILE)
@@ -354,11 +421,13 @@ class Processor(PolicyProcessor):
 
     @classmethod
     def load(cls, folder: Path | str, tokenizer: Path | str | None = None) -> Self:
-        """Read what `save` wrote. Nothing outside of the folder is read for it, and of the hub only π0.5's tokenizer.
+        """Read what `save` wrote. Nothing outside of the folder is read for it, and of the hub only
+        π0.5's tokenizer.
 
         Args:
             folder: of a checkpoint, which may be untrusted.
-            tokenizer: in place of the one that `processor.json` names, as `Tokenizer.load` takes it.
+            tokenizer: in place of the one that `processor.json` names, as `Tokenizer.load` takes
+                it.
         """
         config = saved_settings(Path(folder), tokenizer)
         try:

@@ -47,10 +47,11 @@ class PromptFormat:
 
     A subclass sets what it reads beside the goal and implements `pieces`.
 
-    notes: names of the notes it reads. In training they are columns of texts (`data.texts`), in an episode
-    `Episode.notes`, set by the user or written by the policy.
-    writes: those of them that the policy learns to write, one line a decision. The prompt of a training sample has
-    the line of the decision before, and the line of its own step is a label, token ids [`note_length`].
+    notes: names of the notes it reads. In training they are columns of texts (`data.texts`), in an
+    episode `Episode.notes`, set by the user or written by the policy.
+    writes: those of them that the policy learns to write, one line a decision. The prompt of a
+    training sample has the line of the decision before, and the line of its own step is a label,
+    token ids [`note_length`].
     """
 
     reads_subgoal: bool = False
@@ -67,7 +68,9 @@ class PromptFormat:
 
 @PROMPTS.register("plain")
 class GoalPrompt(PromptFormat):
-    """The goal and a newline: π0.5 without state in the prompt, and every policy with a neural memory."""
+    """The goal and a newline: π0.5 without state in the prompt, and every policy with a neural
+    memory.
+    """
 
     def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return the goal, then the newline, which is tokenised apart."""
@@ -76,14 +79,17 @@ class GoalPrompt(PromptFormat):
 
 @PROMPTS.register("state")
 class State(PromptFormat):
-    """The goal and the state as 256-level numbers, as released (openpi's own π0.5 has a comma for the semicolon)."""
+    """The goal and the state as 256-level numbers, as released (openpi's own π0.5 has a comma for
+    the semicolon).
+    """
 
     reads_state = True
 
     def pieces(self, inputs: PromptInput) -> list[Piece]:
         if inputs.state is None:
             raise UserError(
-                "The prompt format 'state' needs the robot's state; give one, or choose the format 'plain'."
+                "The prompt format 'state' needs the robot's state; give one, or choose the format"
+                " 'plain'."
             )
         levels = " ".join(map(str, discretize(inputs.state)))
         return [(f"Task: {_one_line(inputs.goal)}; State: {levels};\nAction: ", True)]
@@ -101,28 +107,50 @@ class Subgoal(PromptFormat):
     def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text, or the plain pieces if there is no subgoal."""
         if inputs.subgoal is None:
-            _warn_once("The prompt format 'subgoal' got no subgoal: such steps use the plain prompt, as released.")
+            _warn_once(
+                "The prompt format 'subgoal' got no subgoal: such steps use the plain prompt, as"
+                " released."
+            )
             return GoalPrompt().pieces(inputs)
-        return [(f"Task: {_one_line(inputs.goal)};\nCurrent Subgoal: {_one_line(inputs.subgoal)};\nAction: ", True)]
+        return [
+            (
+                (
+                    f"Task: {_one_line(inputs.goal)};\nCurrent Subgoal:"
+                    f" {_one_line(inputs.subgoal)};\nAction: "
+                ),
+                True,
+            )
+        ]
 
 
 @PROMPTS.register("subgoal_sentence")
 class SubgoalSentence(Subgoal):
-    """The goal and the subgoal with the punctuation of the real-robot release, which has a state but leaves it out."""
+    """The goal and the subgoal with the punctuation of the real-robot release, which has a state
+    but leaves it out.
+    """
 
     def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text, or the plain pieces if there is no subgoal."""
         if inputs.subgoal is None:
             return super().pieces(inputs)
-        return [(f"Task: {_one_line(inputs.goal)}\nCurrent Subgoal: {_one_line(inputs.subgoal)}.\nAction: ", True)]
+        return [
+            (
+                (
+                    f"Task: {_one_line(inputs.goal)}\nCurrent Subgoal:"
+                    f" {_one_line(inputs.subgoal)}.\nAction: "
+                ),
+                True,
+            )
+        ]
 
 
 @PROMPTS.register("past_actions")
 class PastActions(PromptFormat):
-    """The goal and the last 16 executed actions as 256-level numbers: the memory baseline after UniVLA.
+    """The goal and the last 16 executed actions as 256-level numbers: the memory baseline after
+    UniVLA.
 
-    An action is written in the units of the chunk, joints relative to the current state. Before the first action
-    the list is empty.
+    An action is written in the units of the chunk, joints relative to the current state. Before the
+    first action the list is empty.
     """
 
     past_actions = 16
@@ -130,7 +158,8 @@ class PastActions(PromptFormat):
     def pieces(self, inputs: PromptInput) -> list[Piece]:
         if inputs.past_actions is None:
             raise UserError(
-                "The prompt format 'past_actions' needs the executed actions (none yet: an empty array [0, w])."
+                "The prompt format 'past_actions' needs the executed actions (none yet: an empty"
+                " array [0, w])."
             )
         levels = " ".join(map(str, discretize(inputs.past_actions.reshape(-1))))
         return [(f"Task: {_one_line(inputs.goal)}; Past actions: {levels};\nAction: ", True)]
@@ -157,7 +186,10 @@ class OpenVlaSubgoal(OpenVla):
     def language(self, inputs: PromptInput) -> str:
         """The goal without its full stop, and the subgoal."""
         if inputs.subgoal is None:
-            _warn_once("The prompt format 'openvla_subgoal' got no subgoal: such steps use the plain prompt.")
+            _warn_once(
+                "The prompt format 'openvla_subgoal' got no subgoal: such steps use the plain"
+                " prompt."
+            )
             return super().language(inputs)
         goal = inputs.goal.strip().removesuffix(".")
         return f"{goal}; current subgoal: {inputs.subgoal.strip()}".lower()
@@ -176,7 +208,8 @@ GOAL_CASES = ("given", "lower")
 def goal_case(robot: Embodiment) -> str:
     """How a new policy of this robot spells goals when acting.
 
-    A robot of one's own: as in training. The benchmark's: as they are given, as in the released code.
+    A robot of one's own: as in training. The benchmark's: as they are given, as in the released
+    code.
     """
     return "lower" if robot.action.space is None else "given"
 
@@ -193,7 +226,10 @@ def checked_goal(text: object) -> str:
         UserError: it is no text, holds half a character, or nothing but spaces.
     """
     goal = checked_text(text, "the goal")
-    require(goal.strip(), f"The goal is {goal!r}: a policy is told what to do in words. Give the task as a text.")
+    require(
+        goal.strip(),
+        f"The goal is {goal!r}: a policy is told what to do in words. Give the task as a text.",
+    )
     return goal
 
 
@@ -201,7 +237,11 @@ def checked_text(text: object, what: str) -> str:
     """`text`, if a tokenizer can take it."""
     if not isinstance(text, str):
         raise UserError(f"{what} must be a text, got {brief(text)}.")
-    require(is_text(text), f"{what} holds half a character (a lone surrogate), which cannot be written: {brief(text)}.")
+    require(
+        is_text(text),
+        f"{what} holds half a character (a lone surrogate), which cannot be written:"
+        f" {brief(text)}.",
+    )
     return text
 
 
@@ -220,11 +260,15 @@ def encode_prompt(
         ids [l] int64, padded on the right with 0; mask [l] bool, False on the padding.
     """
     checked_text(inputs.goal, "the goal")
-    tokens = [token for text, bos in prompt_format.pieces(inputs) for token in tokenizer.encode(text, bos=bos)]
+    tokens = [
+        token
+        for text, bos in prompt_format.pieces(inputs)
+        for token in tokenizer.encode(text, bos=bos)
+    ]
     if len(tokens) > max_length:
         _warn_once(
-            f"A prompt has more tokens than prompt_length={max_length} and loses its end; raise prompt_length. "
-            f"The first one, {len(tokens)} tokens long: {brief(inputs.goal, 200)}.",
+            f"A prompt has more tokens than prompt_length={max_length} and loses its end; raise"
+            f" prompt_length. The first one, {len(tokens)} tokens long: {brief(inputs.goal, 200)}.",
             key=("truncated", max_length),
         )
         tokens = tokens[:max_length]
@@ -240,7 +284,8 @@ def shorten(text: str, tokenizer: Tokenizer, length: int | None) -> str:
     if length is None or len(tokens) <= length:
         return text
     _warn_once(
-        f"A subgoal has more tokens than subgoal_length={length} and loses its end. The first one: {brief(text, 200)}.",
+        f"A subgoal has more tokens than subgoal_length={length} and loses its end. The first one:"
+        f" {brief(text, 200)}.",
         key=("shortened", length),
     )
     return tokenizer.decode(tokens[:length])
@@ -266,9 +311,11 @@ class SubgoalText:
     """Chooses the text of one training step, as released.
 
     kind: `simple_subgoal` or `grounded_subgoal`.
-    online_probability: how often the label is the one the simulator reports at test time, which switches a little
+    online_probability: how often the label is the one the simulator reports at test time, which
+    switches a little
         earlier than the planner's.
-    point_noise: pixels; a text with exactly one point `at <y, x>` gets Gaussian noise on both numbers, cut off here
+    point_noise: pixels; a text with exactly one point `at <y, x>` gets Gaussian noise on both
+    numbers, cut off here
         and rounded. 0 adds none. The result may leave the image, as released.
     """
 
@@ -279,8 +326,14 @@ class SubgoalText:
     def __post_init__(self) -> None:
         check_choice("subgoal_text.kind", self.kind, KINDS)
         probability = self.online_probability
-        require(0 <= probability <= 1, f"subgoal_text.online_probability={probability} must lie between 0 and 1.")
-        require(self.point_noise >= 0, f"subgoal_text.point_noise={self.point_noise} must be 0 or more pixels.")
+        require(
+            0 <= probability <= 1,
+            f"subgoal_text.online_probability={probability} must lie between 0 and 1.",
+        )
+        require(
+            self.point_noise >= 0,
+            f"subgoal_text.point_noise={self.point_noise} must be 0 or more pixels.",
+        )
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any] | None) -> Self | None:
@@ -300,7 +353,9 @@ class SubgoalText:
 
 
 def perturb_point(text: str, limit: int, rng: np.random.Generator) -> str:
-    """Move the one point of a text by up to `limit` pixels; a text with no point or several stays as it is."""
+    """Move the one point of a text by up to `limit` pixels; a text with no point or several stays
+    as it is.
+    """
     if len(POINT.findall(text)) != 1:
         return text
     shift = np.clip(rng.normal(0, limit * STD_PER_LIMIT, 2), -limit, limit).round().astype(int)

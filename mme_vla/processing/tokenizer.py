@@ -1,4 +1,6 @@
-"""Text to token ids with SentencePiece: PaliGemma's model for real weights, a small one of our own for the sample."""
+"""Text to token ids with SentencePiece: PaliGemma's model for real weights, a small one of our own
+for the sample.
+"""
 
 import hashlib
 from importlib.resources import files
@@ -27,8 +29,13 @@ class Tokenizer:
         try:
             self._processor = SentencePieceProcessor(model_proto=model)
         except (RuntimeError, TypeError) as error:
-            raise UserError(f"Tokenizer {spec!r} is not a SentencePiece model file: {error}.") from None
-        require(self._processor.bos_id() >= 0, f"Tokenizer {spec!r} has no beginning-of-sequence token for prompts.")
+            raise UserError(
+                f"Tokenizer {spec!r} is not a SentencePiece model file: {error}."
+            ) from None
+        require(
+            self._processor.bos_id() >= 0,
+            f"Tokenizer {spec!r} has no beginning-of-sequence token for prompts.",
+        )
         self._model = model
         self.spec = spec
         self.fingerprint = hashlib.sha256(model).hexdigest()[:16]
@@ -38,8 +45,9 @@ class Tokenizer:
         """Load a tokenizer.
 
         Args:
-            spec: "sample" for the small model shipped with the library, the path of a `.model` file, or
-                "hf://owner/repository/path/in/it.model" for a file on the Hugging Face hub.
+            spec: "sample" for the small model shipped with the library, the path of a `.model`
+                file, or "hf://owner/repository/path/in/it.model" for a file on the Hugging Face
+                hub.
         """
         spec = str(spec)
         if spec == SAMPLE:
@@ -47,11 +55,14 @@ class Tokenizer:
         path = _download(spec) if spec.startswith(HUB) else Path(spec).expanduser()
         require(
             path.is_file(),
-            f"No tokenizer at {brief(spec, 300)}. Give {SAMPLE!r}, the path of a SentencePiece .model file, or "
-            f"{HUB}owner/repository/file.model (PaliGemma's: {HUB}google/paligemma-3b-pt-224/tokenizer.model).",
+            f"No tokenizer at {brief(spec, 300)}. Give {SAMPLE!r}, the path of a SentencePiece"
+            f" .model file, or {HUB}owner/repository/file.model (PaliGemma's:"
+            f" {HUB}google/paligemma-3b-pt-224/tokenizer.model).",
         )
         if path.stat().st_size > _LARGEST:
-            raise UserError(f"{path} has {path.stat().st_size:,} bytes; a tokenizer has at most {_LARGEST:,}.")
+            raise UserError(
+                f"{path} has {path.stat().st_size:,} bytes; a tokenizer has at most {_LARGEST:,}."
+            )
         return cls(path.read_bytes(), spec)
 
     @property
@@ -67,14 +78,18 @@ class Tokenizer:
         """The id of one piece, as the model spells it (`▁` means a space)."""
         index = self._processor.piece_to_id(text)
         require(
-            index != self._processor.unk_id(), f"Tokenizer {self.spec!r} has no piece {text!r}, which prompts need."
+            index != self._processor.unk_id(),
+            f"Tokenizer {self.spec!r} has no piece {text!r}, which prompts need.",
         )
         return index
 
     @property
     def end(self) -> int:
         """The id that ends a text."""
-        require(self._processor.eos_id() >= 0, f"Tokenizer {self.spec!r} has no end-of-sequence token for prompts.")
+        require(
+            self._processor.eos_id() >= 0,
+            f"Tokenizer {self.spec!r} has no end-of-sequence token for prompts.",
+        )
         return self._processor.eos_id()
 
     def decode(self, ids: list[int]) -> str:
@@ -92,12 +107,16 @@ def _download(spec: str) -> Path:
 
     owner, _, remaining = spec.removeprefix(HUB).partition("/")
     name, _, filename = remaining.partition("/")
-    require(owner and name and filename, f"Tokenizer {spec!r} should read {HUB}owner/repository/path/in/it.model.")
+    require(
+        owner and name and filename,
+        f"Tokenizer {spec!r} should read {HUB}owner/repository/path/in/it.model.",
+    )
     try:
         return Path(hf_hub_download(f"{owner}/{name}", filename))
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
         raise UserError(
-            f"The hub did not give the tokenizer {spec!r} ({type(error).__name__}: {str(error).splitlines()[0]}). "
-            "Check the name, the network and `hf auth login` (PaliGemma's files ask you to accept a licence), "
-            "or download the file manually and give its path."
+            f"The hub did not give the tokenizer {spec!r} ({type(error).__name__}:"
+            f" {str(error).splitlines()[0]}). Check the name, the network and `hf auth login`"
+            " (PaliGemma's files ask you to accept a licence), or download the file manually and"
+            " give its path."
         ) from None

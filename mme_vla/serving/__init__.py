@@ -12,11 +12,16 @@ if TYPE_CHECKING:
     from mme_vla.serving.server import PolicyServer
     from mme_vla.serving.settings import Limits, ServeSettings
 
-# Loaded on first use: a client needs no network library of the server, and neither is needed to import the package.
+# Loaded on first use: a client needs no network library of the server, and neither is needed to
+# import the package.
 _HOME = {
-    "Client": "client", "pack": "codec", "unpack": "codec", "PolicyServer": "server", "Limits": "settings",
+    "Client": "client",
+    "pack": "codec",
+    "unpack": "codec",
+    "PolicyServer": "server",
+    "Limits": "settings",
     "ServeSettings": "settings",
-}  # fmt: skip
+}
 
 __all__ = ["Client", "Limits", "PolicyServer", "ServeSettings", "pack", "unpack"]
 

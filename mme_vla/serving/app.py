@@ -1,4 +1,6 @@
-"""The server's one application: a websocket at any path, and /healthz, /metadata, /stats, /reset and /infer by HTTP."""
+"""The server's one application: a websocket at any path, and /healthz, /metadata, /stats, /reset
+and /infer by HTTP.
+"""
 
 import asyncio
 import hmac
@@ -21,7 +23,14 @@ from mme_vla.errors import UserError
 from mme_vla.serving.codec import pack
 from mme_vla.serving.connections import Connection, Connections
 from mme_vla.serving.engine import Engine
-from mme_vla.serving.session import BusyError, HttpSessions, NoEpisodeError, Session, error_text, read_request
+from mme_vla.serving.session import (
+    BusyError,
+    HttpSessions,
+    NoEpisodeError,
+    Session,
+    error_text,
+    read_request,
+)
 from mme_vla.serving.settings import ServeSettings
 
 logger = logging.getLogger("mme_vla.serving")
@@ -30,11 +39,19 @@ logger = logging.getLogger("mme_vla.serving")
 class ServedConnection:
     """Sends `metadata` (packed), then responds to one request after the other.
 
-    Reading continues while the policy computes, so that pings are served and a client that leaves is noticed.
+    Reading continues while the policy computes, so that pings are served and a client that leaves
+    is noticed.
     """
 
-    def __init__(self, socket: WebSocket, engine: Engine, settings: ServeSettings, metadata: bytes) -> None:
-        self._socket, self._engine, self._settings, self._metadata = socket, engine, settings, metadata
+    def __init__(
+        self, socket: WebSocket, engine: Engine, settings: ServeSettings, metadata: bytes
+    ) -> None:
+        self._socket, self._engine, self._settings, self._metadata = (
+            socket,
+            engine,
+            settings,
+            metadata,
+        )
         self._connection: Connection = socket.scope["connection"]
         self._peer = f"{socket.client.host}:{socket.client.port}" if socket.client else "client"
         self._coming: asyncio.Future[Any] | None = None
@@ -107,7 +124,9 @@ class ServedConnection:
 
     async def _reply(self, session: Session, message: bytes) -> dict[str, Any]:
         begun = time.perf_counter()
-        return await session.respond(await read_request(self._engine, self._settings, message), begun)
+        return await session.respond(
+            await read_request(self._engine, self._settings, message), begun
+        )
 
     async def _while_connected[T](self, work: Awaitable[T]) -> T:
         """The result of `work`, which is given up when the client goes first."""
@@ -128,16 +147,32 @@ class ServedConnection:
 
 
 MSGPACK = "application/msgpack"
-METHODS = {"/healthz": "GET", "/metadata": "GET", "/stats": "GET", "/reset": "POST", "/infer": "POST"}
-OPEN = ("/healthz", "/metadata")  # need no key: the challenge's client requests the metadata without one
+METHODS = {
+    "/healthz": "GET",
+    "/metadata": "GET",
+    "/stats": "GET",
+    "/reset": "POST",
+    "/infer": "POST",
+}
+OPEN = (
+    "/healthz",
+    "/metadata",
+)  # need no key: the challenge's client requests the metadata without one
 MIN_BYTES_S = 2**16  # bytes a second of a body, beside limits.receive_s
-LINGER_S = 5  # seconds for the remaining body of a refused request, so that the client can read the response
+# seconds for the remaining body of a refused request, so that the client can read the response
+LINGER_S = 5
 
 
 def make_app(
-    engine: Engine, settings: ServeSettings, metadata: bytes, connections: Connections, sessions: HttpSessions
+    engine: Engine,
+    settings: ServeSettings,
+    metadata: bytes,
+    connections: Connections,
+    sessions: HttpSessions,
 ) -> ASGIApp:
-    """The ASGI application, under uvicorn with `timed_protocol(connections)`; `metadata` is packed."""
+    """The ASGI application, under uvicorn with `timed_protocol(connections)`;
+    `metadata` is packed.
+    """
 
     async def healthz(_: Request) -> Response:
         return PlainTextResponse("OK\n")
@@ -182,12 +217,20 @@ def make_app(
             405: f"{path} takes {METHODS.get(path, 'another method')}.",
         }
         engine.stats.count("refused")
-        return PlainTextResponse(f"{known.get(error.status_code, error.detail)}\n", error.status_code, error.headers)
+        return PlainTextResponse(
+            f"{known.get(error.status_code, error.detail)}\n", error.status_code, error.headers
+        )
 
     async def websocket(socket: WebSocket) -> None:
         await ServedConnection(socket, engine, settings, metadata).run()
 
-    handlers = {"/healthz": healthz, "/metadata": describe, "/stats": stats, "/reset": infer, "/infer": infer}
+    handlers = {
+        "/healthz": healthz,
+        "/metadata": describe,
+        "/stats": stats,
+        "/reset": infer,
+        "/infer": infer,
+    }
     app = Starlette(
         routes=[
             *(Route(path, handler, methods=[METHODS[path]]) for path, handler in handlers.items()),
@@ -211,7 +254,10 @@ async def read_body(request: Request, settings: ServeSettings) -> bytearray:
     if length == 0:
         raise HTTPException(400, "The body is empty: send a packed request.")
     if length > limits.message_bytes:
-        what = f"The message has {length} bytes; this server takes {limits.message_bytes} (limits.message_mib)."
+        what = (
+            f"The message has {length} bytes; this server takes {limits.message_bytes}"
+            " (limits.message_mib)."
+        )
         raise HTTPException(413, what)
     body, last = bytearray(), time.monotonic() + limits.receive_s + length / MIN_BYTES_S
     while len(body) < length:
@@ -219,7 +265,10 @@ async def read_body(request: Request, settings: ServeSettings) -> bytearray:
             seconds = min(limits.receive_s, last - time.monotonic())
             message = await asyncio.wait_for(request.receive(), seconds)
         except TimeoutError:
-            what = f"No byte of the body came for {limits.receive_s:g} s, or less than {MIN_BYTES_S} of them a second."
+            what = (
+                f"No byte of the body came for {limits.receive_s:g} s, or less than {MIN_BYTES_S}"
+                " of them a second."
+            )
             raise HTTPException(408, what) from None
         if message["type"] == "http.disconnect":
             raise HTTPException(400, "The body was cut short.")
@@ -230,8 +279,15 @@ async def read_body(request: Request, settings: ServeSettings) -> bytearray:
 class RequestGuard:
     """Checks key and place of a request before anything of its body is read."""
 
-    def __init__(self, app: ASGIApp, settings: ServeSettings, connections: Connections, engine: Engine) -> None:
-        self._app, self._settings, self._connections, self._stats = app, settings, connections, engine.stats
+    def __init__(
+        self, app: ASGIApp, settings: ServeSettings, connections: Connections, engine: Engine
+    ) -> None:
+        self._app, self._settings, self._connections, self._stats = (
+            app,
+            settings,
+            connections,
+            engine.stats,
+        )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         connection = self._connections.open.get(scope.get("client"))
@@ -274,9 +330,13 @@ class RequestGuard:
         return right and scheme.lower() == "api-key"
 
     async def _http(self, app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-        """Respond; after a response that precedes the end of the body, discard the body for `LINGER_S` and close."""
+        """Respond; after a response that precedes the end of the body, discard the body for
+        `LINGER_S` and close.
+        """
         headers = Headers(scope=scope)
-        unread = "transfer-encoding" in headers or headers.get("content-length", "0").strip("0") != ""
+        unread = (
+            "transfer-encoding" in headers or headers.get("content-length", "0").strip("0") != ""
+        )
 
         async def reading() -> Message:
             nonlocal unread

@@ -19,13 +19,14 @@ except ImportError as error:
 class Client:
     """A connection to a policy server; blocking, for one thread.
 
-    The episode lives on the server with the connection and is lost with it, so nothing reconnects by itself: after a
-    `ConnectionError` call `reconnect()` and begin the episode again.
+    The episode lives on the server with the connection and is lost with it, so nothing reconnects
+    by itself: after a `ConnectionError` call `reconnect()` and begin the episode again.
 
     Args:
         url: `ws://host:port`.
         api_key: of the server, if it has one.
-        timeout: seconds to wait for an answer; a first request of 1,000 frames may take minutes on a CPU.
+        timeout: seconds to wait for an answer; a first request of 1,000 frames may take minutes on
+            a CPU.
         open_timeout: seconds to wait for the connection and the server's metadata.
 
     Raises:
@@ -54,7 +55,9 @@ class Client:
         self.reconnect()
 
     def reconnect(self) -> None:
-        """Close the connection if there is one and open another, with an episode that has not begun."""
+        """Close the connection if there is one and open another, with an episode that has not
+        begun.
+        """
         self.close()
         try:
             opening = connect(
@@ -68,11 +71,15 @@ class Client:
             )
             self._socket = self._ends.enter_context(opening)
         except InvalidURI as error:
-            raise UserError(f"{self.url!r} is not an address such as ws://127.0.0.1:8001: {error}") from None
+            raise UserError(
+                f"{self.url!r} is not an address such as ws://127.0.0.1:8001: {error}"
+            ) from None
         except InvalidHandshake as error:
             reply = getattr(getattr(error, "response", None), "body", b"") or b""
             message = bytes(reply).decode(errors="replace").strip()
-            raise UserError(f"The server at {self.url} refuses the connection: {message or error}") from None
+            raise UserError(
+                f"The server at {self.url} refuses the connection: {message or error}"
+            ) from None
         except (OSError, TimeoutError, EOFError) as error:
             raise ConnectionError(f"No policy server responds at {self.url}: {error}") from error
         self.metadata = self._receive(self.open_timeout)
@@ -80,25 +87,31 @@ class Client:
     def reset(self) -> dict[str, Any]:
         return self.request({"reset": True})
 
-    def add_buffer(self, images: np.ndarray, states: np.ndarray, exec_start: int = 0) -> dict[str, Any]:
+    def add_buffer(
+        self, images: np.ndarray, states: np.ndarray, exec_start: int = 0
+    ) -> dict[str, Any]:
         """Send frames to remember, the current one included, before `infer` (MME-VLA schema).
 
         Args:
-            images: of the camera that feeds memory (RoboMME: front) [t, H, W, 3] or [t, 1, H, W, 3] uint8.
+            images: of the camera that feeds memory (RoboMME: front) [t, H, W, 3] or [t, 1, H, W, 3]
+                uint8.
             states: [t, s].
-            exec_start: index of the episode's first execution frame, when these frames begin with a video.
+            exec_start: index of the episode's first execution frame, when these frames begin with a
+                video.
         """
         images = np.asarray(images)
         images = images[:, None] if images.ndim == 4 else images
         states = np.asarray(states, np.float32)
-        return self.request({"add_buffer": True, "images": images, "state": states, "exec_start_idx": exec_start})
+        return self.request(
+            {"add_buffer": True, "images": images, "state": states, "exec_start_idx": exec_start}
+        )
 
     def infer(self, observation: Mapping[str, Any]) -> dict[str, Any]:
         """Request the next chunk.
 
         Args:
-            observation: of either schema: `observation/image`, `observation/wrist_image`, `observation/state` and
-                `prompt`; or the challenge's lists.
+            observation: of either schema: `observation/image`, `observation/wrist_image`,
+                `observation/state` and `prompt`; or the challenge's lists.
 
         Returns:
             `actions` [n, w] float32, absolute, and `infer_time_ms`.
@@ -110,7 +123,8 @@ class Client:
 
         Raises:
             UserError: the server refuses the message, and says why. The connection is closed then.
-            ConnectionError: the connection is lost. TimeoutError: no answer within `timeout`; the connection is closed.
+            ConnectionError: the connection is lost. TimeoutError: no answer within `timeout`; the
+                connection is closed.
         """
         data = pack(message)
         if self._socket is None:
@@ -135,12 +149,19 @@ class Client:
             response = self._socket.recv(timeout)
         except ConnectionClosed as error:
             self.close()
-            raise ConnectionError(f"The server at {self.url} closed the connection: {error}") from None
+            raise ConnectionError(
+                f"The server at {self.url} closed the connection: {error}"
+            ) from None
         except TimeoutError:
             self.close()  # an answer that came later would be taken for that of the next request
-            raise TimeoutError(f"No answer from {self.url} within {timeout:g} s; call reconnect().") from None
+            raise TimeoutError(
+                f"No answer from {self.url} within {timeout:g} s; call reconnect()."
+            ) from None
         if isinstance(response, str):
             self.close()
             raise UserError(f"The server refuses this request: {response}")
         fields: dict[str, Any] = unpack(response)
-        return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in fields.items()}
+        return {
+            key: value.copy() if isinstance(value, np.ndarray) else value
+            for key, value in fields.items()
+        }

@@ -1,7 +1,9 @@
-"""NumPy arrays inside msgpack, as openpi's clients and the RoboMME challenge write them; never pickle.
+"""NumPy arrays inside msgpack, as openpi's clients and the RoboMME challenge write them; never
+pickle.
 
-An array is a map with bytes keys, `{b"__ndarray__": True, b"data": raw, b"dtype": "<f4", b"shape": [2, 3]}`, in C
-order; a NumPy scalar is `{b"__npgeneric__": True, b"data": value, b"dtype": "<f4"}`. Records, objects and complex
+An array is a map with bytes keys,
+`{b"__ndarray__": True, b"data": raw, b"dtype": "<f4", b"shape": [2, 3]}`, in C order; a NumPy
+scalar is `{b"__npgeneric__": True, b"data": value, b"dtype": "<f4"}`. Records, objects and complex
 numbers are refused both ways. All else is msgpack with its defaults.
 """
 
@@ -13,7 +15,9 @@ import numpy as np
 from mme_vla.errors import UserError, missing_extra, require
 
 REFUSED_KINDS = "VOc"  # records and raw bytes, Python objects, complex numbers
-MOST_OBJECTS = 2**20  # values of a message, whatever holds them; a frame with all its cameras takes about 130
+MOST_OBJECTS = (
+    2**20
+)  # values of a message, whatever holds them; a frame with all its cameras takes about 130
 MOST_TEXT = 2**20  # characters of one text
 
 try:
@@ -39,13 +43,17 @@ def unpack(data: bytes | bytearray | memoryview) -> Any:
     except UserError:
         raise
     except Exception as error:  # msgpack raises many kinds of exception
-        raise UserError(f"This is not a msgpack message ({type(error).__name__}: {error}).") from error
+        raise UserError(
+            f"This is not a msgpack message ({type(error).__name__}: {error})."
+        ) from error
 
 
 def _sizes() -> tuple[tuple[int, int, int], ...]:
-    """For each first byte of a value: bytes it takes at least, width of the length after it, values it announces.
+    """For each first byte of a value: bytes it takes at least, width of the length after it, values
+    it announces.
 
-    Where there is a width, the number written there counts bytes (values announced: 0) or entries of so many values.
+    Where there is a width, the number written there counts bytes (values announced: 0) or entries
+    of so many values.
     """
     sizes = [(1, 0, 0)] * 256
     for kind in range(16):
@@ -53,14 +61,23 @@ def _sizes() -> tuple[tuple[int, int, int], ...]:
         sizes[0x90 + kind] = (1, 0, kind)
     for length in range(32):
         sizes[0xA0 + length] = (1 + length, 0, 0)
-    for kind, width in ((0xC4, 1), (0xC5, 2), (0xC6, 4), (0xD9, 1), (0xDA, 2), (0xDB, 4)):  # bytes and texts
+    for kind, width in (
+        (0xC4, 1),
+        (0xC5, 2),
+        (0xC6, 4),
+        (0xD9, 1),
+        (0xDA, 2),
+        (0xDB, 4),
+    ):  # bytes and texts
         sizes[kind] = (1 + width, width, 0)
     for kind, width in ((0xC7, 1), (0xC8, 2), (0xC9, 4)):  # extensions carry a type as well
         sizes[kind] = (2 + width, width, 0)
     for kind, width in ((0xDC, 2), (0xDD, 4)):
         sizes[kind] = (1 + width, width, 1)
         sizes[kind + 2] = (1 + width, width, 2)
-    for kind, bytes_after in zip((*range(0xCA, 0xD9),), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8, 2, 3, 5, 9, 17), strict=True):
+    for kind, bytes_after in zip(
+        (*range(0xCA, 0xD9),), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8, 2, 3, 5, 9, 17), strict=True
+    ):
         sizes[kind] = (1 + bytes_after, 0, 0)
     return tuple(sizes)
 
@@ -69,7 +86,8 @@ _SIZES = _sizes()
 
 
 def check_size(data: bytes | bytearray | memoryview, most: int = MOST_OBJECTS) -> None:
-    """Count the values of a message without making any: an empty map takes one byte here and 64 in memory.
+    """Count the values of a message without making any: an empty map takes one byte here and 64 in
+    memory.
 
     A message that is cut short or malformed passes; `unpack` says what is wrong with it.
     """
@@ -87,17 +105,28 @@ def check_size(data: bytes | bytearray | memoryview, most: int = MOST_OBJECTS) -
             waiting += more
             announced += more
             if announced > most:
-                raise UserError(f"The message holds more than {most} values; a frame takes about 130. Send fewer.")
+                raise UserError(
+                    f"The message holds more than {most} values; a frame takes about 130. Send"
+                    " fewer."
+                )
         at += taken
 
 
 def _encode(value: Any) -> dict[bytes, Any]:
     if not isinstance(value, np.ndarray | np.generic):
-        raise TypeError(f"{type(value).__name__} has no form in msgpack; use numbers, text, lists, dicts and arrays")
+        raise TypeError(
+            f"{type(value).__name__} has no form in msgpack; use numbers, text, lists, dicts and"
+            " arrays"
+        )
     if value.dtype.kind in REFUSED_KINDS:
         raise ValueError(f"arrays of dtype {value.dtype} are not sent")
     if isinstance(value, np.ndarray):
-        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": list(value.shape)}
+        return {
+            b"__ndarray__": True,
+            b"data": value.tobytes(),
+            b"dtype": value.dtype.str,
+            b"shape": list(value.shape),
+        }
     scalar = value.item()
     if not isinstance(scalar, bool | int | float | str | bytes):
         raise ValueError(f"a scalar of dtype {value.dtype} is not sent; make it a plain number")
@@ -114,7 +143,9 @@ def _decode(fields: dict[Any, Any]) -> Any:
         try:
             return dtype.type(value)
         except (ValueError, TypeError, OverflowError) as error:
-            raise UserError(f"A NumPy scalar of dtype {dtype} holds {str(value)[:40]!r}: {error}") from None
+            raise UserError(
+                f"A NumPy scalar of dtype {dtype} holds {str(value)[:40]!r}: {error}"
+            ) from None
     return fields
 
 
@@ -122,12 +153,20 @@ def _array(fields: dict[Any, Any]) -> np.ndarray:
     dtype = _dtype(fields)
     shape: Any = fields.get(b"shape")
     data: Any = fields.get(b"data")
-    if not isinstance(shape, list) or len(shape) > 32 or not all(type(n) is int and n >= 0 for n in shape):
-        raise UserError(f"An array's shape must be a list of at most 32 whole numbers, got {str(shape)[:80]}.")
+    if (
+        not isinstance(shape, list)
+        or len(shape) > 32
+        or not all(type(n) is int and n >= 0 for n in shape)
+    ):
+        raise UserError(
+            f"An array's shape must be a list of at most 32 whole numbers, got {str(shape)[:80]}."
+        )
     require(isinstance(data, bytes), f"An array's data must be bytes, got {type(data).__name__}.")
     needed = math.prod(shape) * dtype.itemsize
     if len(data) != needed:
-        raise UserError(f"An array {dtype} {shape} takes {needed} bytes, but {len(data)} were sent.")
+        raise UserError(
+            f"An array {dtype} {shape} takes {needed} bytes, but {len(data)} were sent."
+        )
     try:
         return np.ndarray(tuple(shape), dtype, data)
     except ValueError as error:  # an empty array of impossible size
@@ -137,11 +176,15 @@ def _array(fields: dict[Any, Any]) -> np.ndarray:
 def _dtype(fields: dict[Any, Any]) -> np.dtype:
     name = fields.get(b"dtype")
     if not isinstance(name, str) or len(name) > 16:
-        raise UserError(f"An array's dtype must be a short text such as '<f4', got {str(name)[:40]!r}.")
+        raise UserError(
+            f"An array's dtype must be a short text such as '<f4', got {str(name)[:40]!r}."
+        )
     try:
         dtype = np.dtype(name)
     except (TypeError, ValueError, SyntaxError):
         raise UserError(f"{name!r} is not a NumPy dtype.") from None
     if dtype.kind in REFUSED_KINDS or dtype.hasobject:
-        raise UserError(f"Arrays of dtype {name!r} are refused: send numbers, truth values or text.")
+        raise UserError(
+            f"Arrays of dtype {name!r} are refused: send numbers, truth values or text."
+        )
     return dtype

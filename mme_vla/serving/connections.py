@@ -1,7 +1,9 @@
-"""Places on the server: time limits of connections, and which one is closed when the server is full.
+"""Places on the server: time limits of connections, and which one is closed when the server is
+full.
 
-uvicorn parses HTTP and websockets, limits message sizes and pings. It has no time limit for headers, which an ASGI
-application never sees: `timed_protocol` notes when bytes arrive, by methods of `asyncio.Protocol` alone.
+uvicorn parses HTTP and websockets, limits message sizes and pings. It has no time limit for
+headers, which an ASGI application never sees: `timed_protocol` notes when bytes arrive, by methods
+of `asyncio.Protocol` alone.
 """
 
 import asyncio
@@ -17,7 +19,10 @@ from mme_vla.serving.settings import Limits
 HEAD_S = 10  # seconds from a request's first byte (or the connection) to the end of its headers
 CLOSE_S = 10  # seconds for a client to complete the closing handshake
 MAX_UNAUTHENTICATED = 64  # connections without a request that the key allows
-FULL = "The server is full and this connection was silent longest; connect and begin the episode again."
+FULL = (
+    "The server is full and this connection was silent longest; connect and begin the episode"
+    " again."
+)
 IDLE = "This connection was silent for limits.idle_s; connect and begin the episode again."
 
 
@@ -26,11 +31,14 @@ class Connection:
     """One TCP connection.
 
     Attributes:
-        admitted: it made a request that the key allows, and holds one of `limits.connections` places.
+        admitted: it made a request that the key allows, and holds one of `limits.connections`
+            places.
         websocket: it holds an episode of its own.
-        busy: a complete request waits for its response. A connection whose body still arrives is not busy.
+        busy: a complete request waits for its response. A connection whose body still arrives is
+            not busy.
         in_head, in_request: headers arrive; they are complete, and the response is not.
-        silent_since, deadline: seconds of `time.monotonic`; the connection is closed at its deadline unless busy.
+        silent_since, deadline: seconds of `time.monotonic`; the connection is closed at its
+            deadline unless busy.
         dismissed: code and reason with which a websocket is to be closed.
     """
 
@@ -70,18 +78,23 @@ class Connection:
 class Connections:
     """All open connections of a server.
 
-    Clients that have not shown the key hold no place: at most `MAX_UNAUTHENTICATED` of them are open, and the longest
-    silent one is closed first. When all places are taken, the longest silent connection that is not busy is closed
-    for a new client; HTTP, which holds no episode here, before websockets.
+    Clients that have not shown the key hold no place: at most `MAX_UNAUTHENTICATED` of them are
+    open, and the longest silent one is closed first. When all places are taken, the longest silent
+    connection that is not busy is closed for a new client; HTTP, which holds no episode here,
+    before websockets.
     """
 
     def __init__(self, limits: Limits, stats: ServerStats) -> None:
         self.limits, self._stats = limits, stats
-        self.open: dict[Any, Connection] = {}  # by the client's address and port, as in an ASGI scope
+        self.open: dict[
+            Any, Connection
+        ] = {}  # by the client's address and port, as in an ASGI scope
         self.stopping = False
 
     def arrive(self, transport: asyncio.Transport) -> Connection:
-        unauthenticated = [known for known in self.open.values() if not (known.admitted or known.busy)]
+        unauthenticated = [
+            known for known in self.open.values() if not (known.admitted or known.busy)
+        ]
         if len(unauthenticated) >= MAX_UNAUTHENTICATED:
             oldest = min(unauthenticated, key=lambda known: known.silent_since)
             oldest.transport.abort()
@@ -109,7 +122,9 @@ class Connections:
         """Give a connection a place, if there is one or one can be freed."""
         if self.stopping:
             return False
-        admitted = [known for known in self.open.values() if known.admitted and known is not connection]
+        admitted = [
+            known for known in self.open.values() if known.admitted and known is not connection
+        ]
         if len(admitted) >= self.limits.connections:
             silent = [known for known in admitted if not known.busy]
             if not silent:
@@ -138,7 +153,9 @@ class Connections:
             connection.transport.abort()
 
     async def watch(self) -> None:
-        """Close connections that are silent, stalled, or do not read their responses, while the server runs."""
+        """Close connections that are silent, stalled, or do not read their responses, while the
+        server runs.
+        """
         limits = self.limits
         while True:
             await asyncio.sleep(min(1.0, limits.idle_s / 4, limits.send_s / 4))
@@ -167,7 +184,9 @@ class Connections:
 
 
 def timed_protocol(connections: Connections) -> type[H11Protocol]:
-    """HTTP protocol of uvicorn that adds each connection to `connections` and starts the time limit of headers."""
+    """HTTP protocol of uvicorn that adds each connection to `connections` and starts the time limit
+    of headers.
+    """
 
     class TimedProtocol(H11Protocol):
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

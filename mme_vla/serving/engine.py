@@ -1,4 +1,6 @@
-"""The one thread that runs the policy: waiting requests travel in one batch, long videos in pieces between batches."""
+"""The one thread that runs the policy: waiting requests travel in one batch, long videos in pieces
+between batches.
+"""
 
 import asyncio
 import logging
@@ -42,7 +44,11 @@ class ServerStats:
         if not seconds:
             return None
         p50, p95 = np.percentile(np.fromiter(seconds, float), [50, 95])
-        return {"p50": round(p50 * 1e3, 2), "p95": round(p95 * 1e3, 2), "max": round(max(seconds) * 1e3, 2)}
+        return {
+            "p50": round(p50 * 1e3, 2),
+            "p95": round(p95 * 1e3, 2),
+            "max": round(max(seconds) * 1e3, 2),
+        }
 
     def snapshot(self) -> dict[str, Any]:
         batches = self.counts["batch"]
@@ -83,7 +89,8 @@ class _Waiting[T]:
 class Engine:
     """Runs the policy for all clients.
 
-    The event loop never computes. All computing happens in one thread, in the order of `mme_vla.policy.scheduler`.
+    The event loop never computes. All computing happens in one thread, in the order of
+    `mme_vla.policy.scheduler`.
 
     Args:
         policy: with statistics, on its device.
@@ -92,12 +99,18 @@ class Engine:
     """
 
     def __init__(
-        self, policy: Policy, max_batch: int = 16, flow_steps: int | None = None, stats: ServerStats | None = None
+        self,
+        policy: Policy,
+        max_batch: int = 16,
+        flow_steps: int | None = None,
+        stats: ServerStats | None = None,
     ) -> None:
         self.policy = policy
         self.flow_steps = flow_steps
         self.stats = stats or ServerStats()
-        self.scheduler: Scheduler[_Waiting[Iterator[None]], _Waiting[Episode], Episode] = Scheduler(max_batch)
+        self.scheduler: Scheduler[_Waiting[Iterator[None]], _Waiting[Episode], Episode] = Scheduler(
+            max_batch
+        )
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "policy")
         self._readers = ThreadPoolExecutor(2, "decode")
@@ -112,18 +125,25 @@ class Engine:
             self._task.cancel()
             with suppress(asyncio.CancelledError):
                 await self._task
-        for future in [*(w.future for w in self.scheduler.acting), *(w.future for w in self.scheduler.reading)]:
+        for future in [
+            *(w.future for w in self.scheduler.acting),
+            *(w.future for w in self.scheduler.reading),
+        ]:
             future.cancel()
         self._readers.shutdown(wait=False)
         await asyncio.to_thread(self._thread.shutdown)
 
     async def act(self, episode: Episode) -> np.ndarray:
-        """The next chunk [h, w] of an episode, in one batch with all episodes that wait at the same time."""
+        """The next chunk [h, w] of an episode, in one batch with all episodes that wait at the same
+        time.
+        """
         chunk: np.ndarray = await self._join(self.scheduler.acting, episode)
         return chunk
 
     async def run(self, steps: Iterator[None], pieces: int = 1) -> None:
-        """Run an iterator that pauses between its `pieces` in the policy's thread, with others' work in the pauses."""
+        """Run an iterator that pauses between its `pieces` in the policy's thread, with others'
+        work in the pauses.
+        """
         await self._join(self.scheduler.reading, steps, pieces)
 
     async def call[T](self, function: Callable[[], T]) -> T:
@@ -178,13 +198,17 @@ class Engine:
         try:
             left = await self.call(lambda: policy.prepare(episode))
         except Exception:
-            logger.exception("preparing an episode's next chunk failed; it will be computed on request")
+            logger.exception(
+                "preparing an episode's next chunk failed; it will be computed on request"
+            )
             return
         if left:
             self.scheduler.later[episode] = None
 
     def _act(self, episodes: list[Episode]) -> list[np.ndarray | Exception]:
-        """Chunks [h, w], or why there is none. Where a batch fails each is tried alone, so that none fails another."""
+        """Chunks [h, w], or why there is none. Where a batch fails each is tried alone, so that
+        none fails another.
+        """
         noise = [episode.noise_state for episode in episodes]
         try:
             return list(self.policy.act(episodes, self.flow_steps))

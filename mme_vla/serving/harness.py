@@ -1,7 +1,9 @@
-"""A policy behind AI2's vla-evaluation-harness (package `vla-eval`): every frame is remembered, sessions act together.
+"""A policy behind AI2's vla-evaluation-harness (package `vla-eval`): every frame is remembered,
+sessions act together.
 
-The harness sends one observation a step and asks for one action. Most are answered out of the chunk under way; their
-frames count all the same, and are handed to the episode when the next chunk is chosen.
+The harness sends one observation a step and asks for one action. Most are answered out of the chunk
+under way; their frames count all the same, and are handed to the episode when the next chunk is
+chosen.
 """
 
 import logging
@@ -37,7 +39,9 @@ SPACES = ("joint_angle", "ee_pose")
 
 @dataclass
 class Running:
-    """One session's episode, and the observations since its last chunk: images by camera, and states."""
+    """One session's episode, and the observations since its last chunk: images by camera, and
+    states.
+    """
 
     episode: Episode
     images: list[dict[str, np.ndarray]] = field(default_factory=list)
@@ -54,7 +58,8 @@ class MMEVLAModelServer(PredictModelServer):
         flow_steps: of an iterative head; by default its own.
         seed: of every episode's noise.
         trust_plugins: import the modules that the checkpoint names: their authors' code.
-        max_batch_size: most sessions that act together. max_wait_time: seconds to wait for more of them.
+        max_batch_size: most sessions that act together. max_wait_time: seconds to wait for more of
+            them.
     """
 
     def __init__(
@@ -72,31 +77,40 @@ class MMEVLAModelServer(PredictModelServer):
     ) -> None:
         if not isinstance(checkpoint, Policy):
             place = find_device(device)
-            checkpoint = Policy.from_pretrained(checkpoint, device=place, dtype=dtype, trust_plugins=trust_plugins)
+            checkpoint = Policy.from_pretrained(
+                checkpoint, device=place, dtype=dtype, trust_plugins=trust_plugins
+            )
         self.policy = checkpoint.eval()
         robot = self.policy.embodiment
         check_benchmark(robot, SPACES)
         require(
             not robot.readings,
-            f"This policy reads {', '.join(robot.readings)}, which the harness does not send: it cannot be served "
-            "to it. Evaluate it with python -m mme_vla.evaluate.",
+            f"This policy reads {', '.join(robot.readings)}, which the harness does not send: it"
+            " cannot be served to it. Evaluate it with python -m mme_vla.evaluate.",
         )
         require(
             not robot.action.of_pose,
-            f"This policy returns differences to poses ({robot.action.answers}), which the harness does not "
-            "execute: it cannot be served to it. Evaluate it with python -m mme_vla.evaluate.",
+            f"This policy returns differences to poses ({robot.action.answers}), which the harness"
+            " does not execute: it cannot be served to it. Evaluate it with python -m"
+            " mme_vla.evaluate.",
         )
         settings = ServeSettings(execute=execute, flow_steps=flow_steps, seed=seed)
         settings.check_robot(robot, self.policy.require_processor().prompt_spec.past_actions)
         self.flow_steps, self.seed, self.subgoal = flow_steps, seed, subgoal_kind(self.policy)
         self.sessions: dict[str, Running] = {}
         super().__init__(
-            chunk_size=settings.executed(robot), max_batch_size=max_batch_size, max_wait_time=max_wait_time
+            chunk_size=settings.executed(robot),
+            max_batch_size=max_batch_size,
+            max_wait_time=max_wait_time,
         )
 
     def get_observation_params(self) -> dict[str, Any]:
         robot = self.policy.embodiment
-        params: dict[str, Any] = {"send_state": True, "send_video_history": True, "action_space": robot.action.space}
+        params: dict[str, Any] = {
+            "send_state": True,
+            "send_video_history": True,
+            "action_space": robot.action.space,
+        }
         params["send_wrist_image"] = CAMERAS[1] in robot.camera_names
         if self.subgoal is not None:
             params |= {"send_subgoal": True, "subgoal_mode": self.subgoal.removesuffix("_subgoal")}
@@ -131,8 +145,9 @@ class MMEVLAModelServer(PredictModelServer):
         lacking = [VIEWS[name] for name in names if images.get(VIEWS[name]) is None]
         if lacking or state is None:
             raise UserError(
-                f"the observation lacks {', '.join([*lacking, *(['states'] if state is None else [])])}: the "
-                "environment failed, or the benchmark does not send what get_observation_params() lists."
+                "the observation lacks"
+                f" {', '.join([*lacking, *(['states'] if state is None else [])])}: the environment"
+                " failed, or the benchmark does not send what get_observation_params() lists."
             )
         running.images.append({name: np.asarray(images[VIEWS[name]]) for name in names})
         running.states.append(np.asarray(state, np.float32))
@@ -142,7 +157,9 @@ class MMEVLAModelServer(PredictModelServer):
         self, obs_batch: list[dict[str, Any]], ctx_batch: list[SessionContext]
     ) -> list[dict[str, np.ndarray]]:
         """Choose the chunks of these sessions in one batch."""
-        episodes = [self._caught_up(obs, ctx) for obs, ctx in zip(obs_batch, ctx_batch, strict=True)]
+        episodes = [
+            self._caught_up(obs, ctx) for obs, ctx in zip(obs_batch, ctx_batch, strict=True)
+        ]
         return [{"actions": chunk} for chunk in self.policy.act(episodes, self.flow_steps)]
 
     def _caught_up(self, obs: dict[str, Any], ctx: SessionContext) -> Episode:
@@ -154,15 +171,21 @@ class MMEVLAModelServer(PredictModelServer):
         video = obs.get("video_history")
         if video is not None and len(video):
             episode.add_frames(np.stack(video), is_demo=True)
-        episode.observe({name: np.stack([p[name] for p in images]) for name in images[0]}, np.stack(states))
+        episode.observe(
+            {name: np.stack([p[name] for p in images]) for name in images[0]}, np.stack(states)
+        )
         return episode
 
 
 def run_server(arguments: Sequence[str] | None = None) -> None:
-    """Serve with the command-line options of the harness's model servers, but on this machine alone by default."""
+    """Serve with the command-line options of the harness's model servers, but on this machine alone
+    by default.
+    """
     parser = ArgumentParser(description="A policy behind vla-evaluation-harness.")
     parser.add_argument("--config", action=ActionConfigFile, help="YAML file with these options")
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on; clients send no key")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on; clients send no key"
+    )
     parser.add_argument("--port", type=int, default=8000)
     parser.add_argument("--address", help="host:port in one, before --host and --port")
     parser.add_argument("--verbose", "-v", action="store_true", help="log every message")
@@ -174,9 +197,14 @@ def run_server(arguments: Sequence[str] | None = None) -> None:
     host, port = options.host, options.port
     if options.address:
         name, _, number = options.address.rpartition(":")
-        require(number.isdecimal(), f"--address={options.address!r} must be host:port, such as 127.0.0.1:8000.")
+        require(
+            number.isdecimal(),
+            f"--address={options.address!r} must be host:port, such as 127.0.0.1:8000.",
+        )
         host, port = name or host, int(number)
     server = MMEVLAModelServer(**options.args.as_dict())
     if not is_local(host):
-        logger.warning("host=%s: every client that reaches this port can use it, the harness has no key", host)
+        logger.warning(
+            "host=%s: every client that reaches this port can use it, the harness has no key", host
+        )
     serve(server, host=host, port=port)

@@ -1,7 +1,9 @@
-"""What clients say: two message schemas, told apart by their keys, checked whole before anything is done.
+"""What clients say: two message schemas, told apart by their keys, checked whole before anything is
+done.
 
-The MME-VLA schema (openpi's, with memory) sends past frames and the current observation apart: `add_buffer`, then an
-`observation/…` message. The RoboMME challenge sends lists of all frames since its last request. Both reset alike.
+The MME-VLA schema (openpi's, with memory) sends past frames and the current observation apart:
+`add_buffer`, then an `observation/…` message. The RoboMME challenge sends lists of all frames since
+its last request. Both reset alike.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,16 +28,21 @@ def read_beside(
     """Depth and poses of every camera that has them, one for each of its images.
 
     Args:
-        images: [t, H, W, 3] by camera. message: lists (or arrays) of t readings. key: how it spells their names.
+        images: [t, H, W, 3] by camera. message: lists (or arrays) of t readings. key: how it spells
+            their names.
 
     Returns:
-        By the robot's names: depth float32 [t, H, W, 1] in millimetres, poses float32 [t, 3, 4] from the world to the
-        camera.
+        By the robot's names: depth float32 [t, H, W, 1] in millimetres, poses float32 [t, 3, 4]
+        from the world to the camera.
     """
     readings = {}
     for camera in robot.cameras:
-        for name, shape in zip(camera.readings, (images[camera.name].shape[1:3], POSE), strict=False):
-            readings[name] = _reading_rows(key.format(name), message, len(images[camera.name]), shape)
+        for name, shape in zip(
+            camera.readings, (images[camera.name].shape[1:3], POSE), strict=False
+        ):
+            readings[name] = _reading_rows(
+                key.format(name), message, len(images[camera.name]), shape
+            )
         if camera.readings:
             depth = camera.readings[0]
             if (readings[depth] < 0).any() or (readings[depth] > DEEPEST).any():
@@ -44,12 +51,25 @@ def read_beside(
     return readings
 
 
-def _reading_rows(key: str, message: Mapping[str, Any], count: int, shape: tuple[int, ...]) -> np.ndarray:
+def _reading_rows(
+    key: str, message: Mapping[str, Any], count: int, shape: tuple[int, ...]
+) -> np.ndarray:
     if key not in message:
-        expected = "one pose [3, 4] from the world to the camera" if shape == POSE else "depth in millimetres"
-        raise UserError(f"The request lacks {key}: this policy reads {expected} beside every image of the camera.")
+        expected = (
+            "one pose [3, 4] from the world to the camera"
+            if shape == POSE
+            else "depth in millimetres"
+        )
+        raise UserError(
+            f"The request lacks {key}: this policy reads {expected} beside every image of the"
+            " camera."
+        )
     value = message[key]
-    rows = list(value) if isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim) else None
+    rows = (
+        list(value)
+        if isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim)
+        else None
+    )
     if rows is None or len(rows) != count:
         got = type(value).__name__ if rows is None else f"{len(rows)} entries"
         raise UserError(f"{key} must have one entry for each of {count} frames, got {got}.")
@@ -60,15 +80,24 @@ def _reading_rows(key: str, message: Mapping[str, Any], count: int, shape: tuple
         except ValueError:  # rows of different lengths
             array = np.empty(0, object)
         fits = array.dtype.kind in "fiu" and array.shape in (shape, (*shape, 1))
-        got = f"{array.dtype} {list(array.shape)}" if isinstance(row, np.ndarray) else type(row).__name__
+        got = (
+            f"{array.dtype} {list(array.shape)}"
+            if isinstance(row, np.ndarray)
+            else type(row).__name__
+        )
         require(fits, f"{key} must hold arrays {list(shape)} of numbers, got {got}.")
         readings.append(_numbers(key, array).reshape(shape))
     return np.stack(readings)
 
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal")
-OPTIONS = "available_multi_choices"  # beside an observation, for policies that choose; the benchmark's name
-IMAGE_KEYS = {"front": "observation/image", "wrist": "observation/wrist_image"}  # openpi's names of RoboMME's cameras
+OPTIONS = (  # beside an observation, for policies that choose; the benchmark's name
+    "available_multi_choices"
+)
+IMAGE_KEYS = {
+    "front": "observation/image",
+    "wrist": "observation/wrist_image",
+}  # openpi's names of RoboMME's cameras
 MOST_GOAL = 4000  # characters
 SIDES = (8, 4096)  # pixels of an image's side
 KNOWN = ("reset", "add_buffer", "observation/image", "front_rgb_list")
@@ -97,12 +126,13 @@ class AddBuffer:
 class Infer:
     """Choose a chunk.
 
-    images: the current ones, by camera. state [s]. goal: the task in words. subgoals: by kind, those given.
-    frames: frames to remember first, the current one last (challenge); None where they came by `add_buffer`.
-    first: whether the message begins an episode; None where the schema does not say.
-    options: what can be chosen, for a policy that chooses; none where they stay as they were.
-    states: what the robot felt at `frames`, [t, s].
-    observed: for a robot that reads more than images, all that its cameras delivered at the frames of this message, in
+    images: the current ones, by camera. state [s]. goal: the task in words. subgoals: by kind,
+    those given. frames: frames to remember first, the current one last (challenge); None where they
+    came by `add_buffer`. first: whether the message begins an episode; None where the schema does
+    not say. options: what can be chosen, for a policy that chooses; none where they stay as they
+    were. states: what the robot felt at `frames`, [t, s].
+    observed: for a robot that reads more than images, all that its cameras delivered at the frames
+    of this message, in
         the form of `Episode.observe`: images by camera, depth and poses; `states` goes with it.
     """
 
@@ -124,20 +154,24 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
     """Recognise a decoded message.
 
     Args:
-        most_frames: longest list of frames taken. robot: the policy's, which says what an observation is made of.
+        most_frames: longest list of frames taken. robot: the policy's, which says what an
+            observation is made of.
     """
     require(isinstance(message, dict), f"A request is a map, got {type(message).__name__}.")
     space_name = robot.action.answers
     space = message.get("action_space", space_name)
-    require(space == space_name, f"action_space={str(space)[:40]!r}: this policy returns {space_name} only.")
+    require(
+        space == space_name,
+        f"action_space={str(space)[:40]!r}: this policy returns {space_name} only.",
+    )
     if _flag(message, "reset"):
         return Reset()
     if _flag(message, "add_buffer"):
         return _add_buffer(message, most_frames, robot)
     require(
         not robot.action.of_pose or "action_space" in message,
-        f"This policy returns differences to the tool's pose at each step, to be added to the pose at that step: "
-        f"send action_space={space_name!r} in the request to confirm it.",
+        "This policy returns differences to the tool's pose at each step, to be added to the pose"
+        f" at that step: send action_space={space_name!r} in the request to confirm it.",
     )
     if "front_rgb_list" in message or "task_goal" in message:
         return _challenge(message, most_frames, robot)
@@ -146,8 +180,8 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
     keys = [key for key in message if isinstance(key, str)][:10]
     require(
         not keys or not set(keys) <= set(KNOWN),  # flags: true was handled above
-        f"{' and '.join(f'{key}=false' for key in keys)}: no request. Send reset=true, or an observation with the "
-        "keys observation/image, … or front_rgb_list, …",
+        f"{' and '.join(f'{key}=false' for key in keys)}: no request. Send reset=true, or an"
+        " observation with the keys observation/image, … or front_rgb_list, …",
     )
     unknown = [key for key in keys if key not in KNOWN]
     near = did_you_mean(unknown[0], KNOWN) if unknown else f"Known: {', '.join(KNOWN)}."
@@ -167,24 +201,30 @@ def _flag(message: dict[Any, Any], key: str) -> bool:
 def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> AddBuffer:
     require(
         not robot.readings,
-        f"This policy reads {', '.join(robot.readings)} at every frame, and add_buffer has no place for them: send "
-        "past frames in the challenge's lists, and the current one in either schema.",
+        f"This policy reads {', '.join(robot.readings)} at every frame, and add_buffer has no place"
+        " for them: send past frames in the challenge's lists, and the current one in either"
+        " schema.",
     )
     images = _array(message, "images")
     if images.ndim != 5 or images.shape[1] != 1:
-        raise UserError(f"images must be uint8 [frames, 1, height, width, 3], got {images.dtype} {list(images.shape)}.")
+        raise UserError(
+            f"images must be uint8 [frames, 1, height, width, 3], got {images.dtype}"
+            f" {list(images.shape)}."
+        )
     count = len(images)
     frames = _frames("images", list(images[:, 0]), most_frames)
     states = _numbers("state", _array(message, "state"))
     width = robot.state.width
     require(
-        states.shape == (count, width), f"state must be [{count}, {width}], one row a frame, got {list(states.shape)}."
+        states.shape == (count, width),
+        f"state must be [{count}, {width}], one row a frame, got {list(states.shape)}.",
     )
     start = message.get("exec_start_idx", 0)
     if isinstance(start, np.integer):
         start = int(start)
     require(
-        type(start) is int and start >= 0, f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}."
+        type(start) is int and start >= 0,
+        f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}.",
     )
     return AddBuffer(frames, start, states)
 
@@ -194,19 +234,32 @@ def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
     images = {name: _image(key, _get(message, key)) for name, key in keys.items()}
     state = _numbers("observation/state", _array(message, "observation/state"))
     if state.shape != (robot.state.width,):
-        raise UserError(f"observation/state must be [{robot.state.width}], got {list(state.shape)}.")
+        raise UserError(
+            f"observation/state must be [{robot.state.width}], got {list(state.shape)}."
+        )
     goal, options = _goal("prompt", _get(message, "prompt")), _options(message, robot)
     if not robot.readings:
         return Infer(images, state, goal, _subgoals(message), options=options)
-    readings = {f"observation/{name}": [_get(message, f"observation/{name}")] for name in robot.readings}
+    readings = {
+        f"observation/{name}": [_get(message, f"observation/{name}")] for name in robot.readings
+    }
     frames = {name: image[None] for name, image in images.items()}
     frames |= read_beside(robot, frames, readings, "observation/{}")
-    return Infer(images, state, goal, _subgoals(message), options=options, states=state[None], observed=frames)
+    return Infer(
+        images,
+        state,
+        goal,
+        _subgoals(message),
+        options=options,
+        states=state[None],
+        observed=frames,
+    )
 
 
 def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> Infer:
     require(
-        robot.action.space is not None, f"The robot {robot.name!r} is not the benchmark's: send observation/… messages."
+        robot.action.space is not None,
+        f"The robot {robot.name!r} is not the benchmark's: send observation/… messages.",
     )
     keys = {name: f"{name}_rgb_list" for name in robot.camera_names}
     views = {name: _frames(key, _get(message, key), most_frames) for name, key in keys.items()}
@@ -218,7 +271,10 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
         counts = ", ".join(f"{key} has {length}" for key, length in lengths.items())
         raise UserError(f"All lists need one entry a frame: {counts}.")
     first = _get(message, "is_first_step")
-    require(isinstance(first, bool | np.bool_), f"is_first_step must be true or false, got {type(first).__name__}.")
+    require(
+        isinstance(first, bool | np.bool_),
+        f"is_first_step must be true or false, got {type(first).__name__}.",
+    )
     goal = _goal("task_goal", _get(message, "task_goal"))
     states = np.stack([benchmark_state(*proprio) for proprio in zip(joints, grippers, strict=True)])
     images = {name: view[-1] for name, view in views.items()}
@@ -227,7 +283,17 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
     if robot.readings:
         frame_views = {name: np.stack(view) for name, view in views.items()}
         frame_views |= read_beside(robot, frame_views, message, "{}_list")
-    return Infer(images, states[-1], goal, _subgoals(message), frames, bool(first), options, states, frame_views)
+    return Infer(
+        images,
+        states[-1],
+        goal,
+        _subgoals(message),
+        frames,
+        bool(first),
+        options,
+        states,
+        frame_views,
+    )
 
 
 def _subgoals(message: dict[Any, Any]) -> dict[str, str]:
@@ -237,12 +303,18 @@ def _subgoals(message: dict[Any, Any]) -> dict[str, str]:
 def _options(message: dict[Any, Any], robot: Embodiment) -> tuple[Option, ...]:
     """What the message offers to a robot that chooses; others are not offered anything."""
     letters = len(robot.action.choice)
-    return read_options(message[OPTIONS], letters) if letters and message.get(OPTIONS) is not None else ()
+    return (
+        read_options(message[OPTIONS], letters)
+        if letters and message.get(OPTIONS) is not None
+        else ()
+    )
 
 
 def _get(message: dict[Any, Any], key: str) -> Any:
     if key not in message:
-        raise UserError(f"The request lacks {key}; it has {sorted(str(k)[:40] for k in list(message)[:20])}.")
+        raise UserError(
+            f"The request lacks {key}; it has {sorted(str(k)[:40] for k in list(message)[:20])}."
+        )
     return message[key]
 
 
@@ -281,7 +353,9 @@ def _frames(key: str, frames: Any, most: int) -> list[np.ndarray]:
         frames = list(frames) if frames.ndim == 4 else None
     require(isinstance(frames, list), f"{key} must be a list of uint8 images [height, width, 3].")
     if not 1 <= len(frames) <= most:
-        raise UserError(f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames).")
+        raise UserError(
+            f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames)."
+        )
     shapes = {_image(key, frame).shape for frame in frames}
     require(len(shapes) <= 1, f"All images of {key} need one size, got {sorted(shapes)[:3]}.")
     return frames
@@ -294,7 +368,8 @@ def _image(key: str, image: Any) -> np.ndarray:
     require(fits, f"{key} must be a uint8 image [height, width, 3], got {got}.")
     low, high = sorted(image.shape[:2])
     require(
-        low >= SIDES[0] and high <= SIDES[1], f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {got}."
+        low >= SIDES[0] and high <= SIDES[1],
+        f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {got}.",
     )
     require(high <= 8 * low, f"{key}: an image {got} is too narrow to be scaled into a square.")
     checked: np.ndarray = image
@@ -303,7 +378,10 @@ def _image(key: str, image: Any) -> np.ndarray:
 
 def _goal(key: str, value: Any) -> str:
     goal = _text(key, value)
-    require(goal.strip(), f"{key} is {goal[:40]!r}: a policy is told what to do in words. Send the task as a text.")
+    require(
+        goal.strip(),
+        f"{key} is {goal[:40]!r}: a policy is told what to do in words. Send the task as a text.",
+    )
     return goal
 
 
@@ -311,7 +389,15 @@ def _text(key: str, value: Any) -> str:
     if isinstance(value, list | tuple) and value:
         value = value[0]  # the benchmark gives a goal as a list of wordings
     if not isinstance(value, str):
-        raise UserError(f"{key} must be a text (or a list that begins with one), got {type(value).__name__}.")
-    require(len(value) <= MOST_GOAL, f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.")
-    require(is_text(value), f"{key} holds half of a surrogate pair, which is no character: {value[:40]!a}.")
+        raise UserError(
+            f"{key} must be a text (or a list that begins with one), got {type(value).__name__}."
+        )
+    require(
+        len(value) <= MOST_GOAL,
+        f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.",
+    )
+    require(
+        is_text(value),
+        f"{key} holds half of a surrogate pair, which is no character: {value[:40]!a}.",
+    )
     return str(value)

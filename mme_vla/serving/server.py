@@ -24,11 +24,17 @@ def warm_up(policy: Policy, settings: ServeSettings) -> None:
     robot, count = policy.embodiment, settings.encode_chunk
     # Black images of every camera, and a wall at no distance where it reads depth.
     frames: dict[str, np.ndarray] = {}
-    beside = (np.zeros((count, SIDE, SIDE, 1), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (count, 1, 1)))
+    beside = (
+        np.zeros((count, SIDE, SIDE, 1), np.float32),
+        np.tile(np.eye(3, 4, dtype=np.float32), (count, 1, 1)),
+    )
     for camera in robot.cameras:
         frames[camera.name] = np.zeros((count, SIDE, SIDE, 3), np.uint8)
         frames |= dict(zip(camera.readings, beside, strict=False))
-    episodes = [policy.start_episode("warm up", seed=settings.seed) for _ in range(min(2, settings.max_batch))]
+    episodes = [
+        policy.start_episode("warm up", seed=settings.seed)
+        for _ in range(min(2, settings.max_batch))
+    ]
     for episode in episodes:
         episode.subgoal, episode.options = "warm up", (Option("a", "warm up"),)
         episode.observe(frames, np.zeros((count, robot.state.width), np.float32))
@@ -53,8 +59,8 @@ HEAD = 2**16  # bytes of request line and headers
 class PolicyServer:
     """Serves a policy.
 
-    Use: `await server.start()`, later `await server.stop()`; both in one event loop. Each connection has an episode of
-    its own, which ends with it.
+    Use: `await server.start()`, later `await server.stop()`; both in one event loop. Each
+    connection has an episode of its own, which ends with it.
 
     Args:
         policy: with normalisation statistics, in eval mode, on its device.
@@ -62,7 +68,9 @@ class PolicyServer:
         name: what metadata call the policy. trained: False says that its weights are fresh.
     """
 
-    def __init__(self, policy: Policy, settings: ServeSettings, *, name: str = "", trained: bool = True) -> None:
+    def __init__(
+        self, policy: Policy, settings: ServeSettings, *, name: str = "", trained: bool = True
+    ) -> None:
         policy.require_processor().require_stats()
         settings.check_robot(policy.embodiment, policy.require_processor().prompt_spec.past_actions)
         self.settings, self.stats = settings, ServerStats()
@@ -83,16 +91,24 @@ class PolicyServer:
         config = self._config()
         config.load()
         self._uvicorn = uvicorn.Server(config)
-        self._uvicorn.lifespan = config.lifespan_class(config)  # `serve()` would take over the signals of the process
+        self._uvicorn.lifespan = config.lifespan_class(
+            config
+        )  # `serve()` would take over the signals of the process
         await self._uvicorn.startup(sockets=[bound])
         self.port = bound.getsockname()[1]
-        for work in (self._log_regularly(), self.connections.watch(), self.sessions.forget_silent()):
+        for work in (
+            self._log_regularly(),
+            self.connections.watch(),
+            self.sessions.forget_silent(),
+        ):
             self._background.add(asyncio.get_running_loop().create_task(work))
 
     def _config(self) -> uvicorn.Config:
         limits = self.settings.limits
         return uvicorn.Config(
-            make_app(self.engine, self.settings, pack(self.metadata), self.connections, self.sessions),
+            make_app(
+                self.engine, self.settings, pack(self.metadata), self.connections, self.sessions
+            ),
             http=timed_protocol(self.connections),
             ws="websockets-sansio",
             ws_max_size=limits.message_bytes,
@@ -111,7 +127,9 @@ class PolicyServer:
         )
 
     async def stop(self) -> None:
-        """Refuse new clients, finish the requests that are running, close every connection with a reason."""
+        """Refuse new clients, finish the requests that are running, close every connection with a
+        reason.
+        """
         connections, server = self.connections, self._uvicorn
         connections.stopping = True
         for task in self._background:

@@ -1,4 +1,6 @@
-"""One client: its episode, and what its requests do to it. Dropping the session frees all the client's memory."""
+"""One client: its episode, and what its requests do to it. Dropping the session frees all the
+client's memory.
+"""
 
 import asyncio
 import time
@@ -40,7 +42,8 @@ def begins(request: Request) -> bool:
 class Session:
     """The episode of one client.
 
-    Requests of a session must come one after the other; `respond` is not to be called twice at the same time.
+    Requests of a session must come one after the other; `respond` is not to be called twice at the
+    same time.
     """
 
     def __init__(self, engine: Engine, settings: ServeSettings) -> None:
@@ -56,17 +59,23 @@ class Session:
         """Do what a request asks and return the answer, not yet packed.
 
         Args:
-            begun: when the message was there whole (`time.perf_counter()`); the answer says how long it took.
+            begun: when the message was there whole (`time.perf_counter()`); the answer says how
+                long it took.
         """
         if isinstance(request, Reset):
             self._begin()
             return {"reset_finished": True, "reset_time_ms": self._took("reset", begun)}
         if isinstance(request, AddBuffer):
             await self._add(request)
-            return {"add_buffer_finished": True, "add_buffer_time_ms": self._took("add_buffer", begun)}
+            return {
+                "add_buffer_finished": True,
+                "add_buffer_time_ms": self._took("add_buffer", begun),
+            }
         actions = await self._infer(request)
         space = self._engine.policy.embodiment.action
-        choices = {"choices": [benchmark_action(space, row) for row in actions]} if space.choice else {}
+        choices = (
+            {"choices": [benchmark_action(space, row) for row in actions]} if space.choice else {}
+        )
         return {"actions": actions, **choices, "infer_time_ms": self._took("infer", begun)}
 
     def _took(self, kind: str, begun: float) -> float:
@@ -78,20 +87,31 @@ class Session:
         if request.exec_start > 0:
             self._exec_start = request.exec_start
         self._check_capacity(len(request.frames))
-        await self._engine.run(self._add_frames(request.frames, request.states), self._pieces(request.frames))
+        await self._engine.run(
+            self._add_frames(request.frames, request.states), self._pieces(request.frames)
+        )
 
     async def _infer(self, request: Infer) -> np.ndarray:
         policy = self._engine.policy
         reads_actions = policy.require_processor().prompt_spec.past_actions > 0
         if request.first:
-            self._begin()  # a client that repeats its first request means the same episode, not a longer one
+            # a client that repeats its first request means the same episode, not a longer one
+            self._begin()
         elif request.first is not None and self.episode.n_observed_frames == 0:
             raise NoEpisodeError(
-                "is_first_step is false but this episode has no frame here: its first request must come first. Was the "
-                "server restarted, or the connection lost? Reset and begin the episode again."
+                "is_first_step is false but this episode has no frame here: its first request must"
+                " come first. Was the server restarted, or the connection lost? Reset and begin the"
+                " episode again."
             )
-        if request.frames is None and self.episode.n_observed_frames == 0 and policy.memory is not None:
-            raise UserError("This policy remembers past frames: send them with add_buffer, the current one included.")
+        if (
+            request.frames is None
+            and self.episode.n_observed_frames == 0
+            and policy.memory is not None
+        ):
+            raise UserError(
+                "This policy remembers past frames: send them with add_buffer, the current one"
+                " included."
+            )
         if request.frames is None and request.observed is not None:
             self._check_capacity(1)
         if request.frames is not None:
@@ -100,8 +120,8 @@ class Session:
                 self._exec_start = len(request.frames) - 1
         elif reads_actions and self._n_frames_at_action == self.episode.n_observed_frames:
             raise UserError(
-                "This policy reads which actions were executed, one a frame: send the frames since the last chunk with "
-                "add_buffer before the observation."
+                "This policy reads which actions were executed, one a frame: send the frames since"
+                " the last chunk with add_buffer before the observation."
             )
         episode = self.episode
         episode.goal, episode.subgoal = request.goal, self._subgoal(request)
@@ -112,7 +132,9 @@ class Session:
             raise RuntimeError("the policy's answer is not finite")
         self._n_frames_at_action = episode.n_observed_frames
         # A challenge client executes all it is given; an MME-VLA client cuts the chunk itself.
-        return chunk if request.frames is None else chunk[: self._settings.executed(policy.embodiment)]
+        return (
+            chunk if request.frames is None else chunk[: self._settings.executed(policy.embodiment)]
+        )
 
     def _observe(self, request: Infer) -> Iterator[None]:
         if request.observed is not None and request.states is not None:
@@ -121,10 +143,16 @@ class Session:
             if request.frames is not None:
                 yield from self._add_frames(request.frames, request.states)
             self.episode.set_view(request.images, request.state)
-        _ = self.episode.prompt  # a goal that cannot be read fails here, and not in a batch with others
+        _ = (
+            self.episode.prompt
+        )  # a goal that cannot be read fails here, and not in a batch with others
 
-    def _add_frames(self, frames: Sequence[np.ndarray], states: np.ndarray | None) -> Iterator[None]:
-        """Take frames into memory, pausing after every `encode_chunk` frames that have to be encoded."""
+    def _add_frames(
+        self, frames: Sequence[np.ndarray], states: np.ndarray | None
+    ) -> Iterator[None]:
+        """Take frames into memory, pausing after every `encode_chunk` frames that have to be
+        encoded.
+        """
         episode, piece = self.episode, self._piece
         for start in range(0, len(frames), piece):
             if start:
@@ -142,7 +170,9 @@ class Session:
                 yield
             part = slice(start, start + piece)
             demo = episode.n_observed_frames + np.arange(len(states[part])) < self._exec_start
-            episode.observe({name: values[part] for name, values in frames.items()}, states[part], demo)
+            episode.observe(
+                {name: values[part] for name, values in frames.items()}, states[part], demo
+            )
 
     @property
     def _piece(self) -> int:
@@ -157,8 +187,8 @@ class Session:
         total, most = self.episode.n_observed_frames + count, self._settings.limits.frames
         require(
             total <= most,
-            f"An episode of {total} frames: this server remembers at most {most} (limits.frames). Reset between "
-            "episodes.",
+            f"An episode of {total} frames: this server remembers at most {most} (limits.frames)."
+            " Reset between episodes.",
         )
 
     def _subgoal(self, request: Infer) -> str | None:
@@ -172,8 +202,9 @@ class Session:
 
 Name = tuple[str, str]  # address and X-Session
 LOST = (
-    "There is no episode of yours here: it was never begun, an error ended it, it was silent for too long, it gave its "
-    "place to another on a full server, or the server was restarted. Reset and begin the episode again."
+    "There is no episode of yours here: it was never begun, an error ended it, it was silent for"
+    " too long, it gave its place to another on a full server, or the server was restarted. Reset"
+    " and begin the episode again."
 )
 
 
@@ -183,7 +214,9 @@ class BusyError(Exception):
 
 @dataclass(eq=False)
 class SessionEntry:
-    """A session. requests: those it works on or that wait for their turn; `used`: end of the last one."""
+    """A session. requests: those it works on or that wait for their turn; `used`: end of the last
+    one.
+    """
 
     session: Session
     requests: int = 0
@@ -215,7 +248,9 @@ class HttpSessions:
             entry.used = time.monotonic()
 
     def find(self, name: Name, request: Request) -> SessionEntry:
-        """The session of that name; a new one takes the place of the longest silent where there is no other."""
+        """The session of that name; a new one takes the place of the longest silent where there is
+        no other.
+        """
         if name in self.entries:
             return self.entries[name]
         if not begins(request):
@@ -246,7 +281,9 @@ class HttpSessions:
 
 
 def error_text(error: Exception) -> str:
-    """What a client is told of an error: a mistake of its own in full, anything else without its traceback."""
+    """What a client is told of an error: a mistake of its own in full, anything else without its
+    traceback.
+    """
     if isinstance(error, UserError | BusyError):
         return str(error)
     return f"The server failed on this request ({type(error).__name__}: {str(error)[:200]})."

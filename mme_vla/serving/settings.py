@@ -23,7 +23,9 @@ def listen(host: str, port: int) -> socket.socket:
     require(0 <= port < 2**16, f"port={port!r} is no port; choose 0 (any free one) to 65535.")
     bound = None
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM
+        )[0]
         bound = socket.socket(family, kind, protocol)
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         bound.bind(address)
@@ -31,7 +33,9 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         if bound is not None:
             bound.close()
-        raise UserError(f"Cannot listen at {host}, port {port} ({error.strerror}); choose others.") from None
+        raise UserError(
+            f"Cannot listen at {host}, port {port} ({error.strerror}); choose others."
+        ) from None
     return bound
 
 
@@ -61,7 +65,9 @@ class ServeSettings:
     port: Annotated[int, Range(0, 65535)] = 8001
     api_key: str | None = field(default=None, repr=False)
     require_key: bool = False
-    action_space: Literal["joint_angle", "ee_pose", "waypoint", "ee_delta", "multi_choice"] | None = None
+    action_space: (
+        Literal["joint_angle", "ee_pose", "waypoint", "ee_delta", "multi_choice"] | None
+    ) = None
     execute: PositiveInt | None = None
     flow_steps: PositiveInt | None = None
     seed: int = 42
@@ -72,12 +78,16 @@ class ServeSettings:
 
     def __post_init__(self) -> None:
         key = self.api_key
-        if key is not None and not (key.isascii() and key.isprintable() and key.strip() == key != ""):
-            raise UserError("api_key must be plain ASCII text without blanks around it; null for no key.")
+        if key is not None and not (
+            key.isascii() and key.isprintable() and key.strip() == key != ""
+        ):
+            raise UserError(
+                "api_key must be plain ASCII text without blanks around it; null for no key."
+            )
         require(
             not self.require_key or key is not None,
-            "require_key=true, and there is no api_key: set the environment variable MME_VLA_API_KEY, or "
-            "require_key=false to serve every client that reaches the port.",
+            "require_key=true, and there is no api_key: set the environment variable"
+            " MME_VLA_API_KEY, or require_key=false to serve every client that reaches the port.",
         )
 
     @classmethod
@@ -91,14 +101,17 @@ class ServeSettings:
         return min(self.execute or robot.action.execute, robot.action.horizon)
 
     def check_robot(self, robot: Embodiment, past_actions: int = 0) -> None:
-        """Make sure that a policy for this robot, whose prompt reads so many past actions, can be served like this."""
+        """Make sure that a policy for this robot, whose prompt reads so many past actions, can be
+        served like this.
+        """
         require(
             not past_actions or robot.action.frames is not None,
-            f"This policy reads which motions were executed, and the frames that a client sends do not tell how "
-            f"many motions of {robot.name!r} they took: it cannot be served.",
+            "This policy reads which motions were executed, and the frames that a client sends do"
+            f" not tell how many motions of {robot.name!r} they took: it cannot be served.",
         )
         require(
             self.action_space in (None, robot.action.answers),
-            f"action_space={self.action_space}: this policy returns {robot.action.answers}, "
-            f"{robot.action.width} numbers an action, and nothing is converted. The client has to convert.",
+            f"action_space={self.action_space}: this policy returns {robot.action.answers},"
+            f" {robot.action.width} numbers an action, and nothing is converted. The client has to"
+            " convert.",
         )

@@ -1,4 +1,5 @@
-"""Optional speed of a backbone: compiled attention, CUDA graphs, recomputation, sharding groups, real-time chunking.
+"""Optional speed of a backbone: compiled attention, CUDA graphs, recomputation, sharding groups,
+real-time chunking.
 
 Each is a class to inherit from beside `Backbone`. Callers test for it with `isinstance`.
 """
@@ -15,22 +16,35 @@ if TYPE_CHECKING:
 
 
 Recompute = bool | str
-"""What to compute again in the backward pass: True everything inside a layer, False nothing, or SELECTIVE."""
+"""What to compute again in the backward pass: True everything inside a layer, False nothing, or
+SELECTIVE.
+"""
 ALL, SELECTIVE = "all", "selective"
-"""Everything inside a layer; or all of it but the results of matrix products and of attention, which are kept."""
+"""Everything inside a layer; or all of it but the results of matrix products and of attention,
+which are kept.
+"""
 
 _ATEN = torch.ops.aten
 SAVED_OPS: list[Any] = [
-    _ATEN.mm.default, _ATEN.addmm.default, _ATEN.bmm.default, _ATEN.convolution.default,
-    _ATEN._scaled_dot_product_flash_attention.default, _ATEN._scaled_dot_product_efficient_attention.default,
-    _ATEN._scaled_dot_product_cudnn_attention.default, _ATEN._scaled_dot_product_flash_attention_for_cpu.default,
+    _ATEN.mm.default,
+    _ATEN.addmm.default,
+    _ATEN.bmm.default,
+    _ATEN.convolution.default,
+    _ATEN._scaled_dot_product_flash_attention.default,
+    _ATEN._scaled_dot_product_efficient_attention.default,
+    _ATEN._scaled_dot_product_cudnn_attention.default,
+    _ATEN._scaled_dot_product_flash_attention_for_cpu.default,
     torch.ops.higher_order.flex_attention,
-]  # fmt: skip
+]
 
 
 def checkpoint_options(how: Recompute) -> dict[str, Any]:
     """What `torch.utils.checkpoint` and transformers take besides the layer."""
-    contexts = {"context_fn": partial(create_selective_checkpoint_contexts, SAVED_OPS)} if how == SELECTIVE else {}
+    contexts = (
+        {"context_fn": partial(create_selective_checkpoint_contexts, SAVED_OPS)}
+        if how == SELECTIVE
+        else {}
+    )
     return {"use_reentrant": False, **contexts}
 
 
@@ -42,7 +56,9 @@ def run_layer(layer: Callable[..., Any], *inputs: Any, how: Recompute) -> Any:
 
 
 class HasAttentionBackends:
-    """Capability of a backbone: it can compute attention with each backend (`mme_vla.backbone.layers.BACKENDS`)."""
+    """Capability of a backbone: it can compute attention with each backend
+    (`mme_vla.backbone.layers.BACKENDS`).
+    """
 
     def set_attention_backend(self, name: str) -> None:
         """Use another backend than `auto`."""
@@ -58,20 +74,28 @@ class Recomputes:
 
 
 class Sharded:
-    """Capability of a backbone or policy: it has sharding groups of its own instead of `backbone_groups`."""
+    """Capability of a backbone or policy: it has sharding groups of its own instead of
+    `backbone_groups`.
+    """
 
     def shard_groups(self) -> "Sequence[ShardGroup]":
-        """Modules that are gathered one by one. All other weights are gathered for a whole pass, in float32."""
+        """Modules that are gathered one by one. All other weights are gathered for a whole pass, in
+        float32.
+        """
         raise NotImplementedError
 
 
 class CapturableSampling:
-    """Capability of a backbone: `sample` never waits for the GPU, so that it can be captured as a CUDA graph."""
+    """Capability of a backbone: `sample` never waits for the GPU, so that it can be captured as a
+    CUDA graph.
+    """
 
     def compile_sampling(self) -> None:
         """Keep what depends on weights alone between chunks."""
         raise NotImplementedError
 
     def sampling_stamp(self) -> object:
-        """Identifies the weights that the kept values were computed from; graphs are captured anew when it changes."""
+        """Identifies the weights that the kept values were computed from; graphs are captured anew
+        when it changes.
+        """
         raise NotImplementedError

@@ -1,4 +1,6 @@
-"""A chunk as one CUDA graph: thousands of kernel launches become one, for each batch size that occurs."""
+"""A chunk as one CUDA graph: thousands of kernel launches become one, for each batch size that
+occurs.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -26,8 +28,8 @@ class _Captured:
 class GraphSampler:
     """Captures `run` once for every size, and replays it from then on.
 
-    Batches are padded to a power of two with rows whose output is ignored, so that few sizes occur. All graphs share
-    one pool of memory: a chunk is copied out before the next one is computed.
+    Batches are padded to a power of two with rows whose output is ignored, so that few sizes occur.
+    All graphs share one pool of memory: a chunk is copied out before the next one is computed.
 
     Args:
         run: what is captured; it must give the same for a row whatever stands beside it.
@@ -61,8 +63,9 @@ class GraphSampler:
     def _capture(self, inputs: Inputs) -> _Captured:
         if self._pool is None:
             self._pool, self._stream = torch.cuda.graph_pool_handle(), torch.cuda.Stream()
-        # Libraries choose their kernels and take their workspaces (cuBLAS 32 MiB a stream) in a first run, which no
-        # graph may hold: on the stream that all graphs are captured on, so that they are there.
+        # Libraries choose their kernels and take their workspaces (cuBLAS 32 MiB a stream) in a
+        # first run, which no graph may hold: on the stream that all graphs are captured on, so that
+        # they are there.
         self._stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self._stream):
             self._run(inputs)
@@ -84,15 +87,19 @@ def _map(inputs: Inputs, change: Callable[[Tensor], Tensor]) -> Inputs:
 
 
 def _tensors(inputs: Inputs) -> list[Tensor]:
-    return [x for value in inputs.values() for x in ([value] if isinstance(value, Tensor) else value.tensors())]
+    return [
+        x
+        for value in inputs.values()
+        for x in ([value] if isinstance(value, Tensor) else value.tensors())
+    ]
 
 
 class CapturedSampling:
     """A policy's sampler behind graphs: one `GraphSampler` for each number of steps.
 
     Args:
-        sample: (batch, memory, noise, steps) → chunks. stamp: what graphs depend on beside their inputs and the places
-            of weights; where it changes they are captured again.
+        sample: (batch, memory, noise, steps) → chunks. stamp: what graphs depend on beside their
+            inputs and the places of weights; where it changes they are captured again.
     """
 
     def __init__(self, sample: Callable[..., Tensor], stamp: Callable[[], object]) -> None:
@@ -100,7 +107,9 @@ class CapturedSampling:
         self._graphs: dict[int, GraphSampler] = {}
         self._captured_at: object = None
 
-    def __call__(self, batch: Batch, memory: MemoryTokens | None, noise: Mapping[str, Tensor], steps: int) -> Tensor:
+    def __call__(
+        self, batch: Batch, memory: MemoryTokens | None, noise: Mapping[str, Tensor], steps: int
+    ) -> Tensor:
         """Chunks [b, h, a]."""
         if (stamp := self._stamp()) != self._captured_at:
             self._graphs, self._captured_at = {}, stamp

@@ -9,8 +9,9 @@ from torch import nn
 class ShardGroup(NamedTuple):
     """A module whose weights are gathered before its forward and freed after it.
 
-    module: its weights are read in its forward alone, and it returns tensors or collections of them.
-    full: gather in float32 instead of bfloat16: modules that compute in float32, and towers that hold such layers
+    module: its weights are read in its forward alone, and it returns tensors or collections of
+    them. full: gather in float32 instead of bfloat16: modules that compute in float32, and towers
+    that hold such layers
         without calling them.
     """
 
@@ -19,13 +20,16 @@ class ShardGroup(NamedTuple):
 
 
 def stacked_layers(module: nn.Module) -> Iterator[nn.Module]:
-    """The layers of a network: members of a `ModuleList` of at least two of one class, of nested ones the outermost.
+    """The layers of a network: members of a `ModuleList` of at least two of one class, of nested
+    ones the outermost.
 
     They run one after the other, so that one layer's weights are needed at a time.
     """
     for child in module.children():
         inside = list(child.children())
-        alike = len({type(layer) for layer in inside}) == 1 and not isinstance(inside[0], nn.ModuleList)
+        alike = len({type(layer) for layer in inside}) == 1 and not isinstance(
+            inside[0], nn.ModuleList
+        )
         if isinstance(child, nn.ModuleList) and len(inside) > 1 and alike:
             yield from inside
         else:

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mme_vla.subgoal.background import BackgroundPredictor
-    from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, Usage, build_predictor
+    from mme_vla.subgoal.base import (
+        Subgoal,
+        SubgoalEpisode,
+        SubgoalPredictor,
+        Usage,
+        build_predictor,
+    )
     from mme_vla.subgoal.gemini import Gemini, OpenAI
     from mme_vla.subgoal.memer import Memer
     from mme_vla.subgoal.notebook import NotebookPredictor
@@ -16,15 +22,34 @@ if TYPE_CHECKING:
     from mme_vla.subgoal.qwenvl import QwenVL
 
 _MODULES = {
-    "BackgroundPredictor": "background", "Gemini": "gemini", "Memer": "memer", "NotebookPredictor": "notebook",
-    "OpenAI": "gemini", "Oracle": "oracle", "QwenVL": "qwenvl", "Subgoal": "base", "SubgoalEpisode": "base",
-    "SubgoalPredictor": "base", "Usage": "base", "build_predictor": "base",
-}  # fmt: skip
+    "BackgroundPredictor": "background",
+    "Gemini": "gemini",
+    "Memer": "memer",
+    "NotebookPredictor": "notebook",
+    "OpenAI": "gemini",
+    "Oracle": "oracle",
+    "QwenVL": "qwenvl",
+    "Subgoal": "base",
+    "SubgoalEpisode": "base",
+    "SubgoalPredictor": "base",
+    "Usage": "base",
+    "build_predictor": "base",
+}
 
 __all__ = [
-    "BackgroundPredictor", "Gemini", "Memer", "NotebookPredictor", "OpenAI", "Oracle", "QwenVL", "Subgoal",
-    "SubgoalEpisode", "SubgoalPredictor", "Usage", "build_predictor",
-]  # fmt: skip
+    "BackgroundPredictor",
+    "Gemini",
+    "Memer",
+    "NotebookPredictor",
+    "OpenAI",
+    "Oracle",
+    "QwenVL",
+    "Subgoal",
+    "SubgoalEpisode",
+    "SubgoalPredictor",
+    "Usage",
+    "build_predictor",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,6 @@
-"""State that predictors keep of an episode: past subgoals, keyframes, and how long a subgoal is held."""
+"""State that predictors keep of an episode: past subgoals, keyframes, and how long a subgoal is
+held.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -6,7 +8,9 @@ from dataclasses import dataclass, field
 from mme_vla.subgoal.text import Point
 
 HOLD = {"ButtonUnmask": 90, "PickHighlight": 90}
-_HOLD_BY_SUBGOAL = {"ButtonUnmaskSwap": {"press the first button": 100, "press the second button": 250}}
+_HOLD_BY_SUBGOAL = {
+    "ButtonUnmaskSwap": {"press the first button": 100, "press the second button": 250}
+}
 
 
 @dataclass
@@ -20,7 +24,9 @@ class SubgoalHistory:
     points: list[Point] = field(default_factory=list)
 
     def add(self, entry: str, points: Sequence[Point] = ()) -> bool:
-        """Note an answer (points as `<bbox>`) unless it repeats the last one; return whether it was noted."""
+        """Note an answer (points as `<bbox>`) unless it repeats the last one; return whether it was
+        noted.
+        """
         if self.entries and self.entries[-1] == entry:
             return False
         self.entries.append(entry)
@@ -43,7 +49,9 @@ def hold_until(task: str, last: str | None) -> int:
 
 
 def merge_keyframes(frames: Sequence[int], distance: int = 8) -> list[int]:
-    """Thin out keyframes: of each run with gaps of at most `distance`, the middle one (the later of two) stays."""
+    """Thin out keyframes: of each run with gaps of at most `distance`, the middle one (the later of
+    two) stays.
+    """
     groups: list[list[int]] = []
     for frame in sorted(set(frames)):
         if groups and frame - groups[-1][-1] <= distance:
@@ -54,7 +62,8 @@ def merge_keyframes(frames: Sequence[int], distance: int = 8) -> list[int]:
 
 
 def recent_frames(newest: int, queried_before: bool, count: int = 8, stride: int = 2) -> list[int]:
-    """Indices of MemER's recent frames: `count` of them, `stride` apart, ending at `newest`; one at the first call.
+    """Indices of MemER's recent frames: `count` of them, `stride` apart, ending at `newest`; one at
+    the first call.
 
     Before the episode is long enough the list is shorter, never padded.
     """

@@ -1,4 +1,6 @@
-"""A predictor in the background: the policy acts on with the last subgoal until the next one is there."""
+"""A predictor in the background: the policy acts on with the last subgoal until the next one is
+there.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
@@ -9,11 +11,15 @@ import numpy as np
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.models.api import start
 
-GRACE = 2.0  # seconds that closing waits: better not to end the process while a local model computes
+GRACE = (
+    2.0  # seconds that closing waits: better not to end the process while a local model computes
+)
 
 
 class BackgroundEpisode(SubgoalEpisode):
-    """An episode as the policy sees it; the predictor's own (`inner`) waits while a model computes its subgoal."""
+    """An episode as the policy sees it; the predictor's own (`inner`) waits while a model computes
+    its subgoal.
+    """
 
     def __init__(self, inner: SubgoalEpisode) -> None:
         super().__init__(inner.goal, inner.video, inner.task)
@@ -41,9 +47,10 @@ class BackgroundEpisode(SubgoalEpisode):
 class BackgroundPredictor(SubgoalPredictor):
     """Runs another predictor in a thread.
 
-    Only the first subgoal of an episode is waited for. Later a question goes out as soon as the thread is free, for all
-    waiting episodes together, and its answer is used from the next chunk on; one that came due while the thread was
-    busy goes out once it is free. The subgoals therefore depend on the speed of the model.
+    Only the first subgoal of an episode is waited for. Later a question goes out as soon as the
+    thread is free, for all waiting episodes together, and its answer is used from the next chunk
+    on; one that came due while the thread was busy goes out once it is free. The subgoals therefore
+    depend on the speed of the model.
 
     Args:
         inner: the predictor. It is used by one thread at a time.
@@ -56,11 +63,14 @@ class BackgroundPredictor(SubgoalPredictor):
         self._queried_episodes: list[BackgroundEpisode] = []
         self._prediction: Future[list[Subgoal]] | None = None
 
-    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> BackgroundEpisode:
+    def start_episode(
+        self, goal: str, video: np.ndarray | None = None, task: str = ""
+    ) -> BackgroundEpisode:
         return BackgroundEpisode(self.inner.start_episode(goal, video, task))
 
     def predict(self, episodes: Sequence[Any]) -> list[Subgoal]:
-        """The newest subgoals there are; begins a prediction for the episodes that are due if the thread is free.
+        """The newest subgoals there are; begins a prediction for the episodes that are due if the
+        thread is free.
 
         Raises:
             Exception: what the predictor itself raised meanwhile.
@@ -87,8 +97,14 @@ class BackgroundPredictor(SubgoalPredictor):
         if self._prediction is not None:
             return
         # What was answered just now for the current frame need not be asked again.
-        advanced = [e for e in episodes if not e.answered or e.inner.n_observed_frames < e.n_observed_frames]
-        due = [episode for episode in advanced if self.inner.due(episode.catch_up()) or not episode.answered]
+        advanced = [
+            e for e in episodes if not e.answered or e.inner.n_observed_frames < e.n_observed_frames
+        ]
+        due = [
+            episode
+            for episode in advanced
+            if self.inner.due(episode.catch_up()) or not episode.answered
+        ]
         if due:
             self._queried_episodes = due
             inner = [episode.inner for episode in due]

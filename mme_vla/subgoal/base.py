@@ -1,7 +1,7 @@
 """`SubgoalPredictor`: language subgoals for many running episodes at once.
 
-As with the policy, what belongs to one episode lives in an object of its own (`start_episode`), and `predict` returns
-for many episodes in one batch.
+As with the policy, what belongs to one episode lives in an object of its own (`start_episode`), and
+`predict` returns for many episodes in one batch.
 """
 
 import logging
@@ -25,12 +25,14 @@ _CONFIG_TYPES = (str, int, float, bool, list, dict, type(None))  # the values of
 class Subgoal:
     """A subgoal for the policy, and how it came about.
 
-    text: in words, points as `<row, column>` in pixels of the front image; None while there has been none (the
+    text: in words, points as `<row, column>` in pixels of the front image; None while there has
+    been none (the
         policy's prompt is then the plain one).
     points: those points in order, (row, column).
     queried: whether a model was asked for this one; False for one that is kept.
     reply: of the model, unchanged; empty if none was asked.
-    problem: why the answer could not be used (one of `PROBLEMS`), empty if it could. The last subgoal is then kept.
+    problem: why the answer could not be used (one of `PROBLEMS`), empty if it could. The last
+    subgoal is then kept.
     """
 
     text: str | None
@@ -44,8 +46,8 @@ class Subgoal:
 class Usage:
     """What a predictor has done so far, over all episodes.
 
-    calls: questions to a model (replies from the cache are counted apart). tokens: as the model counts
-    them. problems: unusable replies by kind. cost: US dollars.
+    calls: questions to a model (replies from the cache are counted apart). tokens: as the model
+    counts them. problems: unusable replies by kind. cost: US dollars.
     """
 
     calls: int = 0
@@ -108,19 +110,25 @@ class SubgoalEpisode:
     @property
     def frame(self) -> np.ndarray:
         if self._frame is None:
-            raise UserError("The episode has seen no frame yet: call observe() with the current one before predict().")
+            raise UserError(
+                "The episode has seen no frame yet: call observe() with the current one before"
+                " predict()."
+            )
         return self._frame
 
 
 class SubgoalPredictor:
-    """The interface of every predictor. A subclass implements `predict_due`, and overrides the rest where it needs to.
+    """The interface of every predictor. A subclass implements `predict_due`, and overrides the rest
+    where it needs to.
 
     Args:
         kind: `simple` (words alone) or `grounded` (with points).
-        interval: a question is due at every multiple of it, and goes out with the first prediction from there on;
-            predictions are wanted whenever a new chunk is due, every 16 steps, so 1 asks every time.
+        interval: a question is due at every multiple of it, and goes out with the first prediction
+            from there on; predictions are wanted whenever a new chunk is due, every 16 steps, so 1
+            asks every time.
 
-    settings: the options that `build_predictor` built it from, as plain values; empty for one built otherwise.
+    settings: the options that `build_predictor` built it from, as plain values; empty for one built
+    otherwise.
     """
 
     sees_video = True
@@ -136,28 +144,38 @@ class SubgoalPredictor:
         self.usage = Usage()
         self.settings: dict[str, Any] = {}
 
-    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> SubgoalEpisode:
+    def start_episode(
+        self, goal: str, video: np.ndarray | None = None, task: str = ""
+    ) -> SubgoalEpisode:
         """Begin an episode.
 
         Args:
-            goal: the task in words. video: [t, H, W, 3] uint8, all frames before the first execution frame.
+            goal: the task in words. video: [t, H, W, 3] uint8, all frames before the first
+                execution frame.
             task: its name (`ButtonUnmask`), for rules that hold for some tasks.
         """
         return self.episode_type(goal, video, task)
 
     def predict(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
-        """The subgoals of these episodes at their current frames; those that are due are asked in one batch.
+        """The subgoals of these episodes at their current frames; those that are due are asked in
+        one batch.
 
-        An answer that cannot be used is counted in `usage.problems` and the episode keeps its last subgoal.
+        An answer that cannot be used is counted in `usage.problems` and the episode keeps its last
+        subgoal.
         """
         due = [episode for episode in episodes if self.due(episode)]
         for episode, subgoal in zip(due, self.predict_due(due) if due else [], strict=True):
             episode.subgoal, episode.query_step = subgoal, episode.step
         queried = {id(episode) for episode in due}
-        return [e.subgoal if id(e) in queried else Subgoal(e.subgoal.text, e.subgoal.points) for e in episodes]
+        return [
+            e.subgoal if id(e) in queried else Subgoal(e.subgoal.text, e.subgoal.points)
+            for e in episodes
+        ]
 
     def due(self, episode: SubgoalEpisode) -> bool:
-        """Whether the episode's subgoal is to be asked for now: never yet, or a multiple of the interval was passed."""
+        """Whether the episode's subgoal is to be asked for now: never yet, or a multiple of the
+        interval was passed.
+        """
         return episode.query_step is None or self.due_step(episode) > episode.query_step
 
     def due_step(self, episode: SubgoalEpisode) -> int:
@@ -171,11 +189,22 @@ class SubgoalPredictor:
     def accepted(self, parsed: Parsed, reply: str) -> Subgoal:
         return Subgoal(parsed.text, parsed.points, queried=True, reply=reply)
 
-    def unchanged(self, episode: SubgoalEpisode, problem: str, reply: str = "", reason: str = "") -> Subgoal:
-        """The episode's last subgoal, after an answer that cannot be used; counts and reports the problem."""
+    def unchanged(
+        self, episode: SubgoalEpisode, problem: str, reply: str = "", reason: str = ""
+    ) -> Subgoal:
+        """The episode's last subgoal, after an answer that cannot be used; counts and reports the
+        problem.
+        """
         self.usage.problems[problem] += 1
-        log.warning("Subgoal answer unusable (%s) at step %d, the last one is kept: %s", problem, episode.step, reason)
-        return Subgoal(episode.subgoal.text, episode.subgoal.points, queried=True, reply=reply, problem=problem)
+        log.warning(
+            "Subgoal answer unusable (%s) at step %d, the last one is kept: %s",
+            problem,
+            episode.step,
+            reason,
+        )
+        return Subgoal(
+            episode.subgoal.text, episode.subgoal.points, queried=True, reply=reply, problem=problem
+        )
 
     def unreadable(self, episode: SubgoalEpisode, reply: str, error: MalformedReply) -> Subgoal:
         """As `unchanged`, after a reply that is empty or malformed."""
@@ -190,12 +219,18 @@ def build_predictor(config: Mapping[str, Any] | None) -> SubgoalPredictor | None
     if not config or config.get("name") in (None, "none"):
         return None
     built: SubgoalPredictor = SUBGOALS.build(config)
-    built.settings = {key: value for key, value in config.items() if key != "name" and isinstance(value, _CONFIG_TYPES)}
+    built.settings = {
+        key: value
+        for key, value in config.items()
+        if key != "name" and isinstance(value, _CONFIG_TYPES)
+    }
     return built
 
 
 def _checked(frames: np.ndarray, what: str) -> np.ndarray:
     frames = np.asarray(frames)
     if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
-        raise UserError(f"{what} must be uint8 [n, height, width, 3]; got {frames.dtype} {frames.shape}.")
+        raise UserError(
+            f"{what} must be uint8 [n, height, width, 3]; got {frames.dtype} {frames.shape}."
+        )
     return frames

@@ -12,7 +12,9 @@ from mme_vla.utils.media import FPS
 
 VIDEO_FRAMES = 10  # of a video, at most
 ENCODING: dict[str, Any] = {"crf": 18, "preset": "medium"}
-"""Compression of videos for models (`mme_vla.utils.media`), finer than that of videos for people."""
+"""Compression of videos for models (`mme_vla.utils.media`), finer than that of videos
+for people.
+"""
 
 _REMEDY = "Build the training data again."
 
@@ -29,7 +31,8 @@ def read_image(path: Path) -> np.ndarray:
 class Clip:
     """Frames of a video that a Qwen model reads.
 
-    frames: [n, H, W, 3] uint8. indices: [n] their places in the video. length: of the whole video, in frames.
+    frames: [n, H, W, 3] uint8. indices: [n] their places in the video. length: of the whole video,
+    in frames.
     """
 
     frames: np.ndarray
@@ -47,7 +50,10 @@ class Clip:
         """Sample a file; frames that are not looked at are decoded but not turned into images."""
         import av
 
-        with decoding(require_file(path, "a video"), "a video", _REMEDY), av.open(str(path)) as container:
+        with (
+            decoding(require_file(path, "a video"), "a video", _REMEDY),
+            av.open(str(path)) as container,
+        ):
             length = container.streams.video[0].frames
             indices = sample_video(length)
             required = set(indices.tolist())
@@ -61,7 +67,8 @@ class Clip:
 def sample_video(
     length: int, fps: float = FPS, rate: float = 2.0, least: int = 4, most: int = VIDEO_FRAMES
 ) -> np.ndarray:
-    """Indices of the frames of a video that a Qwen model reads: `rate` a second, within bounds, an even number of them.
+    """Indices of the frames of a video that a Qwen model reads: `rate` a second, within bounds, an
+    even number of them.
 
     Args:
         length: frames of the video. fps: of the video. rate: frames a second.

@@ -1,4 +1,6 @@
-"""`memer`: a fine-tuned Qwen3-VL that chooses keyframes and reads them again (MemER, as the paper runs it)."""
+"""`memer`: a fine-tuned Qwen3-VL that chooses keyframes and reads them again (MemER, as the paper
+runs it).
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -31,7 +33,11 @@ class MemerEpisode(SubgoalEpisode):
         first = self.n_observed_frames
         super().observe(frames, info)
         self._recent |= {first + i: frame for i, frame in enumerate(frames)}
-        self._recent = {t: frame for t, frame in self._recent.items() if t >= self.n_observed_frames - self._reach}
+        self._recent = {
+            t: frame
+            for t, frame in self._recent.items()
+            if t >= self.n_observed_frames - self._reach
+        }
 
     def recent(self, count: int, stride: int) -> dict[int, np.ndarray]:
         """The recent frames the next question shows, by number."""
@@ -45,9 +51,11 @@ class MemerEpisode(SubgoalEpisode):
 
 @SUBGOALS.register("memer")
 class Memer(VLMPredictor):
-    """Shows the model its keyframes and the recent frames; the answer names the subgoal and new keyframes.
+    """Shows the model its keyframes and the recent frames; the answer names the subgoal and new
+    keyframes.
 
-    After an answer that cannot be read the keyframes and the last subgoal stay (the released code fails there).
+    After an answer that cannot be read the keyframes and the last subgoal stay (the released code
+    fails there).
 
     Args:
         recent: frames shown besides the keyframes. stride: steps between two of them.
@@ -66,7 +74,9 @@ class Memer(VLMPredictor):
         super().__init__(kind, interval, **options)
         self.recent, self.stride, self.merge_distance = recent, stride, merge_distance
 
-    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> MemerEpisode:
+    def start_episode(
+        self, goal: str, video: np.ndarray | None = None, task: str = ""
+    ) -> MemerEpisode:
         return MemerEpisode(goal, video, task, (self.recent - 1) * self.stride + 1)
 
     def question(self, episode: MemerEpisode) -> Question:
@@ -79,7 +89,10 @@ class Memer(VLMPredictor):
     def predict_due(self, episodes: Sequence[MemerEpisode]) -> list[Subgoal]:
         _ = [episode.frame for episode in episodes]  # every episode has seen something
         completions = self.ask([self.question(episode) for episode in episodes])
-        return [self._read(e, completion.text) for e, completion in zip(episodes, completions, strict=True)]
+        return [
+            self._read(e, completion.text)
+            for e, completion in zip(episodes, completions, strict=True)
+        ]
 
     def _read(self, episode: MemerEpisode, reply: str) -> Subgoal:
         recent = episode.recent(self.recent, self.stride)
@@ -89,5 +102,7 @@ class Memer(VLMPredictor):
         except MalformedReply as error:
             return self.unreadable(episode, reply, error)
         numbers = list(recent)
-        episode.add_keyframes({numbers[p - 1]: recent[numbers[p - 1]] for p in positions}, self.merge_distance)
+        episode.add_keyframes(
+            {numbers[p - 1]: recent[numbers[p - 1]] for p in positions}, self.merge_distance
+        )
         return self.accepted(parsed, reply)

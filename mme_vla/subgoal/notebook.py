@@ -1,4 +1,6 @@
-"""`notebook`: a prompted model that watches for completion, and takes typed notes only when it has seen it."""
+"""`notebook`: a prompted model that watches for completion, and takes typed notes only when it has
+seen it.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,15 +14,22 @@ from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.gemini import PromptedPredictor, example_of, what_there_is
 from mme_vla.subgoal.models.api import ApiFailure
 from mme_vla.subgoal.models.connection import MediaPart
-from mme_vla.subgoal.text import MalformedReply, json_object, parse_gemini, pixels_of_pairs, says_done
+from mme_vla.subgoal.text import (
+    MalformedReply,
+    json_object,
+    parse_gemini,
+    pixels_of_pairs,
+    says_done,
+)
 from mme_vla.utils import is_text
 
 MONITOR = (
-    "You watch a robot arm at a table through a camera in front of it, and judge one thing alone: whether it has "
-    "completed the subgoal that it was given. An object is picked up once it is in the air; it is put down once the "
-    "gripper has let go of it; a button is pressed once it was pushed down; a place is reached once the tool is over "
-    "it. What only seems to be about to happen is not complete.\n\n"
-    'Answer with JSON alone: {"why": "what is to be seen", "done": true} or {"why": "…", "done": false}.'
+    "You watch a robot arm at a table through a camera in front of it, and judge one thing alone:"
+    " whether it has completed the subgoal that it was given. An object is picked up once it is in"
+    " the air; it is put down once the gripper has let go of it; a button is pressed once it was"
+    " pushed down; a place is reached once the tool is over it. What only seems to be about to"
+    ' happen is not complete.\n\nAnswer with JSON alone: {"why": "what is to be seen", "done":'
+    ' true} or {"why": "…", "done": false}.'
 )
 
 
@@ -28,22 +37,31 @@ def planner_system(task: str, kind: str) -> str:
     """The system prompt of the planner.
 
     Args:
-        task: its name; for an unknown one the subgoals of all tasks are listed. kind: `simple` or `grounded`.
+        task: its name; for an unknown one the subgoals of all tasks are listed. kind: `simple` or
+            `grounded`.
     """
     example = example_of(task, kind)
     parts = [
-        "You lead a robot arm at a table, which you see through a camera in front of it. You keep a notebook, the only "
-        "thing that you remember from one question to the next: write down what later decisions depend on. Whether a "
-        "subgoal is complete is judged by somebody else; you are asked once it is, and name the next one.",
+        (
+            "You lead a robot arm at a table, which you see through a camera in front of it. You"
+            " keep a notebook, the only thing that you remember from one question to the next:"
+            " write down what later decisions depend on. Whether a subgoal is complete is judged by"
+            " somebody else; you are asked once it is, and name the next one."
+        ),
         *what_there_is(task, kind),
-        "Notes are of three kinds. A count says how often something has been done; it may stay or grow by one. An "
-        "identity says which thing is meant, in words that tell it from the others, where it is now. A route is a list "
-        "of steps that never changes, and how many of them are done. A note with a name that is there already takes "
-        "its place.",
-        'Answer with JSON alone: {"notes": [{"kind": "count", "name": "cubes in the bin", "value": 1}, {"kind": '
-        '"identity", "name": "the container with the red cube", "words": "the left one of the two in front"}, {"kind": '
-        f'"route", "name": "the pattern", "steps": ["move left"], "done": 0}}], "subgoal": "{example}"}}. Leave '
-        '"notes" empty where there is nothing to write.',
+        (
+            "Notes are of three kinds. A count says how often something has been done; it may stay"
+            " or grow by one. An identity says which thing is meant, in words that tell it from the"
+            " others, where it is now. A route is a list of steps that never changes, and how many"
+            " of them are done. A note with a name that is there already takes its place."
+        ),
+        (
+            'Answer with JSON alone: {"notes": [{"kind": "count", "name": "cubes in the bin",'
+            ' "value": 1}, {"kind": "identity", "name": "the container with the red cube",'
+            ' "words": "the left one of the two in front"}, {"kind": "route", "name": "the'
+            f' pattern", "steps": ["move left"], "done": 0}}], "subgoal": "{example}"}}. Leave'
+            ' "notes" empty where there is nothing to write.'
+        ),
     ]
     return "\n\n".join(parts)
 
@@ -51,8 +69,8 @@ def planner_system(task: str, kind: str) -> str:
 def opening_query(goal: str, video: bool) -> str:
     """The planner's first question; its images come before it, the demonstration video first."""
     context = (
-        "The video shows what happened before the robot's turn, the image shows the scene now. Note what has to be "
-        "remembered of the video."
+        "The video shows what happened before the robot's turn, the image shows the scene now. Note"
+        " what has to be remembered of the video."
         if video
         else "The image shows the scene at the start."
     )
@@ -60,20 +78,23 @@ def opening_query(goal: str, video: bool) -> str:
 
 
 def next_query(goal: str, finished: str, notes: str, clip: bool) -> str:
-    """A later question to the planner; the video of the finished subgoal, if it has frames, comes before it."""
+    """A later question to the planner; the video of the finished subgoal, if it has frames, comes
+    before it.
+    """
     context = "The image shows the scene now."
     if clip:
         context = "The video shows how it was done, the image the scene now."
     return (
-        f"The task: {goal}\nYour notebook:\n{notes}\nThe subgoal {finished!r} is complete. {context} Bring the "
-        "notebook up to date, and name the next subgoal."
+        f"The task: {goal}\nYour notebook:\n{notes}\nThe subgoal {finished!r} is complete."
+        f" {context} Bring the notebook up to date, and name the next subgoal."
     )
 
 
 def monitor_query(goal: str, subgoal: str, clip: bool) -> str:
     """A question to the monitor; its images come before it."""
     context = (
-        "The video shows what the robot did since it was given the subgoal, the image the scene now."
+        "The video shows what the robot did since it was given the subgoal, the image the scene"
+        " now."
         if clip
         else "The image shows the scene now."
     )
@@ -85,13 +106,17 @@ MOST_NOTES, MOST_STEPS, MOST_WORDS, MOST_COUNT = 16, 32, 200, 99
 
 @dataclass(frozen=True)
 class Count:
-    """How often something has been done; it never falls, and one finished subgoal adds one at most."""
+    """How often something has been done; it never falls, and one finished subgoal adds
+    one at most.
+    """
 
     value: int
 
     def check(self, before: "Count | None", finished: bool) -> None:
         if before is not None and not before.value <= self.value <= before.value + finished:
-            raise MalformedReply(f"a count goes from {before.value} to {self.value}; it may stay or grow by one")
+            raise MalformedReply(
+                f"a count goes from {before.value} to {self.value}; it may stay or grow by one"
+            )
 
 
 @dataclass(frozen=True)
@@ -106,16 +131,28 @@ class Identity:
 
 @dataclass(frozen=True)
 class Route:
-    """Steps in order, and how many are done; they stay what they were, and one finished subgoal does one at most."""
+    """Steps in order, and how many are done; they stay what they were, and one finished subgoal
+    does one at most.
+    """
 
     steps: tuple[str, ...]
     done: int = 0
 
     def check(self, before: "Route | None", finished: bool) -> None:
-        require(self.done <= len(self.steps), f"{self.done} of {len(self.steps)} steps cannot be done", MalformedReply)
-        require(before is None or before.steps == self.steps, "the steps of a route were changed", MalformedReply)
+        require(
+            self.done <= len(self.steps),
+            f"{self.done} of {len(self.steps)} steps cannot be done",
+            MalformedReply,
+        )
+        require(
+            before is None or before.steps == self.steps,
+            "the steps of a route were changed",
+            MalformedReply,
+        )
         if before is not None and not before.done <= self.done <= before.done + finished:
-            raise MalformedReply(f"done goes from {before.done} to {self.done}; it may stay or grow by one")
+            raise MalformedReply(
+                f"done goes from {before.done} to {self.done}; it may stay or grow by one"
+            )
 
 
 Note = Count | Identity | Route
@@ -132,7 +169,8 @@ class Notebook:
         """The notebook with these entries.
 
         Args:
-            finished: the subgoal that was just completed; None where notes are taken before anything was done.
+            finished: the subgoal that was just completed; None where notes are taken before
+                anything was done.
         """
         notes = dict(self.notes)
         for name, note in entries:
@@ -163,7 +201,9 @@ def read_notes(entries: Any) -> list[tuple[str, Note]]:
     """Entries that a model proposes: a list of maps with `name`, `kind` and what the kind has."""
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise MalformedReply("notes is not a list of objects")
-    return [(_words(entry.get("name"), "name"), _read(entry)) for entry in entries[: MOST_NOTES + 1]]
+    return [
+        (_words(entry.get("name"), "name"), _read(entry)) for entry in entries[: MOST_NOTES + 1]
+    ]
 
 
 def _read(entry: dict[str, Any]) -> Note:
@@ -179,14 +219,23 @@ def _read(entry: dict[str, Any]) -> Note:
             f"steps is not a list of 1 to {MOST_STEPS} texts",
             MalformedReply,
         )
-        return Route(tuple(_words(step, "steps") for step in steps), _integer(entry.get("done", 0), "done", MOST_STEPS))
-    raise MalformedReply(f"there are notes of the kinds count, identity and route, not {brief(kind)}")
+        return Route(
+            tuple(_words(step, "steps") for step in steps),
+            _integer(entry.get("done", 0), "done", MOST_STEPS),
+        )
+    raise MalformedReply(
+        f"there are notes of the kinds count, identity and route, not {brief(kind)}"
+    )
 
 
 def _words(value: Any, what: str) -> str:
     if not isinstance(value, str) or not is_text(value) or not (text := " ".join(value.split())):
         raise MalformedReply(f"the {what} of a note is no text")
-    require(len(text) <= MOST_WORDS, f"the {what} of a note has more than {MOST_WORDS} characters", MalformedReply)
+    require(
+        len(text) <= MOST_WORDS,
+        f"the {what} of a note has more than {MOST_WORDS} characters",
+        MalformedReply,
+    )
     return text
 
 
@@ -203,7 +252,8 @@ LONGEST = 200  # frames of a subgoal that are shown: the last ones of a longer o
 class NotebookEpisode(SubgoalEpisode):
     """An episode, its notebook, and the frames since its subgoal was given.
 
-    agreed: the monitor has seen the current subgoal complete, and the next one is still to be named.
+    agreed: the monitor has seen the current subgoal complete, and the next one is still to be
+    named.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None, task: str) -> None:
@@ -224,10 +274,12 @@ class NotebookEpisode(SubgoalEpisode):
 
 @SUBGOALS.register("notebook")
 class NotebookPredictor(PromptedPredictor):
-    """Asks whether the subgoal is complete; only then brings the notebook up to date and names the next one.
+    """Asks whether the subgoal is complete; only then brings the notebook up to date and names the
+    next one.
 
-    The notebook is what a question tells of the past, beside the frames of the current subgoal: no conversation grows.
-    Nothing that goes wrong ends an episode: it keeps its subgoal and its notebook, and the problem is counted.
+    The notebook is what a question tells of the past, beside the frames of the current subgoal: no
+    conversation grows. Nothing that goes wrong ends an episode: it keeps its subgoal and its
+    notebook, and the problem is counted.
 
     Args:
         interval: steps between two questions to the monitor.
@@ -250,7 +302,9 @@ class NotebookPredictor(PromptedPredictor):
         replies: list[str] = []
         try:
             if episode.subgoal.text is not None and not self._complete(episode, replies):
-                return Subgoal(episode.subgoal.text, episode.subgoal.points, queried=True, reply=replies[0])
+                return Subgoal(
+                    episode.subgoal.text, episode.subgoal.points, queried=True, reply=replies[0]
+                )
             return self._next(episode, replies)
         except ApiFailure as failure:
             problem, reason = failure.problem, str(failure)
@@ -260,13 +314,19 @@ class NotebookPredictor(PromptedPredictor):
             return self.unchanged(episode, problem, "\n".join(replies), reason)
 
     def _complete(self, episode: NotebookEpisode, replies: list[str]) -> bool:
-        """Whether the monitor has seen the current subgoal complete, now or before; its answer goes into `replies`."""
+        """Whether the monitor has seen the current subgoal complete, now or before; its answer goes
+        into `replies`.
+        """
         if not episode.agreed:
             images = episode.images()
             query = monitor_query(episode.goal, str(episode.subgoal.text), len(images) > 1)
             replies.append(self.api.ask(MONITOR, [("user", [*images, query])]).text)
             done: Any = json_object(replies[-1]).get("done")
-            require(isinstance(done, bool), "the monitor's answer does not say whether it is done", MalformedReply)
+            require(
+                isinstance(done, bool),
+                "the monitor's answer does not say whether it is done",
+                MalformedReply,
+            )
             episode.agreed = done
         return episode.agreed
 
@@ -279,11 +339,17 @@ class NotebookPredictor(PromptedPredictor):
             query = opening_query(episode.goal, bool(video))
         else:
             query = next_query(episode.goal, finished, episode.notebook.in_words(), len(parts) > 1)
-        replies.append(self.api.ask(planner_system(episode.task, self.kind), [("user", [*parts, query])]).text)
+        replies.append(
+            self.api.ask(planner_system(episode.task, self.kind), [("user", [*parts, query])]).text
+        )
         text = parse_gemini(replies[-1]).lower()
-        notebook = episode.notebook.with_entries(read_notes(json_object(replies[-1]).get("notes", [])), finished)
+        notebook = episode.notebook.with_entries(
+            read_notes(json_object(replies[-1]).get("notes", [])), finished
+        )
         if says_done(text):
-            subgoal = Subgoal(finished, episode.subgoal.points, queried=True, reply="\n".join(replies))
+            subgoal = Subgoal(
+                finished, episode.subgoal.points, queried=True, reply="\n".join(replies)
+            )
         else:
             subgoal = self.accepted(pixels_of_pairs(text), "\n".join(replies))
         episode.notebook, episode.since, episode.agreed = notebook, [], False

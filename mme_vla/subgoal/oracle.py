@@ -13,8 +13,8 @@ from mme_vla.subgoal.text import points_of
 class Oracle(SubgoalPredictor):
     """Reads `<kind>_subgoal_online` from the environment's report.
 
-    An episode that is over, or between two sub-tasks, reports none (`complete`, `no record`): the last one then
-    stays, as in training.
+    An episode that is over, or between two sub-tasks, reports none (`complete`, `no record`): the
+    last one then stays, as in training.
     """
 
     sees_video = sees_passing = False
@@ -25,8 +25,8 @@ class Oracle(SubgoalPredictor):
     def _read(self, episode: SubgoalEpisode) -> Subgoal:
         require(
             isinstance(episode.info.get(f"{self.kind}_subgoal_online"), str),
-            f"subgoal=oracle needs the environment's '{self.kind}_subgoal_online' in observe(…, info); it reports "
-            f"{sorted(map(str, episode.info)) or 'nothing'}.",
+            f"subgoal=oracle needs the environment's '{self.kind}_subgoal_online' in observe(…,"
+            f" info); it reports {sorted(map(str, episode.info)) or 'nothing'}.",
         )
         text = online_subgoal(episode.info, self.kind)
         if text is None:
@@ -35,7 +35,9 @@ class Oracle(SubgoalPredictor):
 
 
 def online_subgoal(info: Mapping[str, Any], kind: str) -> str | None:
-    """The subgoal that an environment reports, lower-case as in training; None where it names none."""
+    """The subgoal that an environment reports, lower-case as in training; None where
+    it names none.
+    """
     text = info.get(f"{kind}_subgoal_online")
     text = text.strip().lower() if isinstance(text, str) else ""
     return None if text in ("", "complete", "no record") else text

@@ -1,4 +1,6 @@
-"""`qwenvl`: a fine-tuned Qwen3-VL that reads the current image, the video and its own past subgoals."""
+"""`qwenvl`: a fine-tuned Qwen3-VL that reads the current image, the video and its own past
+subgoals.
+"""
 
 import time
 from collections.abc import Sequence
@@ -12,16 +14,24 @@ from mme_vla.subgoal.answers import SubgoalHistory, hold_until
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.clips import Clip
 from mme_vla.subgoal.models.qwen3vl import VLM, Completion, Question
-from mme_vla.subgoal.text import MalformedReply, parse_subgoal, subgoal_system, subgoal_user, write_boxes
+from mme_vla.subgoal.text import (
+    MalformedReply,
+    parse_subgoal,
+    subgoal_system,
+    subgoal_user,
+    write_boxes,
+)
 
 
 class VLMPredictor(SubgoalPredictor):
     """What `qwenvl` and `memer` share: one model for a batch of all episodes.
 
     Args:
-        model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for none.
+        model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for
+            none.
         max_new_tokens: longest answer. batch_size: questions answered at once.
-        device, dtype: where and how the model runs. vlm: a model that is loaded already, instead of all these.
+        device, dtype: where and how the model runs. vlm: a model that is loaded already, instead of
+            all these.
     """
 
     def __init__(
@@ -39,7 +49,9 @@ class VLMPredictor(SubgoalPredictor):
         super().__init__(kind, interval)
         require(max_new_tokens >= 1, f"max_new_tokens={max_new_tokens} must be at least 1.")
         self.max_new_tokens = max_new_tokens
-        self.vlm = vlm or VLM.load(model, adapter, device=device, dtype=dtype, batch_size=batch_size)
+        self.vlm = vlm or VLM.load(
+            model, adapter, device=device, dtype=dtype, batch_size=batch_size
+        )
 
     def ask(self, questions: Sequence[Question]) -> list[Completion]:
         started = time.perf_counter()
@@ -70,14 +82,22 @@ class QwenVL(VLMPredictor):
     sees_passing = False
     episode_type = QwenEpisode
 
-    def __init__(self, kind: str = "grounded", interval: int = 1, hold: bool = True, **options: Any) -> None:
+    def __init__(
+        self, kind: str = "grounded", interval: int = 1, hold: bool = True, **options: Any
+    ) -> None:
         super().__init__(kind, interval, **options)
         self.hold = hold
 
     def due(self, episode: SubgoalEpisode) -> bool:
-        """Whether to ask now: see `SubgoalPredictor`; what came due while the last subgoal is held is left out."""
+        """Whether to ask now: see `SubgoalPredictor`; what came due while the last subgoal is held
+        is left out.
+        """
         last = episode.subgoal.text
-        on_hold = self.hold and last is not None and self.due_step(episode) <= hold_until(episode.task, last)
+        on_hold = (
+            self.hold
+            and last is not None
+            and self.due_step(episode) <= hold_until(episode.task, last)
+        )
         return super().due(episode) and not on_hold
 
     def question(self, episode: QwenEpisode) -> Question:
@@ -92,7 +112,10 @@ class QwenVL(VLMPredictor):
 
     def predict_due(self, episodes: Sequence[QwenEpisode]) -> list[Subgoal]:
         completions = self.ask([self.question(episode) for episode in episodes])
-        return [self._read(e, completion.text) for e, completion in zip(episodes, completions, strict=True)]
+        return [
+            self._read(e, completion.text)
+            for e, completion in zip(episodes, completions, strict=True)
+        ]
 
     def _read(self, episode: QwenEpisode, reply: str) -> Subgoal:
         try:

@@ -1,8 +1,8 @@
 """From a language model's answer to a subgoal: points, JSON, coordinates.
 
-Models write points in thousandths of the image's sides, `(row, column)` from 0 to 1000; the policy reads pixels of
-the 256×256 front image, `<row, column>`. What cannot be read raises `MalformedReply`, which the predictors count
-and survive.
+Models write points in thousandths of the image's sides, `(row, column)` from 0 to 1000; the policy
+reads pixels of the 256×256 front image, `<row, column>`. What cannot be read raises
+`MalformedReply`, which the predictors count and survive.
 """
 
 import re
@@ -18,15 +18,19 @@ IMAGE, VIDEO, BBOX = "<image>", "<video>", "<bbox>"
 KINDS = ("simple", "grounded")
 
 _PHRASE = {"simple": "language subgoal", "grounded": "grounded language subgoal"}
-_SYSTEM = "You are a helpful assistant to help guide the robot to complete the task by predicting a sequence of {}s"
+_SYSTEM = (
+    "You are a helpful assistant to help guide the robot to complete the task by predicting a"
+    " sequence of {}s"
+)
 MEMER_SYSTEM = (
-    "You are a robot program that predicts actions. The current input images from the front-view camera shows the most "
-    "recent actions the robot has executed. The past keyframes are selected frames of particular importance from all "
-    "the actions the robot has executed so far. Based on these, output the current subtask the robot should execute "
-    "and nothing else. Some tasks may have a video input for initial setup, some may not.\n\n"
-    "Return a JSON with:\n"
-    "- current_subtask: the action that should be executed at the current timestep\n"
-    "- keyframe_positions: list of frame positions (1-indexed) from the current input images where actions change"
+    "You are a robot program that predicts actions. The current input images from the front-view"
+    " camera shows the most recent actions the robot has executed. The past keyframes are selected"
+    " frames of particular importance from all the actions the robot has executed so far. Based on"
+    " these, output the current subtask the robot should execute and nothing else. Some tasks may"
+    " have a video input for initial setup, some may not.\n\nReturn a JSON with:\n-"
+    " current_subtask: the action that should be executed at the current timestep\n-"
+    " keyframe_positions: list of frame positions (1-indexed) from the current input images where"
+    " actions change"
 )
 
 
@@ -69,22 +73,25 @@ def memer_user(goal: str, keyframes: int, recent: int, video: bool) -> str:
     """
     setup = f"The task has a video input for initial setup: {VIDEO}\n" if video else ""
     return (
-        f"{setup}The task goal is: {goal}\n"
-        "Here are the selected frames from the entirety of the full execution that are of particular importance:"
-        f"{_image_tags(keyframes)}\n"
-        f"Here is current input image list from the front-view camera: {_image_tags(recent)}\n\n"
-        "What subtask should the robot execute and what is the keyframe position?"
+        f"{setup}The task goal is: {goal}\nHere are the selected frames from the entirety of the"
+        f" full execution that are of particular importance:{_image_tags(keyframes)}\nHere is"
+        f" current input image list from the front-view camera: {_image_tags(recent)}\n\nWhat"
+        " subtask should the robot execute and what is the keyframe position?"
     )
 
 
 def memer_reply(subtask: str, positions: Sequence[int]) -> str:
-    """MemER's answer; without keyframes there is no space after the first colon, as in the released training set."""
+    """MemER's answer; without keyframes there is no space after the first colon, as in the released
+    training set.
+    """
     space = " " if positions else ""
     return f'{{"current_subtask":{space}"{subtask}", "keyframe_positions": {list(positions)}}}'
 
 
 def split_media(text: str) -> list[str]:
-    """Cut a text at its `<image>` and `<video>` marks, which stay as entries; empty pieces are left out."""
+    """Cut a text at its `<image>` and `<video>` marks, which stay as entries; empty pieces are left
+    out.
+    """
     return [piece for piece in re.split(f"({IMAGE}|{VIDEO})", text) if piece]
 
 
@@ -141,18 +148,27 @@ def write_boxes(text: str, points: Sequence[Point], side: int = SIDE) -> str:
     """
     pieces = text.split(BBOX)
     if len(pieces) != len(points) + 1:
-        raise ValueError(f"{len(pieces) - 1} {BBOX} marks for {len(points)} points in {brief(text)}.")
-    boxes = [f"<|box_start|>({to_thousandths(y, side)},{to_thousandths(x, side)})<|box_end|>" for y, x in points]
+        raise ValueError(
+            f"{len(pieces) - 1} {BBOX} marks for {len(points)} points in {brief(text)}."
+        )
+    boxes = [
+        f"<|box_start|>({to_thousandths(y, side)},{to_thousandths(x, side)})<|box_end|>"
+        for y, x in points
+    ]
     return "".join(piece + box for piece, box in zip(pieces, [*boxes, ""], strict=True))
 
 
 def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
-    """Read the answer of the fine-tuned predictor: a line of text with `<|box_start|>(a,b)<|box_end|>` points."""
+    """Read the answer of the fine-tuned predictor: a line of text with
+    `<|box_start|>(a,b)<|box_end|>` points.
+    """
     text = " ".join(reply.split())
     require(text, "the answer is empty", MalformedReply)
     pixels = [(int(y), int(x)) for y, x in _BOX.findall(text)]
     require(
-        not any(value > THOUSAND for point in pixels for value in point), "a point lies outside 0…1000", MalformedReply
+        not any(value > THOUSAND for point in pixels for value in point),
+        "a point lies outside 0…1000",
+        MalformedReply,
     )
     require(
         not _BOX_MARK.search(_BOX.sub("", text)),
@@ -180,17 +196,21 @@ def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list
     positions: Any = fields.get("keyframe_positions", [])
     require(isinstance(subtask, str), "the answer has no current_subtask", MalformedReply)
     require(
-        isinstance(positions, list) and not any(isinstance(p, bool) or not isinstance(p, int) for p in positions),
+        isinstance(positions, list)
+        and not any(isinstance(p, bool) or not isinstance(p, int) for p in positions),
         "keyframe_positions is not a list of whole numbers",
         MalformedReply,
     )
-    return parse_subgoal(_writable(subtask), side), sorted({p for p in positions if 1 <= p <= recent})
+    return parse_subgoal(_writable(subtask), side), sorted(
+        {p for p in positions if 1 <= p <= recent}
+    )
 
 
 def parse_gemini(reply: str) -> str:
     """Return the subgoal of a prompted model's reply, points still in thousandths.
 
-    The first quoted string after a `"subgoal"` key on that line counts; failing that, the answer read as JSON.
+    The first quoted string after a `"subgoal"` key on that line counts; failing that, the answer
+    read as JSON.
     """
     for remainder in _SUBGOAL_KEY.findall(reply):
         quoted = _QUOTED.search(remainder)
@@ -202,7 +222,9 @@ def parse_gemini(reply: str) -> str:
 
 
 def pixels_of_pairs(text: str, side: int = SIDE) -> Parsed:
-    """Turn every `<y, x>` of a prompted model's subgoal from thousandths into pixels, clipped to [0, side]."""
+    """Turn every `<y, x>` of a prompted model's subgoal from thousandths into pixels, clipped to
+    [0, side].
+    """
     points: list[Point] = []
 
     def pixel(match: re.Match[str]) -> str:
@@ -222,7 +244,9 @@ def says_done(text: str) -> bool:
 
 
 def mark_points(text: str) -> tuple[str, list[Point]]:
-    """Replace each `at <y, x>` of a label by `at <bbox>`; return the text and the points in pixels."""
+    """Replace each `at <y, x>` of a label by `at <bbox>`; return the text and the
+    points in pixels.
+    """
     points = [(int(y), int(x)) for y, x in _PIXELS.findall(text)]
     return _PIXELS.sub(f"at {BBOX}", text), points
 
@@ -243,6 +267,8 @@ def json_object(reply: str) -> dict[str, Any]:
 
 
 def _writable(text: str) -> str:
-    """The text, unless it holds half a character (JSON's escapes allow that), which no file or tokenizer takes."""
+    """The text, unless it holds half a character (JSON's escapes allow that), which no file or
+    tokenizer takes.
+    """
     require(is_text(text), "the answer holds half a character", MalformedReply)
     return text

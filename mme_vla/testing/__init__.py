@@ -1,4 +1,5 @@
-"""For tests of one's own parts: small policies and batches, and checks of the contracts a part signs.
+"""For tests of one's own parts: small policies and batches, and checks of the contracts a part
+signs.
 
 The library holds its own memories, integrations, backbones and tasks to the same checks.
 """

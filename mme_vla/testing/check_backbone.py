@@ -14,7 +14,8 @@ TOLERANCE = 1e-4
 
 
 def check_backbone(name: str, **sizes: Any) -> None:
-    """Run every check on the backbone that is registered under `name`, and print a line for each that passed.
+    """Run every check on the backbone that is registered under `name`, and print a line for each
+    that passed.
 
     Args:
         name: the key in `BACKBONES`. sizes: small ones, as its YAML would give them.
@@ -27,9 +28,15 @@ def check_backbone(name: str, **sizes: Any) -> None:
     check_tokens(backbone, batch.images)
     print(f"{name}: vision tokens have the right shapes, and do not depend on the batch")
     check_loss(backbone, batch)
-    print(f"{name}: the loss is finite, repeats with the same random numbers, and ignores the prompt's padding")
+    print(
+        f"{name}: the loss is finite, repeats with the same random numbers, and ignores the"
+        " prompt's padding"
+    )
     check_sample(backbone, batch)
-    print(f"{name}: a sampled chunk is {backbone.horizon} x {backbone.action_dim}, finite, and repeats")
+    print(
+        f"{name}: a sampled chunk is {backbone.horizon} x {backbone.action_dim}, finite, and"
+        " repeats"
+    )
     check_parts(backbone)
     print(f"{name}: parts() covers every parameter, vision and action among them")
 
@@ -47,7 +54,9 @@ def _batch(backbone: Backbone) -> Batch:
 
 
 def _inject(backbone: Backbone, batch: Batch) -> Injection:
-    """No memory: every block of the observation attends to the observation, actions attend to all."""
+    """No memory: every block of the observation attends to the observation, actions
+    attend to all.
+    """
     blocks = backbone.embed(batch)
     names = {block.name for block in blocks}
     return Injection(blocks, {**dict.fromkeys(names, names), "action": names | {"action"}})
@@ -72,13 +81,21 @@ def check_loss(backbone: Backbone, batch: Batch) -> None:
     """The loss is one number a step, repeats with the same noise, and does not read padding."""
     injection = _inject(backbone, batch)
     noise = backbone.training_noise(2, torch.Generator().manual_seed(0))
-    assert all(len(value) == 2 for value in noise.values()), "every value of training_noise(n) must have n rows."
+    assert all(len(value) == 2 for value in noise.values()), (
+        "every value of training_noise(n) must have n rows."
+    )
     again = backbone.training_noise(2, torch.Generator().manual_seed(0))
-    assert all(torch.equal(noise[key], again[key]) for key in noise), "training_noise must follow its generator alone."
+    assert all(torch.equal(noise[key], again[key]) for key in noise), (
+        "training_noise must follow its generator alone."
+    )
     loss = backbone.loss(batch, injection, noise)
     assert loss.shape == (2, backbone.horizon), f"loss must be [b, h]; got {tuple(loss.shape)}."
-    assert torch.isfinite(loss).all() and (loss > 0).any(), "the loss of random actions must be finite and not zero."
-    assert torch.equal(loss, backbone.loss(batch, injection, noise)), "the same noise must give the same loss."
+    assert torch.isfinite(loss).all() and (loss > 0).any(), (
+        "the loss of random actions must be finite and not zero."
+    )
+    assert torch.equal(loss, backbone.loss(batch, injection, noise)), (
+        "the same noise must give the same loss."
+    )
     other = Batch(**{**vars(batch), "prompt": batch.prompt.masked_fill(~batch.prompt_mask, 3)})
     error = float((backbone.loss(other, _inject(backbone, other), noise) - loss).abs().max())
     assert error <= TOLERANCE, f"tokens in the prompt's padding changed the loss by {error:.2g}."
@@ -94,7 +111,9 @@ def check_sample(backbone: Backbone, batch: Batch) -> None:
     shape = (2, backbone.horizon, backbone.action_dim)
     assert chunk.shape == shape, f"sample must be {shape}; got {tuple(chunk.shape)}."
     assert torch.isfinite(chunk).all(), "a sampled chunk is not finite."
-    assert torch.equal(chunk, backbone.sample(batch, injection, noise)), "the same noise must give the same chunk."
+    assert torch.equal(chunk, backbone.sample(batch, injection, noise)), (
+        "the same noise must give the same chunk."
+    )
 
 
 def check_parts(backbone: Backbone) -> None:
@@ -103,12 +122,20 @@ def check_parts(backbone: Backbone) -> None:
 
     parts = set()
     for name, _ in backbone.named_parameters():
-        part = next((part for part, pattern in backbone.parts().items() if re.match(pattern, name)), None)
-        assert part is not None, f"no part of parts() holds {name!r}; its last pattern must match the rest."
+        part = next(
+            (part for part, pattern in backbone.parts().items() if re.match(pattern, name)), None
+        )
+        assert part is not None, (
+            f"no part of parts() holds {name!r}; its last pattern must match the rest."
+        )
         parts.add(part)
-    assert {"vision", "action"} <= parts, f"parts() must name 'vision' and 'action'; parameters fall into {parts}."
+    assert {"vision", "action"} <= parts, (
+        f"parts() must name 'vision' and 'action'; parameters fall into {parts}."
+    )
     if not isinstance(backbone, HasLoraTargets):
         return
     names = [name for name, _ in backbone.named_modules()]
     for end in (*backbone.lora_targets, *backbone.heads):
-        assert any(f".{name}".endswith(f".{end}") for name in names), f"{end!r} ends no module's name."
+        assert any(f".{name}".endswith(f".{end}") for name in names), (
+            f"{end!r} ends no module's name."
+        )

@@ -1,4 +1,6 @@
-"""`check_integration`: does memory reach the action through an integration, and only as it should?"""
+"""`check_integration`: does memory reach the action through an integration, and only
+as it should?
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -14,13 +16,17 @@ from mme_vla.types import Batch, MemoryTokens
 TOLERANCE = 1e-4
 
 
-def check_integration(name: str, memory: str = "framesamp", backbone: str = "tiny", **options: Any) -> None:
-    """Run every check on the integration that is registered under `name`, with a memory and a small backbone.
+def check_integration(
+    name: str, memory: str = "framesamp", backbone: str = "tiny", **options: Any
+) -> None:
+    """Run every check on the integration that is registered under `name`, with a memory and a small
+    backbone.
 
     Prints a line for each that passed.
 
     Args:
-        name: the key in `INTEGRATIONS`. memory: the key of a memory to bring in. backbone: a file of configs/backbone.
+        name: the key in `INTEGRATIONS`. memory: the key of a memory to bring in. backbone: a file
+            of configs/backbone.
         options: the integration's own, as its YAML would give them.
     """
     sections = tiny_sections(f"{memory}_context", backbone)
@@ -51,19 +57,32 @@ def build_small(sections: dict[str, Any]) -> MMEPolicy:
         policy = MMEPolicy.from_config(sections)
     open_gates(policy)
     with torch.no_grad():
-        for parameter in policy.integration.parameters():  # near zero, or zero, where it starts as the identity
-            parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
+        for (
+            parameter
+        ) in policy.integration.parameters():  # near zero, or zero, where it starts as the identity
+            parameter.add_(
+                0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
+            )
     return policy.eval()
 
 
-def _loss(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens) -> Tensor:
+def _loss(
+    policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens
+) -> Tensor:
     assert batch.actions is not None
     rows = []
     for row in (slice(i, i + 1) for i in range(len(batch.prompt))):
-        inputs = (batch.images[row], batch.image_mask[row], batch.prompt[row], batch.prompt_mask[row])
+        inputs = (
+            batch.images[row],
+            batch.image_mask[row],
+            batch.prompt[row],
+            batch.prompt_mask[row],
+        )
         one = Batch(*inputs, history=None, actions=batch.actions[row])
         mine = memory.rows(row)
-        rows.append(policy(one, {name: value[row] for name, value in draws.items()}, memory=mine)[0])
+        rows.append(
+            policy(one, {name: value[row] for name, value in draws.items()}, memory=mine)[0]
+        )
     return torch.stack(rows)
 
 
@@ -72,31 +91,44 @@ def check_reach(
 ) -> None:
     """Other memories give other losses; what stands where the mask is False gives none."""
     other = _loss(policy, batch, draws, replace(memory, tokens=-memory.tokens))
-    assert (other - before).abs().min() > 0, "memory does not reach the action: other tokens, the same loss."
+    assert (other - before).abs().min() > 0, (
+        "memory does not reach the action: other tokens, the same loss."
+    )
     padded = replace(memory, tokens=memory.tokens.masked_fill(~memory.mask[..., None], 1e3))
     assert (~memory.mask).any(), "the check needs padding among the memory tokens"
     error = float((_loss(policy, batch, draws, padded) - before).abs().max())
     assert error <= TOLERANCE, f"what is in the memory's padding changed the loss by {error:.2g}."
 
 
-def check_rows(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens, before: Tensor) -> None:
+def check_rows(
+    policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens, before: Tensor
+) -> None:
     together, _ = policy(batch, draws, memory=memory)
     error = float((together - before.mean()).abs())
-    assert error <= TOLERANCE, f"samples of one batch see each other: alone their loss differs by {error:.2g}."
+    assert error <= TOLERANCE, (
+        f"samples of one batch see each other: alone their loss differs by {error:.2g}."
+    )
 
 
 def check_sampling(policy: MMEPolicy, batch: Batch, memory: MemoryTokens) -> None:
     """What runs once a chunk and what runs in every step add up to the pass that training makes."""
-    draws = {k: torch.stack([v, v]) for k, v in policy.sampling_noise(torch.Generator().manual_seed(0)).items()}
+    draws = {
+        k: torch.stack([v, v])
+        for k, v in policy.sampling_noise(torch.Generator().manual_seed(0)).items()
+    }
     for steps in (1, 2):  # as many as samples, too: a step must not be taken for a sample
         chunk = policy.sample_actions(batch, draws, steps=steps, memory=memory)
         assert torch.isfinite(chunk).all(), "a sampled chunk is not finite."
         if "noise" in draws:  # Euler's way from noise at time 1, each velocity in one joint pass
             joint = draws["noise"]
             for time in (1 - i / steps for i in range(steps)):
-                joint = joint - policy.velocity(batch, joint, torch.full((2,), time), memory) / steps
+                joint = (
+                    joint - policy.velocity(batch, joint, torch.full((2,), time), memory) / steps
+                )
             error = float((chunk - joint).abs().max())
-            assert error <= TOLERANCE, f"sampling (cached prefix) and training (one pass) differ by {error:.2g}."
+            assert error <= TOLERANCE, (
+                f"sampling (cached prefix) and training (one pass) differ by {error:.2g}."
+            )
 
 
 def check_gradients(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor]) -> None:
@@ -105,7 +137,9 @@ def check_gradients(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor]) -
     loss, _ = policy(batch, draws)
     loss.backward()
     idle = [
-        name for name, parameter in policy.named_parameters()
-        if policy.finetune_spec.component_of(name) == "memory" and (parameter.grad is None or not parameter.grad.any())
-    ]  # fmt: skip
+        name
+        for name, parameter in policy.named_parameters()
+        if policy.finetune_spec.component_of(name) == "memory"
+        and (parameter.grad is None or not parameter.grad.any())
+    ]
     assert not idle, f"no gradient reaches {', '.join(idle)}."

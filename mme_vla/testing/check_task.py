@@ -1,4 +1,6 @@
-"""`check_task`: is a task of one's own deterministic, solvable by its own demonstration, and complete?"""
+"""`check_task`: is a task of one's own deterministic, solvable by its own demonstration, and
+complete?
+"""
 
 from typing import Any
 
@@ -6,7 +8,8 @@ import numpy as np
 
 
 def check_task(task: str, seed: int = 1, difficulty: str | None = None, **options: Any) -> None:
-    """Run every check on the task that is registered under `task`, and print a line for each that passed.
+    """Run every check on the task that is registered under `task`, and print a line for each that
+    passed.
 
     Nothing is rendered.
 
@@ -15,16 +18,26 @@ def check_task(task: str, seed: int = 1, difficulty: str | None = None, **option
     """
     first, second = (_demonstrated(task, seed, difficulty, options) for _ in range(2))
     assert first["goal"], "goals() must give at least one wording."
-    assert all(isinstance(goal, str) and goal for goal in first["goal"]), "every wording of the goal is a text."
+    assert all(isinstance(goal, str) and goal for goal in first["goal"]), (
+        "every wording of the goal is a text."
+    )
     assert first["subtasks"] > 0, "subtasks() must give at least one sub-task."
-    assert first["success"], f"the task's own sub-tasks, demonstrated with seed {seed}, do not end in success."
+    assert first["success"], (
+        f"the task's own sub-tasks, demonstrated with seed {seed}, do not end in success."
+    )
     print(f"{task}: {first['subtasks']} sub-tasks, demonstrated with seed {seed}, end in success")
-    assert np.array_equal(first["qpos"], second["qpos"]), "two demonstrations of one seed differ: a draw is not seeded."
+    assert np.array_equal(first["qpos"], second["qpos"]), (
+        "two demonstrations of one seed differ: a draw is not seeded."
+    )
     print(f"{task}: a second demonstration moves the robot in the same way")
     other = _scene(task, seed + 1, difficulty, options)
     same = _scene(task, seed, difficulty, options)
-    assert np.array_equal(same, _scene(task, seed, difficulty, options)), "one seed built two different scenes."
-    assert same.shape != other.shape or not np.array_equal(same, other), "two seeds built the same scene."
+    assert np.array_equal(same, _scene(task, seed, difficulty, options)), (
+        "one seed built two different scenes."
+    )
+    assert same.shape != other.shape or not np.array_equal(same, other), (
+        "two seeds built the same scene."
+    )
     print(f"{task}: a seed builds one scene, and seed {seed + 1} another")
 
 
@@ -44,7 +57,9 @@ def _scene(task: str, seed: int, difficulty: str | None, options: dict[str, Any]
         env.close()
 
 
-def _demonstrated(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> dict[str, Any]:
+def _demonstrated(
+    task: str, seed: int, difficulty: str | None, options: dict[str, Any]
+) -> dict[str, Any]:
     from mme_vla.envs.recording.recorder import demonstrate
     from mme_vla.envs.robot.demonstrator import Demonstrator
 
@@ -56,8 +71,10 @@ def _demonstrated(task: str, seed: int, difficulty: str | None, options: dict[st
         script.on_frame = lambda info: track.append(script.qpos)
         done = demonstrate(script, Demonstrator(script, env.step))
         return {
-            "goal": script.goals(), "subtasks": len(script.progress.subtasks), "success": bool(done),
+            "goal": script.goals(),
+            "subtasks": len(script.progress.subtasks),
+            "success": bool(done),
             "qpos": np.array(track),
-        }  # fmt: skip
+        }
     finally:
         env.close()

@@ -1,4 +1,6 @@
-"""Small policies, batches and episodes for testing a memory or an integration: the library's own tests use them."""
+"""Small policies, batches and episodes for testing a memory or an integration: the library's own
+tests use them.
+"""
 
 from functools import cache
 from typing import Any
@@ -17,24 +19,51 @@ from mme_vla.processing.images import full_past
 from mme_vla.processing.normalise import NormStats
 from mme_vla.types import Batch, HistoryTokens, PastViews
 
-PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")]
+PERCEPTUAL = [
+    f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")
+]
 RECURRENT = [f"{m}_{i}" for m in ("ttt", "rmt") for i in ("context", "modul", "expert")]
 NEURAL = [*PERCEPTUAL, *RECURRENT]
 """The paper's."""
 BEYOND_MEMORIES = (
-    "retrieval", "moment", "gist", "actions", "learned_topk", "anchors", "events", "pyramid", "keyframes",
-)  # fmt: skip
+    "retrieval",
+    "moment",
+    "gist",
+    "actions",
+    "learned_topk",
+    "anchors",
+    "events",
+    "pyramid",
+    "keyframes",
+)
 """On every backbone with a place for tokens; `spacetime` needs one whose tower looks back."""
-ALL_BEYOND = [f"{m}_{i}" for m in (*BEYOND_MEMORIES, "spacetime") for i in ("context", "modul", "expert")]
+ALL_BEYOND = [
+    f"{m}_{i}" for m in (*BEYOND_MEMORIES, "spacetime") for i in ("context", "modul", "expert")
+]
 BEYOND = [
-    "retrieval_modul", "moment_context", "gist_expert", "actions_expert", "learned_topk_context", "spacetime_context",
-    "anchors_context", "events_modul", "pyramid_expert", "keyframes_modul",
-]  # fmt: skip
+    "retrieval_modul",
+    "moment_context",
+    "gist_expert",
+    "actions_expert",
+    "learned_topk_context",
+    "spacetime_context",
+    "anchors_context",
+    "events_modul",
+    "pyramid_expert",
+    "keyframes_modul",
+]
 """Of each memory beyond the paper one composition, for tests that go through all models."""
 MODELS = ["pi05", *NEURAL]
 # The first four are one network; hybrid is framesamp_modul with a subgoal in its prompt.
 ALL_MODELS = ["pi05", "pi05_past_actions", "simplesg", "groundsg", *NEURAL, "hybrid"]
-SMALL_VISION = {"image_size": 64, "patch_size": 4, "width": 32, "depth": 1, "mlp_dim": 64, "num_heads": 2}
+SMALL_VISION = {
+    "image_size": 64,
+    "patch_size": 4,
+    "width": 32,
+    "depth": 1,
+    "mlp_dim": 64,
+    "num_heads": 2,
+}
 
 
 def unit_stats(robot: Embodiment = ROBOMME_JOINT) -> NormStats:
@@ -43,8 +72,12 @@ def unit_stats(robot: Embodiment = ROBOMME_JOINT) -> NormStats:
 
 
 def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:
-    """A tiny policy whose gates are open, so that every part reaches the action (fresh adaptive norms are shut)."""
-    built = build_from_config(_composed(*policy_words(name, {"backbone": "tiny", **overrides})), seed=seed)
+    """A tiny policy whose gates are open, so that every part reaches the action (fresh adaptive
+    norms are shut).
+    """
+    built = build_from_config(
+        _composed(*policy_words(name, {"backbone": "tiny", **overrides})), seed=seed
+    )
     policy = mme_of(built, "small_policy()")
     policy.require_processor().stats = unit_stats(policy.embodiment)
     open_gates(policy)
@@ -53,14 +86,18 @@ def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:
 
 def tiny_sections(model: str, backbone: str = "tiny") -> dict[str, Any]:
     """The plain sections of a model at a small backbone's size, for `MMEPolicy.from_config`."""
-    sections = OmegaConf.to_container(_composed(*policy_words(model, {"backbone": backbone})), resolve=True)
+    sections = OmegaConf.to_container(
+        _composed(*policy_words(model, {"backbone": backbone})), resolve=True
+    )
     assert isinstance(sections, dict)
     return {str(key): sections[key] for key in ("backbone", "memory", "integration", "policy")}
 
 
 @cache
 def _composed(*words: str) -> DictConfig:
-    """Composing takes several times as long as building a tiny policy, and tests build the same ones over and over."""
+    """Composing takes several times as long as building a tiny policy, and tests build the same
+    ones over and over.
+    """
     return compose("policy", words)
 
 
@@ -69,13 +106,20 @@ def open_gates(policy: MMEPolicy, scale: float = 0.5) -> None:
     generator = torch.Generator().manual_seed(7)
     with torch.no_grad():
         for name, parameter in sorted(policy.named_parameters()):
-            if name.endswith(("norm.dense.weight", "norm.dense.bias")) and ".experts.memory." not in name:
+            if (
+                name.endswith(("norm.dense.weight", "norm.dense.bias"))
+                and ".experts.memory." not in name
+            ):
                 std = scale * (parameter.shape[-1] ** -0.5 if parameter.ndim == 2 else 1)
                 parameter.copy_(torch.randn(parameter.shape, generator=generator) * std)
 
 
-def random_history(policy: MMEPolicy, batch: int, valid: int, seed: int = 0) -> HistoryTokens | None:
-    """`valid` random tokens at random places, the rest padding; whole frames where padding goes in front."""
+def random_history(
+    policy: MMEPolicy, batch: int, valid: int, seed: int = 0
+) -> HistoryTokens | None:
+    """`valid` random tokens at random places, the rest padding; whole frames where padding goes in
+    front.
+    """
     if policy.memory is None:
         return None
     generator = torch.Generator().manual_seed(seed)
@@ -97,7 +141,9 @@ def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int 
     prompt_mask = torch.zeros(batch, length, dtype=torch.bool)
     prompt_mask[:, : length // 2] = True
     return Batch(
-        images=torch.randint(0, 256, (batch, views, 3, size, size), generator=generator, dtype=torch.uint8),
+        images=torch.randint(
+            0, 256, (batch, views, 3, size, size), generator=generator, dtype=torch.uint8
+        ),
         image_mask=torch.ones(batch, views, dtype=torch.bool),
         prompt=torch.randint(4, 100, (batch, length), generator=generator) * prompt_mask,
         prompt_mask=prompt_mask,
@@ -108,7 +154,9 @@ def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int 
 
 
 def random_past(policy: MMEPolicy, batch: int, seed: int = 0) -> PastViews | None:
-    """Past views of noise, where the memory gives any; the first sample's oldest lies before its episode."""
+    """Past views of noise, where the memory gives any; the first sample's oldest lies before its
+    episode.
+    """
     if policy.memory is None:
         return None
     views = len(policy.embodiment.cameras)
@@ -119,11 +167,15 @@ def random_past(policy: MMEPolicy, batch: int, seed: int = 0) -> PastViews | Non
     shape = (batch, *past.images.shape[1:])
     mask = past.mask.repeat(batch, 1)
     mask[0, 0] = False
-    return PastViews(torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8), mask, past.every)
+    return PastViews(
+        torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8), mask, past.every
+    )
 
 
 def moving_frames(count: int, size: int = 64, seed: int = 0) -> np.ndarray:
-    """Frames [count, size, size, 3] uint8 of a still background and a bright square that wanders."""
+    """Frames [count, size, size, 3] uint8 of a still background and a bright square
+    that wanders.
+    """
     rng = np.random.default_rng(seed)
     background = rng.integers(0, 200, (size, size, 3), dtype=np.uint8)
     frames = np.repeat(background[None], count, 0)
@@ -142,7 +194,9 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
     rows = [] if scorer is None else [(t, scorer(t, frame)) for t, frame in enumerate(frames)]
     scored = [(t, values) for t, values in rows if values is not None]
     scores = (
-        FrameScores(np.array([t for t, _ in scored]), np.stack([v for _, v in scored]).astype(np.float32))
+        FrameScores(
+            np.array([t for t, _ in scored]), np.stack([v for _, v in scored]).astype(np.float32)
+        )
         if scored
         else None
     )
@@ -150,7 +204,9 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
     return CachedHistory(spec, stored, stored_frames, len(frames), scores, exec_start)
 
 
-def online_history(policy: MMEPolicy, frames: np.ndarray, chunk: int, exec_start: int = 0) -> OnlineHistory:
+def online_history(
+    policy: MMEPolicy, frames: np.ndarray, chunk: int, exec_start: int = 0
+) -> OnlineHistory:
     """The same episode as an environment would deliver it, `chunk` frames at a time."""
     memory = policy.require_memory()
     history = OnlineHistory(memory.storage, make_scorer(memory), exec_start)

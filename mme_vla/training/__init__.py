@@ -1,1 +1,3 @@
-"""Training: the loop, its optimizer and averages, checkpoints, logging, and the open-loop check at the end."""
+"""Training: the loop, its optimizer and averages, checkpoints, logging, and the open-loop check at
+the end.
+"""

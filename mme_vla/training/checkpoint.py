@@ -1,14 +1,17 @@
-"""Training checkpoints: `save_pretrained`'s folder with the EMA weights, and beside them what exact resume needs.
+"""Training checkpoints: `save_pretrained`'s folder with the EMA weights, and beside them what exact
+resume needs.
 
     checkpoints/step_000500/
         model.safetensors, config.json, processor.json, norm_stats.json, …   the policy, EMA weights
-        raw.safetensors          the trained weights themselves; frozen ones are in model.safetensors
+        raw.safetensors          the trained weights themselves; frozen ones are in
+                                 model.safetensors
         optimizer.safetensors    Adam's moments and step counts
         training_state.json      step, configuration, versions
-        SHA256SUMS               of each of these files (the last pass of writing reads them once more)
+        SHA256SUMS               of each of these files (the last pass of writing reads them once
+                                 more)
 
-All randomness is a function of (seed, step), so there is no generator state and no data position to keep. Nothing is
-pickled: a checkpoint from an untrusted source cannot run code.
+All randomness is a function of (seed, step), so there is no generator state and no data position to
+keep. Nothing is pickled: a checkpoint from an untrusted source cannot run code.
 """
 
 import importlib.metadata
@@ -69,7 +72,9 @@ def save_checkpoint(
     config: Mapping[str, Any],
     keep: KeepRule,
 ) -> Path:
-    """Write `folder`/step_…; it appears whole or not at all. Then remove what `keep` does not hold on to."""
+    """Write `folder`/step_…; it appears whole or not at all. Then remove what `keep` does not hold
+    on to.
+    """
     from safetensors.torch import save_file
 
     target, draft = _places(folder, step)
@@ -103,11 +108,12 @@ def save_shards(
     keep: KeepRule,
     hurry: bool = False,
 ) -> Path:
-    """Begin to write `folder`/step_… of a sharded run; all processes call it and wait for the copies alone.
+    """Begin to write `folder`/step_… of a sharded run; all processes call it and wait for the
+    copies alone.
 
     Args:
-        hurry: let the checkpoint appear as soon as it can be resumed from, and write the policy's weights into it
-            after; otherwise it appears whole or not at all.
+        hurry: let the checkpoint appear as soon as it can be resumed from, and write the policy's
+            weights into it after; otherwise it appears whole or not at all.
     """
     target, draft = _places(folder, step)
     first = distributed.get_rank() == 0
@@ -131,13 +137,19 @@ def save_shards(
             _publish(draft, target)
         tidy(folder, keep)
 
-    writer.write(draft, training_tensors(policy, ema.tensors(), optimizer, trainable(policy)), finish)
+    writer.write(
+        draft, training_tensors(policy, ema.tensors(), optimizer, trainable(policy)), finish
+    )
     return target
 
 
 def load_policy(checkpoint: Path, policy: Policy) -> None:
-    """Give a policy, on meta or not, the weights that a run continues from; `restore` brings all else."""
-    tensors = read_weights(checkpoint, policy) if shard_files(checkpoint) else load_tensors(checkpoint)
+    """Give a policy, on meta or not, the weights that a run continues from; `restore` brings all
+    else.
+    """
+    tensors = (
+        read_weights(checkpoint, policy) if shard_files(checkpoint) else load_tensors(checkpoint)
+    )
     assign_tensors(policy, tensors, str(checkpoint))
 
 
@@ -149,9 +161,14 @@ def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optim
     else:
         moments = _read_full(folder, policy, ema)
     state = optimizer.state_dict()
-    place = {id(p): i for i, p in enumerate(p for group in optimizer.param_groups for p in group["params"])}
+    place = {
+        id(p): i
+        for i, p in enumerate(p for group in optimizer.param_groups for p in group["params"])
+    }
     state["state"] = {
-        place[id(p)]: {key: like(p, moments[f"{name}/{key}"]).clone() for key in MOMENTS}  # not in a mapped file
+        place[id(p)]: {
+            key: like(p, moments[f"{name}/{key}"]).clone() for key in MOMENTS
+        }  # not in a mapped file
         | {"step": moments[f"{name}/step"].clone()}
         for name, p in parameters.items()
         if f"{name}/step" in moments
@@ -160,20 +177,34 @@ def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optim
 
 
 def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
-    """Give weights and averages back their values, and return Adam's moments and counts as `<name>/<key>`."""
+    """Give weights and averages back their values, and return Adam's moments and counts as
+    `<name>/<key>`.
+    """
     parameters = trainable(policy)
     averaged, raw, moments = load_tensors(folder), _read(folder / RAW), _read(folder / OPTIMIZER)
     state = policy.state_dict()
-    low = {name for name, tensor in state.items() if tensor.dtype == torch.bfloat16}  # frozen, and stored in float32
-    averaged = {name: cast(tensor, torch.bfloat16) if name in low else tensor for name, tensor in averaged.items()}
+    low = {
+        name for name, tensor in state.items() if tensor.dtype == torch.bfloat16
+    }  # frozen, and stored in float32
+    averaged = {
+        name: cast(tensor, torch.bfloat16) if name in low else tensor
+        for name, tensor in averaged.items()
+    }
     _check_fit(folder / "model.safetensors", averaged, state)
     _check_fit(folder / RAW, raw, parameters)
-    required = {f"{name}/{key}": p for name, p in parameters.items() for key in _ADAM if f"{name}/{key}" in moments}
+    required = {
+        f"{name}/{key}": p
+        for name, p in parameters.items()
+        for key in _ADAM
+        if f"{name}/{key}" in moments
+    }
     _check_fit(folder / OPTIMIZER, moments, required, scalar="/step")
     for path, tensors in ((folder, averaged), (folder / RAW, raw), (folder / OPTIMIZER, moments)):
         check_values(tensors, str(path))
     ema.load(averaged)
-    policy.load_state_dict({name: like(state[name], tensor) for name, tensor in {**averaged, **raw}.items()})
+    policy.load_state_dict(
+        {name: like(state[name], tensor) for name, tensor in {**averaged, **raw}.items()}
+    )
     return moments
 
 
@@ -185,47 +216,65 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
         f"{checkpoint} holds weights but no training state, so there is nothing to resume. "
         f"To start a new run from its weights use init_from={checkpoint}.",
     )
-    state: dict[str, Any] = read_json(checked_file(checkpoint, STATE), "a training state", limit=2**24)
+    state: dict[str, Any] = read_json(
+        checked_file(checkpoint, STATE), "a training state", limit=2**24
+    )
     if state.get("format") != FORMAT:
-        raise UserError(f"{path} was not written by this library's training (format {FORMAT!r} expected).")
+        raise UserError(
+            f"{path} was not written by this library's training (format {FORMAT!r} expected)."
+        )
     step = state.get("step")
     sections = isinstance(state.get("config"), dict) and isinstance(state.get("versions"), dict)
     if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < 2**53 or not sections:
-        raise UserError(f"{path} is damaged: it lacks a step, a configuration or versions. Resume from an older one.")
+        raise UserError(
+            f"{path} is damaged: it lacks a step, a configuration or versions. Resume from an older"
+            " one."
+        )
     shards = state.get("shards", 0)
     require(
         len(shard_files(checkpoint)) == shards,
-        f"{checkpoint} holds {len(shard_files(checkpoint))} of the {shards} files that its processes wrote: it is "
-        "incomplete. Copy the whole folder again, or resume from an older checkpoint.",
+        f"{checkpoint} holds {len(shard_files(checkpoint))} of the {shards} files that its"
+        " processes wrote: it is incomplete. Copy the whole folder again, or resume from an older"
+        " checkpoint.",
     )
     for name in () if shards else (RAW, OPTIMIZER):
         if not (checkpoint / name).is_file():
-            raise UserError(f"{checkpoint} lacks {name}: it is incomplete. Resume from an older checkpoint.")
+            raise UserError(
+                f"{checkpoint} lacks {name}: it is incomplete. Resume from an older checkpoint."
+            )
     return state
 
 
 def check_disk(folder: Path, policy: Policy, keep: KeepRule, sharded: bool = False) -> None:
     """Refuse to begin a run whose first checkpoints would not fit on the disk.
 
-    They are stored in float32. A sharded run's hold the weights twice: the trained ones in parts, the averages whole.
+    They are stored in float32. A sharded run's hold the weights twice: the trained ones in parts,
+    the averages whole.
     """
     weights = sum(4 * p.numel() for p in policy.parameters())
     trained = sum(4 * p.numel() for p in trainable(policy).values())
-    needed = (weights * (1 + sharded) + 3 * trained) * (keep.last + 1)  # a new one is written before an old one goes
+    needed = (weights * (1 + sharded) + 3 * trained) * (
+        keep.last + 1
+    )  # a new one is written before an old one goes
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free
     require(
         needed <= free,
-        f"Checkpoints would take {needed / 1e9:.1f} GB in {folder} (train.keep.last={keep.last} and the one being "
-        f"written), but {free / 1e9:.1f} GB are free: make room, keep fewer, or choose another output.",
+        f"Checkpoints would take {needed / 1e9:.1f} GB in {folder} (train.keep.last={keep.last} and"
+        f" the one being written), but {free / 1e9:.1f} GB are free: make room, keep fewer, or"
+        " choose another output.",
     )
 
 
 def tidy(folder: Path, keep: KeepRule) -> None:
-    """Remove the checkpoints that `keep` does not hold on to, and what a killed run left half-written or -removed."""
+    """Remove the checkpoints that `keep` does not hold on to, and what a killed run left
+    half-written or -removed.
+    """
     for path in checkpoints_in(folder)[: -keep.last]:
         if not keep.every or step_of(path) % keep.every:
-            path.rename(folder / f".{path.name}.partial")  # a reader finds a full checkpoint or none
+            path.rename(
+                folder / f".{path.name}.partial"
+            )  # a reader finds a full checkpoint or none
     for path in folder.glob(".step_*.partial"):
         shutil.rmtree(path)
 
@@ -242,7 +291,10 @@ def _write_state(draft: Path, step: int, config: Mapping[str, Any], **more: Any)
 
 
 def _publish(draft: Path, target: Path) -> Path:
-    for path in (*draft.rglob("*"), draft):  # the disk holds all of it before the folder gets its final name
+    for path in (
+        *draft.rglob("*"),
+        draft,
+    ):  # the disk holds all of it before the folder gets its final name
         handle = os.open(path, os.O_RDONLY)
         try:
             os.fsync(handle)
@@ -263,16 +315,19 @@ def _read(path: Path) -> dict[str, Tensor]:
         raise UserError(f"{error} Resume from an older checkpoint.") from None
 
 
-def _check_fit(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], scalar: str = "") -> None:
+def _check_fit(
+    path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], scalar: str = ""
+) -> None:
     names = set(tensors) ^ set(expected)
     wrong = sorted(names) + [
         f"{name}: {tuple(tensors[name].shape)} {tensors[name].dtype}"
         for name in sorted(set(tensors) & set(expected))
         if not (scalar and name.endswith(scalar))
-        and (tensors[name].shape, tensors[name].dtype) != (expected[name].shape, expected[name].dtype)
+        and (tensors[name].shape, tensors[name].dtype)
+        != (expected[name].shape, expected[name].dtype)
     ]
     require(
         not wrong,
-        f"{path} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
-        "It belongs to another model or other settings.",
+        f"{path} does not fit this policy: {len(wrong):,} tensors differ, such as"
+        f" {listed(wrong, 4)}. It belongs to another model or other settings.",
     )

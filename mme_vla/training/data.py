@@ -1,4 +1,6 @@
-"""From the section `data` to the two sides of the split, with statistics and vision caches in place."""
+"""From the section `data` to the two sides of the split, with statistics and vision caches in
+place.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -41,17 +43,23 @@ def prepare_data(
     say: Callable[[str], None] = print,
     encoder: str | None = None,
 ) -> SplitData:
-    """Open and check the datasets, give the policy's processor its statistics, and build or open the vision caches.
+    """Open and check the datasets, give the policy's processor its statistics, and build or open
+    the vision caches.
 
     Args:
-        policy: with the vision weights it will train with. data: the section `data` of a configuration.
+        policy: with the vision weights it will train with. data: the section `data` of a
+            configuration.
         cache_command: what to tell the user to run where a cache is missing.
-        stats_from: a checkpoint folder whose statistics to use; otherwise they are computed over the training split.
+        stats_from: a checkpoint folder whose statistics to use; otherwise they are computed over
+            the training split.
         say: takes a line for the user.
-        encoder: the policy's `vision_fingerprint`, where this process does not hold the weights; by default asked here.
+        encoder: the policy's `vision_fingerprint`, where this process does not hold the weights; by
+            default asked here.
     """
     sources = open_sources(data["sources"], policy.embodiment)
-    val_episodes = default_val_episodes(sources) if data["val_episodes"] is None else data["val_episodes"]
+    val_episodes = (
+        default_val_episodes(sources) if data["val_episodes"] is None else data["val_episodes"]
+    )
     split = split_episodes(sources, data["val_fraction"], val_episodes)
     processor, offset = policy.require_processor(), data["action_offset"]
     if stats_from is not None:
@@ -69,8 +77,10 @@ def prepare_data(
         )  # fmt: skip
     labels = labels_read(*(part for part in policy.children() if part is not policy.memory))
     require(
-        data.get("weights") is None or (isinstance(policy, WeighsLosses) and processor.samples.kind == "steps"),
-        f"data.weights={data.get('weights')}: {type(policy).__name__} does not weigh samples. Set data.weights=null.",
+        data.get("weights") is None
+        or (isinstance(policy, WeighsLosses) and processor.samples.kind == "steps"),
+        f"data.weights={data.get('weights')}: {type(policy).__name__} does not weigh samples. Set"
+        " data.weights=null.",
     )
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
@@ -95,27 +105,41 @@ def prepare_data(
     transforms = build_transforms(data.get("history_transforms"))
     require(
         not transforms or processor.samples.kind != "keyframes",
-        "data.history_transforms changes frames, and this policy learns from keyframes: leave it empty.",
+        "data.history_transforms changes frames, and this policy learns from keyframes: leave it"
+        " empty.",
     )
 
     def side(episodes: list[Any], held_out: bool = False) -> TrainingDataset | KeyframeDataset:
         if processor.samples.kind == "keyframes":
             keyframes = policy.keyframes if isinstance(policy, TrainsOnKeyframes) else 1
-            return KeyframeDataset(sources, processor, keyframes, episodes=episodes, seed=seed, sampled=not held_out)
+            return KeyframeDataset(
+                sources, processor, keyframes, episodes=episodes, seed=seed, sampled=not held_out
+            )
         kind = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
         return kind(
-            sources, processor, policy.memory, caches, episodes=episodes, action_offset=offset,
-            mask_padding=data["mask_padding"], jitter=data["jitter"] and not held_out, subgoal=subgoal,
-            labels=labels, weights=data.get("weights"), texts=data.get("texts"), seed=seed,
+            sources,
+            processor,
+            policy.memory,
+            caches,
+            episodes=episodes,
+            action_offset=offset,
+            mask_padding=data["mask_padding"],
+            jitter=data["jitter"] and not held_out,
+            subgoal=subgoal,
+            labels=labels,
+            weights=data.get("weights"),
+            texts=data.get("texts"),
+            seed=seed,
             transforms=() if held_out else transforms,
-        )  # fmt: skip
+        )
 
     held_out = sum(map(len, split.val))
     prepared = SplitData(side(split.train), side(split.val, held_out=True) if held_out else None,
                          [source.fingerprint for source in sources])  # fmt: skip
     say(
-        f"data {data['name']}: {len(prepared.train)} training steps in {sum(map(len, split.train))} episodes, "
-        f"{0 if prepared.val is None else len(prepared.val)} held-out steps in {held_out}"
+        f"data {data['name']}: {len(prepared.train)} training steps in {sum(map(len, split.train))}"
+        f" episodes, {0 if prepared.val is None else len(prepared.val)} held-out steps in"
+        f" {held_out}"
     )
     return prepared
 
@@ -124,7 +148,7 @@ def check_frozen(policy: Policy, freeze_vision: bool) -> None:
     """Refuse to train the vision tower under a memory, whose cached tokens would not follow it."""
     require(
         policy.memory is None or freeze_vision,
-        "finetune.freeze_vision=false changes the vision tower while the memory reads tokens that were cached "
-        "before: at test time it would see other tokens than in training. Keep it frozen "
-        "(finetune.freeze_vision=true), or train without a memory.",
+        "finetune.freeze_vision=false changes the vision tower while the memory reads tokens that"
+        " were cached before: at test time it would see other tokens than in training. Keep it"
+        " frozen (finetune.freeze_vision=true), or train without a memory.",
     )

@@ -7,9 +7,11 @@ from timm.optim.lamb import Lamb
 
 
 class ClippedLamb(Lamb):
-    """timm's LAMB, scaling updates down and never up; it counts its steps in each parameter's state, as Adam does.
+    """timm's LAMB, scaling updates down and never up; it counts its steps in each parameter's
+    state, as Adam does.
 
-    timm counts them in the group, which checkpoints do not keep: the correction of the moments' bias would start anew.
+    timm counts them in the group, which checkpoints do not keep: the correction of the moments'
+    bias would start anew.
     """
 
     def __init__(self, params: Any, **options: Any) -> None:
@@ -17,7 +19,11 @@ class ClippedLamb(Lamb):
 
     def step(self, closure: Callable[[], float] | None = None) -> Any:
         for group in self.param_groups:
-            counts = [self.state[p]["step"] for p in group["params"] if p in self.state and "step" in self.state[p]]
+            counts = [
+                self.state[p]["step"]
+                for p in group["params"]
+                if p in self.state and "step" in self.state[p]
+            ]
             if counts:
                 group["step"] = counts[0].clone()
         loss = super().step(closure)

@@ -1,4 +1,6 @@
-"""Numbers of a run: `metrics.jsonl` in its folder, a line on the screen, and one of accelerate's trackers."""
+"""Numbers of a run: `metrics.jsonl` in its folder, a line on the screen, and one of accelerate's
+trackers.
+"""
 
 import json
 import math
@@ -14,7 +16,13 @@ from typing import IO, Any, Literal, Self
 
 import numpy as np
 import torch
-from accelerate.tracking import GeneralTracker, MLflowTracker, TensorBoardTracker, TrackioTracker, WandBTracker
+from accelerate.tracking import (
+    GeneralTracker,
+    MLflowTracker,
+    TensorBoardTracker,
+    TrackioTracker,
+    WandBTracker,
+)
 from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -27,7 +35,8 @@ from mme_vla.utils import read_lines, write_atomically
 
 
 class Window:
-    """Sums what updates report, on their device, and the time they take; reading it waits for the device once.
+    """Sums what updates report, on their device, and the time they take; reading it waits for the
+    device once.
 
     A number that only some updates report is averaged over those.
     """
@@ -44,7 +53,9 @@ class Window:
         self._begun = time.perf_counter()
 
     def add(self, metrics: Mapping[str, Tensor | float]) -> None:
-        """Take one update's numbers; plain ones, such as the learning rate, are the same in every process."""
+        """Take one update's numbers; plain ones, such as the learning rate, are the same in every
+        process.
+        """
         for name, value in metrics.items():
             self._sums[name] = self._sums[name] + value if name in self._sums else value
             self._counts[name] = self._counts.get(name, 0) + 1
@@ -71,7 +82,9 @@ class Window:
             step: updates done. reduce: averages a tensor over all processes (`Accelerator.reduce`).
         """
         averages = {name: total / self._counts[name] for name, total in self._sums.items()}
-        measured = {name: average for name, average in averages.items() if isinstance(average, Tensor)}
+        measured = {
+            name: average for name, average in averages.items() if isinstance(average, Tensor)
+        }
         means = reduce(torch.stack(list(measured.values())), reduction="mean").tolist()
         known = averages | dict(zip(measured, means, strict=True))
         values = {f"train/{name}": float(mean) for name, mean in known.items()}
@@ -81,23 +94,31 @@ class Window:
         broken = [name for name, value in values.items() if not math.isfinite(value)]
         require(
             not broken,
-            f"{' and '.join(broken)} stopped being a number before step {step}; nothing of it was saved. "
-            "Resume from the last checkpoint with a lower train.lr in a new run (init_from=…), "
-            "or look for broken values in the data (python -m mme_vla.inspect dataset=…).",
+            f"{' and '.join(broken)} stopped being a number before step {step}; nothing of it was"
+            " saved. Resume from the last checkpoint with a lower train.lr in a new run"
+            " (init_from=…), or look for broken values in the data (python -m mme_vla.inspect"
+            " dataset=…).",
         )
         self.restart()
         return values
 
 
 class ProgressLine:
-    """Shows the step and the latest numbers. Without a terminal it prints a line whenever numbers arrive."""
+    """Shows the step and the latest numbers. Without a terminal it prints a line whenever numbers
+    arrive.
+    """
 
     def __init__(self, total: int, done: int, visible: bool = True) -> None:
         self.console = Console(quiet=not visible, highlight=False, soft_wrap=True)
         self._total = total
         self._bar: Progress | None = None
         if self.console.is_terminal and self.console.file.isatty() and visible:
-            columns = (BarColumn(24), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
+            columns = (
+                BarColumn(24),
+                MofNCompleteColumn(),
+                TextColumn("{task.description}"),
+                TimeRemainingColumn(),
+            )
             self._bar = Progress(*columns, console=self.console, transient=True)
             self._task = self._bar.add_task("starting", total=total, completed=done)
 
@@ -116,8 +137,9 @@ class ProgressLine:
 
     def numbers(self, step: int, values: Mapping[str, float]) -> None:
         text = (
-            f"loss {values['train/loss']:.4f} · lr {values['train/lr']:.1e} · grad {values['train/grad_norm']:.2f} · "
-            f"{values['speed/samples_per_s']:.1f} samples/s · {values['memory/gib']:.1f} GiB"
+            f"loss {values['train/loss']:.4f} · lr {values['train/lr']:.1e} · grad"
+            f" {values['train/grad_norm']:.2f} · {values['speed/samples_per_s']:.1f} samples/s ·"
+            f" {values['memory/gib']:.1f} GiB"
         )
         if self._bar is not None:
             self._bar.update(self._task, description=text)
@@ -136,8 +158,12 @@ def memory_gib(device: torch.device) -> float:
 
 
 def resident_gib() -> float:
-    """Most resident memory this process has had, or, where the system does not say so, it or its parent before it."""
-    with suppress(OSError):  # on Linux; getrusage begins with what the parent had when it started this process
+    """Most resident memory this process has had, or, where the system does not say so, it or its
+    parent before it.
+    """
+    with suppress(
+        OSError
+    ):  # on Linux; getrusage begins with what the parent had when it started this process
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 2**20
@@ -146,8 +172,9 @@ def resident_gib() -> float:
 
 
 LOGGERS: Registry[Any] = Registry("logger")
-"""Makers of accelerate trackers, called with (run folder, configuration, updates already done, **the section's other
-keys)."""
+"""Makers of accelerate trackers, called with (run folder, configuration, updates already done,
+**the section's other keys).
+"""
 
 
 @LOGGERS.register("tensorboard")
@@ -173,9 +200,17 @@ def wandb_tracker(
 ) -> GeneralTracker:
     """A Weights & Biases run under the run folder's name; a resumed run continues the same one."""
     return WandBTracker(
-        project, entity=entity, group=group, tags=tags, mode=mode, dir=str(folder), name=_run_name(folder),
-        id=_run_id(folder), resume="allow", config=dict(config),
-    )  # fmt: skip
+        project,
+        entity=entity,
+        group=group,
+        tags=tags,
+        mode=mode,
+        dir=str(folder),
+        name=_run_name(folder),
+        id=_run_id(folder),
+        resume="allow",
+        config=dict(config),
+    )
 
 
 @LOGGERS.register("trackio")
@@ -187,18 +222,32 @@ def trackio_tracker(
     group: str | None = None,
     space_id: str | None = None,
 ) -> GeneralTracker:
-    """A Trackio run, on this machine or in a Space of the hub; a resumed run continues the same one."""
+    """A Trackio run, on this machine or in a Space of the hub; a resumed run continues the same
+    one.
+    """
     name = f"{_run_name(folder)}-{_run_id(folder)}"
     return TrackioTracker(
-        project, name=name, group=group, space_id=space_id, resume="allow", embed=False, config=dict(config)
+        project,
+        name=name,
+        group=group,
+        space_id=space_id,
+        resume="allow",
+        embed=False,
+        config=dict(config),
     )
 
 
 @LOGGERS.register("mlflow")
 def mlflow_tracker(
-    folder: Path, config: Mapping[str, Any], first_step: int, project: str = "mme_vla", tracking_uri: str | None = None
+    folder: Path,
+    config: Mapping[str, Any],
+    first_step: int,
+    project: str = "mme_vla",
+    tracking_uri: str | None = None,
 ) -> GeneralTracker:
-    """An MLflow run, in a file of the run folder or on a server; a resumed run continues the same one."""
+    """An MLflow run, in a file of the run folder or on a server; a resumed run continues the same
+    one.
+    """
     import mlflow
 
     mlflow.set_tracking_uri(tracking_uri or f"sqlite:///{(folder / 'mlflow.db').absolute()}")
@@ -222,7 +271,9 @@ def _run_id(folder: Path) -> str:
 
 
 class Loggers:
-    """`metrics.jsonl` of a run, and its tracker. Processes other than the first have neither and record nothing."""
+    """`metrics.jsonl` of a run, and its tracker. Processes other than the first have neither and
+    record nothing.
+    """
 
     def __init__(self, file: IO[str] | None = None, tracker: GeneralTracker | None = None) -> None:
         self._file, self._tracker = file, tracker
@@ -253,7 +304,9 @@ class Loggers:
 
 
 def check_logger(config: Mapping[str, Any]) -> None:
-    """Raise an error, before any long work, if the package of the logger that the section `logger` names is missing."""
+    """Raise an error, before any long work, if the package of the logger that the section `logger`
+    names is missing.
+    """
     name = (config.get("logger") or {}).get("name")
     try:
         is_installed = name not in ("wandb", "trackio", "mlflow") or find_spec(name) is not None
@@ -262,7 +315,9 @@ def check_logger(config: Mapping[str, Any]) -> None:
     if not is_installed:
         if name == "wandb":
             raise missing_extra("logger=wandb", "wandb")
-        raise UserError(f"logger={name} needs the package {name}: pip install -c constraints.txt {name}")
+        raise UserError(
+            f"logger={name} needs the package {name}: pip install -c constraints.txt {name}"
+        )
 
 
 def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Loggers:

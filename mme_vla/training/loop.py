@@ -18,12 +18,28 @@ from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import AugmentsImages, WeighsLosses
 from mme_vla.speed import Recomputes
-from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, save_shards, tidy, trainable
+from mme_vla.training.checkpoint import (
+    checkpoint_name,
+    restore,
+    save_checkpoint,
+    save_shards,
+    tidy,
+    trainable,
+)
 from mme_vla.training.data import SplitData
 from mme_vla.training.logging import Loggers, ProgressLine, Window, memory_gib, read_metrics
 from mme_vla.training.open_loop import error_lines, open_loop, plot_open_loop
 from mme_vla.training.optim import EMA, clip_gradients, lr_factors, make_optimizer, scheduled_rate
-from mme_vla.training.order import BatchOrder, Collate, Samples, Validation, generator_for, readers, seed_of, size_of
+from mme_vla.training.order import (
+    BatchOrder,
+    Collate,
+    Samples,
+    Validation,
+    generator_for,
+    readers,
+    seed_of,
+    size_of,
+)
 from mme_vla.training.parallel import full_value, gathered, reshard, shard
 from mme_vla.training.runs import PLOT, SUMMARY, Run
 from mme_vla.training.settings import TrainSettings
@@ -34,7 +50,9 @@ from mme_vla.utils import write_atomically
 
 
 class _InEpoch(Dataset[Any]):
-    """The samples under keys (epoch, index): that is how workers learn the epoch, which random items depend on."""
+    """The samples under keys (epoch, index): that is how workers learn the epoch, which random
+    items depend on.
+    """
 
     def __init__(self, samples: Samples) -> None:
         self._samples = samples
@@ -47,7 +65,9 @@ class _InEpoch(Dataset[Any]):
 
 
 class Trainer:
-    """One training run of one policy. Everything that can fail for the user's reasons fails while it is built."""
+    """One training run of one policy. Everything that can fail for the user's reasons fails while
+    it is built.
+    """
 
     def __init__(
         self,
@@ -70,9 +90,14 @@ class Trainer:
         self.settings, self.run_info, self.config = settings, run, config
         self.accelerator, self.validation = accelerator, validation
         self.order = BatchOrder(
-            len(samples), settings.batch_size, settings.seed, range(run.step, settings.steps), settings.accumulate,
-            accelerator.process_index, accelerator.num_processes,
-        )  # fmt: skip
+            len(samples),
+            settings.batch_size,
+            settings.seed,
+            range(run.step, settings.steps),
+            settings.accumulate,
+            accelerator.process_index,
+            accelerator.num_processes,
+        )
         workers, ahead = settings.workers, None
         if workers:
             rows = self.order.rows(0)
@@ -94,13 +119,15 @@ class Trainer:
         self.policy = policy.train()
         if settings.losses:
             if not isinstance(policy, WeighsLosses):
-                raise UserError(f"train.losses: {type(policy).__name__} has no auxiliary losses. Leave it out.")
+                raise UserError(
+                    f"train.losses: {type(policy).__name__} has no auxiliary losses. Leave it out."
+                )
             policy.loss_weights = dict(settings.losses)
         if settings.recomputation:
             if not isinstance(policy, Recomputes):
                 raise UserError(
-                    f"train.gradient_checkpointing=true: {type(policy).__name__} cannot recompute activations; set it "
-                    "to false."
+                    f"train.gradient_checkpointing=true: {type(policy).__name__} cannot recompute"
+                    " activations; set it to false."
                 )
             policy.recompute(settings.recomputation)
         if settings.compile:
@@ -122,18 +149,24 @@ class Trainer:
         """The signal that ended `run` early."""
 
     def describe(self) -> str:
-        total, trained = (sum(p.numel() for p in part) for part in (self.policy.parameters(), self._parameters))
-        processes = f"{self.accelerator.num_processes} × " if self.accelerator.num_processes > 1 else ""
+        total, trained = (
+            sum(p.numel() for p in part) for part in (self.policy.parameters(), self._parameters)
+        )
+        processes = (
+            f"{self.accelerator.num_processes} × " if self.accelerator.num_processes > 1 else ""
+        )
         return (
-            f"{self.config.get('name', 'policy')}: {total / 1e6:.2f} M parameters, {trained / 1e6:.2f} M trained, on "
-            f"{processes}{self.accelerator.device}, in {self.run_info.folder}"
+            f"{self.config.get('name', 'policy')}: {total / 1e6:.2f} M parameters,"
+            f" {trained / 1e6:.2f} M trained, on {processes}{self.accelerator.device}, in"
+            f" {self.run_info.folder}"
         )
 
     def run(self, line: ProgressLine, loggers: Loggers) -> bool:
         """Train to the last step.
 
         Returns:
-            Whether it got there; False when the user or the cluster asked it to stop, which saves a checkpoint first.
+            Whether it got there; False when the user or the cluster asked it to stop, which saves a
+            checkpoint first.
         """
         window, settings = Window(self.settings.batch_size), self.settings
         if self.run_info.step >= settings.steps:  # killed between its last step and its end
@@ -159,18 +192,28 @@ class Trainer:
                         self.save(done, stopping)
                 if stopping:
                     self.stopped_by = stop.signal
-                    line.say(f"Stopped at step {done} as asked; continue with resume={self.run_info.folder}")
+                    line.say(
+                        f"Stopped at step {done} as asked; continue with"
+                        f" resume={self.run_info.folder}"
+                    )
                     return False
         return True
 
-    def update(self, step: int, batches: Iterator[Any], window: Window) -> dict[str, Tensor | float]:
-        """One optimizer update from the next `accumulate` pieces of `batches`; its metrics, detached, unwaited for."""
+    def update(
+        self, step: int, batches: Iterator[Any], window: Window
+    ) -> dict[str, Tensor | float]:
+        """One optimizer update from the next `accumulate` pieces of `batches`; its metrics,
+        detached, unwaited for.
+        """
         settings, device = self.settings, self.accelerator.device
         rate = scheduled_rate(step, settings)
         for group in self.optimizer.param_groups:
             group["lr"] = rate * group.get("lr_factor", 1.0)
-        draws = self.policy.training_noise(settings.batch_size, generator_for(settings.seed, "train", step))
-        # Of the whole update: the images of a sample depend neither on the number of processes nor of pieces.
+        draws = self.policy.training_noise(
+            settings.batch_size, generator_for(settings.seed, "train", step)
+        )
+        # Of the whole update: the images of a sample depend neither on the number of processes nor
+        # of pieces.
         generator = generator_for(settings.seed, "model", step, 0, 0)
         if isinstance(self.policy, AugmentsImages):
             draws = {**draws, **self.policy.augmentation_params(settings.batch_size, generator)}
@@ -180,10 +223,14 @@ class Trainer:
                 batch = next(batches).to(device, non_blocking=True)
             rows = self.order.rows(piece)
             # Whatever else draws (a memory's dropout) takes it from the default generator.
-            torch.manual_seed(seed_of(settings.seed, "model", step, piece, self.accelerator.process_index))
+            torch.manual_seed(
+                seed_of(settings.seed, "model", step, piece, self.accelerator.process_index)
+            )
             last = piece == settings.accumulate - 1
             with self._gradients_shared(last):
-                loss, metrics = self.model(batch, {name: send(value[rows], device) for name, value in draws.items()})
+                loss, metrics = self.model(
+                    batch, {name: send(value[rows], device) for name, value in draws.items()}
+                )
                 self.accelerator.backward(loss / settings.accumulate)
             for name, value in metrics.items():
                 part = value.detach().float() / settings.accumulate
@@ -197,7 +244,9 @@ class Trainer:
 
     @contextmanager
     def _gradients_shared(self, shared: bool) -> Iterator[None]:
-        """Whether the backward passes within send their gradients to the other processes, or add up their own."""
+        """Whether the backward passes within send their gradients to the other processes, or add up
+        their own.
+        """
         if self.sharded:
             self.policy.set_requires_gradient_sync(shared)  # type: ignore[operator]
             yield
@@ -206,19 +255,25 @@ class Trainer:
                 yield
 
     def validate(self, step: int, line: ProgressLine, loggers: Loggers) -> float | None:
-        """Log the loss of the averaged weights on held-out steps, of which every process takes its share."""
+        """Log the loss of the averaged weights on held-out steps, of which every process takes its
+        share.
+        """
         if self.validation is None:
             return None
         processes = self.accelerator.process_index, self.accelerator.num_processes
         with self.ema.applied():
             loss = self.validation.loss(self.policy, *processes, self.accelerator.reduce)
         loggers.write(step, {"val/loss": loss})
-        self.policy.config.setdefault("card", {})["results"] = {"validation loss": round(loss, 4), "at step": step}
+        self.policy.config.setdefault("card", {})["results"] = {
+            "validation loss": round(loss, 4),
+            "at step": step,
+        }
         line.say(f"step {step}/{self.settings.steps} · validation loss {loss:.4f}")
         return loss
 
     def save(self, step: int, stopping: bool = False) -> Path:
-        """Write a checkpoint: the first process does, or all their parts, which training does not wait for.
+        """Write a checkpoint: the first process does, or all their parts, which training does not
+        wait for.
 
         Args:
             stopping: the process may be killed before long: what resuming needs comes first.
@@ -241,9 +296,15 @@ class Trainer:
             self._shard_writer = None
 
     def _due(self, done: int) -> bool:
-        """Whether a window ends after `done` updates, as far as the plan goes; being asked to stop ends one too."""
+        """Whether a window ends after `done` updates, as far as the plan goes; being asked to stop
+        ends one too.
+        """
         settings = self.settings
-        return done == settings.steps or done % settings.save_every == 0 or done % settings.log_every == 0
+        return (
+            done == settings.steps
+            or done % settings.save_every == 0
+            or done % settings.log_every == 0
+        )
 
     def _log(self, step: int, window: Window, line: ProgressLine, loggers: Loggers) -> None:
         values = window.close(step, self.accelerator.reduce)
@@ -265,8 +326,11 @@ def _reporting(memory: Memory | None, enabled: bool) -> Iterator[None]:
         memory.reporting = False
 
 
-def finish(trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine, loggers: Loggers) -> dict[str, Any]:
-    """Check the averaged weights open loop, and write `open_loop.png` and `summary.json` into the run folder.
+def finish(
+    trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine, loggers: Loggers
+) -> dict[str, Any]:
+    """Check the averaged weights open loop, and write `open_loop.png` and `summary.json` into the
+    run folder.
 
     All processes call it, so that shared weights come together; the first does all else.
 
@@ -277,12 +341,20 @@ def finish(trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine
     samples = data.train if data.val is None else data.val
     first, result = trainer.accelerator.is_main_process, None
     if settings.open_loop_chunks and not isinstance(samples, TrainingDataset):
-        line.say("no open-loop check: it compares chunks step by step, and these samples are keyframes")
-    elif isinstance(samples, TrainingDataset) and settings.open_loop_chunks and (first or trainer.sharded):
+        line.say(
+            "no open-loop check: it compares chunks step by step, and these samples are keyframes"
+        )
+    elif (
+        isinstance(samples, TrainingDataset)
+        and settings.open_loop_chunks
+        and (first or trainer.sharded)
+    ):
         with trainer.ema.applied(), gathered(policy):
             if first:
                 policy.eval()
-                result = open_loop(policy, samples, settings.open_loop_chunks, settings.seed, data.val is not None)
+                result = open_loop(
+                    policy, samples, settings.open_loop_chunks, settings.seed, data.val is not None
+                )
     if not first:
         return {}
     summary: dict[str, Any] = {"steps": settings.steps, **loss_change(read_metrics(folder))}
@@ -297,16 +369,21 @@ def finish(trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine
     summary |= {"checkpoint": str(trainer.last_checkpoint), "seconds": round(seconds, 1)}
     with write_atomically(folder / SUMMARY) as draft:  # a run that has one is finished
         draft.write_text(json.dumps(summary, indent=2) + "\n")
-    line.say(f"loss {summary['first_loss']:.4f} → {summary['last_loss']:.4f} (first and last twentieth of the run)")
+    line.say(
+        f"loss {summary['first_loss']:.4f} → {summary['last_loss']:.4f} (first and last twentieth"
+        " of the run)"
+    )
     line.say(f"checkpoint: {trainer.last_checkpoint}")
     return summary
 
 
 def worse_than_still(summary: Mapping[str, Any], steps: int) -> str:
-    """A sentence on the numbers that holding still would predict better; empty where there are none.
+    """A sentence on the numbers that holding still would predict better; empty where there are
+    none.
 
     Args:
-        summary: of the open-loop check; without `mean_abs_error_holding_still` where the state is no action.
+        summary: of the open-loop check; without `mean_abs_error_holding_still` where the state is
+            no action.
         steps: updates of the run.
     """
     if "mean_abs_error_holding_still" not in summary:
@@ -316,14 +393,16 @@ def worse_than_still(summary: Mapping[str, Any], steps: int) -> str:
     if not worse:
         return ""
     return (
-        f"{worse} of {len(summary['names'])} numbers of the action are predicted worse than by holding still (the "
-        f"robot moves little within a chunk): {steps:,} updates on this data are too few for a policy. They show that "
-        "everything runs; raise train.steps, or train on more data, before evaluating."
+        f"{worse} of {len(summary['names'])} numbers of the action are predicted worse than by"
+        f" holding still (the robot moves little within a chunk): {steps:,} updates on this data"
+        " are too few for a policy. They show that everything runs; raise train.steps, or train on"
+        " more data, before evaluating."
     )
 
 
 def loss_change(lines: Sequence[Mapping[str, Any]], share: float = 0.05) -> dict[str, float]:
-    """The mean training loss over the first and over the last `share` of a run, and the last validation loss.
+    """The mean training loss over the first and over the last `share` of a run, and the last
+    validation loss.
 
     Args:
         lines: of `metrics.jsonl`; each holds the mean since the line before it.
@@ -336,7 +415,9 @@ def loss_change(lines: Sequence[Mapping[str, Any]], share: float = 0.05) -> dict
     spans = [(begun, step, loss) for begun, (step, loss) in zip(before, losses, strict=True)]
 
     def mean(entries: list[tuple[int, int, float]]) -> float:
-        return sum((end - begun) * loss for begun, end, loss in entries) / sum(end - begun for begun, end, _ in entries)
+        return sum((end - begun) * loss for begun, end, loss in entries) / sum(
+            end - begun for begun, end, _ in entries
+        )
 
     first = [span for span in spans if span[0] < max(share * total, 1)]
     last = [span for span in spans if span[1] > min((1 - share) * total, total - 1)]

@@ -1,4 +1,6 @@
-"""The open-loop check: predicted against recorded chunks along held-out episodes, as numbers and as an image."""
+"""The open-loop check: predicted against recorded chunks along held-out episodes, as numbers and as
+an image.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,10 +21,12 @@ from mme_vla.types import stack_noise
 class OpenLoop:
     """Chunks of n steps along one episode.
 
-    steps: [n] frames they start at. predicted, recorded: [n, h, w] absolute actions of the robot's `space`.
-    valid: [n, h] False on actions beyond the episode's end. scale: [w] half the (q01, q99) range of each
+    steps: [n] frames they start at. predicted, recorded: [n, h, w] absolute actions of the robot's
+    `space`. valid: [n, h] False on actions beyond the episode's end. scale: [w] half the (q01, q99)
+    range of each
         dimension; 1 where it never changes.
-    still: [n, w] the state held, which a policy that does not move would answer; None where an action is not a state
+    still: [n, w] the state held, which a policy that does not move would answer; None where an
+    action is not a state
         to come.
     """
 
@@ -41,7 +45,9 @@ class OpenLoop:
         return (difference * self.valid[..., None]).sum((0, 1)) / self.valid.sum()
 
     def summary(self) -> dict[str, Any]:
-        """The errors, plain: physical and normalised (1 = half the range of the training data's deltas)."""
+        """The errors, plain: physical and normalised (1 = half the range of the training data's
+        deltas).
+        """
         physical = self.error()
         still = {}
         if self.still is not None:
@@ -57,19 +63,24 @@ class OpenLoop:
 
 
 @torch.compiler.set_stance("force_eager")  # a few chunks are not worth compiling for
-def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, held_out: bool = True) -> OpenLoop:
+def open_loop(
+    policy: Policy, samples: TrainingDataset, chunks: int, seed: int, held_out: bool = True
+) -> OpenLoop:
     """Predict chunks that tile the first of the samples' episodes, at most `chunks` of them.
 
     Args:
         policy: its averaged weights and mode are the caller's business.
-        samples: the held-out steps; or the training steps, where there are none (`held_out` False says so).
+        samples: the held-out steps; or the training steps, where there are none (`held_out` False
+            says so).
     """
     processor = policy.require_processor()
     horizon = policy.horizon
     source, episode, _ = samples.locate(0)
     count = len(samples.decisions(source, episode))
     starts = np.arange(0, count, horizon)
-    starts = starts[np.linspace(0, len(starts) - 1, min(chunks, len(starts))).round().astype(int)].tolist()
+    starts = starts[
+        np.linspace(0, len(starts) - 1, min(chunks, len(starts))).round().astype(int)
+    ].tolist()
     predicted = []
     generator = generator_for(seed, "open loop")
     for place in (starts[i : i + 8] for i in range(0, len(starts), 8)):
@@ -113,28 +124,48 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
     errors, scaled = result.error(), result.error() / result.scale
     time = result.steps[:, None] + np.arange(result.recorded.shape[1])
     for joint, panel in enumerate(panels[: result.space.width]):
-        panel.plot(*_unbroken(time, result.recorded[..., joint], result.valid), color="0.25", lw=2.2, label="recorded")
+        panel.plot(
+            *_unbroken(time, result.recorded[..., joint], result.valid),
+            color="0.25",
+            lw=2.2,
+            label="recorded",
+        )
         for i, valid in enumerate(result.valid):
             chunk = result.predicted[i, valid, joint]
-            panel.plot(time[i, valid], chunk, color="tab:orange", lw=1.5, label="predicted chunk" if i == 0 else None)
+            panel.plot(
+                time[i, valid],
+                chunk,
+                color="tab:orange",
+                lw=1.5,
+                label="predicted chunk" if i == 0 else None,
+            )
             panel.plot(time[i, :1], chunk[:1], "o", color="tab:orange", ms=4)
         panel.set_title(
-            f"{result.space.names[joint]}: mean error {errors[joint]:.3f} ({scaled[joint]:.2f} normalised)",
-            fontsize=10, loc="left",
-        )  # fmt: skip
+            f"{result.space.names[joint]}: mean error {errors[joint]:.3f} ({scaled[joint]:.2f}"
+            " normalised)",
+            fontsize=10,
+            loc="left",
+        )
         panel.set_ylabel(result.space.units[joint], fontsize=9)
         panel.grid(alpha=0.25)
         panel.margins(x=0.01)
     for panel in panels[-2:]:
         panel.set_xlabel("step of the episode; a dot marks where a chunk was predicted", fontsize=9)
     figure.suptitle(
-        f"{name}, open loop on {result.title}", x=0.01, y=1 - 0.1 / height, ha="left", va="top", fontsize=12
+        f"{name}, open loop on {result.title}",
+        x=0.01,
+        y=1 - 0.1 / height,
+        ha="left",
+        va="top",
+        fontsize=12,
     )
     figure.legend(*panels[0].get_legend_handles_labels(), loc="lower right", ncols=2, frameon=False)
     figure.savefig(path, dpi=110)
 
 
-def _unbroken(time: np.ndarray, values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _unbroken(
+    time: np.ndarray, values: np.ndarray, valid: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Chunks [n, h] as one line that is cut only where no chunk tells what was recorded."""
     t, y = time[valid].astype(float), values[valid].astype(float)
     gaps = np.flatnonzero(np.diff(t) > 1) + 1
@@ -149,5 +180,9 @@ def error_lines(summary: Mapping[str, Any]) -> Sequence[str]:
     width = max(map(len, [*summary["names"], " " * 8]))
     lines = ["  ".join([" " * width, *(f"{title:>13}" for title in columns)])]
     for i, name in enumerate(summary["names"]):
-        lines.append("  ".join([f"{name:{width}}", *(f"{summary[key][i]:13.4f}" for key in columns.values())]))
+        lines.append(
+            "  ".join(
+                [f"{name:{width}}", *(f"{summary[key][i]:13.4f}" for key in columns.values())]
+            )
+        )
     return lines

@@ -16,7 +16,9 @@ from mme_vla.training.settings import TrainSettings
 
 
 def learning_rate(step: int, peak: float, warmup: int) -> float:
-    """Rate of update `step`, from 0: linear from peak/(warmup + 1) to `peak` at step `warmup`, then constant."""
+    """Rate of update `step`, from 0: linear from peak/(warmup + 1) to `peak` at step `warmup`, then
+    constant.
+    """
     if step >= warmup:
         return peak
     start = peak / (warmup + 1)
@@ -26,12 +28,15 @@ def learning_rate(step: int, peak: float, warmup: int) -> float:
 def scheduled_rate(step: int, settings: TrainSettings) -> float:
     """Rate of update `step`, from 0, of a recipe.
 
-    Linear to `lr` at step `warmup`, from lr/(warmup + 1) or from 0; then constant, or half a cosine that is `lr` times
-    `schedule_end` at `schedule_steps`, or `gamma` times less from each of the `milestones` on.
+    Linear to `lr` at step `warmup`, from lr/(warmup + 1) or from 0; then constant, or half a cosine
+    that is `lr` times `schedule_end` at `schedule_steps`, or `gamma` times less from each of the
+    `milestones` on.
     """
     peak, warmup = settings.lr, settings.warmup
     if step < warmup:
-        return peak * step / warmup if settings.warmup_from_zero else learning_rate(step, peak, warmup)
+        return (
+            peak * step / warmup if settings.warmup_from_zero else learning_rate(step, peak, warmup)
+        )
     if settings.schedule == "cosine":
         total = settings.schedule_steps or settings.steps
         done = min((step - warmup) / max(total - warmup, 1), 1.0)
@@ -51,45 +56,68 @@ def lr_factors(names: Iterable[str], spec: FineTuneSpec, settings: TrainSettings
 
 
 def make_optimizer(
-    parameters: Iterable[nn.Parameter], settings: TrainSettings, factors: Sequence[float] | None = None
+    parameters: Iterable[nn.Parameter],
+    settings: TrainSettings,
+    factors: Sequence[float] | None = None,
 ) -> torch.optim.Optimizer:
-    """AdamW over all trainable parameters, fused, which every device that trains supports; or timm's LAMB.
+    """AdamW over all trainable parameters, fused, which every device that trains supports; or
+    timm's LAMB.
 
-    LAMB scales each tensor's update down to that tensor's norm, never up. Parameters of fewer than `decay_min_dim`
-    dimensions (biases, norms) are a group of their own, without weight decay.
+    LAMB scales each tensor's update down to that tensor's norm, never up. Parameters of fewer than
+    `decay_min_dim` dimensions (biases, norms) are a group of their own, without weight decay.
 
     Args:
-        factors: of each parameter's learning rate, of `lr_factors`; a group keeps its own as `lr_factor`. None: all 1.
+        factors: of each parameter's learning rate, of `lr_factors`; a group keeps its own as
+            `lr_factor`. None: all 1.
     """
     parameters_list, least = list(parameters), settings.decay_min_dim
     members: dict[tuple[float, bool], list[nn.Parameter]] = {}
-    for parameter, factor in zip(parameters_list, factors or [1.0] * len(parameters_list), strict=True):
+    for parameter, factor in zip(
+        parameters_list, factors or [1.0] * len(parameters_list), strict=True
+    ):
         members.setdefault((factor, parameter.ndim >= least), []).append(parameter)
     groups: list[dict[str, Any]] = [
-        {"params": group} | ({} if decays else {"weight_decay": 0.0}) | ({} if factor == 1 else {"lr_factor": factor})
-        for (factor, decays), group in sorted(members.items(), key=lambda item: (-item[0][0], -item[0][1]))
+        {"params": group}
+        | ({} if decays else {"weight_decay": 0.0})
+        | ({} if factor == 1 else {"lr_factor": factor})
+        for (factor, decays), group in sorted(
+            members.items(), key=lambda item: (-item[0][0], -item[0][1])
+        )
     ]
     if settings.optimizer == "lamb":
         from mme_vla.training.lamb import ClippedLamb  # imports timm, and so torchvision
 
         return ClippedLamb(
-            groups, lr=settings.lr, betas=settings.betas, eps=settings.eps, weight_decay=settings.weight_decay
+            groups,
+            lr=settings.lr,
+            betas=settings.betas,
+            eps=settings.eps,
+            weight_decay=settings.weight_decay,
         )
     return torch.optim.AdamW(
-        groups, lr=settings.lr, betas=settings.betas, eps=settings.eps, weight_decay=settings.weight_decay, fused=True
+        groups,
+        lr=settings.lr,
+        betas=settings.betas,
+        eps=settings.eps,
+        weight_decay=settings.weight_decay,
+        fused=True,
     )
 
 
 @torch.no_grad()
 def clip_gradients(gradients: list[Tensor], max_norm: float) -> Tensor:
-    """Scale all gradients in place so that their common norm is at most `max_norm`; return the norm before."""
+    """Scale all gradients in place so that their common norm is at most `max_norm`; return the norm
+    before.
+    """
     norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
     torch._foreach_mul_(gradients, (max_norm / norm).clamp(max=1.0))
     return norm
 
 
 class EMA:
-    """average ← decay·average + (1 − decay)·weights after every update, begun with the initial weights as released."""
+    """average ← decay·average + (1 − decay)·weights after every update, begun with the initial
+    weights as released.
+    """
 
     def __init__(
         self,
@@ -101,7 +129,8 @@ class EMA:
         """Begin with copies of the parameters; of sharded ones, every process of its own part.
 
         Args:
-            decay: of the average; with `warmup` at most, and (1 + k)/(10 + k) after k updates before (0 at first).
+            decay: of the average; with `warmup` at most, and (1 + k)/(10 + k) after k updates
+                before (0 at first).
             reshard: lets go of weights that were gathered from the parameters before they change.
         """
         self.decay, self.warmup, self._reshard = decay, warmup, reshard
@@ -109,15 +138,21 @@ class EMA:
         self._average = [p.detach().clone() for p in self._parameters.values()]
 
     def decay_after(self, done: int) -> float:
-        """The decay of the update before which `done` were done; the first one copies, while warming up."""
+        """The decay of the update before which `done` were done; the first one copies, while
+        warming up.
+        """
         if not self.warmup:
             return self.decay
         return min((1 + done) / (10 + done), self.decay) if done else 0.0
 
     @torch.no_grad()
     def update(self, done: int = 0) -> None:
-        """Move towards the current weights, after `done` earlier updates (which only a warm-up asks)."""
-        torch._foreach_lerp_(self._average, list(self._parameters.values()), 1 - self.decay_after(done))
+        """Move towards the current weights, after `done` earlier updates (which only a warm-up
+        asks).
+        """
+        torch._foreach_lerp_(
+            self._average, list(self._parameters.values()), 1 - self.decay_after(done)
+        )
 
     @torch.no_grad()
     def load(self, tensors: Mapping[str, Tensor]) -> None:
@@ -132,8 +167,8 @@ class EMA:
     def applied(self) -> Iterator[None]:
         """Within this context the module has the averaged weights.
 
-        Storage is exchanged and nothing copied, but for shards: what gathers them holds on to their storage, so their
-        numbers are exchanged.
+        Storage is exchanged and nothing copied, but for shards: what gathers them holds on to their
+        storage, so their numbers are exchanged.
         """
         self._exchange()
         try:

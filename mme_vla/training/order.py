@@ -1,4 +1,6 @@
-"""Batch order, random numbers and validation loss as functions of (seed, step): resuming replays nothing."""
+"""Batch order, random numbers and validation loss as functions of (seed, step): resuming replays
+nothing.
+"""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,10 +25,12 @@ def generator_for(*key: int | str) -> torch.Generator:
 
 
 class BatchOrder:
-    """Which samples each update sees: a fresh global shuffle every epoch, the last incomplete batch dropped.
+    """Which samples each update sees: a fresh global shuffle every epoch, the last incomplete batch
+    dropped.
 
-    As a batch sampler it yields, update after update, this process's `accumulate` pieces as lists of (epoch, index).
-    The whole batch of an update depends on neither the number of processes nor of pieces.
+    As a batch sampler it yields, update after update, this process's `accumulate` pieces as lists
+    of (epoch, index). The whole batch of an update depends on neither the number of processes nor
+    of pieces.
     """
 
     def __init__(
@@ -46,8 +50,8 @@ class BatchOrder:
         )
         require(
             not (batch_size % (accumulate * processes)),
-            f"train.batch_size={batch_size} counts the samples of one update over all processes: it must be a "
-            f"multiple of {processes} processes × train.accumulate={accumulate}.",
+            f"train.batch_size={batch_size} counts the samples of one update over all processes: it"
+            f" must be a multiple of {processes} processes × train.accumulate={accumulate}.",
         )
         self.samples, self.batch_size, self.seed, self.steps = samples, batch_size, seed, steps
         self.accumulate, self.process, self.processes = accumulate, process, processes
@@ -59,7 +63,9 @@ class BatchOrder:
         epoch, place = divmod(step, self.steps_per_epoch)
         if epoch != self._epoch:
             self._epoch = epoch
-            self._shuffled = torch.randperm(self.samples, generator=generator_for(self.seed, "order", epoch))
+            self._shuffled = torch.randperm(
+                self.samples, generator=generator_for(self.seed, "order", epoch)
+            )
         return self._shuffled[place * self.batch_size : (place + 1) * self.batch_size].tolist()
 
     def rows(self, piece: int) -> slice:
@@ -115,37 +121,58 @@ Collate = Callable[[Sequence[Any]], Any]
 class Validation:
     """A fixed set of held-out samples, read once and kept on the CPU."""
 
-    def __init__(self, samples: Samples, collate: Collate, count: int, batch_size: int, seed: int) -> None:
+    def __init__(
+        self, samples: Samples, collate: Collate, count: int, batch_size: int, seed: int
+    ) -> None:
         """Choose `count` samples, evenly spaced over the split (all, if it has no more)."""
-        self._samples, self._collate, self._batch_size, self._seed = samples, collate, batch_size, seed
+        self._samples, self._collate, self._batch_size, self._seed = (
+            samples,
+            collate,
+            batch_size,
+            seed,
+        )
         size = len(samples)
         self.indices = np.linspace(0, size - 1, min(count, size)).round().astype(int).tolist()
         self._batches: list[Any] = []
 
-    # Compiled code of the training step does not fit here, and a few batches are not worth code of their own.
+    # Compiled code of the training step does not fit here, and a few batches are not worth code of
+    # their own.
     @torch.compiler.set_stance("force_eager")
     @torch.no_grad()
     def loss(
-        self, policy: Policy, process: int = 0, processes: int = 1, reduce: Callable[..., Any] | None = None
+        self,
+        policy: Policy,
+        process: int = 0,
+        processes: int = 1,
+        reduce: Callable[..., Any] | None = None,
     ) -> float:
         """The mean loss, without augmentation; the policy's mode is put back.
 
         Args:
-            process, processes: which of how many this is; each takes its share of the batches. All of them run the
-                policy equally often, as sharing its weights asks: one without a batch of its own repeats its last.
-            reduce: sums a tensor over all processes (`Accelerator.reduce`), where there are several.
+            process, processes: which of how many this is; each takes its share of the batches. All
+                of them run the policy equally often, as sharing its weights asks: one without a
+                batch of its own repeats its last.
+            reduce: sums a tensor over all processes (`Accelerator.reduce`), where there are
+                several.
         """
         was_training = policy.training
         policy.eval()
         total = torch.zeros((), dtype=torch.float64)
-        places = [self.indices[i : i + self._batch_size] for i in range(0, len(self.indices), self._batch_size)]
+        places = [
+            self.indices[i : i + self._batch_size]
+            for i in range(0, len(self.indices), self._batch_size)
+        ]
         mine = places[process::processes]
         for number in range(-(-len(places) // processes)):
             place = mine[number] if number < len(mine) else places[process % len(places)]
             if number == len(self._batches):
                 self._batches.append(self._collate([self._samples[i] for i in place]))
-            rows = [policy.training_noise(1, generator_for(self._seed, "validation", i)) for i in place]
-            draws = {name: torch.cat([row[name] for row in rows]).to(policy.device) for name in rows[0]}
+            rows = [
+                policy.training_noise(1, generator_for(self._seed, "validation", i)) for i in place
+            ]
+            draws = {
+                name: torch.cat([row[name] for row in rows]).to(policy.device) for name in rows[0]
+            }
             loss, _ = policy(self._batches[number].to(policy.device), draws)
             if number < len(mine):
                 total += float(loss) * len(place)

@@ -1,8 +1,9 @@
-"""How processes share one training run: every one with all weights (DDP), or each with a part of them (FSDP2).
+"""How processes share one training run: every one with all weights (DDP), or each with a part of
+them (FSDP2).
 
-Sharded, a process keeps 1/n of the weights, gradients, moments and averages, and gathers a group of weights
-(`Sharded.shard_groups`) right before it is needed. All of it is PyTorch's `fully_shard`; launchers stay `torchrun` and
-`accelerate launch`.
+Sharded, a process keeps 1/n of the weights, gradients, moments and averages, and gathers a group of
+weights (`Sharded.shard_groups`) right before it is needed. All of it is PyTorch's `fully_shard`;
+launchers stay `torchrun` and `accelerate launch`.
 """
 
 import os
@@ -13,7 +14,11 @@ from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor, distributed, nn
-from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict, set_model_state_dict
+from torch.distributed.checkpoint.state_dict import (
+    StateDictOptions,
+    get_model_state_dict,
+    set_model_state_dict,
+)
 from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
 from torch.distributed.fsdp import FSDPModule, MixedPrecisionPolicy, fully_shard
 from torch.distributed.tensor import DTensor
@@ -37,38 +42,48 @@ class ParallelSettings:
     replicate: PositiveInt | None = None
 
     def shards(self, device: torch.device) -> bool:
-        """Whether this run shards its weights: where that is asked for, and of itself on several GPUs."""
+        """Whether this run shards its weights: where that is asked for, and of itself on several
+        GPUs.
+        """
         started = distributed.is_available() and distributed.is_initialized()
         require(
             self.strategy != "fsdp" or started,
-            "train.parallel.strategy=fsdp shares the weights among processes, and this one was started alone: "
-            "start it with torchrun --nproc-per-node <GPUs> -m mme_vla.train …, or leave the strategy at auto.",
+            "train.parallel.strategy=fsdp shares the weights among processes, and this one was"
+            " started alone: start it with torchrun --nproc-per-node <GPUs> -m mme_vla.train …, or"
+            " leave the strategy at auto.",
         )
         if self.strategy == "auto":
             return started and distributed.get_world_size() > 1 and device.type == "cuda"
         return self.strategy == "fsdp"
 
     def mesh(self, device_type: str) -> DeviceMesh:
-        """The processes: weights are shared along the last axis; with copies (HSDP) the first axis counts those."""
+        """The processes: weights are shared along the last axis; with copies (HSDP) the first axis
+        counts those.
+        """
         world = distributed.get_world_size()
         nodes = max(world // int(os.environ.get("LOCAL_WORLD_SIZE", world)), 1)
         copies = nodes if self.replicate is None else self.replicate
         require(
-            not (world % copies), f"train.parallel.replicate={copies} must divide the number of processes, {world}."
+            not (world % copies),
+            f"train.parallel.replicate={copies} must divide the number of processes, {world}.",
         )
         if copies == 1:
             return init_device_mesh(device_type, (world,), mesh_dim_names=("shard",))
-        return init_device_mesh(device_type, (copies, world // copies), mesh_dim_names=("replicate", "shard"))
+        return init_device_mesh(
+            device_type, (copies, world // copies), mesh_dim_names=("replicate", "shard")
+        )
 
 
 def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool = False) -> None:
-    """Share a policy's weights in place; the first process's are what all get, and the others' may be on meta.
+    """Share a policy's weights in place; the first process's are what all get, and the others' may
+    be on meta.
 
     Args:
         policy: with adapters, frozen parameters, recomputation and compilation as they shall be.
-        dtype: matrix products run in it (`policy.compute_dtype`). Groups are gathered in it, but for what computes in
-            float32: groups that say so, norms, and all that is in no group.
-        compiled: groups are compiled whole, so nothing inside one is gathered apart: its norms are in `dtype` too.
+        dtype: matrix products run in it (`policy.compute_dtype`). Groups are gathered in it, but
+            for what computes in float32: groups that say so, norms, and all that is in no group.
+        compiled: groups are compiled whole, so nothing inside one is gathered apart: its norms are
+            in `dtype` too.
     """
     full = dict(policy.state_dict()) if distributed.get_rank() == 0 else {}
     full = {name: tensor.detach().cpu() for name, tensor in full.items()}
@@ -77,10 +92,16 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
     low = None if dtype == torch.float32 else dtype
 
     def wrap(module: nn.Module | list[nn.Module], kind: torch.dtype | None) -> None:
-        rules = MixedPrecisionPolicy(param_dtype=kind, reduce_dtype=torch.float32, cast_forward_inputs=False)
+        rules = MixedPrecisionPolicy(
+            param_dtype=kind, reduce_dtype=torch.float32, cast_forward_inputs=False
+        )
         fully_shard(module, mesh=mesh, mp_policy=rules)
 
-    groups = policy.shard_groups() if isinstance(policy, Sharded) else map(ShardGroup, stacked_layers(policy))
+    groups = (
+        policy.shard_groups()
+        if isinstance(policy, Sharded)
+        else map(ShardGroup, stacked_layers(policy))
+    )
     for group in groups:
         exact = [] if group.full or low is None or compiled else float32_modules(group.module)
         if exact:
@@ -96,7 +117,9 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
 def _materialise(policy: Policy, mesh: DeviceMesh) -> None:
     """Give what is on meta memory, and what no checkpoint holds the first process's values."""
     kind = mesh.device_type
-    device = torch.device(kind, torch.cuda.current_device()) if kind == "cuda" else torch.device(kind)
+    device = (
+        torch.device(kind, torch.cuda.current_device()) if kind == "cuda" else torch.device(kind)
+    )
     for module in policy.modules():
         tensors = [*module.parameters(recurse=False), *module.buffers(recurse=False)]
         if any(tensor.is_meta for tensor in tensors):
@@ -108,10 +131,17 @@ def _materialise(policy: Policy, mesh: DeviceMesh) -> None:
 
 
 def full_state(policy: Policy) -> dict[str, Tensor]:
-    """All of a sharded policy's tensors on the first process's CPU; elsewhere nothing. All processes call it."""
+    """All of a sharded policy's tensors on the first process's CPU; elsewhere nothing. All
+    processes call it.
+    """
     full = cast(dict[str, Tensor], get_model_state_dict(policy, options=FULL_STATE))
-    # Trained on the CPU they may lie in what training continues with, or in the middle of what was gathered.
-    return {name: tensor.clone() for name, tensor in full.items()} if policy.device.type == "cpu" else full
+    # Trained on the CPU they may lie in what training continues with, or in the middle of what was
+    # gathered.
+    return (
+        {name: tensor.clone() for name, tensor in full.items()}
+        if policy.device.type == "cpu"
+        else full
+    )
 
 
 def reshard(module: nn.Module) -> None:
@@ -124,9 +154,11 @@ def reshard(module: nn.Module) -> None:
 
 @contextmanager
 def gathered(policy: Policy) -> Iterator[None]:
-    """Within this context every process holds all weights of a sharded policy, and any of its methods may be called.
+    """Within this context every process holds all weights of a sharded policy, and any of its
+    methods may be called.
 
-    For sampling and looking, without gradients. All processes enter it; inside nothing is collective.
+    For sampling and looking, without gradients. All processes enter it; inside nothing is
+    collective.
     """
     parts = _sharded_parts(policy)
     if not parts:
@@ -145,7 +177,9 @@ def gathered(policy: Policy) -> Iterator[None]:
 
 
 def like(tensor: Tensor, full: Tensor) -> Tensor:
-    """Of a whole tensor the part that this process keeps, laid out as `tensor` is; nothing is sent."""
+    """Of a whole tensor the part that this process keeps, laid out as `tensor` is;
+    nothing is sent.
+    """
     if not isinstance(tensor, DTensor) or isinstance(full, DTensor):
         return full
     from torch.distributed.tensor import distribute_tensor

@@ -1,4 +1,6 @@
-"""Run folders: which one this run writes to, what it may resume from, and which settings it may change then."""
+"""Run folders: which one this run writes to, what it may resume from, and which settings it may
+change then.
+"""
 
 import inspect
 from collections.abc import Mapping, Sequence
@@ -33,20 +35,41 @@ PARTS = {"memory": MEMORIES, "integration": INTEGRATIONS}
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
 
 MAY_DIFFER = (
-    "name", "full_size", "output", "resume", "trainings", "init_from", "logger", "train.steps", "train.log_every",
-    "train.val_every", "train.save_every", "train.keep", "train.parallel", "train.prefetch_gb", "train.workers",
-    "train.open_loop_chunks", "train.device",
-    "data.cache", "data.content", "trust_plugins",
-)  # fmt: skip
-"""Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that changes a loss.
+    "name",
+    "full_size",
+    "output",
+    "resume",
+    "trainings",
+    "init_from",
+    "logger",
+    "train.steps",
+    "train.log_every",
+    "train.val_every",
+    "train.save_every",
+    "train.keep",
+    "train.parallel",
+    "train.prefetch_gb",
+    "train.workers",
+    "train.open_loop_chunks",
+    "train.device",
+    "data.cache",
+    "data.content",
+    "trust_plugins",
+)
+"""Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that
+changes a loss.
 
-The name too: it follows from the sections that are compared, and runs of earlier versions may be called otherwise.
-`data.content`, the fingerprints of the datasets, is compared when they are open (`check_content`)."""
+The name too: it follows from the sections that are compared, and runs of earlier versions may be
+called otherwise. `data.content`, the fingerprints of the datasets, is compared when they are open
+(`check_content`).
+"""
 
 
 @dataclass(frozen=True)
 class Run:
-    """Where a run writes, and the checkpoint it continues from with the updates already done (None: from nothing)."""
+    """Where a run writes, and the checkpoint it continues from with the updates already done (None:
+    from nothing).
+    """
 
     folder: Path
     checkpoint: Path | None = None
@@ -57,12 +80,15 @@ class Run:
         return self.folder / CHECKPOINTS
 
 
-def claim_run(folder: Path, named: bool, resume: str | None, config: Mapping[str, Any]) -> tuple[Run, FolderLock]:
+def claim_run(
+    folder: Path, named: bool, resume: str | None, config: Mapping[str, Any]
+) -> tuple[Run, FolderLock]:
     """Decide as `open_run`, and hold the run's folder against other processes.
 
     Args:
-        named: whether the user chose `folder`. One that is named after the clock may belong to another run that began
-            in the same second: then this run takes the next name, `<folder>-2`.
+        named: whether the user chose `folder`. One that is named after the clock may belong to
+            another run that began in the same second: then this run takes the next name,
+            `<folder>-2`.
     """
     for number in range(1, 1000):
         place = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
@@ -74,10 +100,14 @@ def claim_run(folder: Path, named: bool, resume: str | None, config: Mapping[str
                 raise
             continue
         try:
-            again = open_run(place, resume, config)  # what decided may have changed before the folder was held
+            again = open_run(
+                place, resume, config
+            )  # what decided may have changed before the folder was held
             if again.folder == run.folder:
                 return again, lock
-            raise UserError(f"{run.folder} has just been finished by another process; repeat the command.")
+            raise UserError(
+                f"{run.folder} has just been finished by another process; repeat the command."
+            )
         except BaseException:
             lock.release()
             raise
@@ -98,27 +128,34 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
             f"continue it with resume={folder}, or choose another output.",
         )
         return Run(folder)
-    checkpoint = _newest_unfinished(folder) if resume == "auto" else resolve_checkpoint(Path(resume))
+    checkpoint = (
+        _newest_unfinished(folder) if resume == "auto" else resolve_checkpoint(Path(resume))
+    )
     if checkpoint is None:
         return Run(folder)
     state = read_state(checkpoint)
     changed = changed_settings(state["config"], config)
     if changed:
         pairs = [
-            f"  {brief(key, quote=False)}: {brief(old)} then, {brief(new)} now" for key, (old, new) in changed.items()
+            f"  {brief(key, quote=False)}: {brief(old)} then, {brief(new)} now"
+            for key, (old, new) in changed.items()
         ]
         more = [f"  … and {len(pairs) - 7:,} more"] if len(pairs) > 7 else []
         lines = "\n".join([*pairs[:7], *more])
         raise UserError(
-            f"{checkpoint} was trained with other settings, so continuing from it would be another run:\n{lines}\n"
-            f"Repeat the settings of {checkpoint.parent.parent / CONFIG}, or start anew with init_from={checkpoint}."
+            f"{checkpoint} was trained with other settings, so continuing from it would be another"
+            f" run:\n{lines}\nRepeat the settings of {checkpoint.parent.parent / CONFIG}, or start"
+            f" anew with init_from={checkpoint}."
         )
     steps = config["train"]["steps"]
     require(
         state["step"] <= steps,
-        f"{checkpoint} has done {state['step']} steps already, more than train.steps={steps}: give as many or more.",
+        f"{checkpoint} has done {state['step']} steps already, more than train.steps={steps}: give"
+        " as many or more.",
     )
-    newer = [path.name for path in checkpoints_in(checkpoint.parent) if step_of(path) > state["step"]]
+    newer = [
+        path.name for path in checkpoints_in(checkpoint.parent) if step_of(path) > state["step"]
+    ]
     require(
         not newer,
         f"{checkpoint.parent} holds newer checkpoints ({', '.join(newer)}), which continuing from "
@@ -137,14 +174,19 @@ def check_content(checkpoint: Path, now: Sequence[str]) -> None:
     if then is not None and list(then) != list(now):
         which = [i for i, (old, new) in enumerate(zip_longest(then, now)) if old != new]
         raise UserError(
-            f"The data have changed since {checkpoint} was written: number {', '.join(map(str, which))} of "
-            "data.sources holds other episodes, so continuing would be another run. Bring the data back, or start anew "
-            f"with init_from={checkpoint}."
+            f"The data have changed since {checkpoint} was written: number"
+            f" {', '.join(map(str, which))} of data.sources holds other episodes, so continuing"
+            " would be another run. Bring the data back, or start anew with"
+            f" init_from={checkpoint}."
         )
 
 
-def changed_settings(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Dotted keys that a run may not change, with their values before and now, of two plain configurations."""
+def changed_settings(
+    before: Mapping[str, Any], now: Mapping[str, Any]
+) -> dict[str, tuple[Any, Any]]:
+    """Dotted keys that a run may not change, with their values before and now, of two plain
+    configurations.
+    """
     return differing_keys(_completed(before), _completed(now))
 
 
@@ -154,18 +196,27 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
     return {
         key: (before.get(key), after.get(key))
         for key in sorted(before.keys() | after.keys())
-        if before.get(key) != after.get(key) and not any(f"{key}.".startswith(f"{free}.") for free in MAY_DIFFER)
+        if before.get(key) != after.get(key)
+        and not any(f"{key}.".startswith(f"{free}.") for free in MAY_DIFFER)
     }
 
 
 def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration with what runs of earlier versions did not say, because there was no other choice."""
+    """A configuration with what runs of earlier versions did not say, because there was no other
+    choice.
+    """
     options = [f for f in fields(TrainSettings) if f.name != "seed"]
     train = {f.name: f.default for f in options if f.default is not MISSING}
     train |= {f.name: {} for f in options if f.default_factory is dict}
     data = {"history_transforms": [], **(config.get("data") or {})}
-    learning = {"learning": {"history_transforms": [], **config["learning"]}} if config.get("learning") else {}
-    if list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]:  # now the default
+    learning = (
+        {"learning": {"history_transforms": [], **config["learning"]}}
+        if config.get("learning")
+        else {}
+    )
+    if list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [
+        3
+    ]:  # now the default
         data["val_episodes"] = None
     return {
         **config,
@@ -174,7 +225,11 @@ def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
         "data": data,
         **learning,
         "policy": {"name": policy_name(config), **(config.get("policy") or {})},
-        **{key: _with_defaults(table, config[key]) for key, table in PARTS.items() if config.get(key)},
+        **{
+            key: _with_defaults(table, config[key])
+            for key, table in PARTS.items()
+            if config.get(key)
+        },
         **({"backbone": _with_head(config["backbone"])} if config.get("backbone") else {}),
     }
 
@@ -182,12 +237,18 @@ def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
 def _with_head(section: Mapping[str, Any]) -> dict[str, Any]:
     """The section `backbone` with the default flow head, where earlier versions had no other."""
     sizes: Any = BACKBONES[section["name"]].Config if section["name"] in BACKBONES else None
-    heads = [f.default_factory for f in (fields(sizes) if is_dataclass(sizes) else ()) if f.name == "head"]
+    heads = [
+        f.default_factory
+        for f in (fields(sizes) if is_dataclass(sizes) else ())
+        if f.name == "head"
+    ]
     return ({"head": heads[0]()} if heads and heads[0] is not MISSING else {}) | dict(section)
 
 
 def _with_defaults(table: Registry[Any], section: Mapping[str, Any]) -> dict[str, Any]:
-    """A part's section with the options that it leaves to the constructor: some came later than the run."""
+    """A part's section with the options that it leaves to the constructor: some came later than the
+    run.
+    """
     if section.get("name") not in table:
         return dict(section)
     options = inspect.signature(table[str(section["name"])]).parameters.values()
@@ -199,9 +260,14 @@ def _holds_run(folder: Path) -> bool:
 
 
 def _newest_unfinished(folder: Path) -> Path | None:
-    """The last checkpoint in `folder`, else of the run beside it that wrote last, unless that run is finished."""
+    """The last checkpoint in `folder`, else of the run beside it that wrote last, unless that run
+    is finished.
+    """
     beside = [path for path in folder.parent.glob("*") if (path / CHECKPOINTS).is_dir()]
-    runs = [folder, *sorted(beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True)]
+    runs = [
+        folder,
+        *sorted(beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True),
+    ]
     for run in runs:
         checkpoints = checkpoints_in(run / CHECKPOINTS)
         if checkpoints:
@@ -210,7 +276,9 @@ def _newest_unfinished(folder: Path) -> Path | None:
 
 
 def unfinished_trainings(folder: Path, count: int) -> Path:
-    """`folder`, or the newest folder beside it that holds trainings of which fewer than `count` are finished."""
+    """`folder`, or the newest folder beside it that holds trainings of which fewer than `count` are
+    finished.
+    """
     beside = [path for path in folder.parent.glob("*") if trainings_in(path)]
     newest = max(beside, key=newest_write, default=folder)
     finished = [run for run in trainings_in(newest) if (run / SUMMARY).is_file()]
@@ -218,12 +286,15 @@ def unfinished_trainings(folder: Path, count: int) -> Path:
 
 
 def check_finished(trainings: Sequence[Path]) -> None:
-    """Make sure that all trainings of a recipe are finished, so that their last checkpoints are alike."""
+    """Make sure that all trainings of a recipe are finished, so that their last checkpoints are
+    alike.
+    """
     lacking = [run for run in trainings if not (run / SUMMARY).is_file()]
     require(
         not lacking,
-        f"{', '.join(map(str, lacking))}: not finished. Repeat the command that trains, with trainings=… and "
-        f"resume={lacking[0].parent if lacking else ''}, or evaluate one that is finished.",
+        f"{', '.join(map(str, lacking))}: not finished. Repeat the command that trains, with"
+        f" trainings=… and resume={lacking[0].parent if lacking else ''}, or evaluate one that is"
+        " finished.",
     )
 
 
@@ -242,11 +313,12 @@ def weights_to_start_from(init_from: str | None) -> str | None:
 
 
 def start_from(policy: Policy, source: str) -> str:
-    """Copy every weight that `source` holds into a freshly built policy; only its memory's own may be new.
+    """Copy every weight that `source` holds into a freshly built policy; only its memory's own may
+    be new.
 
     Args:
-        source: a checkpoint of any format (`mme_vla.weights`), or one of this library's run folders, which means
-            its newest checkpoint.
+        source: a checkpoint of any format (`mme_vla.weights`), or one of this library's run
+            folders, which means its newest checkpoint.
 
     Returns:
         A sentence that says what was taken, what is new and what was left behind.

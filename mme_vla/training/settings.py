@@ -4,7 +4,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self
 
-from mme_vla.config.sections import NonNegative, NonNegativeInt, Positive, PositiveInt, Range, read_section
+from mme_vla.config.sections import (
+    NonNegative,
+    NonNegativeInt,
+    Positive,
+    PositiveInt,
+    Range,
+    read_section,
+)
 from mme_vla.errors import require
 from mme_vla.speed import SELECTIVE, Recompute
 from mme_vla.training.parallel import ParallelSettings
@@ -12,7 +19,9 @@ from mme_vla.training.parallel import ParallelSettings
 
 @dataclass(frozen=True)
 class KeepRule:
-    """Which checkpoints stay: the newest `last`, and every one whose step is a multiple of `every` (0: none)."""
+    """Which checkpoints stay: the newest `last`, and every one whose step is a multiple of `every`
+    (0: none).
+    """
 
     last: PositiveInt = 2
     every: NonNegativeInt = 0
@@ -67,17 +76,32 @@ class TrainSettings:
         steps, milestones = self.schedule_steps, list(self.milestones)
         checks = {
             "schedule_steps": (
-                steps is None or steps >= max(self.warmup, 1), f"no fewer than train.warmup={self.warmup}, or null"
+                steps is None or steps >= max(self.warmup, 1),
+                f"no fewer than train.warmup={self.warmup}, or null",
             ),
-            "milestones": (milestones == sorted(milestones), "updates in ascending order, such as [1000, 2000]"),
+            "milestones": (
+                milestones == sorted(milestones),
+                "updates in ascending order, such as [1000, 2000]",
+            ),
             "gamma": (0 < self.gamma <= 1, "above 0 and at most 1"),
             "ema": (0 <= self.ema < 1, "at least 0 (no averaging) and below 1"),
             "betas": (all(0 <= beta < 1 for beta in self.betas), "two numbers in [0, 1)"),
-            "batch_size": (not self.batch_size % self.accumulate, f"a multiple of train.accumulate={self.accumulate}"),
-        }  # fmt: skip
+            "batch_size": (
+                not self.batch_size % self.accumulate,
+                f"a multiple of train.accumulate={self.accumulate}",
+            ),
+        }
         for name, weight in (self.losses or {}).items():
-            number = isinstance(weight, int | float) and not isinstance(weight, bool) and 0 <= weight < float("inf")
-            require(number, f"train.losses.{name}={weight!r} must be a number of 0 or more, the weight of this loss.")
+            number = (
+                isinstance(weight, int | float)
+                and not isinstance(weight, bool)
+                and 0 <= weight < float("inf")
+            )
+            require(
+                number,
+                f"train.losses.{name}={weight!r} must be a number of 0 or more, the weight of this"
+                " loss.",
+            )
         for name, (fits, expected) in checks.items():
             require(fits, f"train.{name}={getattr(self, name)!r} must be {expected}.")
 

@@ -1,9 +1,12 @@
-"""Checkpoints of sharded runs: every process writes its part, beside training, and any number of them reads it again.
+"""Checkpoints of sharded runs: every process writes its part, beside training, and any number of
+them reads it again.
 
     checkpoints/step_000500/
-        shards/shard-00001-….safetensors   one a process: its part of weights, averages and Adam's moments
+        shards/shard-00001-….safetensors   one a process: its part of weights, averages and
+                                           Adam's moments
         shards/shard-00001-….sha256        its checksum
-        training_state.json, config.json, …, model.safetensors     as in every checkpoint (`training/checkpoint.py`)
+        training_state.json, config.json, …, model.safetensors
+                                           as in every checkpoint (`training/checkpoint.py`)
 
 `torch.distributed.checkpoint` writes and reads them. They are safetensors too: nothing is pickled.
 """
@@ -35,12 +38,16 @@ _REMEDY = "Copy the whole checkpoint again, or take an earlier one."
 
 
 def shard_files(checkpoint: Path) -> list[Path]:
-    """The files that the processes of a sharded run wrote, in their order; none of any other run."""
+    """The files that the processes of a sharded run wrote, in their order; none of any
+    other run.
+    """
     return sorted((checkpoint / SHARDS).glob("*.safetensors"))
 
 
 class ShardWriter:
-    """Writes parts in a thread while training continues; one checkpoint at a time. All processes call each method."""
+    """Writes parts in a thread while training continues; one checkpoint at a time. All processes
+    call each method.
+    """
 
     def __init__(self) -> None:
         self._group = distributed.new_group(backend="gloo")
@@ -51,7 +58,8 @@ class ShardWriter:
         """Copy tensors to the CPU, then write them below `draft` in the background.
 
         Args:
-            draft: a folder that is there. finish: called by the first process when all have written.
+            draft: a folder that is there. finish: called by the first process when all have
+                written.
         """
         self.wait()
         distributed.barrier(self._group)  # the folder is made
@@ -59,7 +67,9 @@ class ShardWriter:
         pinned = torch.cuda.is_available()
         stager = DefaultStager(StagingOptions(pinned, False, False, pinned))
         with _quiet():
-            parts = dcp.async_save(dict(tensors), storage_writer=writer, process_group=self._group, async_stager=stager)
+            parts = dcp.async_save(
+                dict(tensors), storage_writer=writer, process_group=self._group, async_stager=stager
+            )
         self._pending = self._thread.submit(self._complete, parts, draft, finish)
 
     def _complete(self, parts: Any, draft: Path, finish: Callable[[], None]) -> None:
@@ -72,7 +82,9 @@ class ShardWriter:
             finish()
 
     def wait(self) -> None:
-        """Return when nothing is being written any more; what went wrong meanwhile is raised here."""
+        """Return when nothing is being written any more; what went wrong meanwhile is
+        raised here.
+        """
         pending, self._pending = self._pending, None
         if pending is not None:
             pending.result()
@@ -85,19 +97,25 @@ class ShardWriter:
 
 
 def training_tensors(
-    policy: nn.Module, averages: Mapping[str, Tensor], optimizer: torch.optim.Optimizer, trained: Mapping[str, Tensor]
+    policy: nn.Module,
+    averages: Mapping[str, Tensor],
+    optimizer: torch.optim.Optimizer,
+    trained: Mapping[str, Tensor],
 ) -> dict[str, Tensor]:
     """What exact resume needs, by name: as processes hold it, in parts or whole.
 
     Args:
-        trained: the parameters that learn. `steps` counts their updates, in that order; −1 where there were none.
+        trained: the parameters that learn. `steps` counts their updates, in that order; −1 where
+            there were none.
     """
     tensors = {f"{RAW}/{name}": tensor for name, tensor in policy.state_dict().items()}
     tensors |= {f"{AVERAGE}/{name}": tensor for name, tensor in averages.items()}
     counts = torch.full((len(trained),), -1.0)
     for i, (name, parameter) in enumerate(trained.items()):
         state = optimizer.state.get(parameter, {})
-        tensors |= {f"{key}/{name}": state.get(key, torch.zeros_like(parameter)).detach() for key in MOMENTS}
+        tensors |= {
+            f"{key}/{name}": state.get(key, torch.zeros_like(parameter)).detach() for key in MOMENTS
+        }
         if "step" in state:
             counts[i] = float(state["step"])
     return tensors | {STEPS: counts}
@@ -110,24 +128,36 @@ def read_shards(
     optimizer: torch.optim.Optimizer,
     trained: Mapping[str, Tensor],
 ) -> dict[str, Tensor]:
-    """Give weights and averages back their values, in place, whatever number of processes wrote them.
+    """Give weights and averages back their values, in place, whatever number of processes wrote
+    them.
 
     Returns:
         Adam's moments and counts as `<name>/<key>`, of those parameters that had any.
     """
     tensors = training_tensors(policy, averages, optimizer, trained)
-    _load(checkpoint, tensors, alone=not any(isinstance(tensor, DTensor) for tensor in tensors.values()))
+    _load(
+        checkpoint,
+        tensors,
+        alone=not any(isinstance(tensor, DTensor) for tensor in tensors.values()),
+    )
     reshard(policy)
     moments: dict[str, Tensor] = {}
     for name, count in zip(trained, tensors[STEPS], strict=True):
         if count >= 0:
-            moments |= {f"{name}/{key}": tensors[f"{key}/{name}"] for key in MOMENTS} | {f"{name}/step": count}
+            moments |= {f"{name}/{key}": tensors[f"{key}/{name}"] for key in MOMENTS} | {
+                f"{name}/step": count
+            }
     return moments
 
 
 def read_weights(checkpoint: Path, policy: nn.Module) -> dict[str, Tensor]:
-    """The trained weights themselves of a whole policy (built on meta or not), by name, on the CPU."""
-    tensors = {f"{RAW}/{name}": torch.empty_like(tensor, device="cpu") for name, tensor in policy.state_dict().items()}
+    """The trained weights themselves of a whole policy (built on meta or not), by
+    name, on the CPU.
+    """
+    tensors = {
+        f"{RAW}/{name}": torch.empty_like(tensor, device="cpu")
+        for name, tensor in policy.state_dict().items()
+    }
     _load(checkpoint, tensors, alone=True, others=True)
     return {name.removeprefix(f"{RAW}/"): tensor for name, tensor in tensors.items()}
 
@@ -142,20 +172,27 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
         for path in (file, note):
             inside(checkpoint, path.relative_to(checkpoint).as_posix())
         sums[file] = Sums(file.parent, note.name)
-        require(file.name in sums[file].table, f"{note} with the checksum of {file.name} is missing. {_REMEDY}")
+        require(
+            file.name in sums[file].table,
+            f"{note} with the checksum of {file.name} is missing. {_REMEDY}",
+        )
         check_header(file)
     for file in files[rank::world]:  # all together compare each file once
         sums[file].check(file.name)
     reader = dcp.HuggingFaceStorageReader(str(folder))
     with _decoding(folder):
-        stored = {name: about.size for name, about in reader.read_metadata().state_dict_metadata.items()}  # type: ignore[union-attr]
+        metadata = reader.read_metadata().state_dict_metadata
+        stored = {name: about.size for name, about in metadata.items()}  # type: ignore[union-attr]
     shapes = {name: tensor.shape for name, tensor in tensors.items()}
     names = set(shapes) - set(stored) if others else set(shapes) ^ set(stored)
-    wrong = sorted(names | {name for name in shapes.keys() & stored.keys() if shapes[name] != stored[name]})
+    wrong = sorted(
+        names | {name for name in shapes.keys() & stored.keys() if shapes[name] != stored[name]}
+    )
     require(
         not wrong,
-        f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
-        "It belongs to another model or other settings, or a file of it is missing.",
+        f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as"
+        f" {listed(wrong, 4)}. It belongs to another model or other settings, or a file of it is"
+        " missing.",
     )
     try:
         with _quiet():
@@ -178,7 +215,9 @@ def fresh_folder(draft: Path) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without PyTorch's warnings on what it calls experimental, or assumes of a process that is alone."""
+    """Without PyTorch's warnings on what it calls experimental, or assumes of a process that is
+    alone.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield

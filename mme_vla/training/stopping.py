@@ -1,4 +1,6 @@
-"""Leaving a run early: Ctrl-C or a cluster's SIGTERM, answered by every process after the same update."""
+"""Leaving a run early: Ctrl-C or a cluster's SIGTERM, answered by every process after the same
+update.
+"""
 
 import signal
 import threading
@@ -19,8 +21,8 @@ ANSWERED = (signal.SIGINT, signal.SIGTERM)
 class StopRequest:
     """Call it to know whether any process was asked to stop.
 
-    It is a collective: all processes call it after the same update, so all get the same answer, though the signals
-    reach them at different moments or only one of them.
+    It is a collective: all processes call it after the same update, so all get the same answer,
+    though the signals reach them at different moments or only one of them.
     """
 
     anyone: Callable[[], bool]
@@ -38,7 +40,11 @@ def stop_requests() -> Iterator[StopRequest]:
     request = StopRequest(lambda: request.event.is_set())
     event = request.event
     with _signals_set(request):
-        if not (distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1):
+        if not (
+            distributed.is_available()
+            and distributed.is_initialized()
+            and distributed.get_world_size() > 1
+        ):
             yield request
             return
         # On the CPU, and apart from the gradients' group: nothing waits for a GPU to answer.
@@ -57,7 +63,8 @@ def stop_requests() -> Iterator[StopRequest]:
 
 
 def leave_signals_alone(worker: int) -> None:
-    """Signals go to every process of a group, data workers included: the training process alone handles them.
+    """Signals go to every process of a group, data workers included: the training process alone
+    handles them.
 
     A data worker ends with it, also when it is killed.
     """
@@ -68,7 +75,9 @@ def leave_signals_alone(worker: int) -> None:
 
 @contextmanager
 def _signals_set(request: StopRequest) -> Iterator[None]:
-    """Each signal asks, once; only a main thread may answer signals, in any other nothing changes."""
+    """Each signal asks, once; only a main thread may answer signals, in any other
+    nothing changes.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

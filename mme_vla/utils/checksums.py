@@ -1,4 +1,6 @@
-"""A checksum of every file of a folder, in the layout of `sha256sum`, which can check it as well: `sha256sum -c`."""
+"""A checksum of every file of a folder, in the layout of `sha256sum`, which can check it as well:
+`sha256sum -c`.
+"""
 
 import hashlib
 import re
@@ -29,8 +31,8 @@ def sum_line(path: Path, name: str) -> str:
 def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = False) -> None:
     """Write `SHA256SUMS` for these files of a folder, by default for all files in it and below.
 
-    Files are read once more for it, in blocks and several at a time. With `keep`, the sums that are there of other
-    files stay.
+    Files are read once more for it, in blocks and several at a time. With `keep`, the sums that are
+    there of other files stay.
     """
     files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     chosen = sorted(set(names) if names is not None else {name for name in files if name != SUMS})
@@ -42,7 +44,8 @@ def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = Fa
 
 
 class Sums:
-    """The checksums that lie beside a folder's files, read once; each file is compared at most once.
+    """The checksums that lie beside a folder's files, read once; each file is compared at most
+    once.
 
     there: whether there are any; folders written by others, or before there were sums, have none.
     """
@@ -51,7 +54,8 @@ class Sums:
         """Read the list.
 
         Args:
-            folder: a folder that may hold the list `name`. remedy: what the user can do about a damaged file.
+            folder: a folder that may hold the list `name`. remedy: what the user can do about a
+                damaged file.
         """
         self.folder, self.name, self.remedy = folder, name, remedy
         path = folder / name
@@ -60,22 +64,32 @@ class Sums:
         self._compared: set[str] = set()
 
     def check(self, *names: str) -> None:
-        """Compare these files, each the first time it is asked about; one that is not listed is not checked.
+        """Compare these files, each the first time it is asked about; one that is not listed is not
+        checked.
 
-        Datasets have such files: rows of the user's own, results of other programs. Of checkpoints, `check_sums` asks.
+        Datasets have such files: rows of the user's own, results of other programs. Of checkpoints,
+        `check_sums` asks.
         """
-        paths = {name: inside(self.folder, name) for name in names if name in self.table and name not in self._compared}
+        paths = {
+            name: inside(self.folder, name)
+            for name in names
+            if name in self.table and name not in self._compared
+        }
         for path in paths.values():
             require(
                 path.is_file(),
-                f"{path} is missing, though {self.folder / self.name} lists it. Copy the whole folder again.",
+                f"{path} is missing, though {self.folder / self.name} lists it. Copy the whole"
+                " folder again.",
             )
         with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
-            for (name, path), checksum in zip(paths.items(), pool.map(file_sum, paths.values()), strict=True):
+            for (name, path), checksum in zip(
+                paths.items(), pool.map(file_sum, paths.values()), strict=True
+            ):
                 require(
                     checksum == self.table[name],
-                    f"{path} is damaged: its content is not what was written (SHA-256 differs from {self.name}). "
-                    f"{self.remedy}; if you changed it on purpose, delete {self.name}.",
+                    f"{path} is damaged: its content is not what was written (SHA-256 differs from"
+                    f" {self.name}). {self.remedy}; if you changed it on purpose, delete"
+                    f" {self.name}.",
                 )
         self._compared |= set(paths)
 
@@ -85,14 +99,16 @@ def check_sums(folder: Path, names: Collection[str] | None = None) -> bool:
 
     Args:
         folder: a folder that may hold `SHA256SUMS`.
-        names: the files about to be read, each of which must be listed where there is a list; by default all that are
-            listed. Notes and cards that people add are not read, and need no line.
+        names: the files about to be read, each of which must be listed where there is a list; by
+            default all that are listed. Notes and cards that people add are not read, and need no
+            line.
 
     Returns:
         Whether there were sums to compare with.
 
     Raises:
-        UserError: a file is damaged, missing, or not listed: it was added after the sums were written.
+        UserError: a file is damaged, missing, or not listed: it was added after the sums were
+            written.
     """
     sums = Sums(folder)
     if names is None:
@@ -102,18 +118,21 @@ def check_sums(folder: Path, names: Collection[str] | None = None) -> bool:
     added = [name for name in names if sums.there and name not in sums.table]
     if added:
         raise UserError(
-            f"{folder / SUMS} does not list {listed(added)}, which would be read: added after the sums were written. "
-            f"Remove what does not belong to {folder}. If it does, add its line: sha256sum <file> >> {SUMS}"
+            f"{folder / SUMS} does not list {listed(added)}, which would be read: added after the"
+            f" sums were written. Remove what does not belong to {folder}. If it does, add its"
+            f" line: sha256sum <file> >> {SUMS}"
         )
     sums.check(*names)
     return sums.there
 
 
 def checked_file(folder: Path, name: str, what: str = "file") -> Path:
-    """The path of a file of a checkpoint that is about to be read: it lies in the folder, and its sum is right.
+    """The path of a file of a checkpoint that is about to be read: it lies in the folder, and its
+    sum is right.
 
     Args:
-        folder: a folder that may hold `SHA256SUMS`. name: relative to it. what: the file is, for the message.
+        folder: a folder that may hold `SHA256SUMS`. name: relative to it. what: the file is, for
+            the message.
 
     Raises:
         UserError: it lies outside, is damaged, or is not listed; see `check_sums`.
@@ -130,5 +149,7 @@ def _read_sums(sums: Path) -> dict[str, str]:
         if match is not None:
             table[match[2].removeprefix("./")] = match[1]  # as `sha256sum ./*` writes it
         elif line:
-            raise UserError(f"{sums}, line {number} is damaged: expected a SHA-256 and a file's name.")
+            raise UserError(
+                f"{sums}, line {number} is damaged: expected a SHA-256 and a file's name."
+            )
     return table

@@ -1,4 +1,5 @@
-"""Reads and writes files: text, JSON, lines of JSON. A damaged or missing file raises one clear error.
+"""Reads and writes files: text, JSON, lines of JSON. A damaged or missing file raises one clear
+error.
 
 Checks happen when a file is opened; what a reader returns is trusted from then on.
 """
@@ -27,12 +28,20 @@ _NAME = re.compile(r"\bname = '([^']+)'")  # HDF5
 # NumPy counts what it could not write and does not say why.
 _SHORT_WRITE = re.compile(r"\d+ requested and \d+ written")
 _AGAIN = "and repeat the same command: what was finished is kept."
-_PERMIT = "Change the permissions of it or its folder, or choose another, and repeat the same command."
+_PERMIT = (
+    "Change the permissions of it or its folder, or choose another, and repeat the same command."
+)
 _ADVICE = {
     errno.ENOSPC: ("there is no room left for it", f"Free some room {_AGAIN}"),
     errno.EDQUOT: ("your share of the disk is used up", f"Free some room {_AGAIN}"),
-    errno.EFBIG: ("it would be larger than files may be here", f"Raise that limit (see `ulimit -f`) {_AGAIN}"),
-    errno.EROFS: ("its disk can only be read", "Choose another folder, or make that one writable, and repeat."),
+    errno.EFBIG: (
+        "it would be larger than files may be here",
+        f"Raise that limit (see `ulimit -f`) {_AGAIN}",
+    ),
+    errno.EROFS: (
+        "its disk can only be read",
+        "Choose another folder, or make that one writable, and repeat.",
+    ),
     errno.EACCES: ("permission is denied", _PERMIT),
     errno.EPERM: ("that is not permitted", _PERMIT),
     errno.EMFILE: ("too many files are open", f"Raise that limit (`ulimit -n 4096`) {_AGAIN}"),
@@ -42,9 +51,11 @@ _ADVICE = {
 
 
 def disk_trouble(error: BaseException) -> str | None:
-    """One sentence on what the disk refused and what to do; None if this error, or what caused it, is another matter.
+    """One sentence on what the disk refused and what to do; None if this error, or what caused it,
+    is another matter.
 
-    Libraries wrap such errors in their own: the number is looked for in their texts and in what they were raised from.
+    Libraries wrap such errors in their own: the number is looked for in their texts and in what
+    they were raised from.
     """
     number, place, visited = None, None, set[int]()
     current: BaseException | None = error
@@ -55,14 +66,21 @@ def disk_trouble(error: BaseException) -> str | None:
         if place is None and number is not None and (named := _NAME.search(str(current))):
             place = named[1]
         current = current.__cause__ or current.__context__
-    if number is None or (place is None and number in (errno.EACCES, errno.EPERM)):  # a port, not a file
+    if number is None or (
+        place is None and number in (errno.EACCES, errno.EPERM)
+    ):  # a port, not a file
         return None
     reason, advice = _ADVICE[number]
-    return f"{place or Path.cwd()} cannot be written or opened: {reason} ({os.strerror(number)}). {advice}"
+    return (
+        f"{place or Path.cwd()} cannot be written or opened: {reason} ({os.strerror(number)})."
+        f" {advice}"
+    )
 
 
 def name_place(error: BaseException | None, place: Path) -> None:
-    """Note where an error of the disk happened, if it does not say: those of writing to an open file never do."""
+    """Note where an error of the disk happened, if it does not say: those of writing to an open
+    file never do.
+    """
     if error is not None and not getattr(error, "filename", None) and _number(error) is not None:
         error.filename = str(place)  # type: ignore[attr-defined]
 
@@ -90,7 +108,9 @@ def require_file(path: Path, what: str = "a file") -> Path:
         raise UserError(f"{_short_path(path)} is missing; expected {what}.") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{_short_path(path)} cannot be read as {what}: {brief(reason, 300, quote=False)}.") from None
+        raise UserError(
+            f"{_short_path(path)} cannot be read as {what}: {brief(reason, 300, quote=False)}."
+        ) from None
     require(stat.S_ISREG(mode), f"{_short_path(path)} is not a file; expected {what}.")
     return path
 
@@ -103,7 +123,8 @@ def _short_path(path: Path) -> str:
 def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
     """Around a call into another library that parses the file `path`, and nothing else.
 
-    Parsers of binary formats raise whatever they stumble over, from KeyError to MemoryError; there is no list of it.
+    Parsers of binary formats raise whatever they stumble over, from KeyError to MemoryError; there
+    is no list of it.
     """
     try:
         yield
@@ -113,15 +134,21 @@ def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
         message = " ".join(
             str(error.__cause__ or error).split()
         )  # some wrap what happened in a sentence without content
-        reason = f"{type(error).__name__}: {brief(message, 200, quote=False)}" if message else type(error).__name__
-        raise UserError(f"{path} is damaged: it cannot be read as {what} ({reason}). {remedy}") from error
+        reason = (
+            f"{type(error).__name__}: {brief(message, 200, quote=False)}"
+            if message
+            else type(error).__name__
+        )
+        raise UserError(
+            f"{path} is damaged: it cannot be read as {what} ({reason}). {remedy}"
+        ) from error
 
 
 def inside(folder: Path, name: str, what: str = "file") -> Path:
     """Return the path of `name` in `folder`, symbolic links followed.
 
-    A snapshot in the hub's cache is made of links to the files of its repository's folder, `../../blobs/…`: these count
-    as its own.
+    A snapshot in the hub's cache is made of links to the files of its repository's folder,
+    `../../blobs/…`: these count as its own.
     """
     place, root = folder / name, folder.resolve()
     try:
@@ -129,17 +156,22 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
     except (OSError, ValueError, RuntimeError):  # a null character, a loop of links
         resolved = Path("/")
     within = resolved.is_relative_to(root) and resolved != root
-    linked = ".." not in Path(name).parts and any(resolved.is_relative_to(blobs) for blobs in _blobs_of(root))
+    linked = ".." not in Path(name).parts and any(
+        resolved.is_relative_to(blobs) for blobs in _blobs_of(root)
+    )
     require(
         name and not Path(name).is_absolute() and (within or linked),
-        f"{folder} names the {what} {brief(name)}, which lies outside of it. Nothing outside a checkpoint's or "
-        "dataset's own folder is read for it; copy the file into the folder, or correct the name.",
+        f"{folder} names the {what} {brief(name)}, which lies outside of it. Nothing outside a"
+        " checkpoint's or dataset's own folder is read for it; copy the file into the folder, or"
+        " correct the name.",
     )
     return place
 
 
 def _blobs_of(root: Path) -> list[Path]:
-    """Where the hub's cache keeps the files of the snapshot that `root` is, or lies in; nowhere for other folders."""
+    """Where the hub's cache keeps the files of the snapshot that `root` is, or lies in; nowhere for
+    other folders.
+    """
     for place in (root, *root.parents):
         repository = place.parent.parent
         if place.parent.name == "snapshots" and _HUB_REPOSITORY.match(repository.name):
@@ -148,7 +180,8 @@ def _blobs_of(root: Path) -> list[Path]:
 
 
 def require_replaceable(path: Path, *suffixes: str) -> Path:
-    """Return where a command is to write a file, if it destroys nothing but, perhaps, an earlier file of the kind.
+    """Return where a command is to write a file, if it destroys nothing but, perhaps, an earlier
+    file of the kind.
 
     Args:
         suffixes: how names of such files end, such as `.html`.
@@ -158,8 +191,8 @@ def require_replaceable(path: Path, *suffixes: str) -> Path:
     """
     require(
         not path.is_file() or path.suffix.lower() in suffixes,
-        f"{path} exists, and its name does not end with {' or '.join(suffixes)}: it is not replaced. Choose another "
-        "name, or remove it yourself.",
+        f"{path} exists, and its name does not end with {' or '.join(suffixes)}: it is not"
+        " replaced. Choose another name, or remove it yourself.",
     )
     return path
 
@@ -169,23 +202,29 @@ _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]{0,99}")
 
 
 def safe_name(name: str, what: str = "name") -> str:
-    """Return `name` if it can be a folder's name anywhere: letters, digits, `. _ + = -`, at most 100 characters."""
+    """Return `name` if it can be a folder's name anywhere: letters, digits, `. _ + = -`, at most
+    100 characters.
+    """
     require(
         isinstance(name, str) and _SAFE_NAME.fullmatch(name),
-        f"{what}={brief(name)} cannot name a folder: use at most 100 letters, digits and . _ + = -, "
-        "beginning with a letter or digit.",
+        f"{what}={brief(name)} cannot name a folder: use at most 100 letters, digits and . _ + = -,"
+        " beginning with a letter or digit.",
     )
     return name
 
 
 def user_cache(kind: str) -> Path:
-    """Where what can be made again is kept for this user: a folder in $MME_VLA_CACHE, else in ~/.cache/mme_vla."""
+    """Where what can be made again is kept for this user: a folder in $MME_VLA_CACHE, else in
+    ~/.cache/mme_vla.
+    """
     return Path(os.environ.get("MME_VLA_CACHE", Path.home() / ".cache" / "mme_vla")) / kind
 
 
 _KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}
 
-TEXT_LIMIT = 64 * 2**20  # bytes; the largest files of text here, tables of subgoals and statistics, stay far below
+TEXT_LIMIT = (
+    64 * 2**20
+)  # bytes; the largest files of text here, tables of subgoals and statistics, stay far below
 LOG_LIMIT = 2**30  # bytes of a file of lines
 
 
@@ -197,25 +236,40 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
         with os.fdopen(descriptor, "rb") as file:
             status = os.fstat(file.fileno())
             require(stat.S_ISREG(status.st_mode), f"{path} is not a file; expected {what}.")
-            require(status.st_size <= limit, f"{path} has {status.st_size:,} bytes; {what} has at most {limit:,}.")
-            return file.read(status.st_size + 1)  # reading `limit` would allocate it, whatever the size
+            require(
+                status.st_size <= limit,
+                f"{path} has {status.st_size:,} bytes; {what} has at most {limit:,}.",
+            )
+            return file.read(
+                status.st_size + 1
+            )  # reading `limit` would allocate it, whatever the size
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; expected {what}.") from None
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
-        reason = "a folder" if isinstance(error, IsADirectoryError) else getattr(error, "strerror", None) or error
+        reason = (
+            "a folder"
+            if isinstance(error, IsADirectoryError)
+            else getattr(error, "strerror", None) or error
+        )
         raise UserError(f"{path} cannot be read as {what}: {reason}.") from None
 
 
 def read_unpacked(path: Path, what: str = "data", limit: int = LOG_LIMIT) -> bytes:
-    """Read a file of at most `limit` bytes, a file `*.xz` unpacked: all of its streams, and nothing else in it."""
+    """Read a file of at most `limit` bytes, a file `*.xz` unpacked: all of its streams, and nothing
+    else in it.
+    """
     data = read_bytes(path, what, limit)
     return unpack_xz(data, path, what, limit) if path.suffix == ".xz" else data
 
 
-_BLOCK = 2**14  # bytes that a stream's unpacker is given at once: it copies those that it leaves over
+_BLOCK = (
+    2**14
+)  # bytes that a stream's unpacker is given at once: it copies those that it leaves over
 
 
-def unpack_xz(packed: bytes, source: Path | str, what: str = "data", limit: int = LOG_LIMIT) -> bytes:
+def unpack_xz(
+    packed: bytes, source: Path | str, what: str = "data", limit: int = LOG_LIMIT
+) -> bytes:
     """Unpack the content of an `.xz` file to its end: all its streams, as `xz -dc` does.
 
     Args:
@@ -223,7 +277,8 @@ def unpack_xz(packed: bytes, source: Path | str, what: str = "data", limit: int 
         limit: bytes of the unpacked content, over all streams.
 
     Raises:
-        UserError: it is cut off, damaged, larger than `limit`, or something else follows its last stream.
+        UserError: it is cut off, damaged, larger than `limit`, or something else follows its last
+            stream.
     """
     remedy = "Copy it again."
     stream = lzma.LZMADecompressor(lzma.FORMAT_XZ)
@@ -231,15 +286,24 @@ def unpack_xz(packed: bytes, source: Path | str, what: str = "data", limit: int 
     while not stream.eof or position < len(packed):
         if stream.eof:
             stream = lzma.LZMADecompressor(lzma.FORMAT_XZ)
-        block = packed[position : position + _BLOCK]  # what lies behind a stream is copied once a stream
+        block = packed[
+            position : position + _BLOCK
+        ]  # what lies behind a stream is copied once a stream
         require(block, f"{source} is cut off: its last stream has no end. {remedy}")
         with decoding(source, what, remedy):
-            piece = stream.decompress(block, limit + 1 - size)  # one more byte shows that there is more
+            piece = stream.decompress(
+                block, limit + 1 - size
+            )  # one more byte shows that there is more
         size += len(piece)
-        require(size <= limit, f"{source} has more than {limit:,} bytes of {what}, unpacked; that is the limit.")
+        require(
+            size <= limit,
+            f"{source} has more than {limit:,} bytes of {what}, unpacked; that is the limit.",
+        )
         pieces.append(piece)
         position += len(block) - len(stream.unused_data)
-        while stream.eof and packed[position : position + 4] == bytes(4):  # padding between streams, by the format
+        while stream.eof and packed[position : position + 4] == bytes(
+            4
+        ):  # padding between streams, by the format
             position += 4
     return b"".join(pieces)
 
@@ -250,11 +314,14 @@ def read_text(path: Path, what: str = "text", limit: int = TEXT_LIMIT) -> str:
     try:
         return data.decode()
     except UnicodeDecodeError as error:
-        raise UserError(f"{path} is damaged: byte {error.start:,} is not UTF-8 text; expected {what}.") from None
+        raise UserError(
+            f"{path} is damaged: byte {error.start:,} is not UTF-8 text; expected {what}."
+        ) from None
 
 
 def is_text(value: object) -> bool:
-    """Whether a value is text that can be written and tokenised: JSON's escapes allow half characters, UTF-8 does not.
+    """Whether a value is text that can be written and tokenised: JSON's escapes allow half
+    characters, UTF-8 does not.
 
     >>> is_text("\ud800")
     False
@@ -268,7 +335,9 @@ def is_text(value: object) -> bool:
     return True
 
 
-def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = dict, finite: bool = True) -> Any:
+def parse_json(
+    text: str | bytes, source: str, kind: type | tuple[type, ...] = dict, finite: bool = True
+) -> Any:
     """Parse JSON of another program.
 
     Args:
@@ -278,12 +347,22 @@ def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = d
         finite: whether NaN and infinities, which JSON does not have but Python writes, are refused.
     """
     try:
-        # Python's own constants are looked at only where they are refused: hooks slow the parser down.
-        value = json.loads(text, parse_float=_finite, parse_constant=_finite) if finite else json.loads(text)
+        # Python's own constants are looked at only where they are refused: hooks slow the parser
+        # down.
+        value = (
+            json.loads(text, parse_float=_finite, parse_constant=_finite)
+            if finite
+            else json.loads(text)
+        )
     except RecursionError:
         raise UserError(f"{source} is nested too deeply to be JSON of this library.") from None
-    except (ValueError, OverflowError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
-        raise UserError(f"{source} is not valid JSON: {brief(str(error), 200, quote=False)}.") from None
+    except (
+        ValueError,
+        OverflowError,
+    ) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+        raise UserError(
+            f"{source} is not valid JSON: {brief(str(error), 200, quote=False)}."
+        ) from None
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         expected = " or ".join(_KINDS.get(k, k.__name__) for k in kinds)
@@ -292,7 +371,11 @@ def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = d
 
 
 def read_json(
-    path: Path, what: str = "JSON", kind: type | tuple[type, ...] = dict, limit: int = TEXT_LIMIT, finite: bool = True
+    path: Path,
+    what: str = "JSON",
+    kind: type | tuple[type, ...] = dict,
+    limit: int = TEXT_LIMIT,
+    finite: bool = True,
 ) -> Any:
     """Read a file of JSON; see `read_text` and `parse_json`."""
     return parse_json(read_text(path, what, limit), str(path), kind, finite)
@@ -308,8 +391,9 @@ def read_lines[T](
 ) -> list[T]:
     """Read a file of JSON lines, one object each: episode records, probe lines, rows, logs.
 
-    A line's `crc32` (see `with_checksum`) is verified and removed. Empty lines are skipped. A half-written last line
-    without a line end is ignored with a warning: a killed process was writing it. A file `*.xz` is decompressed.
+    A line's `crc32` (see `with_checksum`) is verified and removed. Empty lines are skipped. A
+    half-written last line without a line end is ignored with a warning: a killed process was
+    writing it. A file `*.xz` is decompressed.
 
     Args:
         kind: makes a value from a line's object, such as a class's `from_dict`, or `dict`.
@@ -328,7 +412,9 @@ def read_lines[T](
         except UserError:
             if number <= len(complete):
                 raise
-            warnings.warn(f"{path}: ignored a half-written last line ({len(line)} bytes).", stacklevel=2)
+            warnings.warn(
+                f"{path}: ignored a half-written last line ({len(line)} bytes).", stacklevel=2
+            )
     return values
 
 
@@ -358,15 +444,17 @@ def verified(values: Mapping[str, Any], source: str) -> dict[str, Any]:
     inner = {key: value for key, value in values.items() if key != CHECKSUM}
     if CHECKSUM in values and values[CHECKSUM] != _crc(inner):
         raise UserError(
-            f"{source} is not what was written: its {CHECKSUM} is {brief(values[CHECKSUM], 20)}, that of its content "
-            f"{_crc(inner)!r}. It is damaged; if you changed it on purpose, remove {CHECKSUM}."
+            f"{source} is not what was written: its {CHECKSUM} is {brief(values[CHECKSUM], 20)},"
+            f" that of its content {_crc(inner)!r}. It is damaged; if you changed it on purpose,"
+            f" remove {CHECKSUM}."
         )
     return inner
 
 
 def _crc(values: Mapping[str, Any]) -> str:
     # ASCII, so that half characters, which no encoding of text takes, count as well.
-    return f"{zlib.crc32(json.dumps(values, sort_keys=True, separators=(',', ':')).encode('ascii')):08x}"
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"))
+    return f"{zlib.crc32(text.encode('ascii')):08x}"
 
 
 def to_json(value: Any) -> Any:
@@ -387,7 +475,8 @@ _DRAFT = re.compile(r"\..+\.(?P<host>[^.]*)-(?P<process>\d+)-[0-9a-f]{8}\.partia
 
 @contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:
-    """Yield a draft beside `path`, which becomes `path` in one rename if the block ends well and is removed otherwise.
+    """Yield a draft beside `path`, which becomes `path` in one rename if the block ends well and is
+    removed otherwise.
 
     >>> with write_atomically(Path("plan.json")) as draft:
     ...     draft.write_text("{}")
@@ -412,8 +501,9 @@ def write_json(path: Path, value: Any, indent: int | None = 2) -> None:
 def draft_of(path: Path) -> Path:
     """Where this process writes what is to become `path`.
 
-    Machine and process are in the name, so that a killed one's can be told, and a random number, as both may repeat
-    among containers: two writers never share a draft, and the last one to finish wins whole.
+    Machine and process are in the name, so that a killed one's can be told, and a random number, as
+    both may repeat among containers: two writers never share a draft, and the last one to finish
+    wins whole.
     """
     return path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.partial")
 

@@ -15,25 +15,34 @@ from mme_vla.errors import UserError
 from mme_vla.utils.io import is_draft, name_place, read_json, remove_drafts, write_json
 
 LOCK = ".lock"
-_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)  # errors of a file system without locks
+_NO_LOCKS = (
+    errno.ENOSYS,
+    errno.ENOTSUP,
+    errno.EOPNOTSUPP,
+    errno.ENOLCK,
+)  # errors of a file system without locks
 
 
 class FolderLock:
     """Lock a folder for this process, as a context manager or from `acquire()` to `release()`.
 
-    The lock is a file in the folder. `release` removes it, and the folder if nothing else is in it. After a kill the
-    file stays, unlocked. A forked process does not have its parent's lock.
+    The lock is a file in the folder. `release` removes it, and the folder if nothing else is in it.
+    After a kill the file stays, unlocked. A forked process does not have its parent's lock.
     Deleting the object unlocks the folder.
 
     Args:
-        folder: made if need be. what: its purpose, for the message. name: of the file, where several share a folder.
+        folder: made if need be. what: its purpose, for the message. name: of the file, where
+            several share a folder.
     """
 
     def __init__(self, folder: Path, what: str = "run", name: str = LOCK) -> None:
         self.folder, self.what, self.path = Path(folder), what, Path(folder) / name
         self._process = os.getpid()
-        # A second attempt counts where the process before removes the file between opening and locking it.
-        self._lock = FileLock(self.path, timeout=0.1, poll_interval=0.02, thread_local=False, fallback_to_soft=False)
+        # A second attempt counts where the process before removes the file between opening and
+        # locking it.
+        self._lock = FileLock(
+            self.path, timeout=0.1, poll_interval=0.02, thread_local=False, fallback_to_soft=False
+        )
 
     def acquire(self) -> Self:
         """Lock the folder; raises an error that names the process which has locked it."""
@@ -69,7 +78,10 @@ class FolderLock:
 
     def _holder(self) -> str:
         try:
-            return self.path.read_text(errors="replace")[:200].strip() or "a process that has just started"
+            return (
+                self.path.read_text(errors="replace")[:200].strip()
+                or "a process that has just started"
+            )
         except OSError:
             return "a process that has just ended"
 
@@ -77,7 +89,10 @@ class FolderLock:
         return self.acquire()
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         name_place(error, self.folder)
         self.release()
@@ -116,7 +131,8 @@ def claim_plan(folder: Path, plan: Any) -> bool:
 
 
 def drop_plan(folder: Path) -> None:
-    """Remove a plan's work folder, the plan last: a removal that was cut off is recognised, and repeated.
+    """Remove a plan's work folder, the plan last: a removal that was cut off is recognised, and
+    repeated.
 
     The caller holds the folder's lock, whose release removes the folder itself.
     """

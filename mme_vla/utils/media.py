@@ -1,4 +1,6 @@
-"""What people look at: one writer of videos, one contact sheet, one border. Images are [H, W, 3] uint8 throughout."""
+"""What people look at: one writer of videos, one contact sheet, one border. Images are [H, W, 3]
+uint8 throughout.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -29,15 +31,23 @@ class VideoWriter:
     A context manager: the video ends with the block.
 
     Args:
-        target: a path, written in place (draw into a draft what is to appear whole), or a binary file.
+        target: a path, written in place (draw into a draft what is to appear whole), or a binary
+            file.
         fps: frames a second. crf, preset: the encoder's, quality and effort.
     """
 
-    def __init__(self, target: Path | BinaryIO, fps: float = FPS, crf: int = 20, preset: str = "veryfast") -> None:
+    def __init__(
+        self, target: Path | BinaryIO, fps: float = FPS, crf: int = 20, preset: str = "veryfast"
+    ) -> None:
         import av
 
-        self._container: Any = av.open(str(target) if isinstance(target, Path) else target, "w", format="mp4")
-        self._rate, self._options = Fraction(fps), {"crf": str(crf), "preset": preset, "threads": "1", **_routines()}
+        self._container: Any = av.open(
+            str(target) if isinstance(target, Path) else target, "w", format="mp4"
+        )
+        self._rate, self._options = (
+            Fraction(fps),
+            {"crf": str(crf), "preset": preset, "threads": "1", **_routines()},
+        )
         self._stream: Any = None
         self.frames = 0
 
@@ -59,7 +69,9 @@ class VideoWriter:
         self.frames += 1
 
     def close(self, complete: bool = True) -> None:
-        """End the video; with `complete=False` what the encoder still holds is dropped, for a file that is removed."""
+        """End the video; with `complete=False` what the encoder still holds is dropped, for a file
+        that is removed.
+        """
         if complete and self._stream is not None:
             self._container.mux(self._stream.encode(None))
         self._container.close()
@@ -108,7 +120,9 @@ def bordered(image: np.ndarray, pixels: int = BORDER) -> np.ndarray:
     return framed
 
 
-def video_frame(views: Sequence[np.ndarray], caption: str | None = None, video: bool = False) -> np.ndarray:
+def video_frame(
+    views: Sequence[np.ndarray], caption: str | None = None, video: bool = False
+) -> np.ndarray:
     """One frame [H + 24, W, 3] of a robot's views of one moment.
 
     Args:
@@ -131,12 +145,16 @@ def video_frame(views: Sequence[np.ndarray], caption: str | None = None, video: 
     from PIL import Image, ImageDraw
 
     image = Image.fromarray(canvas)
-    ImageDraw.Draw(image).text((6, height + 5), fitted(caption, width - 12, 13), (255, 255, 255), font(13))
+    ImageDraw.Draw(image).text(
+        (6, height + 5), fitted(caption, width - 12, 13), (255, 255, 255), font(13)
+    )
     return np.asarray(image)
 
 
 def of_one_size(images: Sequence["Image"]) -> Iterator[np.ndarray]:
-    """Images of any sizes as frames of a video: each at the top left of a white one that holds the largest."""
+    """Images of any sizes as frames of a video: each at the top left of a white one that holds the
+    largest.
+    """
     from PIL import Image
 
     width, height = (-(-max(image.size[axis] for image in images) // 2) * 2 for axis in (0, 1))
@@ -156,7 +174,11 @@ class Tile:
 
 
 def contact_sheet(
-    tiles: Sequence[Tile], columns: int, title: str = "", header: "Image | None" = None, side: int = TILE
+    tiles: Sequence[Tile],
+    columns: int,
+    title: str = "",
+    header: "Image | None" = None,
+    side: int = TILE,
 ) -> "Image":
     """Tiles in rows, each above its label.
 
@@ -175,10 +197,15 @@ def contact_sheet(
     if header is not None:
         sheet.paste(header, (MARGIN, top - header.height))
     for place, tile in enumerate(tiles):
-        x, y = MARGIN + place % columns * (side + GAP), top + place // columns * (side + LABEL + GAP)
+        x, y = (
+            MARGIN + place % columns * (side + GAP),
+            top + place // columns * (side + LABEL + GAP),
+        )
         sheet.paste(thumbnail(tile.image, side), (x, y))
         if tile.outline is not None:
-            draw.rectangle((x - 2, y - 2, x + side + 1, y + side + 1), outline=tile.outline, width=2)
+            draw.rectangle(
+                (x - 2, y - 2, x + side + 1, y + side + 1), outline=tile.outline, width=2
+            )
         draw.text((x, y + side + 3), fitted(tile.label, side, 13), INK, font(13))
     return sheet
 
@@ -213,7 +240,9 @@ def fitted(text: str, width: int, size: int) -> str:
 
 
 def _routines() -> dict[str, str]:
-    """Keeps x264 from its AVX-512 routines, which read uninitialised memory: equal frames made unequal bytes."""
+    """Keeps x264 from its AVX-512 routines, which read uninitialised memory: equal frames made
+    unequal bytes.
+    """
     import torch
 
     if torch.backends.cpu.get_cpu_capability() != "AVX512":

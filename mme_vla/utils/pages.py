@@ -1,4 +1,6 @@
-"""Pages from the templates in `mme_vla/assets/templates`. HTML is always escaped, Markdown by a filter."""
+"""Pages from the templates in `mme_vla/assets/templates`. HTML is always escaped, Markdown by a
+filter.
+"""
 
 import re
 from functools import cache
@@ -17,7 +19,9 @@ def render(template: str, **values: Any) -> str:
 
 
 def escape_markdown(text: str) -> str:
-    """Text in one line of Markdown: no name in it becomes a link, an image, HTML, or a cell of its own."""
+    """Text in one line of Markdown: no name in it becomes a link, an image, HTML, or a cell of its
+    own.
+    """
     return re.sub(r"[\\|<`]|(?<=\])[(:\[]", r"\\\g<0>", " ".join(text.splitlines()))
 
 
@@ -26,8 +30,12 @@ def _environment() -> "Environment":
     from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
     environment = Environment(
-        loader=FileSystemLoader(TEMPLATES), autoescape=select_autoescape(["html"]), undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )  # fmt: skip
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=select_autoescape(["html"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
     environment.filters["markdown"] = escape_markdown
     return environment

@@ -1,4 +1,6 @@
-"""Worker processes that end with the process that started them, however that ends, and leave Ctrl-C to it."""
+"""Worker processes that end with the process that started them, however that ends, and leave Ctrl-C
+to it.
+"""
 
 import multiprocessing
 import os
@@ -13,7 +15,8 @@ from mme_vla.errors import brief, require
 
 
 def end_with_parent() -> None:
-    """Called first in a worker: it ends as soon as its parent is gone, even a killed one, and ignores Ctrl-C.
+    """Called first in a worker: it ends as soon as its parent is gone, even a killed one, and
+    ignores Ctrl-C.
 
     Ctrl-C goes to every process of a terminal; the parent alone handles it, and ends its workers.
     """
@@ -21,7 +24,8 @@ def end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is None:
         return
-    # The process that forked this one: the parent itself, or its fork server, which ends when the parent does.
+    # The process that forked this one: the parent itself, or its fork server, which ends when the
+    # parent does.
     watched, number = [parent.sentinel], os.getppid()
 
     def watch() -> None:
@@ -35,7 +39,8 @@ def end_with_parent() -> None:
 
 @contextmanager
 def signals_deferred() -> Iterator[None]:
-    """While this is open, Ctrl-C waits; processes that are started meanwhile never see it, so that they can be young.
+    """While this is open, Ctrl-C waits; processes that are started meanwhile never see it, so that
+    they can be young.
 
     A process that is still importing would otherwise answer with a traceback.
     """
@@ -50,7 +55,9 @@ _OTHERS = 256  # descriptors that libraries, workers and sockets need besides
 
 
 def files_to_hold(limit: int) -> int:
-    """How many of `limit` files may be held open: all, where the system lets this process raise its own limit."""
+    """How many of `limit` files may be held open: all, where the system lets this process raise its
+    own limit.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = limit + _OTHERS
     if soft != resource.RLIM_INFINITY and soft < needed:
@@ -61,25 +68,30 @@ def files_to_hold(limit: int) -> int:
 
 
 def started_processes(environment: Mapping[str, str] | None = None) -> int:
-    """How many processes a launcher, such as torchrun, started this one among; 1 without a launcher.
+    """How many processes a launcher, such as torchrun, started this one among; 1 without a
+    launcher.
 
     Args:
         environment: variables; by default the process's own.
 
     Raises:
-        UserError: WORLD_SIZE is no count, or `accelerate launch --cpu` was asked for several processes. It starts one
-            where it has no MPI.
+        UserError: WORLD_SIZE is no count, or `accelerate launch --cpu` was asked for several
+            processes. It starts one where it has no MPI.
     """
     variables = os.environ if environment is None else environment
     world = variables.get("WORLD_SIZE", "1")
-    require(world.isdecimal() and int(world) >= 1, f"WORLD_SIZE={brief(world)} is no count of processes.")
+    require(
+        world.isdecimal() and int(world) >= 1,
+        f"WORLD_SIZE={brief(world)} is no count of processes.",
+    )
     on_cpu = variables.get("ACCELERATE_USE_CPU", "").lower() in ("1", "true", "yes")
     by_mpi = any(name in variables for name in _MPI)
     # Accelerate names the meeting point alone where more than one process was asked for.
     require(
         "WORLD_SIZE" in variables or by_mpi or not (on_cpu and "MASTER_ADDR" in variables),
-        "accelerate launch --cpu was asked for several processes and started one, since it needs MPI for more. Start "
-        "them with torchrun --nproc-per-node <processes> -m mme_vla.train …, or leave --num_processes out.",
+        "accelerate launch --cpu was asked for several processes and started one, since it needs"
+        " MPI for more. Start them with torchrun --nproc-per-node <processes> -m mme_vla.train …,"
+        " or leave --num_processes out.",
     )
     return int(world)
 

@@ -1,4 +1,6 @@
-"""Checkpoints of every format: one adapter each, over the name tables that the packages below supply."""
+"""Checkpoints of every format: one adapter each, over the name tables that the packages below
+supply.
+"""
 
 from mme_vla.weights.load import load_weights, start_from, transfer
 from mme_vla.weights.source import detect_format, open_source

@@ -13,7 +13,13 @@ from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
 from mme_vla.policy.saving import recompute_buffers
-from mme_vla.policy.tensor_files import assign_tensors, check_fit, check_kinds, check_values, dtype_of
+from mme_vla.policy.tensor_files import (
+    assign_tensors,
+    check_fit,
+    check_kinds,
+    check_values,
+    dtype_of,
+)
 from mme_vla.processing.base import CONFIG_FILE, read_settings
 from mme_vla.weights.ports import HISTORY, check_window, port_adapter
 from mme_vla.weights.released import members_of, partial_adapter, released_adapter
@@ -29,13 +35,16 @@ _ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
 
 
 def adapter_of(fmt: str, policy: Policy) -> Adapter:
-    """The name table of a format for a policy; raises an error where the format does not hold such a policy."""
+    """The name table of a format for a policy; raises an error where the format does not hold such
+    a policy.
+    """
     make = _ADAPTERS[fmt] if fmt in _ADAPTERS else METHOD_FORMATS[fmt].function("adapter")
     adapter: Adapter = make(policy)
     return adapter
 
 
-# What a memory adds to a policy, as our names, the released leaves, LeRobot's own memory and MemoryVLA's banks tell.
+# What a memory adds to a policy, as our names, the released leaves, LeRobot's own memory and
+# MemoryVLA's banks tell.
 _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)")
 _MEMORY_LEAF = re.compile(rf"(^|/)mem_|_mem(/|$)|_mem_bank\.|^{HISTORY}\.")
 
@@ -51,21 +60,23 @@ def load_weights(
 ) -> Policy:
     """Fill a policy with a checkpoint of the same variant, in any format this library knows.
 
-    The policy may lie on the meta device, so that no weight is initialised only to be replaced. A checkpoint that
-    carries the statistics of one dataset hands them to the policy's processor; LeRobot's are left (see `read_stats`),
-    and of several none is taken, with a warning that names them.
+    The policy may lie on the meta device, so that no weight is initialised only to be replaced. A
+    checkpoint that carries the statistics of one dataset hands them to the policy's processor;
+    LeRobot's are left (see `read_stats`), and of several none is taken, with a warning that names
+    them.
 
     Args:
         source: a folder, a safetensors file, an Orbax run or step, or `owner/name` on the hub.
-        dtype: what the weights become, whatever they are stored in. revision, token: of a hub repository.
+        dtype: what the weights become, whatever they are stored in. revision, token: of a hub
+            repository.
         base: what a run of OpenVLA-OFT was trained on, where it holds its adapters alone.
     """
     kind = dtype_of(dtype)
     checkpoint = open_source(source, revision, token, base)
     require(
         checkpoint.format != "openpi" or policy.memory is None,
-        f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
-        "To begin training from it use start_from() (on the command line: init_from=…).",
+        f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset."
+        " To begin training from it use start_from() (on the command line: init_from=…).",
     )
     stats, datasets = None, list(stats_files(checkpoint.folder))
     if policy.processor is not None and checkpoint.format != "lerobot" and len(datasets) < 2:
@@ -76,8 +87,9 @@ def load_weights(
         policy.processor.stats = stats
     elif len(datasets) > 1:
         warnings.warn(
-            f"{source} holds normalisation statistics of {', '.join(datasets)}; none were taken. Choose one: "
-            f"policy.processor.stats = read_stats({str(checkpoint.folder)!r}, {datasets[0]!r})",
+            f"{source} holds normalisation statistics of {', '.join(datasets)}; none were taken."
+            f" Choose one: policy.processor.stats = read_stats({str(checkpoint.folder)!r},"
+            f" {datasets[0]!r})",
             stacklevel=2,
         )
     return policy
@@ -100,7 +112,8 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
 class Start:
     """What a policy took from another's checkpoint.
 
-    taken, new: our names; new ones kept the values they had. left: the checkpoint's names that have no place here.
+    taken, new: our names; new ones kept the values they had. left: the checkpoint's names that have
+    no place here.
     """
 
     taken: list[str]
@@ -109,36 +122,52 @@ class Start:
 
     def __str__(self) -> str:
         sentence = f"{len(self.taken)} tensors taken, {len(self.new)} new ({_groups(self.new)})"
-        return sentence + (f", {len(self.left)} left behind ({_groups(self.left)})" if self.left else "")
+        return sentence + (
+            f", {len(self.left)} left behind ({_groups(self.left)})" if self.left else ""
+        )
 
 
 def start_from(policy: Policy, source: str | Path, *, revision: str | None = None) -> list[str]:
-    """Copy into a built policy all that a checkpoint holds of it, and return the names of what stays new.
+    """Copy into a built policy all that a checkpoint holds of it, and return the names of what
+    stays new.
 
-    The source may be memoryless π0.5 in any format, or another variant. Only parameters of the memory (its integration
-    and its own expert included) may stay new; they keep the values they have. Statistics are not taken.
+    The source may be memoryless π0.5 in any format, or another variant. Only parameters of the
+    memory (its integration and its own expert included) may stay new; they keep the values they
+    have. Statistics are not taken.
     """
     return transfer(policy, source, revision=revision).new
 
 
 def transfer(policy: Policy, source: str | Path, *, revision: str | None = None) -> Start:
-    """Do what `start_from` says, and tell in full what was taken, what is new and what was left behind."""
+    """Do what `start_from` says, and tell in full what was taken, what is new and what was left
+    behind.
+    """
     if policy.device.type == "meta":
-        raise UserError("Build the policy on a real device to start from a checkpoint: its memory needs fresh values.")
+        raise UserError(
+            "Build the policy on a real device to start from a checkpoint: its memory needs fresh"
+            " values."
+        )
     checkpoint = open_source(source, revision)
     memory_names, state = memory_parameters(policy), policy.state_dict()
     if checkpoint.format == "ours":
         source_tensors = merge_state(checkpoint.tensors(), checkpoint.config.get("adapters"))
         _check_tokenizer(policy, checkpoint.folder)
         strange = set(source_tensors) - set(state)
-        left = sorted(name for name in strange if _OF_MEMORY.search(name) or _part(policy, name) == "memory")
+        left = sorted(
+            name for name in strange if _OF_MEMORY.search(name) or _part(policy, name) == "memory"
+        )
         matched = {name: tensor for name, tensor in source_tensors.items() if name not in left}
         check_fit(
-            matched, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=memory_names
+            matched,
+            {name: tuple(tensor.shape) for name, tensor in state.items()},
+            str(source),
+            optional=memory_names,
         )
     else:
         of_format = (
-            partial_adapter(policy) if checkpoint.format == "released" else adapter_of(checkpoint.format, policy)
+            partial_adapter(policy)
+            if checkpoint.format == "released"
+            else adapter_of(checkpoint.format, policy)
         )
         memory_names |= of_format.fresh
         members = [place for place, _ in members_of(policy.memory)]
@@ -156,7 +185,9 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
         source_tensors = checkpoint.tensors(fits)
         left = behind(source_tensors)
         adapter = _reduced(of_format, memory_names, members, source_tensors)
-        source_tensors = {name: tensor for name, tensor in source_tensors.items() if name not in left}
+        source_tensors = {
+            name: tensor for name, tensor in source_tensors.items() if name not in left
+        }
         matched = adapter.translate(source_tensors, state, str(source))
     check_kinds(matched, state, str(source))
     check_values(matched, str(source))
@@ -165,8 +196,17 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
 
 
 def _part(policy: Policy, name: str) -> str | None:
-    """The part of a policy that another's parameter would belong to; None where it has none such."""
-    return next((part for part, pattern in policy.finetune_spec.components.items() if re.match(pattern, name)), None)
+    """The part of a policy that another's parameter would belong to; None where it has
+    none such.
+    """
+    return next(
+        (
+            part
+            for part, pattern in policy.finetune_spec.components.items()
+            if re.match(pattern, name)
+        ),
+        None,
+    )
 
 
 def _check_tokenizer(policy: Policy, folder: Path) -> None:
@@ -177,21 +217,29 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
     source_fingerprint = read_settings(folder).get("tokenizer_fingerprint")
     processor, target_fingerprint = policy.processor, policy.processor.prompt_spec.fingerprint
     require(
-        source_fingerprint is None or target_fingerprint is None or source_fingerprint == target_fingerprint,
-        f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than "
-        f"{processor.prompt_spec.encoder!r} ({target_fingerprint}): its ids would mean other words. Set "
-        "processor.tokenizer to that one.",
+        source_fingerprint is None
+        or target_fingerprint is None
+        or source_fingerprint == target_fingerprint,
+        f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than"
+        f" {processor.prompt_spec.encoder!r} ({target_fingerprint}): its ids would mean other"
+        " words. Set processor.tokenizer to that one.",
     )
 
 
 def _reduced(
     adapter: Adapter, local: set[str], members: Sequence[str], source_tensors: Mapping[str, Tensor]
 ) -> Adapter:
-    """Leave out the memory's parameters that the checkpoint does not hold, and members that it does not hold whole."""
+    """Leave out the memory's parameters that the checkpoint does not hold, and members that it does
+    not hold whole.
+    """
     absent = {
-        name for name, pieces in adapter.table.items() if not all(piece.path in source_tensors for piece in pieces)
+        name
+        for name, pieces in adapter.table.items()
+        if not all(piece.path in source_tensors for piece in pieces)
     }
-    torn = tuple(f"{place}." for place in members if any(name.startswith(f"{place}.") for name in absent))
+    torn = tuple(
+        f"{place}." for place in members if any(name.startswith(f"{place}.") for name in absent)
+    )
     table = {
         name: pieces
         for name, pieces in adapter.table.items()
@@ -203,7 +251,8 @@ def _reduced(
 def _groups(names: list[str]) -> str:
     """Tensor names in short: numbers become *, and each stem is named once."""
     stems = {
-        ".".join("*" if part.isdigit() else part for part in name.split(".")[:-1]) or name.rpartition("/")[0]
+        ".".join("*" if part.isdigit() else part for part in name.split(".")[:-1])
+        or name.rpartition("/")[0]
         for name in names
     }
     return ", ".join(sorted(stems)) or "none"

@@ -1,10 +1,12 @@
 """Orbax checkpoints without JAX: every leaf is a zarr array, which tensorstore reads and writes.
 
-The arrays lie in one OCDBT store or, in the plain layout, in a folder each. Layout of a released run:
+The arrays lie in one OCDBT store or, in the plain layout, in a folder each. Layout of a
+released run:
 
-    <run>/history_config.txt                         which variant (absent for the memoryless baseline)
-    <run>/<step>/params/                             the arrays
-    <run>/<step>/assets/<dataset>/norm_stats.json    normalisation statistics
+    <run>/history_config.txt             which variant (absent for the memoryless baseline)
+    <run>/<step>/params/                 the arrays
+    <run>/<step>/assets/<dataset>/norm_stats.json
+                                         normalisation statistics
 """
 
 import json
@@ -34,7 +36,9 @@ _DICT_KEY = 2  # Orbax's number for "this step of the path is a dictionary's key
 
 @dataclass(frozen=True)
 class Zipped:
-    """Arrays inside a zip archive: `place` is their folder in it, with a slash at its end, `names` what lies there."""
+    """Arrays inside a zip archive: `place` is their folder in it, with a slash at its end, `names`
+    what lies there.
+    """
 
     file: Path
     place: str
@@ -44,8 +48,13 @@ class Zipped:
         return f"{self.file} ({self.place or 'at its top'})"
 
     def check(self) -> None:
-        """Compare what lies there with the archive's checksums, which tensorstore does not ask for."""
-        with decoding(self.file, "a zip archive", "Download or copy it again."), zipfile.ZipFile(self.file) as opened:
+        """Compare what lies there with the archive's checksums, which tensorstore does
+        not ask for.
+        """
+        with (
+            decoding(self.file, "a zip archive", "Download or copy it again."),
+            zipfile.ZipFile(self.file) as opened,
+        ):
             for name in self.names:
                 with opened.open(self.place + name) as piece:
                     while piece.read(2**22):
@@ -53,17 +62,23 @@ class Zipped:
 
 
 def find_params(folder: Path) -> Path | None:
-    """The folder with the arrays of a run (its newest step), a step, or the arrays' folder itself; None without any."""
+    """The folder with the arrays of a run (its newest step), a step, or the arrays' folder itself;
+    None without any.
+    """
     if _holds_arrays(folder):
         return folder
     if _holds_arrays(folder / "params"):
         return folder / "params"
-    steps = [path for path in folder.glob("*") if path.name.isdigit() and _holds_arrays(path / "params")]
+    steps = [
+        path for path in folder.glob("*") if path.name.isdigit() and _holds_arrays(path / "params")
+    ]
     return max(steps, key=lambda path: int(path.name)) / "params" if steps else None
 
 
 def variant_of(folders: Sequence[Path]) -> str | None:
-    """What `history_config.txt` says in the first of these that has one, such as `perceptual-framesamp-modul`."""
+    """What `history_config.txt` says in the first of these that has one, such as
+    `perceptual-framesamp-modul`.
+    """
     for folder in folders:
         note = folder / VARIANT_FILE
         if note.is_file():
@@ -72,12 +87,16 @@ def variant_of(folders: Sequence[Path]) -> str | None:
     return None
 
 
-def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
-    """Read all arrays of a checkpoint, named by their path without the leading `params/` and the trailing `/value`.
+def read_orbax(
+    params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], None] | None = None
+) -> dict[str, Tensor]:
+    """Read all arrays of a checkpoint, named by their path without the leading `params/` and the
+    trailing `/value`.
 
     Args:
         params: the arrays' folder, or where they are in an archive.
-        fits: called with tensors of the arrays' names and shapes on meta, before memory is taken for any.
+        fits: called with tensors of the arrays' names and shapes on meta, before memory is taken
+            for any.
     """
     ts = _tensorstore()
     if isinstance(params, Zipped):
@@ -91,7 +110,8 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
     with _reading(params):
         arrays = _list_arrays(ts, params)
         pending = {
-            # A part that is missing would otherwise be read as zeros. Orbax and this library write zeros like the rest.
+            # A part that is missing would otherwise be read as zeros. Orbax and this library write
+            # zeros like the rest.
             name: ts.open(
                 {"driver": driver, "kvstore": _store(params, path, _is_ocdbt(params)),
                  "fill_missing_data_reads": False},
@@ -105,8 +125,8 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
             piece = math.prod(store.chunk_layout.read_chunk.shape or ())
             require(
                 piece <= max(2 * math.prod(store.shape), _SMALL_PIECE),
-                f"The Orbax checkpoint {params} is damaged: {brief(name)} of shape {brief(tuple(store.shape))} would "
-                f"lie in pieces of {piece:,} numbers.",
+                f"The Orbax checkpoint {params} is damaged: {brief(name)} of shape"
+                f" {brief(tuple(store.shape))} would lie in pieces of {piece:,} numbers.",
             )
         if fits is not None:
             fits({name: torch.empty(store.shape, device="meta") for name, store in stores.items()})
@@ -131,11 +151,15 @@ def _reading(params: Path | Zipped) -> Iterator[None]:
         raise
     except (ValueError, TypeError, RuntimeError, OverflowError) as error:
         reason = brief(str(error).splitlines()[0], 500, quote=False)
-        raise UserError(f"The Orbax checkpoint {params} is damaged or incomplete: {reason}") from error
+        raise UserError(
+            f"The Orbax checkpoint {params} is damaged or incomplete: {reason}"
+        ) from error
 
 
 def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
-    """Write a tree as Orbax does (OCDBT, zarr, full keys `params/…/value`), so that Orbax restores it."""
+    """Write a tree as Orbax does (OCDBT, zarr, full keys `params/…/value`), so that Orbax restores
+    it.
+    """
     ts = _tensorstore()
     params.mkdir(parents=True)
     leaves: dict[str, Any] = {}
@@ -147,16 +171,27 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
             "key_metadata": [{"key": key, "key_type": _DICT_KEY} for key in path],
             "value_metadata": {"value_type": "np.ndarray", "skip_deserialize": False},
         }
-    context = ts.Context()  # shared, and all writes at once: the store then gathers them into few files
+    context = (
+        ts.Context()
+    )  # shared, and all writes at once: the store then gathers them into few files
     layout = {"compressor": {"id": "zstd", "level": 1}}
     opened = [
         ts.open(
-            {"driver": "zarr", "kvstore": _store(params, path, True), "metadata": {**layout, "chunks": array.shape}},
-            create=True, dtype=array.dtype, shape=array.shape, context=context,
+            {
+                "driver": "zarr",
+                "kvstore": _store(params, path, True),
+                "metadata": {**layout, "chunks": array.shape},
+            },
+            create=True,
+            dtype=array.dtype,
+            shape=array.shape,
+            context=context,
         )
         for path, array in arrays.items()
-    ]  # fmt: skip
-    futures = [store.result().write(array) for store, array in zip(opened, arrays.values(), strict=True)]
+    ]
+    futures = [
+        store.result().write(array) for store, array in zip(opened, arrays.values(), strict=True)
+    ]
     for write in futures:
         write.result()
     about = {"tree_metadata": leaves, "use_ocdbt": True, "use_zarr3": False}
@@ -164,7 +199,9 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
 
 
 def _holds_arrays(folder: Path) -> bool:
-    return (folder / MANIFEST).is_file() or any(next(folder.glob(f"*{name}"), None) for name in ARRAY_FILES)
+    return (folder / MANIFEST).is_file() or any(
+        next(folder.glob(f"*{name}"), None) for name in ARRAY_FILES
+    )
 
 
 def _is_ocdbt(params: Path | Zipped) -> bool:
@@ -173,11 +210,18 @@ def _is_ocdbt(params: Path | Zipped) -> bool:
 
 def _list_arrays(ts: Any, params: Path | Zipped) -> dict[str, tuple[str, str]]:
     if _is_ocdbt(params):
-        keys = [key.decode() for key in ts.KvStore.open(_store(params, "", True)).result().list().result()]
+        keys = [
+            key.decode()
+            for key in ts.KvStore.open(_store(params, "", True)).result().list().result()
+        ]
     elif isinstance(params, Zipped):
         keys = [key for key in params.names if key.count("/") == 1]
     else:
-        keys = [f"{file.parent.name}/{file.name}" for name in ARRAY_FILES for file in params.glob(f"*{name}")]
+        keys = [
+            f"{file.parent.name}/{file.name}"
+            for name in ARRAY_FILES
+            for file in params.glob(f"*{name}")
+        ]
     arrays = {}
     for key in keys:
         path, slash, file = key.rpartition("/")
@@ -192,7 +236,11 @@ def _store(params: Path | Zipped, path: str, ocdbt: bool) -> dict[str, Any]:
         archive = {"driver": "zip", "base": f"file://{params.file.as_posix()}"}
         if not ocdbt:
             return {**archive, "path": f"{params.place}{path}/"}
-        return {"driver": "ocdbt", "base": {**archive, "path": params.place}, "path": f"{path}/" if path else ""}
+        return {
+            "driver": "ocdbt",
+            "base": {**archive, "path": params.place},
+            "path": f"{path}/" if path else "",
+        }
     base = f"file://{params.resolve().as_posix()}/"
     return {"driver": "ocdbt", "base": base, "path": f"{path}/" if path else ""} if ocdbt else {
         "driver": "file", "path": f"{params.resolve().as_posix()}/{path}/",
@@ -224,7 +272,9 @@ def _tensorstore() -> Any:
 
 ARCHIVE_SUFFIX = ".zip"
 _MOST_ENTRIES, _MOST_BYTES, _MOST_RATIO = 200_000, 2**38, 200
-"""Of an archive, of all it unpacks to, and of one file or all against the packed size: beyond, it is no checkpoint."""
+"""Of an archive, of all it unpacks to, and of one file or all against the packed size: beyond, it
+is no checkpoint.
+"""
 _SMALL = 4 * 2**20  # bytes of a file that is unpacked
 _HEADER = 30  # least bytes before the content of a file
 _REMEDY = "Download or copy it again."
@@ -238,47 +288,71 @@ def find_archive(folder: Path) -> Path | None:
 
 
 def open_archive(file: Path) -> tuple[Zipped, Path]:
-    """Find the checkpoint in an archive: its arrays, and a folder of its variant's name and statistics, unpacked."""
+    """Find the checkpoint in an archive: its arrays, and a folder of its variant's name and
+    statistics, unpacked.
+    """
     with decoding(file, "a zip archive", _REMEDY), zipfile.ZipFile(file) as opened:
         entries = [entry for entry in opened.infolist() if not entry.is_dir()]
         _check(file, entries, opened.start_dir)
         names = [entry.filename for entry in entries]
         place = _arrays(names)
         if place is None:
-            raise UserError(f"{file} holds no checkpoint of the released code: there are no Orbax arrays in it.")
+            raise UserError(
+                f"{file} holds no checkpoint of the released code: there are no Orbax arrays in it."
+            )
         within = tuple(name.removeprefix(place) for name in names if name.startswith(place))
         folder = _unpack_facts(file, opened, entries)
     return Zipped(file.resolve(), place, within), folder
 
 
 def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
-    """Refuse what no checkpoint holds. end: offset of the archive's directory, where its last entry ends."""
-    total, packed = sum(entry.file_size for entry in entries), sum(entry.compress_size for entry in entries)
+    """Refuse what no checkpoint holds. end: offset of the archive's directory, where its last entry
+    ends.
+    """
+    total, packed = (
+        sum(entry.file_size for entry in entries),
+        sum(entry.compress_size for entry in entries),
+    )
     if len(entries) > _MOST_ENTRIES or total > _MOST_BYTES:
-        raise UserError(f"{file} unpacks to {len(entries):,} files of {total:,} bytes: that is no checkpoint.")
+        raise UserError(
+            f"{file} unpacks to {len(entries):,} files of {total:,} bytes: that is no checkpoint."
+        )
     for entry in entries:
         name, parts = entry.filename, entry.filename.split("/")
         if name.startswith("/") or "\\" in name or ".." in parts or ":" in parts[0]:
             raise UserError(f"{file} names {brief(name)}, which lies outside of it. {_REMEDY}")
-        require(not (entry.flag_bits & 1), f"{file} is encrypted: unpack it yourself, and name the folder.")
+        require(
+            not (entry.flag_bits & 1),
+            f"{file} is encrypted: unpack it yourself, and name the folder.",
+        )
         if entry.file_size > _SMALL and entry.file_size > _MOST_RATIO * max(entry.compress_size, 1):
-            raise UserError(f"{file}: {brief(name)} unpacks to {entry.file_size:,} bytes: that is no checkpoint.")
+            raise UserError(
+                f"{file}: {brief(name)} unpacks to {entry.file_size:,} bytes: that is no"
+                " checkpoint."
+            )
     if total > _SMALL and total > _MOST_RATIO * packed:
         raise UserError(f"{file}: {packed:,} bytes unpack to {total:,}: that is no checkpoint.")
-    # Names and bytes that stand twice: what is compared with its checksum might not be what is read.
+    # Names and bytes that stand twice: what is compared with its checksum might not be what is
+    # read.
     names: set[str] = set()
     for entry in entries:
-        require(entry.filename not in names, f"{file} names {brief(entry.filename)} twice. {_REMEDY}")
+        require(
+            entry.filename not in names, f"{file} names {brief(entry.filename)} twice. {_REMEDY}"
+        )
         names.add(entry.filename)
     ordered = sorted(entries, key=lambda entry: entry.header_offset)
     ends = [*(entry.header_offset for entry in ordered[1:]), end]
     for entry, following in zip(ordered, ends, strict=True):
         if entry.header_offset + _HEADER + entry.compress_size > following:
-            raise UserError(f"{file}: the bytes of {brief(entry.filename)} overlap with what follows. {_REMEDY}")
+            raise UserError(
+                f"{file}: the bytes of {brief(entry.filename)} overlap with what follows. {_REMEDY}"
+            )
 
 
 def _arrays(names: list[str]) -> str | None:
-    """The folder of the arrays, with a slash at its end: `params` before others, the outermost that holds arrays."""
+    """The folder of the arrays, with a slash at its end: `params` before others, the outermost that
+    holds arrays.
+    """
     stores = [name.removesuffix(MANIFEST) for name in names if name.split("/")[-1] == MANIFEST]
     if not stores:
         stores = [
@@ -287,11 +361,17 @@ def _arrays(names: list[str]) -> str | None:
             for array in ARRAY_FILES
             if name.endswith(array)
         ]
-    return min(stores, key=lambda place: (not place.endswith("params/"), place.count("/"), place), default=None)
+    return min(
+        stores,
+        key=lambda place: (not place.endswith("params/"), place.count("/"), place),
+        default=None,
+    )
 
 
 def _unpack_facts(file: Path, opened: zipfile.ZipFile, entries: list[zipfile.ZipInfo]) -> Path:
-    """Write the variant's name and the statistics, as a released step has them, and return the folder."""
+    """Write the variant's name and the statistics, as a released step has them, and return the
+    folder.
+    """
     key = file.resolve(), file.stat().st_mtime_ns
     if key in _facts:
         return Path(_facts[key].name)
@@ -305,7 +385,10 @@ def _unpack_facts(file: Path, opened: zipfile.ZipFile, entries: list[zipfile.Zip
             target = folder / "assets" / safe_name(above[-1]) / last
         else:
             continue
-        require(entry.file_size <= _SMALL, f"{file}: {brief(entry.filename)} has {entry.file_size:,} bytes. {_REMEDY}")
+        require(
+            entry.file_size <= _SMALL,
+            f"{file}: {brief(entry.filename)} has {entry.file_size:,} bytes. {_REMEDY}",
+        )
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(opened.read(entry))
     return folder

@@ -1,8 +1,10 @@
-"""The PyTorch ports of π0.5: LeRobot's `pi05` and openpi's `PI0Pytorch`. One grammar of names in many spellings.
+"""The PyTorch ports of π0.5: LeRobot's `pi05` and openpi's `PI0Pytorch`. One grammar of names in
+many spellings.
 
-Spellings that occur: with a leading `model.` (LeRobot) or without; `vision_tower` with an inner `vision_model` or
-without (transformers 5.23); modules without the inner `model.` (before transformers 4.52); the embedding stored only as
-`lm_head`, which it is tied to (`safetensors.torch.save_model` keeps one name of a tied pair).
+Spellings that occur: with a leading `model.` (LeRobot) or without; `vision_tower` with an inner
+`vision_model` or without (transformers 5.23); modules without the inner `model.` (before
+transformers 4.52); the embedding stored only as `lm_head`, which it is tied to
+(`safetensors.torch.save_model` keeps one name of a tied pair).
 """
 
 import re
@@ -28,8 +30,13 @@ _SPELLINGS = [
     (rf"{_VLM}(vision_tower|multi_modal_projector)\.", rf"{names.ROOT}.paligemma.model.\1."),
     (rf"{_VLM}model\.vision_tower\.(?!vision_model\.)", f"{names.VISION}."),
 ]
-WINDOW_MEMORY = {"use_visual_memory": "past images in its vision tower", "use_proprioceptive_memory": "past states"}
-"""LeRobot's short-window memory of π0.5, by the settings that turn it on; the first adds no tensors."""
+WINDOW_MEMORY = {
+    "use_visual_memory": "past images in its vision tower",
+    "use_proprioceptive_memory": "past states",
+}
+"""LeRobot's short-window memory of π0.5, by the settings that turn it on; the first adds no
+tensors.
+"""
 HISTORY = "proprio_history_proj"
 """The tensors that the second adds."""
 WINDOW = {
@@ -37,19 +44,29 @@ WINDOW = {
     "memory_stride": ("stride", 30),
     "memory_temporal_attention_every": ("every", 4),
 }
-"""Its other settings: how the memory `spacetime` calls them, and what LeRobot takes where they are not written."""
+"""Its other settings: how the memory `spacetime` calls them, and what LeRobot takes where they are
+not written.
+"""
 _PI0 = re.compile(r"^(state_proj|action_time_mlp_(in|out))\.")
 
 
 def port_adapter(policy: MMEPolicy) -> Adapter:
-    """The tensors of a memoryless policy, or the memoryless part of another, in the ports' names (without `model.`).
+    """The tensors of a memoryless policy, or the memoryless part of another, in the ports' names
+    (without `model.`).
 
-    Of the memory `spacetime` the layer of past states has a name too, where its tokens are as wide as the prefix.
+    Of the memory `spacetime` the layer of past states has a name too, where its tokens are as wide
+    as the prefix.
     """
     table = prefixed("backbone", names.torch_names(pi05_of(policy)))
     memory = policy.memory
-    if isinstance(memory, SpaceTime) and memory.states is not None and memory.width == pi05_of(policy).config.vlm.width:
-        table |= {f"memory.states.{part}": [Piece(f"{HISTORY}.{part}")] for part in ("weight", "bias")}
+    if (
+        isinstance(memory, SpaceTime)
+        and memory.states is not None
+        and memory.width == pi05_of(policy).config.vlm.width
+    ):
+        table |= {
+            f"memory.states.{part}": [Piece(f"{HISTORY}.{part}")] for part in ("weight", "bias")
+        }
     return Adapter(table, names.torch_unread(pi05_of(policy)), names.TIED)
 
 
@@ -59,13 +76,17 @@ def is_port(tensor_names: list[str]) -> bool:
 
 
 def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
-    """Bring a port's tensors to the one spelling of the name table, the embedding under its own name."""
+    """Bring a port's tensors to the one spelling of the name table, the embedding under its own
+    name.
+    """
     spelled: dict[str, str] = {}
     for name in tensors:
         taken = spelled.setdefault(_respell(name), name)
         require(taken == name, f"{source} holds the same tensor twice, as {taken} and as {name}.")
     renamed = {name: tensors[source_name] for name, source_name in spelled.items()}
-    adaptive = any(name.startswith(names.EXPERTS["action"]) and ".dense." in name for name in renamed)
+    adaptive = any(
+        name.startswith(names.EXPERTS["action"]) and ".dense." in name for name in renamed
+    )
     require(
         adaptive and not any(_PI0.match(name) for name in renamed),
         f"{source} is not π0.5: its action expert has "
@@ -78,7 +99,9 @@ def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
 
 
 def window_of(policy: Policy) -> dict[str, bool | int]:
-    """What LeRobot's settings of its short-window memory would be for a policy; all off for one that has none."""
+    """What LeRobot's settings of its short-window memory would be for a policy; all off for one
+    that has none.
+    """
     memory = policy.memory
     if not isinstance(memory, SpaceTime):
         return dict.fromkeys(WINDOW_MEMORY, False)
@@ -87,7 +110,9 @@ def window_of(policy: Policy) -> dict[str, bool | int]:
         "use_visual_memory": past_view_spec(memory) is not None,
         "use_proprioceptive_memory": memory.states is not None,
     }
-    return memory_settings | {source_name: settings[target_name] for source_name, (target_name, _) in WINDOW.items()}
+    return memory_settings | {
+        source_name: settings[target_name] for source_name, (target_name, _) in WINDOW.items()
+    }
 
 
 def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None:
@@ -95,11 +120,14 @@ def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None
     has: dict[str, Any] = {setting: bool(config.get(setting)) for setting in WINDOW_MEMORY}
     require(
         any(has.values()) or policy.memory is None,
-        f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
-        "To begin training from it use start_from() (on the command line: init_from=…).",
+        f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset."
+        " To begin training from it use start_from() (on the command line: init_from=…).",
     )
     if any(has.values()):
-        has |= {source_name: config.get(source_name, default) for source_name, (_, default) in WINDOW.items()}
+        has |= {
+            source_name: config.get(source_name, default)
+            for source_name, (_, default) in WINDOW.items()
+        }
     between = getattr(getattr(policy, "integration", None), "mutual", False)
     if any(window_of(policy).get(setting) != value for setting, value in has.items()) or (
         has["use_proprioceptive_memory"] and not between
@@ -112,24 +140,31 @@ def _other_window(has: Mapping[str, Any], source: str) -> str:
     kinds = [what for setting, what in WINDOW_MEMORY.items() if has[setting]]
     views, states = (str(has[setting]).lower() for setting in WINDOW_MEMORY)
     integration = (
-        "integration=context integration.mutual=true" if has["use_proprioceptive_memory"] else "integration=none"
+        "integration=context integration.mutual=true"
+        if has["use_proprioceptive_memory"]
+        else "integration=none"
     )
     window = " ".join(
-        f"memory.{target_name}={brief(has[source_name])}" for source_name, (target_name, _) in WINDOW.items()
+        f"memory.{target_name}={brief(has[source_name])}"
+        for source_name, (target_name, _) in WINDOW.items()
     )
     frames, stride = (brief(has[key]) for key in ("memory_frames", "memory_stride"))
     return (
-        f"{source} reads {' and '.join(kinds)} (LeRobot's short-window memory: memory_frames={frames}, memory_stride="
-        f"{stride}), which this policy does not, or not so: whole, it would act on other things than it was trained "
-        f"with. Build the one that does: memory=spacetime {integration} {window} memory.views={views} "
-        f"memory.states={states}. To begin training another from its weights use start_from() (on the command line: "
-        "init_from=…)."
+        f"{source} reads {' and '.join(kinds)} (LeRobot's short-window memory:"
+        f" memory_frames={frames}, memory_stride={stride}), which this policy does not, or not so:"
+        " whole, it would act on other things than it was trained with. Build the one that does:"
+        f" memory=spacetime {integration} {window} memory.views={views} memory.states={states}. To"
+        " begin training another from its weights use start_from() (on the command line:"
+        " init_from=…)."
     )
 
 
 def to_lerobot(policy: MMEPolicy, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """LeRobot's state dict: all names with `model.`, embedding and language head both."""
-    return {LEROBOT_PREFIX + name: tensor for name, tensor in port_adapter(policy).export(tensors).items()}
+    return {
+        LEROBOT_PREFIX + name: tensor
+        for name, tensor in port_adapter(policy).export(tensors).items()
+    }
 
 
 def to_openpi(policy: MMEPolicy, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -1,7 +1,8 @@
-"""The released (JAX) parameter trees: names to ours and back, for any composition whose packages supply a name table.
+"""The released (JAX) parameter trees: names to ours and back, for any composition whose packages
+supply a name table.
 
-Leaves are named without the leading `params/` and the trailing `/value`; layers are stacked on the first axis.
-`orbax.py` reads and writes the files.
+Leaves are named without the leading `params/` and the trailing `/value`; layers are stacked on the
+first axis. `orbax.py` reads and writes the files.
 """
 
 from collections.abc import Mapping
@@ -17,17 +18,29 @@ from mme_vla.memory.base import Memory
 from mme_vla.memory.joined import JoinedMemory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.tensor_files import assign_tensors
-from mme_vla.weights.tables import Adapter, Derived, NameTable, Unread, memory_parameters, pi05_of, prefixed
+from mme_vla.weights.tables import (
+    Adapter,
+    Derived,
+    NameTable,
+    Unread,
+    memory_parameters,
+    pi05_of,
+    prefixed,
+)
 
 
 def released_adapter(policy: MMEPolicy) -> Adapter:
-    return Adapter(released_table(policy), released_unread(policy), derived=released_derived(policy))
+    return Adapter(
+        released_table(policy), released_unread(policy), derived=released_derived(policy)
+    )
 
 
 def partial_adapter(policy: Any) -> Adapter:
-    """The released tree as far as it has names for this policy: what parts of one's own have beyond it is left out.
+    """The released tree as far as it has names for this policy: what parts of one's own have beyond
+    it is left out.
 
-    Members of a joined memory have the names that each would have alone: a reader keeps those that are there whole.
+    Members of a joined memory have the names that each would have alone: a reader keeps those that
+    are there whole.
     """
     table, state = _table(policy), policy.state_dict()
     unread, derived = released_unread(policy), released_derived(policy)
@@ -44,7 +57,9 @@ def partial_adapter(policy: Any) -> Adapter:
 
 
 def members_of(memory: Memory | None) -> list[tuple[str, Memory]]:
-    """The members of a joined memory, each with the beginning of its tensors' names in the policy."""
+    """The members of a joined memory, each with the beginning of its tensors' names in
+    the policy.
+    """
     if not isinstance(memory, JoinedMemory):
         return []
     return [(f"memory.members.{i}", member) for i, member in enumerate(memory.memories)]
@@ -54,14 +69,16 @@ def released_table(policy: MMEPolicy) -> NameTable:
     """Every parameter of the policy and the released leaves it is made of."""
     table = _table(policy)
     unnamed = sorted(
-        memory_parameters(policy) ^ {name for name in table if policy.finetune_spec.component_of(name) == "memory"}
+        memory_parameters(policy)
+        ^ {name for name in table if policy.finetune_spec.component_of(name) == "memory"}
     )
     if unnamed:
         owners = [part for part in (policy.memory, policy.integration) if part is not None]
         raise UserError(
-            f"{' with '.join(type(part).__name__ for part in owners)} has no released names for {len(unnamed)} tensors "
-            f"({listed(unnamed)}): only the released memories and integrations convert whole. To begin training from a "
-            "released checkpoint use start_from() (on the command line: init_from=…), which leaves these as they are."
+            f"{' with '.join(type(part).__name__ for part in owners)} has no released names for"
+            f" {len(unnamed)} tensors ({listed(unnamed)}): only the released memories and"
+            " integrations convert whole. To begin training from a released checkpoint use"
+            " start_from() (on the command line: init_from=…), which leaves these as they are."
         )
     return table
 
@@ -76,17 +93,25 @@ def _table(policy: MMEPolicy) -> NameTable:
 
 def released_unread(policy: MMEPolicy) -> list[Unread]:
     """Released leaves, or layers of them, that no action reads and this library does not hold."""
-    return backbone_names.released_unread(pi05_of(policy)) + memory_names.released_unread(policy.memory)
+    return backbone_names.released_unread(pi05_of(policy)) + memory_names.released_unread(
+        policy.memory
+    )
 
 
 def released_derived(policy: MMEPolicy) -> list[Derived]:
-    """Released leaves that follow from the configuration: dropped when read, recomputed when written."""
+    """Released leaves that follow from the configuration: dropped when read, recomputed when
+    written.
+    """
     return memory_names.released_derived(policy.memory)
 
 
-def from_released(policy: MMEPolicy, tree: Mapping[str, Tensor], source: str = "the released tree") -> MMEPolicy:
+def from_released(
+    policy: MMEPolicy, tree: Mapping[str, Tensor], source: str = "the released tree"
+) -> MMEPolicy:
     """Fill a policy (on meta or not) from a released tree."""
-    assign_tensors(policy, released_adapter(policy).translate(tree, policy.state_dict(), source), source)
+    assign_tensors(
+        policy, released_adapter(policy).translate(tree, policy.state_dict(), source), source
+    )
     return policy
 
 

@@ -34,7 +34,9 @@ FORMATS = {
     "released": "openpi's and MME-VLA's JAX parameter trees (Orbax)",
     "diffusion_policy": "Diffusion Policy as RoboMME's authors train it (.pth)",
     "sam2act_plus": "SAM2Act and SAM2Act+ as their authors train them (.pth)",
-    "openvla": "OpenVLA, or a run of OpenVLA-OFT, merged or beside its base (safetensors, with .pt files)",
+    "openvla": (
+        "OpenVLA, or a run of OpenVLA-OFT, merged or beside its base (safetensors, with .pt files)"
+    ),
     "memoryvla": "MemoryVLA as its authors train it (.pt)",
     "simplememvla": "SimpleMemVLA as its authors publish it, or Qwen3.5 (safetensors)",
 }
@@ -42,11 +44,13 @@ FORMATS = {
 
 @dataclass(frozen=True)
 class MethodFormat:
-    """A format of one method: where the functions are that read and write it, imported when first used.
+    """A format of one method: where the functions are that read and write it, imported when first
+    used.
 
-    matches: whether tensor names are its. adapter: its name table for a policy. write: a policy as its files.
-    native: tensors under the one spelling of the name table, for files of `torch.save`. stats: reads its statistics.
-    spelling: the same for safetensors. check: compares its config.json with a policy. configure: a composed
+    matches: whether tensor names are its. adapter: its name table for a policy. write: a policy as
+    its files. native: tensors under the one spelling of the name table, for files of `torch.save`.
+    stats: reads its statistics. spelling: the same for safetensors. check: compares its config.json
+    with a policy. configure: a composed
         configuration as its config.json says.
     """
 
@@ -68,26 +72,45 @@ class MethodFormat:
 
 METHOD_FORMATS = {
     "simplememvla": MethodFormat(
-        "mme_vla.methods.simplememvla.weights", "is_simplememvla", "simplememvla_adapter", "write_simplememvla",
-        stats="read_published_stats", spelling="read_names", check="check_config", configure="configured",
+        "mme_vla.methods.simplememvla.weights",
+        "is_simplememvla",
+        "simplememvla_adapter",
+        "write_simplememvla",
+        stats="read_published_stats",
+        spelling="read_names",
+        check="check_config",
+        configure="configured",
     ),
     "diffusion_policy": MethodFormat(
-        "mme_vla.methods.diffusion_policy.weights", "is_diffusion_policy", "diffusion_adapter",
-        "write_diffusion_policy", native="unwrap_names", stats="read_diffusion_stats",
+        "mme_vla.methods.diffusion_policy.weights",
+        "is_diffusion_policy",
+        "diffusion_adapter",
+        "write_diffusion_policy",
+        native="unwrap_names",
+        stats="read_diffusion_stats",
     ),
     "sam2act_plus": MethodFormat(
-        "mme_vla.methods.sam2act.weights", "is_sam2act", "sam2act_adapter", "write_sam2act",
+        "mme_vla.methods.sam2act.weights",
+        "is_sam2act",
+        "sam2act_adapter",
+        "write_sam2act",
         native="unwrap_sam2act_names",
     ),
     "memoryvla": MethodFormat(
-        "mme_vla.methods.memoryvla.weights", "is_memoryvla", "memoryvla_adapter", "write_memoryvla",
+        "mme_vla.methods.memoryvla.weights",
+        "is_memoryvla",
+        "memoryvla_adapter",
+        "write_memoryvla",
         native="read_names",
     ),
     "openvla": MethodFormat(
-        "mme_vla.methods.openvla_oft.weights", "is_openvla", "openvla_adapter", "write_openvla",
+        "mme_vla.methods.openvla_oft.weights",
+        "is_openvla",
+        "openvla_adapter",
+        "write_openvla",
         stats="read_dataset_statistics",
     ),
-}  # fmt: skip
+}
 NATIVE_FORMATS = [name for name, of in METHOD_FORMATS.items() if of.native]
 """Formats in files of `torch.save`; each is called as the model it holds."""
 
@@ -97,9 +120,16 @@ def _openvla() -> Any:
     return importlib.import_module(METHOD_FORMATS["openvla"].module)
 
 
-VARIANTS = {"pi05_baseline": "pi05", "symbolic-simple-subgoal": "simplesg", "symbolic-grounded-subgoal": "groundsg"} | {
+VARIANTS = {
+    "pi05_baseline": "pi05",
+    "symbolic-simple-subgoal": "simplesg",
+    "symbolic-grounded-subgoal": "groundsg",
+} | {
     f"{kind}-{memory}-{integration}": f"{memory}_{integration}"
-    for kind, memories in (("perceptual", ("framesamp", "tokendrop")), ("recurrent", ("rmt", "ttt")))
+    for kind, memories in (
+        ("perceptual", ("framesamp", "tokendrop")),
+        ("recurrent", ("rmt", "ttt")),
+    )
     for memory in memories
     for integration in ("context", "modul", "expert")
 }
@@ -122,12 +152,14 @@ class Source:
     params: Path | Zipped | None = None
     base: "Source | None" = None
 
-    def tensors(self, fits: Callable[[Mapping[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
+    def tensors(
+        self, fits: Callable[[Mapping[str, Tensor]], None] | None = None
+    ) -> dict[str, Tensor]:
         """Read all tensors, under the one spelling that the format's name table knows.
 
         Args:
-            fits: where reading takes memory (Orbax), called before with tensors of the same names and shapes on meta;
-                raises where they do not fit.
+            fits: where reading takes memory (Orbax), called before with tensors of the same names
+                and shapes on meta; raises where they do not fit.
         """
         if self.params is not None:
             self._check_orbax()
@@ -135,7 +167,9 @@ class Source:
         if self.format in NATIVE_FORMATS:
             to_native = METHOD_FORMATS[self.format].function("native")
             check_sums(self.folder, [self.files[0].name])
-            native: dict[str, Tensor] = to_native(read_torch_file(self.files[0]), str(self.files[0]))
+            native: dict[str, Tensor] = to_native(
+                read_torch_file(self.files[0]), str(self.files[0])
+            )
             return native
         if self.base is not None:
             heads: dict[str, Tensor] = _openvla().with_heads({}, self.folder)
@@ -146,17 +180,25 @@ class Source:
         if (of := METHOD_FORMATS.get(self.format)) is not None and of.spelling is not None:
             spelled: dict[str, Tensor] = of.function("spelling")(tensors, str(self.folder))
             return spelled
-        return from_port(tensors, str(self.folder)) if self.format in ("lerobot", "openpi") else tensors
+        return (
+            from_port(tensors, str(self.folder))
+            if self.format in ("lerobot", "openpi")
+            else tensors
+        )
 
     def _check_orbax(self) -> None:
-        """Compare the files of Orbax arrays, or the archive, with the checksums beside them; each must be listed."""
+        """Compare the files of Orbax arrays, or the archive, with the checksums beside them; each
+        must be listed.
+        """
         if isinstance(self.params, Zipped):
             check_sums(self.params.file.parent, [self.params.file.name])
             return
         assert self.params is not None
         for folder in dict.fromkeys((self.folder, self.params)):
             if (folder / SUMS).is_file():
-                files = [file for file in self.params.rglob("*") if file.is_file() and file.name != SUMS]
+                files = [
+                    file for file in self.params.rglob("*") if file.is_file() and file.name != SUMS
+                ]
                 check_sums(folder, sorted(file.relative_to(folder).as_posix() for file in files))
 
     @property
@@ -170,15 +212,17 @@ class Source:
 
     @property
     def model(self) -> str | None:
-        """Our name of the variant a checkpoint is, or None where neither words nor tensors tell one."""
+        """Our name of the variant a checkpoint is, or None where neither words nor tensors tell
+        one.
+        """
         return self.variants[0] if len(self.variants) == 1 else None
 
     @cached_property
     def variants(self) -> list[str]:
         """Our names of the variants that a checkpoint may be; none where it does not say.
 
-        A word in `history_config.txt` that is no variant of the released code never becomes part of a configuration:
-        the names of the tensors tell the variant.
+        A word in `history_config.txt` that is no variant of the released code never becomes part of
+        a configuration: the names of the tensors tell the variant.
         """
         if self.format in (*NATIVE_FORMATS, "simplememvla"):
             return [self.format]
@@ -197,15 +241,21 @@ class Source:
 
     @property
     def lacks_positions(self) -> bool:
-        """Whether a released memory was trained without position features (`use_pos_emb: false`)."""
+        """Whether a released memory was trained without position features
+        (`use_pos_emb: false`).
+        """
         leaves = set() if self.params is None else leaf_names(self.params)
-        return any(leaf.startswith(ENCODER) for leaf in leaves) and f"{ENCODER}/pos_proj/kernel" not in leaves
+        return (
+            any(leaf.startswith(ENCODER) for leaf in leaves)
+            and f"{ENCODER}/pos_proj/kernel" not in leaves
+        )
 
 
 def _variants_with(leaves: Collection[str], word: str) -> list[str]:
     """Our names of the released variants whose trees have such leaves.
 
-    The tensors of FrameSamp and TokenDrop have the same names. Where `word` has neither name in it, it is one of both.
+    The tensors of FrameSamp and TokenDrop have the same names. Where `word` has neither name in it,
+    it is one of both.
     """
 
     def has(part: str) -> bool:
@@ -214,7 +264,10 @@ def _variants_with(leaves: Collection[str], word: str) -> list[str]:
     if not has(ENCODER):
         return ["pi05", "simplesg", "groundsg"]
     integration = "modul" if has("/mem_attn/") else "expert" if has("final_norm_mem") else "context"
-    perceptual = [name for name in ("framesamp", "tokendrop") if name in word] or ["framesamp", "tokendrop"]
+    perceptual = [name for name in ("framesamp", "tokendrop") if name in word] or [
+        "framesamp",
+        "tokendrop",
+    ]
     recurrent = {"recur_layer/W1": ["ttt"], "recur_layer/memory_state": ["rmt"]}
     memories = next((names for leaf, names in recurrent.items() if has(leaf)), perceptual)
     return [f"{memory}_{integration}" for memory in memories]
@@ -226,14 +279,19 @@ def detect_format(source: str | Path) -> str:
 
 
 def open_source(
-    source: str | Path, revision: str | None = None, token: str | None = None, base: str | Path | None = None
+    source: str | Path,
+    revision: str | None = None,
+    token: str | None = None,
+    base: str | Path | None = None,
 ) -> Source:
-    """Find a checkpoint: a folder, a safetensors file, an Orbax run or step, an archive of one, or a place on the hub.
+    """Find a checkpoint: a folder, a safetensors file, an Orbax run or step, an archive of one, or
+    a place on the hub.
 
     On the hub: `owner/name`, or `owner/name/folder/in/it`.
 
     Args:
-        base: OpenVLA, for a run of OpenVLA-OFT that holds its adapters alone. A run's own word for it is not followed.
+        base: OpenVLA, for a run of OpenVLA-OFT that holds its adapters alone. A run's own word for
+            it is not followed.
     """
     path = local_folder(source, revision, token)
     require(path.exists(), f"No checkpoint at {path}: there is no such file or folder.")
@@ -243,12 +301,14 @@ def open_source(
     if base is not None:
         if is_local or not _openvla().has_adapters(path):
             raise UserError(
-                f"base={str(base)!r} is for a run that holds {_openvla().FOLDER} alone; {path} does not: leave it out."
+                f"base={str(base)!r} is for a run that holds {_openvla().FOLDER} alone; {path} does"
+                " not: leave it out."
             )
         base_source = open_source(base)
         require(
             base_source.format == "openvla",
-            f"base={str(base)!r} is {FORMATS[base_source.format]}; the adapters in {path} are OpenVLA's.",
+            f"base={str(base)!r} is {FORMATS[base_source.format]}; the adapters in {path} are"
+            " OpenVLA's.",
         )
         return Source("openvla", path, base=base_source)
     if path.is_file() and path.suffix in SUFFIXES:
@@ -261,12 +321,15 @@ def open_source(
     if (path / WEIGHTS).is_file() or (path / INDEX).is_file():
         require(
             params is None,
-            f"{path} holds two sets of weights: safetensors, and Orbax arrays in {params}. Which are meant is not "
-            "known: name the file or folder of one of them, or remove the other.",
+            f"{path} holds two sets of weights: safetensors, and Orbax arrays in {params}. Which"
+            " are meant is not known: name the file or folder of one of them, or remove the"
+            " other.",
         )
         return _of_files(path, tuple(weight_files(path)))
     if params is not None:
-        return Source("released", params.parent if params.name == "params" else params, params=params)
+        return Source(
+            "released", params.parent if params.name == "params" else params, params=params
+        )
     if (zipped := find_archive(path)) is not None:
         return _of_archive(zipped)
     if _openvla().has_adapters(path):
@@ -277,10 +340,16 @@ def open_source(
         )
     if len(files := find_torch_files(path)) == 1:
         return _of_torch_file(files[0])
-    require(not files, f"{path} holds {listed(file.name for file in files)}: name the one you mean.")
+    require(
+        not files, f"{path} holds {listed(file.name for file in files)}: name the one you mean."
+    )
     if (path / "adapter_model.safetensors").is_file():
-        raise UserError(f"{path} holds a PEFT adapter alone, not a policy: merge it into its base model first.")
-    raise UserError(f"{path} holds no checkpoint of a known kind. Known: {'; '.join(FORMATS.values())}.")
+        raise UserError(
+            f"{path} holds a PEFT adapter alone, not a policy: merge it into its base model first."
+        )
+    raise UserError(
+        f"{path} holds no checkpoint of a known kind. Known: {'; '.join(FORMATS.values())}."
+    )
 
 
 def _of_archive(file: Path) -> Source:
@@ -307,7 +376,8 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         return Source("released", folder, files)
     few = listed(sorted(names), 3) or "none at all"
     raise UserError(
-        f"{files[0]} is no policy of a known kind: its tensors are called {few}. Known: {'; '.join(FORMATS.values())}."
+        f"{files[0]} is no policy of a known kind: its tensors are called {few}. Known:"
+        f" {'; '.join(FORMATS.values())}."
     )
 
 
@@ -318,7 +388,8 @@ def _of_torch_file(path: Path) -> Source:
             return Source(name, path.parent, (path,))
     few = listed(sorted(names), 3)
     raise UserError(
-        f"{path} holds no policy known here: its tensors are called {few}. Known: {', '.join(NATIVE_FORMATS)}."
+        f"{path} holds no policy known here: its tensors are called {few}. Known:"
+        f" {', '.join(NATIVE_FORMATS)}."
     )
 
 
@@ -326,5 +397,8 @@ def _names(file: Path) -> list[str]:
     from safetensors import safe_open
 
     check_header(file)
-    with decoding(file, "a safetensors file", "Download or copy it again."), safe_open(file, "pt") as opened:
+    with (
+        decoding(file, "a safetensors file", "Download or copy it again."),
+        safe_open(file, "pt") as opened,
+    ):
         return list(opened.keys())

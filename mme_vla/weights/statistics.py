@@ -20,10 +20,11 @@ _FEATURES = {"state": "observation.state", "actions": "action"}
 def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None:
     """The statistics in a checkpoint folder, or None where it has none.
 
-    Looked for: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, Diffusion Policy's `stats.json`,
-    OpenVLA-OFT's `dataset_statistics.json` of one dataset, and the file that LeRobot's processor description names as
-    the state of its normaliser. LeRobot's speak of the actions it was trained on: they fit this library's joint deltas
-    if that policy used relative actions with an absolute gripper.
+    Looked for: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, Diffusion
+    Policy's `stats.json`, OpenVLA-OFT's `dataset_statistics.json` of one dataset, and the file that
+    LeRobot's processor description names as the state of its normaliser. LeRobot's speak of the
+    actions it was trained on: they fit this library's joint deltas if that policy used relative
+    actions with an absolute gripper.
 
     Args:
         folder: the checkpoint (for released runs: the step).
@@ -33,8 +34,14 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
     files = stats_files(folder)
     if asset is not None or len(files) > 1:
         if asset not in files:
-            reason = f"none of {brief(asset)}." if asset else "say which: --asset, or read_stats(folder, asset)."
-            raise UserError(f"{folder} holds statistics of {listed(files) or 'no dataset'}: {reason}")
+            reason = (
+                f"none of {brief(asset)}."
+                if asset
+                else "say which: --asset, or read_stats(folder, asset)."
+            )
+            raise UserError(
+                f"{folder} holds statistics of {listed(files) or 'no dataset'}: {reason}"
+            )
         return NormStats.load(_local_file(folder, files[asset]))
     files |= {"": folder / "norm_stats.json"} if (folder / "norm_stats.json").is_file() else {}
     if files:
@@ -48,7 +55,10 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
 def stats_files(folder: Path) -> dict[str, Path]:
     """The statistics that openpi keeps in a checkpoint, by the name of their dataset."""
     assets = folder / "assets"
-    return {file.parent.relative_to(assets).as_posix(): file for file in sorted(assets.glob("**/norm_stats.json"))}
+    return {
+        file.parent.relative_to(assets).as_posix(): file
+        for file in sorted(assets.glob("**/norm_stats.json"))
+    }
 
 
 def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
@@ -57,16 +67,25 @@ def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
             continue
         steps = read_json(_local_file(folder, folder / name), "a LeRobot processor").get("steps")
         if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
-            raise UserError(f"{folder / name} does not describe a LeRobot processor: `steps` must list objects.")
+            raise UserError(
+                f"{folder / name} does not describe a LeRobot processor: `steps` must list objects."
+            )
         for file in (step["state_file"] for step in steps if step.get("state_file")):
-            require(isinstance(file, str), f"{folder / name}: state_file={brief(file)} must be the name of a file.")
+            require(
+                isinstance(file, str),
+                f"{folder / name}: state_file={brief(file)} must be the name of a file.",
+            )
             tensors = read_safetensors(checked_file(folder, file, "statistics"))
             if all(f"{feature}.q01" in tensors for feature in _FEATURES.values()):
-                yield NormStats(**{target: _quantiles(tensors, source) for target, source in _FEATURES.items()})
+                yield NormStats(
+                    **{target: _quantiles(tensors, source) for target, source in _FEATURES.items()}
+                )
 
 
 def _local_file(folder: Path, file: Path) -> Path:
-    """A file of a checkpoint, which must lie in it, compared with its checksum where there is one."""
+    """A file of a checkpoint, which must lie in it, compared with its checksum where
+    there is one.
+    """
     return checked_file(folder, file.relative_to(folder).as_posix(), "statistics")
 
 

@@ -1,6 +1,8 @@
-"""Name tables: how a foreign checkpoint names and lays out our tensors, written once and read in both directions.
+"""Name tables: how a foreign checkpoint names and lays out our tensors, written once and read in
+both directions.
 
-A package supplies a table for its own modules; an adapter in `weights/` applies the tables to whole checkpoints.
+A package supplies a table for its own modules; an adapter in `weights/` applies the tables to whole
+checkpoints.
 """
 
 import math
@@ -35,7 +37,9 @@ class Piece:
 
     def to_target(self, tensor: Tensor) -> Tensor:
         if self.layer is not None:
-            tensor = tensor[self.layer].clone()  # a tensor of its own, which keeps no other layer in memory
+            tensor = tensor[
+                self.layer
+            ].clone()  # a tensor of its own, which keeps no other layer in memory
         return rearrange(tensor, self.pattern, **self.axes) if self.pattern else tensor
 
     def to_source(self, tensor: Tensor) -> Tensor:
@@ -45,7 +49,9 @@ class Piece:
         return rearrange(tensor, f"{right} -> {left}", **self.axes)
 
     def rows(self) -> int:
-        """How many rows of our tensor this piece fills; asked only where several pieces share one."""
+        """How many rows of our tensor this piece fills; asked only where several
+        pieces share one.
+        """
         right = self.pattern.split("->")[1].strip()
         first = right[1:].split(")")[0] if right.startswith("(") else right.split()[0]
         return math.prod(self.axes[axis] for axis in first.split())
@@ -57,7 +63,9 @@ NameTable = dict[str, list[Piece]]
 
 @dataclass(frozen=True)
 class Unread:
-    """A foreign tensor, or one layer of it, that no action reads: dropped when read, zeros when written."""
+    """A foreign tensor, or one layer of it, that no action reads: dropped when read, zeros when
+    written.
+    """
 
     path: str
     shape: tuple[int, ...]
@@ -66,7 +74,9 @@ class Unread:
 
 @dataclass(frozen=True)
 class Derived:
-    """A foreign tensor that follows from the configuration: recomputed, never read, and written for other readers."""
+    """A foreign tensor that follows from the configuration: recomputed, never read, and written for
+    other readers.
+    """
 
     path: str
     make: Callable[[], Tensor]
@@ -79,14 +89,20 @@ def prefixed(prefix: str, table: NameTable) -> NameTable:
 
 def linear(path: str, *, layer: int | None = None) -> NameTable:
     """A linear layer stored as kernel (in, out), with its bias."""
-    kernel, bias = Piece(f"{path}/kernel", "i o -> o i", layer=layer), Piece(f"{path}/bias", layer=layer)
+    kernel, bias = (
+        Piece(f"{path}/kernel", "i o -> o i", layer=layer),
+        Piece(f"{path}/bias", layer=layer),
+    )
     return {"weight": [kernel], "bias": [bias]}
 
 
 def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Translate a foreign checkpoint into our names and layouts."""
     missing = sorted({p.path for pieces in table.values() for p in pieces} - set(source))
-    require(not missing, f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
+    require(
+        not missing,
+        f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}",
+    )
     target = {}
     for name, pieces in table.items():
         try:
@@ -99,9 +115,14 @@ def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def write(
-    table: NameTable, unread: Iterable[Unread], target: Mapping[str, Tensor], derived: Iterable[Derived] = ()
+    table: NameTable,
+    unread: Iterable[Unread],
+    target: Mapping[str, Tensor],
+    derived: Iterable[Derived] = (),
 ) -> dict[str, Tensor]:
-    """Translate our tensors into the foreign names and layouts; what no action reads is written as zeros."""
+    """Translate our tensors into the foreign names and layouts; what no action reads is written as
+    zeros.
+    """
     layers: dict[str, dict[int, Tensor]] = defaultdict(dict)
     released: dict[str, Tensor] = {}
 
@@ -113,7 +134,9 @@ def write(
 
     example = next(iter(target.values()))
     for name, pieces in table.items():
-        parts = target[name].split([p.rows() for p in pieces]) if len(pieces) > 1 else [target[name]]
+        parts = (
+            target[name].split([p.rows() for p in pieces]) if len(pieces) > 1 else [target[name]]
+        )
         for piece, part in zip(pieces, parts, strict=True):
             put(piece.path, piece.layer, piece.to_source(part))
     for gap in unread:
@@ -129,10 +152,11 @@ class Adapter:
     """How a foreign format names and lays out the tensors of one policy.
 
     table: our name → the foreign tensors it is made of.
-    unread: foreign tensors, or layers of them, that no action reads: dropped when read, zeros when written.
-    tied: foreign name → the foreign name it repeats: optional when read, written as a copy.
-    derived: foreign constants that follow from the configuration: dropped when read, recomputed when written.
-    fresh: our names that a checkpoint to start from may lack, beside the memory's: heads that are trained anew.
+    unread: foreign tensors, or layers of them, that no action reads: dropped when read, zeros when
+    written. tied: foreign name → the foreign name it repeats: optional when read, written as a
+    copy. derived: foreign constants that follow from the configuration: dropped when read,
+    recomputed when written. fresh: our names that a checkpoint to start from may lack, beside the
+    memory's: heads that are trained anew.
     """
 
     table: NameTable
@@ -150,35 +174,52 @@ class Adapter:
         homeless = sorted(set(target) - set(self.table))
         require(
             not homeless,
-            f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds memoryless "
-            "policies without adapters: convert another policy, merge the adapters first, or choose another format.",
+            f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds"
+            " memoryless policies without adapters: convert another policy, merge the adapters"
+            " first, or choose another format.",
         )
         released = write(self.table, self.unread, target, self.derived)
         return released | {name: released[original] for name, original in self.tied.items()}
 
     def shapes(self, target: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
-        """Every foreign name but the derived ones, with its shape, where ours have the shapes of `target`."""
+        """Every foreign name but the derived ones, with its shape, where ours have the shapes of
+        `target`.
+        """
         on_meta = {name: torch.empty_like(target[name], device="meta") for name in self.table}
         released = write(self.table, self.unread, on_meta)
         released |= {name: released[original] for name, original in self.tied.items()}
         return {name: tuple(tensor.shape) for name, tensor in released.items()}
 
-    def translate(self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+    def translate(
+        self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str
+    ) -> dict[str, Tensor]:
         """Read foreign tensors into our names; `target` gives the shapes they must have."""
         self.check_fit(released, target, source)
-        for constant in self.derived:  # what a checkpoint stores of them is what this configuration gives
+        for (
+            constant
+        ) in self.derived:  # what a checkpoint stores of them is what this configuration gives
             if constant.path in released:
-                stored, expected = (x.real.float().cpu() for x in (released[constant.path], constant.make()))
+                stored, expected = (
+                    x.real.float().cpu() for x in (released[constant.path], constant.make())
+                )
                 require(
-                    stored.shape == expected.shape and torch.allclose(stored, expected, rtol=1e-2, atol=1e-2),
-                    f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
-                    f"gives {tuple(expected.shape)}: it was trained with other sizes or rates; set the same here.",
+                    stored.shape == expected.shape
+                    and torch.allclose(stored, expected, rtol=1e-2, atol=1e-2),
+                    f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant"
+                    f" this configuration gives {tuple(expected.shape)}: it was trained with other"
+                    " sizes or rates; set the same here.",
                 )
         derived = {constant.path for constant in self.derived}
-        return read(self.table, {name: tensor for name, tensor in released.items() if name not in derived})
+        return read(
+            self.table, {name: tensor for name, tensor in released.items() if name not in derived}
+        )
 
-    def check_fit(self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str) -> None:
-        """Compare names and shapes alone, so that foreign tensors may still be on meta: not read yet."""
+    def check_fit(
+        self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str
+    ) -> None:
+        """Compare names and shapes alone, so that foreign tensors may still be on meta: not read
+        yet.
+        """
         shapes, derived = self.shapes(target), {constant.path for constant in self.derived}
         tensors = {name: tensor for name, tensor in released.items() if name not in derived}
         check_fit(tensors, shapes, source, optional=set(shapes) - self.needed())
@@ -189,12 +230,16 @@ def pi05_of(policy: Policy) -> Pi05Backbone:
     backbone = getattr(policy, "backbone", None)
     if not isinstance(backbone, Pi05Backbone):
         raise UserError(
-            f"Checkpoints of LeRobot's π0.5, openpi and the released trees hold π0.5; this policy's backbone is "
-            f"{type(backbone or policy).__name__}."
+            "Checkpoints of LeRobot's π0.5, openpi and the released trees hold π0.5; this policy's"
+            f" backbone is {type(backbone or policy).__name__}."
         )
     return backbone
 
 
 def memory_parameters(policy: Policy) -> set[str]:
-    """Names of the tensors a policy has beyond memoryless π0.5: memory, integration, and the memory's own expert."""
-    return {name for name in policy.state_dict() if policy.finetune_spec.component_of(name) == "memory"}
+    """Names of the tensors a policy has beyond memoryless π0.5: memory, integration, and the
+    memory's own expert.
+    """
+    return {
+        name for name in policy.state_dict() if policy.finetune_spec.component_of(name) == "memory"
+    }

@@ -19,31 +19,51 @@ def find_torch_files(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix in SUFFIXES and file.is_file())
 
 
-_REMEDY = "It is damaged, or holds objects, which are code and are not run. Download or copy it again."
+_REMEDY = (
+    "It is damaged, or holds objects, which are code and are not run. Download or copy it again."
+)
 
 
 def load_torch_file(path: Path, what: str, mapped: bool = False) -> Any:
-    """Read a file that `torch.save` wrote, tensors on the CPU. Objects in it are code, and are not run.
+    """Read a file that `torch.save` wrote, tensors on the CPU. Objects in it are code, and are not
+    run.
 
     Args:
         what: the file is, for the message.
-        mapped: read a tensor when it is used, without a check of its bytes. Files from before torch 1.6 are read whole.
+        mapped: read a tensor when it is used, without a check of its bytes. Files from before torch
+            1.6 are read whole.
     """
     require_file(path, what)  # torch would wait for a pipe without end
     with decoding(path, what, _REMEDY):
-        return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped and zipfile.is_zipfile(path))
+        return torch.load(
+            path, map_location="cpu", weights_only=True, mmap=mapped and zipfile.is_zipfile(path)
+        )
 
 
 def read_torch_file(path: Path, mapped: bool = False) -> dict[str, Tensor]:
-    """The tensors of a file, by name (of tables by part: part and name). mapped: as for `load_torch_file`."""
+    """The tensors of a file, by name (of tables by part: part and name). mapped: as for
+    `load_torch_file`.
+    """
     content = load_torch_file(path, "weights", mapped)
     for key in MODEL:
         if isinstance(content, dict) and isinstance(content.get(key), dict):
             content = content[key]
             break
-    if isinstance(content, dict) and content and all(isinstance(part, dict) for part in content.values()):
-        content = {f"{part}.{name}": tensor for part, tensors in content.items() for name, tensor in tensors.items()}
-    if not isinstance(content, dict) or not content or not all(isinstance(value, Tensor) for value in content.values()):
+    if (
+        isinstance(content, dict)
+        and content
+        and all(isinstance(part, dict) for part in content.values())
+    ):
+        content = {
+            f"{part}.{name}": tensor
+            for part, tensors in content.items()
+            for name, tensor in tensors.items()
+        }
+    if (
+        not isinstance(content, dict)
+        or not content
+        or not all(isinstance(value, Tensor) for value in content.values())
+    ):
         description = listed(content) if isinstance(content, dict) else type(content).__name__
         raise UserError(f"{path} holds no table of tensors, but {description}.")
     return {str(name): tensor for name, tensor in content.items()}

@@ -29,8 +29,11 @@ BEFORE, AFTER = "policy_preprocessor", "policy_postprocessor"
 _QUANTILES = {"VISUAL": "IDENTITY", "STATE": "QUANTILES", "ACTION": "QUANTILES"}
 
 
-def write_pipelines(policy: MMEPolicy, folder: Path, about: dict[str, Any], stats: NormStats | None) -> str | None:
-    """Write both pipelines and their statistics, if LeRobot's steps can do what this policy's processor does.
+def write_pipelines(
+    policy: MMEPolicy, folder: Path, about: dict[str, Any], stats: NormStats | None
+) -> str | None:
+    """Write both pipelines and their statistics, if LeRobot's steps can do what this policy's
+    processor does.
 
     Args:
         about: LeRobot's `config.json`, whose features and relative actions they follow.
@@ -56,18 +59,30 @@ def write_pipelines(policy: MMEPolicy, folder: Path, about: dict[str, Any], stat
         "action_names": list(policy.embodiment.action.names),
     }
     reading = {
-        "tokenizer_name": "/".join(tokenizer.removeprefix(HUB).split("/")[:2]), "max_length": words["prompt_length"],
-        "task_key": "task", "padding_side": "right", "padding": "max_length", "truncation": True,
-    }  # fmt: skip
-    _write(folder, BEFORE, [
-        ("rename_observations_processor", {"rename_map": {}}),
-        ("to_batch_processor", {}),
-        ("relative_actions_processor", relative),
-        ("normalizer_processor", {"eps": 1e-8, "features": inputs | outputs, "norm_map": _QUANTILES}),
-        ("pi0_new_line_processor", {}),
-        ("tokenizer_processor", reading),
-        ("device_processor", {"device": "cpu", "float_dtype": None}),
-    ], stats)  # fmt: skip
+        "tokenizer_name": "/".join(tokenizer.removeprefix(HUB).split("/")[:2]),
+        "max_length": words["prompt_length"],
+        "task_key": "task",
+        "padding_side": "right",
+        "padding": "max_length",
+        "truncation": True,
+    }
+    _write(
+        folder,
+        BEFORE,
+        [
+            ("rename_observations_processor", {"rename_map": {}}),
+            ("to_batch_processor", {}),
+            ("relative_actions_processor", relative),
+            (
+                "normalizer_processor",
+                {"eps": 1e-8, "features": inputs | outputs, "norm_map": _QUANTILES},
+            ),
+            ("pi0_new_line_processor", {}),
+            ("tokenizer_processor", reading),
+            ("device_processor", {"device": "cpu", "float_dtype": None}),
+        ],
+        stats,
+    )
     _write(folder, AFTER, [
         ("unnormalizer_processor", {"eps": 1e-8, "features": outputs, "norm_map": _QUANTILES}),
         ("absolute_actions_processor", {"enabled": about["use_relative_actions"]}),
@@ -76,7 +91,9 @@ def write_pipelines(policy: MMEPolicy, folder: Path, about: dict[str, Any], stat
     return None
 
 
-def _write(folder: Path, name: str, steps: list[tuple[str, dict[str, Any]]], stats: NormStats) -> None:
+def _write(
+    folder: Path, name: str, steps: list[tuple[str, dict[str, Any]]], stats: NormStats
+) -> None:
     from safetensors.torch import save_file
 
     described: list[dict[str, Any]] = []
@@ -86,12 +103,17 @@ def _write(folder: Path, name: str, steps: list[tuple[str, dict[str, Any]]], sta
             file = f"{name}_step_{i}_{step}.safetensors"
             save_file(_tensors(stats), folder / file)
             described[-1]["state_file"] = file
-    (folder / f"{name}.json").write_text(json.dumps({"name": name, "steps": described}, indent=2) + "\n")
+    (folder / f"{name}.json").write_text(
+        json.dumps({"name": name, "steps": described}, indent=2) + "\n"
+    )
 
 
 def _tensors(stats: NormStats) -> dict[str, torch.Tensor]:
     def named(feature: str, of: QuantileStats) -> dict[str, torch.Tensor]:
-        return {f"{feature}.{key}": torch.tensor(value, dtype=torch.float32) for key, value in of.to_dict().items()}
+        return {
+            f"{feature}.{key}": torch.tensor(value, dtype=torch.float32)
+            for key, value in of.to_dict().items()
+        }
 
     return named("observation.state", stats.state) | named("action", stats.actions)
 
@@ -103,7 +125,10 @@ _SIZES = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"
 def check_target(policy: Policy, fmt: str) -> None:
     """Refuse a format that has no place for this policy, before anything is read."""
     if fmt in ("lerobot", "openpi") and policy.memory is not None:
-        raise UserError(f"The format {fmt!r} holds memoryless π0.5 only: it has no names for a memory's parameters.")
+        raise UserError(
+            f"The format {fmt!r} holds memoryless π0.5 only: it has no names for a memory's"
+            " parameters."
+        )
     if fmt == "released":
         released_table(mme_of(policy, "The released layout"))
     if fmt in METHOD_FORMATS:
@@ -115,21 +140,30 @@ def write_native(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormSt
     policy.save_pretrained(folder, dtype=_name(dtype))
 
 
-def write_lerobot(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
-    """Weights, `config.json` and processors for LeRobot's `PI05Policy`; statistics as openpi writes them, beside them.
+def write_lerobot(
+    policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None
+) -> None:
+    """Weights, `config.json` and processors for LeRobot's `PI05Policy`; statistics as openpi writes
+    them, beside them.
 
-    LeRobot adds the state of the moment to relative actions, also to later ones of a chunk: where there are such, the
-    folder says that one action of a chunk is executed. Cameras are called as in LeRobot's RoboMME environment.
+    LeRobot adds the state of the moment to relative actions, also to later ones of a chunk: where
+    there are such, the folder says that one action of a chunk is executed. Cameras are called as in
+    LeRobot's RoboMME environment.
     """
     policy = mme_of(policy, "LeRobot's layout of π0.5")
     size, robot = policy.backbone.image_size, policy.embodiment
     views = [camera.key or camera.name for camera in robot.cameras]
-    features = {f"observation.images.{view}": {"type": "VISUAL", "shape": [3, size, size]} for view in views}
+    features = {
+        f"observation.images.{view}": {"type": "VISUAL", "shape": [3, size, size]} for view in views
+    }
     absolute = [name for i, name in enumerate(robot.action.names) if i not in robot.action.relative]
     about = {
         "type": "pi05",
         "n_obs_steps": 1,
-        "input_features": {**features, "observation.state": {"type": "STATE", "shape": [robot.state.width]}},
+        "input_features": {
+            **features,
+            "observation.state": {"type": "STATE", "shape": [robot.state.width]},
+        },
         "output_features": {"action": {"type": "ACTION", "shape": [robot.action.width]}},
         **_SIZES,
         "dtype": _name(dtype),
@@ -145,7 +179,8 @@ def write_lerobot(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormS
     _write_json(folder / "config.json", about)
     if (reason := write_pipelines(policy, folder, about, stats)) is not None:
         warnings.warn(
-            f"Written without processors: {reason}. LeRobot's commands cannot open it; PI05Policy.from_pretrained can.",
+            f"Written without processors: {reason}. LeRobot's commands cannot open it;"
+            " PI05Policy.from_pretrained can.",
             stacklevel=2,
         )
     _write_safetensors(to_lerobot(policy, policy.state_dict()), folder, dtype)
@@ -156,22 +191,34 @@ def write_lerobot(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormS
 def write_openpi(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
     """Weights, `config.json` and statistics as openpi's PyTorch training writes them."""
     policy = mme_of(policy, "openpi's layout of π0.5")
-    about = {"action_dim": policy.action_dim, "action_horizon": policy.horizon, **_SIZES, "precision": _name(dtype)}
+    about = {
+        "action_dim": policy.action_dim,
+        "action_horizon": policy.horizon,
+        **_SIZES,
+        "precision": _name(dtype),
+    }
     _write_json(folder / "config.json", about)
     tensors = to_openpi(policy, policy.state_dict())
-    del tensors[EMBEDDING]  # of a tied pair, safetensors' save_model keeps the first name; its load_model wants no more
+    del tensors[
+        EMBEDDING
+    ]  # of a tied pair, safetensors' save_model keeps the first name; its load_model wants no more
     _write_safetensors(tensors, folder, dtype)
     _write_assets(folder, stats)
 
 
-def write_released(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+def write_released(
+    policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None
+) -> None:
     """A run with one step, 0, as the released JAX code lays it out."""
     policy = mme_of(policy, "The released layout")
     names = {target: released for released, target in VARIANTS.items()}
     variant = names.get(str(policy.config.get("name")))
     if variant is not None and policy.config.get("name") != "pi05":
         (folder / "history_config.txt").write_text(f"{variant}.yaml\n")
-    write_orbax({name: cast(tensor, dtype) for name, tensor in to_released(policy).items()}, folder / "0" / "params")
+    write_orbax(
+        {name: cast(tensor, dtype) for name, tensor in to_released(policy).items()},
+        folder / "0" / "params",
+    )
     _write_assets(folder / "0", stats)
 
 
@@ -183,7 +230,9 @@ _WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None
 }
 
 
-def write_policy(policy: Policy, folder: Path, fmt: str, dtype: torch.dtype, stats: NormStats | None) -> None:
+def write_policy(
+    policy: Policy, folder: Path, fmt: str, dtype: torch.dtype, stats: NormStats | None
+) -> None:
     """Write a policy into `folder` in a format of `FORMATS`."""
     writer = _WRITERS[fmt] if fmt in _WRITERS else METHOD_FORMATS[fmt].function("write")
     writer(policy, folder, dtype, stats)

@@ -10,21 +10,34 @@ INTRODUCTION = """# API
 
 Everything below is imported from `mme_vla` itself, and loaded when it is first used. [From Python](../start/python.md)
 shows it at work.
-"""
+"""  # noqa: E501
 GROUPS = {
     "A policy": ["build_policy", "MMEPolicy", "Policy", "Episode", "load_weights"],
     "Evaluation": ["evaluate", "probe", "make_env", "make_vec_env"],
     "Parts to subclass": [
-        "Memory", "PerceptualMemory", "RecurrentMemory", "HistoryTransform", "Integration", "Backbone", "Task",
+        "Memory",
+        "PerceptualMemory",
+        "RecurrentMemory",
+        "HistoryTransform",
+        "Integration",
+        "Backbone",
+        "Task",
         "Environment",
-        "SubgoalPredictor", "register",
+        "SubgoalPredictor",
+        "register",
     ],
     "What parts are given": [
-        "Batch", "HistoryTokens", "MemoryTokens", "History", "OnlineHistory", "CachedHistory", "StorageSpec",
+        "Batch",
+        "HistoryTokens",
+        "MemoryTokens",
+        "History",
+        "OnlineHistory",
+        "CachedHistory",
+        "StorageSpec",
         "Embodiment",
     ],
     "Mistakes": ["UserError"],
-}  # fmt: skip
+}
 
 
 def signature(thing: Any) -> str:
@@ -39,7 +52,9 @@ def signature(thing: Any) -> str:
 
 
 def wrapped(call: str, width: int = 76) -> str:
-    """A call with each argument on a line of its own where it is wider than the page's code blocks."""
+    """A call with each argument on a line of its own where it is wider than the page's
+    code blocks.
+    """
     if len(call) <= width:
         return call
     lines, depth = [""], 0
@@ -57,7 +72,9 @@ def wrapped(call: str, width: int = 76) -> str:
 
 
 def text_of(thing: Any) -> str:
-    """The docstring: prose as it is; sections and examples, whose layout carries meaning, as code."""
+    """The docstring: prose as it is; sections and examples, whose layout carries
+    meaning, as code.
+    """
     blocks = (inspect.getdoc(thing) or "").split("\n\n")
     parts: list[str] = []
     kept: list[str] = []
@@ -75,10 +92,14 @@ def _fenced(blocks: list[str]) -> list[str]:
 
 
 def members(kind: type) -> list[tuple[str, Any]]:
-    """The public methods and properties that a class of this library defines itself, in the order of the file."""
+    """The public methods and properties that a class of this library defines itself, in the order
+    of the file.
+    """
     found = []
     for name, member in vars(kind).items():
-        shown = inspect.isfunction(member) or isinstance(member, property | classmethod | staticmethod)
+        shown = inspect.isfunction(member) or isinstance(
+            member, property | classmethod | staticmethod
+        )
         if shown and not name.startswith("_") and inspect.getdoc(getattr(kind, name)):
             found.append((name, member))
     return found
@@ -89,7 +110,9 @@ def section(name: str) -> str:
     try:
         thing = getattr(mme_vla, name)
     except ImportError as error:
-        return f"### `{name}`\n\nNot described here, since the site was built without `{error.name}`."
+        return (
+            f"### `{name}`\n\nNot described here, since the site was built without `{error.name}`."
+        )
     called = wrapped(f"{name}{signature(thing)}") if signature(thing) else ""
     head = f"from mme_vla import {name}  # {thing.__module__}\n{called}".rstrip()
     parts = [f"### `{name}`", f"```python\n{head}\n```", text_of(thing)]
@@ -110,9 +133,14 @@ def page() -> str:
         ValueError: a public name is in no group.
     """
     named = {name for names in GROUPS.values() for name in names}
-    public = {name for name in mme_vla.__all__ if name != "__version__" and not name.isupper()}  # registries aside
+    public = {
+        name for name in mme_vla.__all__ if name != "__version__" and not name.isupper()
+    }  # registries aside
     if public != named:
-        raise ValueError(f"scripts/site/api_pages.py: GROUPS names other things than mme_vla: {sorted(public ^ named)}")
+        raise ValueError(
+            "scripts/site/api_pages.py: GROUPS names other things than mme_vla:"
+            f" {sorted(public ^ named)}"
+        )
     parts = [INTRODUCTION.strip()]
     for title, names in GROUPS.items():
         parts += [f"## {title}", *map(section, names)]

@@ -13,21 +13,38 @@ from mme_vla.cli import help as cli_help
 from mme_vla.errors import UserError
 
 GUIDES = {
-    "train": "start/getting-started.md", "evaluate": "evaluate/evaluation.md", "results": "evaluate/results.md",
-    "analyse": "probe/analyses.md", "probe": "probe/probe.md", "inspect": "start/getting-started.md",
-    "serve": "serve/serving.md", "harness": "serve/harness.md", "play": "evaluate/play.md", "convert": "train/data.md",
-    "exec-starts": "train/data.md", "cache": "train/cache.md", "nano": "train/nano.md",
-    "vision-pretrain": "train/nano.md", "record": "benchmark/record.md", "gallery": "benchmark/gallery.md",
-    "weights": "train/weights.md", "subgoal-build": "train/subgoal-training.md",
-    "subgoal-train": "train/subgoal-training.md", "sample": "train/data.md", "train-tokenizer": "train/data.md",
+    "train": "start/getting-started.md",
+    "evaluate": "evaluate/evaluation.md",
+    "results": "evaluate/results.md",
+    "analyse": "probe/analyses.md",
+    "probe": "probe/probe.md",
+    "inspect": "start/getting-started.md",
+    "serve": "serve/serving.md",
+    "harness": "serve/harness.md",
+    "play": "evaluate/play.md",
+    "convert": "train/data.md",
+    "exec-starts": "train/data.md",
+    "cache": "train/cache.md",
+    "nano": "train/nano.md",
+    "vision-pretrain": "train/nano.md",
+    "record": "benchmark/record.md",
+    "gallery": "benchmark/gallery.md",
+    "weights": "train/weights.md",
+    "subgoal-build": "train/subgoal-training.md",
+    "subgoal-train": "train/subgoal-training.md",
+    "sample": "train/data.md",
+    "train-tokenizer": "train/data.md",
     "docs": "extend/contributing.md",
-}  # fmt: skip
+}
 """Command → the page that shows it at work."""
 EXAMPLES = {
     "results": "python -m mme_vla.results --demo --html report.html",
     "analyse": "python -m mme_vla.analyse selection --output selection.mp4",
     "harness": "mme-vla harness --port 8000 --args.checkpoint=outputs/framesamp_modul/latest",
-    "weights": "mme-vla weights Yinpei/mme_vla_suite/perceptual-framesamp-modul checkpoints/framesamp_modul",
+    "weights": (
+        "mme-vla weights Yinpei/mme_vla_suite/perceptual-framesamp-modul"
+        " checkpoints/framesamp_modul"
+    ),
     "sample": "mme-vla sample datasets/full datasets/thinned",
     "train-tokenizer": "mme-vla train-tokenizer tokenizer",
     "docs": "mme-vla docs",
@@ -39,12 +56,16 @@ WIDTH = 78
 
 def config_of(command: str) -> str | None:
     """The stem of the YAML file that configures a command; None where it takes options instead."""
-    names = {usage.replace("mme_vla.", "").split()[-1]: stem for stem, usage in cli_help.COMMANDS.items()}
+    names = {
+        usage.replace("mme_vla.", "").split()[-1]: stem for stem, usage in cli_help.COMMANDS.items()
+    }
     return names.get(command)
 
 
 def help_text(command: str) -> str:
-    """What `mme-vla COMMAND --help` prints. Without the extra that the command needs: the error that names it."""
+    """What `mme-vla COMMAND --help` prints. Without the extra that the command needs: the error
+    that names it.
+    """
     before = sys.argv, os.environ.get("COLUMNS")
     sys.argv, os.environ["COLUMNS"] = [f"mme-vla {command}", "--help"], str(WIDTH)
     printed = io.StringIO()
@@ -68,10 +89,16 @@ def page(command: str) -> str:
     parts = [f"# `mme-vla {command}`", f"{purpose[0].upper()}{purpose[1:]}. {guide}"]
     stem = config_of(command)
     if stem is None:
-        parts += [f"```bash\n{EXAMPLES[command]}\n```", f"## Options\n\n```text\n{help_text(command)}\n```"]
+        parts += [
+            f"```bash\n{EXAMPLES[command]}\n```",
+            f"## Options\n\n```text\n{help_text(command)}\n```",
+        ]
         return "\n\n".join(parts) + "\n"
     file = config_pages.CONFIGS / f"{stem}.yaml"
-    parts += [config_pages.introduction(file), f"## Keys of [{file.name}](../../../configs/{file.name})"]
+    parts += [
+        config_pages.introduction(file),
+        f"## Keys of [{file.name}](../../../configs/{file.name})",
+    ]
     parts.append(config_pages.key_table(file))
     chosen = cli_help.defaults(file)
     if chosen.files:
@@ -109,5 +136,7 @@ def pages() -> dict[str, str]:
     """
     examples = EXAMPLES.keys() | filter(config_of, COMMANDS)
     if missing := COMMANDS.keys() - (GUIDES.keys() & examples):
-        raise ValueError(f"scripts/site/command_pages.py: no entry in GUIDES or EXAMPLES for {sorted(missing)}")
+        raise ValueError(
+            f"scripts/site/command_pages.py: no entry in GUIDES or EXAMPLES for {sorted(missing)}"
+        )
     return {f"reference/commands/{command}.md": page(command) for command in COMMANDS}

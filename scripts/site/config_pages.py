@@ -21,14 +21,16 @@ arguments: `build_policy("framesamp_modul", backbone="pi05", memory={"budget": 2
 | `--multirun` | run once for each choice: `model=framesamp_modul,tokendrop_modul` |
 
 A misspelt key is an error that names the nearest keys.
-"""
+"""  # noqa: E501
 
 
 def prose(text: str) -> str:
     """Text of a comment as Markdown: what is in angle brackets is no tag, a bar is no column."""
     pieces = text.split("`")  # every second one is in backticks, where only a bar means anything
     for i, piece in enumerate(pieces):
-        bare = piece if i % 2 else piece.replace("<", "&lt;").replace(">", "&gt;").replace("*", r"\*")
+        bare = (
+            piece if i % 2 else piece.replace("<", "&lt;").replace(">", "&gt;").replace("*", r"\*")
+        )
         pieces[i] = bare.replace("|", r"\|")
     return "`".join(pieces)
 
@@ -47,7 +49,9 @@ def introduction(file: Path) -> str:
 
 def key_table(file: Path) -> str:
     """A file's keys with their defaults and comments; empty where it has none."""
-    rows = [f"| {code(key.name)} | {code(key.default)} | {prose(key.comment)} |" for key in keys(file)]
+    rows = [
+        f"| {code(key.name)} | {code(key.default)} | {prose(key.comment)} |" for key in keys(file)
+    ]
     return "\n".join(["| key | default | |", "|---|---|---|", *rows]) if rows else ""
 
 
@@ -63,11 +67,18 @@ def groups() -> list[Path]:
 
 def overview() -> str:
     """Introduction, and a table of the groups with their files."""
-    files = {group.name: " · ".join(f"`{file.stem}`" for file in files_of(group)) for group in groups()}
+    files = {
+        group.name: " · ".join(f"`{file.stem}`" for file in files_of(group)) for group in groups()
+    }
     rows = [f"| [`{name}`](configuration/{name}.md) | {stems} |" for name, stems in files.items()]
     policy = section(CONFIGS / "policy.yaml", "## `build_policy`")
     return "\n\n".join(
-        [INTRODUCTION.strip(), "## Groups", "\n".join(["| group | files |", "|---|---|", *rows]), policy]
+        [
+            INTRODUCTION.strip(),
+            "## Groups",
+            "\n".join(["| group | files |", "|---|---|", *rows]),
+            policy,
+        ]
     )
 
 
@@ -77,7 +88,10 @@ def files_of(group: Path) -> list[Path]:
 
 def group_page(group: Path) -> str:
     """The files of a group, each with its keys."""
-    parts = [f"# `{group.name}`", f"`{group.name}=NAME` takes one of these files. *default* is the file's value."]
+    parts = [
+        f"# `{group.name}`",
+        f"`{group.name}=NAME` takes one of these files. *default* is the file's value.",
+    ]
     for file in files_of(group):
         title = f"## [`{group.name}={file.stem}`](../../../configs/{group.name}/{file.name})"
         parts.append(section(file, title))

@@ -1,7 +1,9 @@
-"""What MkDocs cannot know of the repository: generated pages, the files that pages link to, and links between them.
+"""What MkDocs cannot know of the repository: generated pages, the files that pages link to, and
+links between them.
 
-A page links to a file beside `docs/` (`../../configs/train.yaml`) as it does on a forge. In the site such a file is a
-page of its own, with its text as a code block, so that every link works offline.
+A page links to a file beside `docs/` (`../../configs/train.yaml`) as it does on a forge. In the
+site such a file is a page of its own, with its text as a code block, so that every link works
+offline.
 """
 
 import re
@@ -40,23 +42,36 @@ LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", "
 def generated() -> dict[str, str]:
     """Path under `docs/` → Markdown, of every page that is written at build time."""
     copies = {page: (ROOT / file).read_text(encoding="utf-8") for page, file in FROM_ROOT.items()}
-    return {**copies, "reference/api.md": api_pages.page(), **config_pages.pages(), **command_pages.pages()}
+    return {
+        **copies,
+        "reference/api.md": api_pages.page(),
+        **config_pages.pages(),
+        **command_pages.pages(),
+    }
 
 
 def on_files(files: Files, config: "MkDocsConfig") -> Files:
-    """Add the generated pages, a page for each linked file outside `docs/`, and the script that sorts tables."""
+    """Add the generated pages, a page for each linked file outside `docs/`, and the script that
+    sorts tables.
+    """
     pages = generated()
     for path, text in pages.items():
         files.append(File.generated(config, path, content=text))
-    files.append(File.generated(config, "javascripts/sort.js", content=(TEMPLATES / "sort.js").read_text()))
+    files.append(
+        File.generated(config, "javascripts/sort.js", content=(TEMPLATES / "sort.js").read_text())
+    )
     texts = {**pages, **{file.src_uri: file.content_string for file in files.documentation_pages()}}
-    for target in sorted({target for path, text in texts.items() for target in outside(path, text)}):
+    for target in sorted(
+        {target for path, text in texts.items() for target in outside(path, text)}
+    ):
         files.append(File.generated(config, shown_as(target), content=source_page(target)))
     return files
 
 
 def on_page_markdown(markdown: str, page: "Page", **_: object) -> str:
-    """Point links to files of the repository at their pages in the site, and rank the page in the search."""
+    """Point links to files of the repository at their pages in the site, and rank the page in the
+    search.
+    """
     folder = page.file.src_uri.partition("/")[0]
     if folder in BOOST:
         page.meta["search"] = {"boost": BOOST[folder]}
@@ -86,7 +101,8 @@ def shown_as(target: str) -> str:
 
 
 def outside(path: str, text: str) -> set[str]:
-    """The files and folders that a page links to and that are neither in `docs/` nor a page of the site.
+    """The files and folders that a page links to and that are neither in `docs/` nor a page of the
+    site.
 
     Raises:
         PluginError: a link leads to no file.
@@ -135,7 +151,10 @@ def source_page(target: str) -> str:
     else:
         text, language = path.read_text(encoding="utf-8"), LANGUAGES.get(path.suffix, "text")
     # Five backticks: a file may hold fences of its own. The search finds pages, not files.
-    return f"---\nsearch:\n  exclude: true\n---\n\n# `{target}`\n\n`````{language}\n{text.rstrip()}\n`````\n"
+    return (
+        "---\nsearch:\n  exclude: true\n---\n\n#"
+        f" `{target}`\n\n`````{language}\n{text.rstrip()}\n`````\n"
+    )
 
 
 def is_source(file: Path) -> bool:

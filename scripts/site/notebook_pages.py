@@ -11,7 +11,9 @@ ANSI = re.compile(r"\x1b\[[0-9;]*m")
 def page(path: Path) -> str:
     """A notebook's cells as Markdown."""
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-    parts = [f"---\ntitle: {path.name}\n---"] + [part for cell in cells for part in cell_parts(cell)]
+    parts = [f"---\ntitle: {path.name}\n---"] + [
+        part for cell in cells for part in cell_parts(cell)
+    ]
     return "\n\n".join(parts) + "\n"
 
 

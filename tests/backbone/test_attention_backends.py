@@ -1,4 +1,6 @@
-"""Every backend of attention computes what the additive mask does, for every table of who may see whom."""
+"""Every backend of attention computes what the additive mask does, for every table of who may see
+whom.
+"""
 
 from typing import Any
 
@@ -23,13 +25,17 @@ def inputs(table: Visibility, kv_heads: int) -> tuple[MaskLayout, list[Tensor]]:
     n = sum(span.length for span in spans)
     generator = torch.Generator().manual_seed(0)
     sizes = [(3, n, heads, 16) for heads in (4, kv_heads, kv_heads)]
-    return MaskLayout.of(spans, spans, validity(n), table), [torch.randn(size, generator=generator) for size in sizes]
+    return MaskLayout.of(spans, spans, validity(n), table), [
+        torch.randn(size, generator=generator) for size in sizes
+    ]
 
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
 @pytest.mark.parametrize("backend", OTHERS)
 @pytest.mark.parametrize("kv_heads", [1, 2])
-def test_answers_and_gradients_are_those_of_the_mask(backend: str, table: Visibility, kv_heads: int) -> None:
+def test_answers_and_gradients_are_those_of_the_mask(
+    backend: str, table: Visibility, kv_heads: int
+) -> None:
     layout, tensors = inputs(table, kv_heads)
     assert layout.visible.any(-1).all(), "every run should see a key here"
 
@@ -45,9 +51,13 @@ def test_answers_and_gradients_are_those_of_the_mask(backend: str, table: Visibi
         assert torch.allclose(actual, expected, atol=1e-4, rtol=1e-4)
 
 
-def test_keys_of_no_sample_get_no_gradient_whatever_the_kernel_leaves_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keys_of_no_sample_get_no_gradient_whatever_the_kernel_leaves_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def kernel(*arguments: Any) -> Tensor:
-        """Flash attention writes no gradient for rows past the last start: NaN here, any number on a GPU."""
+        """Flash attention writes no gradient for rows past the last start: NaN here, any number on
+        a GPU.
+        """
         for x in arguments[1:3]:
             is_invalid = (torch.arange(len(x)) >= arguments[4][-1])[:, None, None]
             x.register_hook(lambda gradient, mask=is_invalid: gradient.masked_fill(mask, torch.nan))
@@ -65,16 +75,25 @@ def test_keys_of_no_sample_get_no_gradient_whatever_the_kernel_leaves_there(monk
 @pytest.mark.parametrize("backend", OTHERS)
 def test_queries_that_see_nothing_get_numbers(backend: str) -> None:
     layout, tensors = inputs(TABLES["memory"], 1)
-    blind = MaskLayout(layout.lengths, layout.visible & (torch.arange(len(layout.lengths)) > 0)[:, None])
-    assert torch.isfinite(attend(*tensors, build_mask(blind, torch.float32, backend, compiled=False))).all()
+    blind = MaskLayout(
+        layout.lengths, layout.visible & (torch.arange(len(layout.lengths)) > 0)[:, None]
+    )
+    assert torch.isfinite(
+        attend(*tensors, build_mask(blind, torch.float32, backend, compiled=False))
+    ).all()
 
 
 @pytest.mark.parametrize("backend", ["sdpa", *OTHERS])
 def test_the_last_layer_reads_a_subset_of_the_queries(backend: str) -> None:
     layout, _ = inputs(TABLES["own"], 1)
-    full, rows = build_mask(layout, torch.float32, "sdpa", compiled=False), [slice(3, 5), slice(18, 22)]
+    full, rows = (
+        build_mask(layout, torch.float32, "sdpa", compiled=False),
+        [slice(3, 5), slice(18, 22)],
+    )
     assert isinstance(full, Tensor)
-    selected = select_rows(build_mask(layout, torch.float32, backend, compiled=False), rows, torch.float32)
+    selected = select_rows(
+        build_mask(layout, torch.float32, backend, compiled=False), rows, torch.float32
+    )
     assert torch.equal(selected, torch.cat([full[:, :, at] for at in rows], 2))
 
 
@@ -82,7 +101,12 @@ def test_the_last_layer_reads_a_subset_of_the_queries(backend: str) -> None:
 @pytest.mark.parametrize("backend", OTHERS)
 def test_a_policy_gives_the_same_loss_and_the_same_chunk(model: str, backend: str) -> None:
     def results(attention: str) -> tuple[float, Tensor]:
-        policy = small_policy(model, backbone=FEW_TOKENS, policy={"augment": False}, **{"+policy.attention": attention})
+        policy = small_policy(
+            model,
+            backbone=FEW_TOKENS,
+            policy={"augment": False},
+            **{"+policy.attention": attention},
+        )
         batch = random_batch(policy, 2)
         draws = policy.training_noise(2, torch.Generator().manual_seed(1))
         with torch.no_grad():
@@ -95,7 +119,8 @@ def test_a_policy_gives_the_same_loss_and_the_same_chunk(model: str, backend: st
 
 
 @pytest.mark.parametrize(
-    ("name", "words"), [("flecks", r"policy\.attention='flecks'.*flex"), ("cudnn", "auto, flex, sdpa, varlen")]
+    ("name", "words"),
+    [("flecks", r"policy\.attention='flecks'.*flex"), ("cudnn", "auto, flex, sdpa, varlen")],
 )
 def test_a_backend_that_is_none_is_refused(name: str, words: str) -> None:
     with pytest.raises(UserError, match=words):

@@ -15,14 +15,18 @@ from mme_vla.types import MemoryTokens
 
 
 def block(positions: Tensor | None, count: int = 3) -> Block:
-    return Block("images", torch.zeros(1, count, 4), torch.ones(1, count, dtype=torch.bool), "vlm", positions)
+    return Block(
+        "images", torch.zeros(1, count, 4), torch.ones(1, count, dtype=torch.bool), "vlm", positions
+    )
 
 
 def test_equal_coordinates_are_one_position() -> None:
     positions = torch.tensor([[0, 1, 5]])
     base, several = rotation(positions, 8), rotation(positions[..., None].expand(-1, -1, 3), 8)
     assert torch.equal(base.cos, several.cos) and torch.equal(base.sin, several.sin)
-    assert not torch.equal(base.cos, rotation(torch.tensor([[[0, 0, 0], [1, 2, 1], [5, 5, 4]]]), 8).cos)
+    assert not torch.equal(
+        base.cos, rotation(torch.tensor([[[0, 0, 0], [1, 2, 1], [5, 5, 4]]]), 8).cos
+    )
 
 
 def test_blocks_with_one_number_stand_beside_those_with_several() -> None:
@@ -52,7 +56,9 @@ def test_the_backbone_reads_coordinates_of_image_tokens() -> None:
         blocks = [replace(images, positions=positions), *others]
         hidden, _ = policy.backbone.transformer(  # type: ignore[operator]
             [*blocks, policy.backbone.action_block(chunk)],  # type: ignore[operator]
-            policy.backbone.transformer.layout([*blocks, policy.backbone.action_block(chunk)], injection.visibility),  # type: ignore[operator]
+            policy.backbone.transformer.layout(
+                [*blocks, policy.backbone.action_block(chunk)], injection.visibility
+            ),  # type: ignore[operator]
             policy.backbone.time_condition(time),  # type: ignore[operator]
             None,
         )
@@ -72,11 +78,16 @@ class PlacedContext(Context):
 
 
 @pytest.mark.parametrize(
-    ("model", "backbone"), [("framesamp_context", "nano"), ("openvla_oft_framesamp_context", "openvla_tiny")]
+    ("model", "backbone"),
+    [("framesamp_context", "nano"), ("openvla_oft_framesamp_context", "openvla_tiny")],
 )
-def test_a_backbone_that_counts_tokens_itself_refuses_coordinates(model: str, backbone: str) -> None:
+def test_a_backbone_that_counts_tokens_itself_refuses_coordinates(
+    model: str, backbone: str
+) -> None:
     policy: Any = build_policy(model, backbone=backbone)
     policy.integration.__class__ = PlacedContext
     kind = type(policy.backbone).__name__
-    with pytest.raises(UserError, match=rf"'memory' has positions of 3 numbers a token, and {kind} .*Allowed here"):
+    with pytest.raises(
+        UserError, match=rf"'memory' has positions of 3 numbers a token, and {kind} .*Allowed here"
+    ):
         policy.sample_actions(policy.full_batch())

@@ -31,7 +31,9 @@ def test_choices_are_sampled_from_the_softmax_over_the_offered_letters(temperatu
     frequency = space.decide(chunks, options)[:, 0, :4].mean(0)
     expected = (LOGITS / temperature).masked_fill(~OFFERED, -torch.inf).softmax(0)
     assert (frequency - expected).abs().max() < 0.015
-    assert torch.equal(chunks[:, 0, 4:], OUTPUT[0, :, 4:].expand(count, -1)), "without deviation the mean is taken"
+    assert torch.equal(chunks[:, 0, 4:], OUTPUT[0, :, 4:].expand(count, -1)), (
+        "without deviation the mean is taken"
+    )
 
 
 def test_the_log_probability_is_that_of_the_distributions() -> None:
@@ -40,14 +42,18 @@ def test_the_log_probability_is_that_of_the_distributions() -> None:
     chunks = one.sample(predict(OUTPUT), noise, 1)
     letters = chunks[..., :4].masked_fill(~OFFERED, -torch.inf).argmax(-1)
     categorical = Categorical(logits=(LOGITS / 0.5).masked_fill(~OFFERED, -torch.inf))
-    expected = categorical.log_prob(letters) + Normal(OUTPUT[0, 0, 4:], 0.1).log_prob(chunks[..., 4:]).sum(-1)
+    expected = categorical.log_prob(letters) + Normal(OUTPUT[0, 0, 4:], 0.1).log_prob(
+        chunks[..., 4:]
+    ).sum(-1)
     log_prob = one.log_prob(predict(OUTPUT), chunks, OFFERED.expand(50, -1))
     assert torch.allclose(log_prob, expected, atol=1e-5)
 
 
 def test_temperature_zero_takes_the_best_letter_and_has_no_log_probability() -> None:
     one = head(temperature=0.0)
-    noise = torch.stack([one.sampling_noise(torch.Generator().manual_seed(seed))["noise"] for seed in range(20)])
+    noise = torch.stack(
+        [one.sampling_noise(torch.Generator().manual_seed(seed))["noise"] for seed in range(20)]
+    )
     assert torch.equal(one.sample(predict(OUTPUT), noise, 1), OUTPUT.expand(20, -1, -1))
     with pytest.raises(UserError, match="temperature=0 has no log-probability"):
         one.log_prob(predict(OUTPUT), OUTPUT, None)

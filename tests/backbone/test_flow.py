@@ -24,7 +24,10 @@ def test_released_times_are_beta_and_lean_to_noise():
 def test_uniform_times_are_an_option():
     assert draw("uniform").mean() == pytest.approx(0.5, abs=0.01)
     assert (
-        build_policy("pi05", backbone={"time_distribution": "uniform"}).backbone.config.time_distribution == "uniform"
+        build_policy(
+            "pi05", backbone={"time_distribution": "uniform"}
+        ).backbone.config.time_distribution
+        == "uniform"
     )
     with pytest.raises(UserError, match="time_distribution"):
         build_policy("pi05", backbone={"time_distribution": "normal"})
@@ -35,7 +38,9 @@ def test_the_path_runs_from_actions_to_noise():
     start, velocity = flow.interpolate(actions, noise, torch.zeros(2))
     end, _ = flow.interpolate(actions, noise, torch.ones(2))
     assert torch.allclose(start, actions) and torch.allclose(end, noise)
-    assert torch.allclose(start + velocity, end, atol=1e-5)  # numbers near zero are differences of larger ones
+    assert torch.allclose(
+        start + velocity, end, atol=1e-5
+    )  # numbers near zero are differences of larger ones
 
 
 @pytest.mark.parametrize("steps", [1, 7, 10])
@@ -43,13 +48,18 @@ def test_euler_steps_of_the_true_velocity_end_at_the_actions(steps):
     actions, noise = torch.randn(2, 3, 4), torch.randn(2, 3, 4)
     times = flow.euler_times(steps, CPU)
     assert len(times) == steps and times[0] == 1 and times[-1] == pytest.approx(1 / steps, abs=1e-5)
-    assert torch.allclose(flow.euler(noise, steps, lambda x, i: noise - actions), actions, atol=1e-5)
+    assert torch.allclose(
+        flow.euler(noise, steps, lambda x, i: noise - actions), actions, atol=1e-5
+    )
 
 
 def test_max_pooling_reaches_the_stored_tokens():
     frames = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8)
     mean, largest = (
-        small_policy("framesamp_context", memory={"pooling": kind}).encode_frames(frames) for kind in ("mean", "max")
+        small_policy("framesamp_context", memory={"pooling": kind}).encode_frames(frames)
+        for kind in ("mean", "max")
     )
     assert mean.shape == largest.shape
-    assert (largest.float() >= mean.float() - 1e-2).all() and not torch.allclose(mean.float(), largest.float())
+    assert (largest.float() >= mean.float() - 1e-2).all() and not torch.allclose(
+        mean.float(), largest.float()
+    )

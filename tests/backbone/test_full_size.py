@@ -39,15 +39,24 @@ def test_names_and_shapes_equal_the_released_tree(variant: str, shared):
     policy = full_size(variant)
     state = policy.state_dict()
     table = released_table(policy)
-    assert set(table) == set(state), "every tensor of ours has a released place, and no place is invented"
+    assert set(table) == set(state), (
+        "every tensor of ours has a released place, and no place is invented"
+    )
     exported = write(table, released_unread(policy), state, released_derived(policy))
-    assert {k: tuple(v.shape) for k, v in exported.items()} == {k: tuple(v["shape"]) for k, v in tree["params"].items()}
+    assert {k: tuple(v.shape) for k, v in exported.items()} == {
+        k: tuple(v["shape"]) for k, v in tree["params"].items()
+    }
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_parameter_count_is_the_released_one_less_unread_and_derived(variant: str, shared):
-    summary = json.loads((shared / "spec" / "param_tree_summary.json").read_text())[VARIANTS[variant]]
+    summary = json.loads((shared / "spec" / "param_tree_summary.json").read_text())[
+        VARIANTS[variant]
+    ]
     policy = full_size(variant)
     unread = sum(math.prod(gap.shape) for gap in released_unread(policy))
     derived = sum(constant.make().numel() for constant in released_derived(policy))
-    assert sum(p.numel() for p in policy.parameters()) == summary["total_parameters"] - unread - derived
+    assert (
+        sum(p.numel() for p in policy.parameters())
+        == summary["total_parameters"] - unread - derived
+    )

@@ -16,9 +16,15 @@ from mme_vla.backbone.pi05 import Pi05Backbone
 from mme_vla.types import Batch
 
 SIZES = BackboneConfig(
-    VisionConfig(16, 2, 16, 1, 32, 2), ExpertConfig(16, 32), ExpertConfig(16, 32), depth=1, head_dim=8, vocab_size=32,
-    action_dim=4, horizon=3,
-)  # fmt: skip
+    VisionConfig(16, 2, 16, 1, 32, 2),
+    ExpertConfig(16, 32),
+    ExpertConfig(16, 32),
+    depth=1,
+    head_dim=8,
+    vocab_size=32,
+    action_dim=4,
+    horizon=3,
+)
 
 
 @register("head", "late_times")
@@ -45,9 +51,12 @@ def built(head: dict[str, Any]) -> Pi05Backbone:
 def batch() -> Batch:
     generator = torch.Generator().manual_seed(0)
     return Batch(
-        torch.rand(2, 1, 3, 16, 16, generator=generator), torch.ones(2, 1, dtype=torch.bool), torch.ones(2, 4).long(),
-        torch.ones(2, 4, dtype=torch.bool), actions=torch.randn(2, 3, 4, generator=generator),
-    )  # fmt: skip
+        torch.rand(2, 1, 3, 16, 16, generator=generator),
+        torch.ones(2, 1, dtype=torch.bool),
+        torch.ones(2, 4).long(),
+        torch.ones(2, 4, dtype=torch.bool),
+        actions=torch.randn(2, 3, 4, generator=generator),
+    )
 
 
 def test_own_head_defines_noise_and_loss() -> None:
@@ -55,7 +64,9 @@ def test_own_head_defines_noise_and_loss() -> None:
     noise, late = (b.training_noise(2, torch.Generator().manual_seed(1)) for b in (default, custom))
     assert torch.equal(late["time"], noise["time"] ** 2)
     injection = Injection(default.embed(batch()), PI05_VISIBILITY)
-    assert torch.allclose(custom.loss(batch(), injection, late), 3 * default.loss(batch(), injection, late))
+    assert torch.allclose(
+        custom.loss(batch(), injection, late), 3 * default.loss(batch(), injection, late)
+    )
 
 
 def test_clean_flow_reads_the_output_as_the_chunk() -> None:

@@ -1,4 +1,6 @@
-"""The worked example of docs/extend/add-a-backbone.md: checked, trained with a memory by the command, acts."""
+"""The worked example of docs/extend/add-a-backbone.md: checked, trained with a memory by the
+command, acts.
+"""
 
 import runpy
 import sys
@@ -17,9 +19,14 @@ from mme_vla.testing.small import random_batch
 
 EXAMPLE = REPOSITORY / "examples" / "regression"
 SMALL = {
-    "vision": {"image_size": 32, "patch_size": 2}, "vlm": {"width": 32, "mlp_dim": 64}, "depth": 2, "num_heads": 4,
-    "vocab_size": 128, "horizon": 5, "action_dim": 8,
-}  # fmt: skip
+    "vision": {"image_size": 32, "patch_size": 2},
+    "vlm": {"width": 32, "mlp_dim": 64},
+    "depth": 2,
+    "num_heads": 4,
+    "vocab_size": 128,
+    "horizon": 5,
+    "action_dim": 8,
+}
 
 
 def custom(integration: str = "context", memory: str = "framesamp") -> MMEPolicy:
@@ -75,11 +82,24 @@ def run(name: str, *words: str) -> None:
 
 @pytest.fixture
 def trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> Path:
-    """A checkpoint that the command trained, the backbone's file alone naming all that goes with it."""
+    """A checkpoint that the command trained, the backbone's file alone naming all that goes with
+    it.
+    """
     monkeypatch.setattr(sys, "argv", [])
     monkeypatch.chdir(EXAMPLE)
-    small = ["backbone.vision.image_size=16", "backbone.vision.patch_size=1", "backbone.depth=1", "memory.every=8"]
-    brief = ["train.steps=2", "train.val_samples=2", "train.open_loop_chunks=1", "train.workers=0", "logger=none"]
+    small = [
+        "backbone.vision.image_size=16",
+        "backbone.vision.patch_size=1",
+        "backbone.depth=1",
+        "memory.every=8",
+    ]
+    brief = [
+        "train.steps=2",
+        "train.val_samples=2",
+        "train.open_loop_chunks=1",
+        "train.workers=0",
+        "logger=none",
+    ]
     choices = ["--config-dir", "configs", "backbone=regression", "model=framesamp_context"]
     run("train", *choices, *small, *brief, f"hydra.run.dir={tmp_path / 'run'}")
     capsys.readouterr()
@@ -99,9 +119,24 @@ def test_a_checkpoint_of_it_works_in_every_command(
     assert "regression" in capsys.readouterr().out
     if find_spec("mani_skill") is None:
         pytest.skip("the simulator (extra `sim`) is not installed")
-    words = ["tasks=StopCube", "episodes=1", "max_steps=1", "workers=1", "render=false", "execute=1"]
-    run("evaluate", f"checkpoint={trained}", *words, f"output={tmp_path / 'records'}", "--trust-plugins")
-    assert [record.outcome for record in read_records(tmp_path / "records" / "episodes.jsonl")] == ["timeout"]
+    words = [
+        "tasks=StopCube",
+        "episodes=1",
+        "max_steps=1",
+        "workers=1",
+        "render=false",
+        "execute=1",
+    ]
+    run(
+        "evaluate",
+        f"checkpoint={trained}",
+        *words,
+        f"output={tmp_path / 'records'}",
+        "--trust-plugins",
+    )
+    assert [record.outcome for record in read_records(tmp_path / "records" / "episodes.jsonl")] == [
+        "timeout"
+    ]
 
 
 def test_what_a_memory_stores_is_rendered_for_its_grid(
@@ -109,12 +144,21 @@ def test_what_a_memory_stores_is_rendered_for_its_grid(
 ) -> None:
     monkeypatch.setattr(sys, "argv", [])
     monkeypatch.chdir(EXAMPLE)
-    words = ["--config-dir", "configs", "backbone=regression", "dataset=sample", "episode=0", "step=20"]
+    words = [
+        "--config-dir",
+        "configs",
+        "backbone=regression",
+        "dataset=sample",
+        "episode=0",
+        "step=20",
+    ]
     run("inspect", *words, "memory=framesamp", f"output={tmp_path}")
     assert [path.suffix for path in tmp_path.iterdir()] == [".png"]
     with pytest.raises(SystemExit):  # 64 / 8 = 8 tokens a side
         run("inspect", *words, "memory=framesamp", "memory.grid=16", "backbone.vision.patch_size=8")
-    assert "8×8 tokens a view pool to 1, 2, 4, 8 a side" in capsys.readouterr().err.replace("\n", " ")
+    assert "8×8 tokens a view pool to 1, 2, 4, 8 a side" in capsys.readouterr().err.replace(
+        "\n", " "
+    )
 
 
 def test_a_backbone_whose_file_names_no_processor_is_reported_how(tmp_path: Path) -> None:
@@ -122,5 +166,7 @@ def test_a_backbone_whose_file_names_no_processor_is_reported_how(tmp_path: Path
     (tmp_path / "backbone").mkdir()
     remaining = [line for line in lines.splitlines() if "processor" not in line]
     (tmp_path / "backbone" / "bare.yaml").write_text("\n".join(remaining))
-    with pytest.raises(UserError, match="No processor goes with the backbone 'regression': under `defaults`"):
+    with pytest.raises(
+        UserError, match="No processor goes with the backbone 'regression': under `defaults`"
+    ):
         build_policy("pi05", config_dir=tmp_path, backbone="bare")

@@ -1,4 +1,6 @@
-"""Who may see whom, run by run: the visibility table for whatever a valid token asks, and no row without a key."""
+"""Who may see whom, run by run: the visibility table for whatever a valid token asks, and no row
+without a key.
+"""
 
 import math
 
@@ -44,11 +46,18 @@ def test_a_subset_of_the_queries_has_the_mask_rows_of_all_queries() -> None:
 
 def test_a_block_without_a_row_is_named() -> None:
     with pytest.raises(UserError, match="'sounds' has no row"):
-        MaskLayout.of([Span("sounds", 2)], [Span("images", 2)], torch.ones(1, 2, dtype=torch.bool), PI05_VISIBILITY)
+        MaskLayout.of(
+            [Span("sounds", 2)],
+            [Span("images", 2)],
+            torch.ones(1, 2, dtype=torch.bool),
+            PI05_VISIBILITY,
+        )
 
 
 def test_the_number_behind_hidden_keys_survives_kernels_that_count_in_base_two() -> None:
-    least = torch.tensor(BIG_NEGATIVE, dtype=torch.float32) * torch.tensor(math.log2(math.e), dtype=torch.float32)
+    least = torch.tensor(BIG_NEGATIVE, dtype=torch.float32) * torch.tensor(
+        math.log2(math.e), dtype=torch.float32
+    )
     assert torch.isfinite(least)
     assert torch.tensor(1e4) + BIG_NEGATIVE == BIG_NEGATIVE, "a logit must vanish beside it"
 
@@ -64,7 +73,9 @@ def test_rows_of_a_mask_lie_where_fused_kernels_want_them(keys: int) -> None:
         assert all(stride % ALIGNMENT == 0 for stride in mask.stride()[2:-1])
 
 
-@pytest.mark.parametrize("model", ["pi05", "tokendrop_expert", "framesamp_context", "tokendrop_modul", "rmt_context"])
+@pytest.mark.parametrize(
+    "model", ["pi05", "tokendrop_expert", "framesamp_context", "tokendrop_modul", "rmt_context"]
+)
 def test_what_padding_asks_changes_no_loss_no_gradient_and_no_chunk(
     model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -79,12 +90,20 @@ def test_what_padding_asks_changes_no_loss_no_gradient_and_no_chunk(
         policy.train()
         loss, _ = policy(batch, draws)
         loss.backward()
-        gradients = {name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None}
-        return loss.detach(), gradients, policy.eval().sample_actions(batch, draws["noise"], steps=2)
+        gradients = {
+            name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None
+        }
+        return (
+            loss.detach(),
+            gradients,
+            policy.eval().sample_actions(batch, draws["noise"], steps=2),
+        )
 
     now = results()
 
-    def as_it_was(spans: list[Span], keys: list[Span], valid: Tensor, table: Visibility) -> MaskLayout:
+    def as_it_was(
+        spans: list[Span], keys: list[Span], valid: Tensor, table: Visibility
+    ) -> MaskLayout:
         asking = valid[:, -sum(span.length for span in spans) :]
         return MaskLayout((1,) * asking.shape[1], attention_mask(spans, keys, asking, valid, table))
 

@@ -1,4 +1,6 @@
-"""The nano backbone's vision tower: what its tokens say, alone and pooled, and the towers of earlier checkpoints."""
+"""The nano backbone's vision tower: what its tokens say, alone and pooled, and the towers of
+earlier checkpoints.
+"""
 
 import math
 from dataclasses import asdict
@@ -10,7 +12,17 @@ from torch import Tensor
 
 from mme_vla import UserError, build_policy
 from mme_vla.backbone.siglip import pool_grid
-from mme_vla.backbone.tower import CLASSES, COLUMNS, FACTORS, FAINT, ROWS, WAVES, WEIGHTS, TowerConfig, summarise
+from mme_vla.backbone.tower import (
+    CLASSES,
+    COLUMNS,
+    FACTORS,
+    FAINT,
+    ROWS,
+    WAVES,
+    WEIGHTS,
+    TowerConfig,
+    summarise,
+)
 from mme_vla.nano.pretraining import fresh_tower, label_cells
 from mme_vla.policy.mme import MMEPolicy
 
@@ -40,7 +52,9 @@ def test_the_one_token_of_a_frame_says_where_the_object_of_a_class_is() -> None:
     assert row[RED] / share[RED] == pytest.approx(within(0.23, ROWS), abs=1e-4)
     of_red = waves.view(K, WAVES, WAVES)[RED]
     c, r = (within(0.41, COLUMNS) + 1) / 2, (within(0.23, ROWS) + 1) / 2
-    assert of_red[2, 1] == pytest.approx(math.cos(2 * math.pi * c) * math.cos(math.pi * r), abs=1e-4)
+    assert of_red[2, 1] == pytest.approx(
+        math.cos(2 * math.pi * c) * math.cos(math.pi * r), abs=1e-4
+    )
 
 
 def test_several_objects_of_a_class_are_counted_and_their_middle_is_kept() -> None:
@@ -50,7 +64,9 @@ def test_several_objects_of_a_class_are_counted_and_their_middle_is_kept() -> No
 
 
 def test_presence_is_in_the_token_of_the_object_alone() -> None:
-    labels = label_cells(torch.tensor([0]), torch.tensor([RED]), torch.tensor([[0.19, 0.31]]), (1, 32))
+    labels = label_cells(
+        torch.tensor([0]), torch.tensor([RED]), torch.tensor([[0.19, 0.31]]), (1, 32)
+    )
     presence = summarise(*labels)[0, :, :K].view(8, 8, K)
     assert presence[2, 1, RED] == 1 and presence.sum() == 1
 
@@ -73,11 +89,17 @@ def test_the_shipped_weights_are_small_and_other_sizes_are_refused() -> None:
     with pytest.raises(UserError, match=r"backbone\.vision\.pretrained=false"):
         build_policy("pi05", backbone="nano", **{"backbone.vision.width_8": 80})  # type: ignore[arg-type]
     with pytest.raises(UserError, match="layout=segments is of checkpoints"):
-        build_policy("pi05", backbone="nano", **{"backbone.vision.layout": "segments", "backbone.goal": "swap"})  # type: ignore[arg-type]
+        build_policy(
+            "pi05",
+            backbone="nano",
+            **{"backbone.vision.layout": "segments", "backbone.goal": "swap"},
+        )  # type: ignore[arg-type]
 
 
 def test_the_checkpoint_of_before_keeps_its_tower() -> None:
-    """A red square on the table's grey, where a cube is seen: present in its token, and nowhere far from it."""
+    """A red square on the table's grey, where a cube is seen: present in its token, and nowhere far
+    from it.
+    """
     from mme_vla.backbone.nano_vision import CLASSES as SEGMENTS
     from mme_vla.backbone.nano_vision import ConvTower
 

@@ -1,7 +1,8 @@
-"""Each extra suffices alone: every command runs where the packages of all other extras cannot be imported.
+"""Each extra suffices alone: every command runs where the packages of all other extras cannot be
+imported.
 
-Which packages those are follows from pyproject.toml and from what is installed. A command that needs an extra names it,
-and the words that install it.
+Which packages those are follows from pyproject.toml and from what is installed. A command that
+needs an extra names it, and the words that install it.
 """
 
 import os
@@ -41,13 +42,15 @@ class Case(NamedTuple):
 
 
 TINY = "backbone.vision.depth=1 backbone.vision.image_size=16 backbone.vision.patch_size=1"
-TRAIN = f"mme_vla.train model=pi05 {TINY} train.steps=1 train.val_samples=1 train.open_loop_chunks=1"
+TRAIN = (
+    f"mme_vla.train model=pi05 {TINY} train.steps=1 train.val_samples=1 train.open_loop_chunks=1"
+)
 PLAY = "mme_vla.play task=StopCube episodes=1 max_choices=1 output=played"
 STEP = "run/checkpoints/step_000001"
 NANO = (
-    "task=VideoUnmask model=framesamp_modul demonstrations.easy=2 demonstrations.medium=0 demonstrations.hard=0 "
-    "train.steps=20 train.batch_size=4 train.val_every=10 episodes=2 max_steps=20 beside=[] also=[] rendered_for=[] "
-    "output=nano"
+    "task=VideoUnmask model=framesamp_modul demonstrations.easy=2 demonstrations.medium=0"
+    " demonstrations.hard=0 train.steps=20 train.batch_size=4 train.val_every=10 episodes=2"
+    " max_steps=20 beside=[] also=[] rendered_for=[] output=nano"
 )
 """The whole way of nanoMME, small: two demonstrations, twenty updates, two episodes."""
 
@@ -56,7 +59,11 @@ SUFFICE = [
     Case((), f"{TRAIN} output=run", "checkpoint"),
     Case((), "mme_vla.inspect dataset=sample episode=0 step=20", ".png"),
     Case((), f"mme_vla cache model=framesamp_modul {TINY} data.cache.root=kept", "frames"),
-    Case((), "mme_vla convert input=record_dataset_Alpha.h5 output=converted images=png", "2 episodes"),
+    Case(
+        (),
+        "mme_vla convert input=record_dataset_Alpha.h5 output=converted images=png",
+        "2 episodes",
+    ),
     Case((), "mme_vla exec-starts input=record_dataset_Alpha.h5 output=starts.json", "2 episodes"),
     Case((), f"mme_vla weights {STEP} lerobot --to lerobot", ""),
     Case((), "mme_vla subgoal-build input=sample output=rows sets=[simple]", "simple"),
@@ -64,29 +71,65 @@ SUFFICE = [
     Case((), "mme_vla.analyse selection --output kept.mp4 --every 128", "wrote kept.mp4"),
     Case((), "mme_vla train-tokenizer run", "tokenizer.model"),
     Case((), "mme_vla sample --help", "full"),
-    Case((), f"mme_vla.probe model=framesamp_modul backbone=tiny {TINY} recordings=sample recorded=1 with=[shuffle] "
-             "draws=2 moments=1 scan=false output=probed", "shuffle"),
+    Case(
+        (),
+        f"mme_vla.probe model=framesamp_modul backbone=tiny {TINY} recordings=sample recorded=1"
+        " with=[shuffle] draws=2 moments=1 scan=false output=probed",
+        "shuffle",
+    ),
     Case(("docs",), "mme_vla docs --build --output site", "index.html"),
     Case(("serve",), "mme_vla.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
     Case(("harness",), "mme_vla harness --help", "--args.flow_steps"),
     Case(("orbax",), f"mme_vla weights {STEP} jax --to released", ""),
-    Case(("baselines",), "mme_vla.train model=diffusion_policy train.steps=1 train.batch_size=1 train.val_samples=0 "
-                         "train.open_loop_chunks=0 output=diffused", "checkpoint"),
-    Case(("viz",), "mme_vla.analyse selection --output seen.mp4 --every 64 --rerun seen.rrd", "seen"),
-    Case(("vlm",), "mme_vla subgoal-train rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0 device=cpu "
-                   "batch=1 per_device_batch=1 gradient_checkpointing=false", ""),
-    Case(("sweep",), "mme_vla.evaluate model=pi05 launcher=joblib --cfg hydra", "hydra_joblib_launcher"),
-    Case(("sim",), f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
-                   "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
+    Case(
+        ("baselines",),
+        "mme_vla.train model=diffusion_policy train.steps=1 train.batch_size=1 train.val_samples=0 "
+        "train.open_loop_chunks=0 output=diffused",
+        "checkpoint",
+    ),
+    Case(
+        ("viz",), "mme_vla.analyse selection --output seen.mp4 --every 64 --rerun seen.rrd", "seen"
+    ),
+    Case(
+        ("vlm",),
+        "mme_vla subgoal-train rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0"
+        " device=cpu batch=1 per_device_batch=1 gradient_checkpointing=false",
+        "",
+    ),
+    Case(
+        ("sweep",),
+        "mme_vla.evaluate model=pi05 launcher=joblib --cfg hydra",
+        "hydra_joblib_launcher",
+    ),
+    Case(
+        ("sim",),
+        f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
+        "workers=1 render=false output=evaluated execute=1 flow_steps=1",
+        "timeout",
+    ),
     Case(("sim",), f"mme_vla.nano {NANO}", "page", draws=True),
-    Case(("sim",), "mme_vla vision-pretrain tasks=StopCube scenes=2 held_out=1 arrangements=1 steps=1 "
-                   "batch_size=1 output=tower", "nano_tower.safetensors", draws=True),
-    Case(("sim",), "mme_vla record task=PatternLock episodes=1 frames=[0] workers=1 output=recorded",
-         "recorded: 1 episodes", draws=True),
-    Case(("sim",), "mme_vla gallery task=StopCube episodes=1 tiles=2 output=shown", "1 tasks", draws=True),
+    Case(
+        ("sim",),
+        "mme_vla vision-pretrain tasks=StopCube scenes=2 held_out=1 arrangements=1 steps=1 "
+        "batch_size=1 output=tower",
+        "nano_tower.safetensors",
+        draws=True,
+    ),
+    Case(
+        ("sim",),
+        "mme_vla record task=PatternLock episodes=1 frames=[0] workers=1 output=recorded",
+        "recorded: 1 episodes",
+        draws=True,
+    ),
+    Case(
+        ("sim",),
+        "mme_vla gallery task=StopCube episodes=1 tiles=2 output=shown",
+        "1 tasks",
+        draws=True,
+    ),
     Case(("sim",), f"{PLAY} player=random", "records:"),
     Case(("sim", "play"), f"{PLAY}2 port=0", "open http", wait="ready at http"),
-]  # fmt: skip
+]
 
 NEED = [
     Case((), "mme_vla.evaluate model=pi05 backbone=tiny", "sim", 2),
@@ -148,7 +191,9 @@ def needs() -> dict[str, set[str]]:
     packages: dict[str, set[str]] = {}
     for requirement in map(Requirement, requires("mme-vla") or []):
         extra = re.search(r"extra == ['\"](\w+)['\"]", str(requirement.marker))
-        packages.setdefault(extra[1] if extra else "", set()).add(canonicalize_name(requirement.name))
+        packages.setdefault(extra[1] if extra else "", set()).add(
+            canonicalize_name(requirement.name)
+        )
     return packages
 
 
@@ -177,7 +222,9 @@ def with_dependencies(packages: Iterable[str]) -> set[str]:
         required.add(package)
         for requirement in map(Requirement, requires(package) or []):
             extras = ("", *LEROBOT_EXTRAS) if package == "lerobot" else ("",)
-            if requirement.marker is None or any(requirement.marker.evaluate({"extra": extra}) for extra in extras):
+            if requirement.marker is None or any(
+                requirement.marker.evaluate({"extra": extra}) for extra in extras
+            ):
                 left.append(canonicalize_name(requirement.name))
     return required
 
@@ -185,7 +232,11 @@ def with_dependencies(packages: Iterable[str]) -> set[str]:
 def hidden(extras: Sequence[str]) -> set[str]:
     """Modules of the packages that only other extras name, and that no present package requires."""
     present = with_dependencies(set().union(*(needs()[extra] for extra in ("", *extras))))
-    return {module for package in set().union(*needs().values()) - present for module in modules().get(package, ())}
+    return {
+        module
+        for package in set().union(*needs().values()) - present
+        for module in modules().get(package, ())
+    }
 
 
 @cache
@@ -200,7 +251,8 @@ def can_draw() -> bool:
 
 
 def name_of(case: Case) -> str:
-    return f"{'+'.join(case.extras) or 'none'}:{case.words.split()[0].removeprefix('mme_vla.')}:{case.says}"
+    command = case.words.split()[0].removeprefix("mme_vla.")
+    return f"{'+'.join(case.extras) or 'none'}:{command}:{case.says}"
 
 
 @pytest.mark.slow
@@ -214,7 +266,11 @@ def test_the_command_runs_with_this_extra_alone(folder: Path, case: Case) -> Non
         assert sorted(record.episode for record in records) == [0, 1]
         assert {record.action_space for record in records} == {"waypoint"}
         page = (nano / "page.md").read_text()
-        assert "| framesamp_modul" in page and "| planner" in page and (nano / "learning.png").is_file()
+        assert (
+            "| framesamp_modul" in page
+            and "| planner" in page
+            and (nano / "learning.png").is_file()
+        )
         videos = list(nano.glob("videos/failure/**/*.mp4"))
         assert len(videos) == 1 and videos[0].name in page
         saved = {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")}
@@ -233,9 +289,17 @@ def test_a_command_names_the_extra_that_it_needs(folder: Path, case: Case) -> No
 
 def test_every_command_is_among_the_cases() -> None:
     words = [case.words.split() for case in SUFFICE]
-    assert {w[1] if w[0] == "mme_vla" else w[0].removeprefix("mme_vla.") for w in words} == set(COMMANDS)
+    assert {w[1] if w[0] == "mme_vla" else w[0].removeprefix("mme_vla.") for w in words} == set(
+        COMMANDS
+    )
 
 
 def test_each_extra_is_among_the_cases() -> None:
     # The services of the others need a key.
-    assert {e for case in SUFFICE for e in case.extras} == set(needs()) - {"", "dev", "gemini", "openai", "wandb"}
+    assert {e for case in SUFFICE for e in case.extras} == set(needs()) - {
+        "",
+        "dev",
+        "gemini",
+        "openai",
+        "wandb",
+    }

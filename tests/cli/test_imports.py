@@ -10,27 +10,57 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 WITHOUT = {
     "the package": (
-        ["lerobot", "hydra", "timm", "transformers", "h5py", "matplotlib", "accelerate", "tensorboard", "PIL"],
-        "import mme_vla\n"
-        "from mme_vla import HistoryTokens, MemoryTokens, Batch, UserError, MEMORIES, INTEGRATIONS, BACKBONES\n"
-        "from mme_vla import Memory, History, StorageSpec, OnlineHistory, CachedHistory",
+        [
+            "lerobot",
+            "hydra",
+            "timm",
+            "transformers",
+            "h5py",
+            "matplotlib",
+            "accelerate",
+            "tensorboard",
+            "PIL",
+        ],
+        (
+            "import mme_vla\nfrom mme_vla import HistoryTokens, MemoryTokens, Batch, UserError,"
+            " MEMORIES, INTEGRATIONS, BACKBONES\nfrom mme_vla import Memory, History, StorageSpec,"
+            " OnlineHistory, CachedHistory"
+        ),
     ),
     "the policy": (
-        ["lerobot", "hydra", "transformers", "h5py", "matplotlib", "accelerate", "tensorboard", "mani_skill"],
+        [
+            "lerobot",
+            "hydra",
+            "transformers",
+            "h5py",
+            "matplotlib",
+            "accelerate",
+            "tensorboard",
+            "mani_skill",
+        ],
         "from mme_vla import MMEPolicy, Episode",
     ),
     "subgoals": (
         ["transformers", "peft", "google", "av", "lerobot", "hydra"],
-        "from mme_vla.subgoal import build_predictor\nassert build_predictor({'name': 'oracle'}).kind == 'grounded'",
+        (
+            "from mme_vla.subgoal import build_predictor\nassert build_predictor({'name':"
+            " 'oracle'}).kind == 'grounded'"
+        ),
     ),
     "training": (
         [],
-        "import sys, mme_vla; from mme_vla import Policy, build_policy; import mme_vla.training.loop\n"
-        "assert not {'diffusers', 'torchvision', 'transformers'} & set(sys.modules), 'there, but not needed'",
+        (
+            "import sys, mme_vla; from mme_vla import Policy, build_policy; import"
+            " mme_vla.training.loop\nassert not {'diffusers', 'torchvision', 'transformers'} &"
+            " set(sys.modules), 'there, but not needed'"
+        ),
     ),
     "environments": (
         [],
-        "import sys, mme_vla.envs as e; e.make_env, e.episodes\nassert 'mani_skill' not in sys.modules",
+        (
+            "import sys, mme_vla.envs as e; e.make_env, e.episodes\nassert 'mani_skill' not in"
+            " sys.modules"
+        ),
     ),
 }
 """Packages that cannot be imported, and what works without them."""
@@ -42,6 +72,9 @@ TRY = "import sys\nsys.modules.update(dict.fromkeys({!r}))  # importing them rai
 @pytest.mark.parametrize("what", WITHOUT)
 def test_it_is_imported_without_what_it_does_not_need(what: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", TRY.format(*WITHOUT[what])], capture_output=True, text=True, cwd=REPOSITORY
+        [sys.executable, "-c", TRY.format(*WITHOUT[what])],
+        capture_output=True,
+        text=True,
+        cwd=REPOSITORY,
     )
     assert done.returncode == 0, done.stderr

@@ -44,7 +44,9 @@ def test_an_episode_shows_its_phases_and_subgoals(sample: EpisodeSource, console
     assert sample.subgoals(0, 100)["simple_subgoal"] in text
 
 
-def test_a_memory_is_rendered_as_it_selects(sample: EpisodeSource, console: Console, tmp_path: Path) -> None:
+def test_a_memory_is_rendered_as_it_selects(
+    sample: EpisodeSource, console: Console, tmp_path: Path
+) -> None:
     memory = build_memory(compose("inspect", ["memory=tokendrop"]))
     path = draw_memory(sample, 3, 120, memory, "tokendrop", tmp_path, console)
     with Image.open(path) as image:

@@ -1,4 +1,6 @@
-"""Commands that are interrupted, refused by the disk, or met by a second process in their folder."""
+"""Commands that are interrupted, refused by the disk, or met by a second process in
+their folder.
+"""
 
 import errno
 import os
@@ -16,15 +18,27 @@ from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
 from mme_vla.errors import UserError
 from mme_vla.training.runs import MAY_DIFFER, SUMMARY, check_content, claim_run
-from mme_vla.utils import PLAN, FolderLock, claim_plan, draft_of, drop_plan, remove_drafts, write_json
+from mme_vla.utils import (
+    PLAN,
+    FolderLock,
+    claim_plan,
+    draft_of,
+    drop_plan,
+    remove_drafts,
+    write_json,
+)
 
 PNG = ConvertOptions(images="png")
 CONFIG = {"train": {"steps": 3}, "seed": 1}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "code", "words"), [("SIGINT", 130, "Ctrl-C"), ("SIGTERM", 143, "SIGTERM")])
-def test_a_signal_ends_a_command_with_a_sentence_and_the_shells_code(number: str, code: int, words: str) -> None:
+@pytest.mark.parametrize(
+    ("number", "code", "words"), [("SIGINT", 130, "Ctrl-C"), ("SIGTERM", 143, "SIGTERM")]
+)
+def test_a_signal_ends_a_command_with_a_sentence_and_the_shells_code(
+    number: str, code: int, words: str
+) -> None:
     script = f"""
         import signal
         from mme_vla.cli.errors import print_user_errors
@@ -32,14 +46,20 @@ def test_a_signal_ends_a_command_with_a_sentence_and_the_shells_code(number: str
         with print_user_errors(), print_user_errors():
             signal.raise_signal(signal.{number})
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True
+    )
     assert (done.returncode, "Traceback" in done.stderr) == (code, False)
     assert done.stderr.count("\n") == 1
     assert f"Stopped by {words}" in done.stderr
 
 
-@pytest.mark.parametrize(("stop", "code"), [(KeyboardInterrupt(), 130), (Terminated(), 143)], ids=["Ctrl-C", "SIGTERM"])
-@pytest.mark.parametrize("hidden", [AttributeError("half-made"), UserError("cannot be composed")], ids=["bug", "user"])
+@pytest.mark.parametrize(
+    ("stop", "code"), [(KeyboardInterrupt(), 130), (Terminated(), 143)], ids=["Ctrl-C", "SIGTERM"]
+)
+@pytest.mark.parametrize(
+    "hidden", [AttributeError("half-made"), UserError("cannot be composed")], ids=["bug", "user"]
+)
 def test_a_signal_is_reported_though_a_finally_fails(
     stop: BaseException, code: int, hidden: Exception, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -55,12 +75,18 @@ def test_a_signal_is_reported_though_a_finally_fails(
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (OSError(errno.ENOSPC, "No space left on device", "a/metrics.jsonl"), "a/metrics.jsonl cannot be written"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "a/metrics.jsonl"),
+            "a/metrics.jsonl cannot be written",
+        ),
         (OSError(errno.EROFS, "Read-only file system", "b"), "can only be read"),
         (OSError(errno.EFBIG, "File too large", "b"), "ulimit -f"),
         (OSError(errno.EMFILE, "Too many open files", "b"), "ulimit -n"),
         (PermissionError(errno.EACCES, "Permission denied", "b"), "permission is denied"),
-        (OSError("Unable to create file (name = 'c.h5', errno = 28, error message = '…')"), "c.h5 cannot be written"),
+        (
+            OSError("Unable to create file (name = 'c.h5', errno = 28, error message = '…')"),
+            "c.h5 cannot be written",
+        ),
         (RuntimeError("I/O error: No space left on device (os error 28)"), "no room left"),
         (OSError("4000 requested and 96 written"), "no room left"),
     ],
@@ -77,7 +103,11 @@ def test_what_the_disk_refuses_is_reported_in_one_sentence(
 
 
 def test_other_errors_keep_their_traceback() -> None:
-    for error in (ValueError("errno = 28"), PermissionError(errno.EACCES, "a port"), OSError("strange")):
+    for error in (
+        ValueError("errno = 28"),
+        PermissionError(errno.EACCES, "a port"),
+        OSError("strange"),
+    ):
         with pytest.raises(type(error)), print_user_errors():
             raise error
 
@@ -122,7 +152,10 @@ def test_a_conversion_notices_that_an_input_changed_at_the_same_size(tmp_path: P
 def test_a_second_conversion_into_one_folder_is_refused(tmp_path: Path) -> None:
     write_file(tmp_path / "record_dataset_Alpha.h5", [4])
     refs = list_episodes(find_files([tmp_path]))
-    with FolderLock(tmp_path / "out.partial"), pytest.raises(UserError, match="in use by another conversion"):
+    with (
+        FolderLock(tmp_path / "out.partial"),
+        pytest.raises(UserError, match="in use by another conversion"),
+    ):
         convert(refs, tmp_path / "out", PNG)
 
 

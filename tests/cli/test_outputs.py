@@ -1,4 +1,6 @@
-"""Commands destroy nothing of the user's: what is there and is no earlier output of the command is refused by name."""
+"""Commands destroy nothing of the user's: what is there and is no earlier output of the command is
+refused by name.
+"""
 
 import json
 from pathlib import Path
@@ -43,7 +45,9 @@ def test_a_site_replaces_an_earlier_one_and_nothing_else(pages: Path, tmp_path: 
     assert [path.name for path in site.parent.iterdir()] == ["site"]
 
 
-@pytest.mark.parametrize("name", ["thesis.txt", "chapter/one.txt", ".notes", ".git/config", "empty/", "sub/mine.html"])
+@pytest.mark.parametrize(
+    "name", ["thesis.txt", "chapter/one.txt", ".notes", ".git/config", "empty/", "sub/mine.html"]
+)
 @pytest.mark.parametrize("built", [False, True], ids=["other folder", "in an earlier site"])
 def test_a_site_is_not_built_where_something_of_the_users_lies(
     built: bool, name: str, pages: Path, tmp_path: Path
@@ -79,11 +83,15 @@ def test_a_link_in_a_site_and_a_file_in_its_place_are_refused(pages: Path, tmp_p
         docs.build_site(tmp_path / "file")
 
 
-def test_an_empty_folder_takes_a_site_and_a_failed_build_leaves_the_earlier_one(pages: Path, tmp_path: Path) -> None:
+def test_an_empty_folder_takes_a_site_and_a_failed_build_leaves_the_earlier_one(
+    pages: Path, tmp_path: Path
+) -> None:
     (tmp_path / "site").mkdir()
     docs.build_site(tmp_path / "site")
     before = contents(tmp_path / "site")
-    (pages.parent / "mkdocs.yml").write_text("site_name: x\nvalidation: {links: {not_found: warn}}\n")
+    (pages.parent / "mkdocs.yml").write_text(
+        "site_name: x\nvalidation: {links: {not_found: warn}}\n"
+    )
     (pages / "index.md").write_text("[nowhere](nowhere.md)\n")
     with pytest.raises(UserError, match="not built"):
         docs.build_site(tmp_path / "site")
@@ -127,7 +135,9 @@ def test_an_analysis_replaces_neither_other_files_nor_one_beside_its_output(tmp_
     assert _beside(tmp_path / "figure.svg", ".csv") == table
 
 
-def test_a_tokenizer_of_a_checkpoint_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tokenizer_of_a_checkpoint_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(train_tokenizer, "train_tokenizer", lambda lines: b"trained")
     (tmp_path / "tokenizer.model").write_bytes(b"mine")
     with pytest.raises(UserError, match="another tokenizer"):
@@ -138,12 +148,16 @@ def test_a_tokenizer_of_a_checkpoint_is_not_replaced(tmp_path: Path, monkeypatch
     assert (tmp_path / "new" / "tokenizer.model").read_bytes() == b"trained"
 
 
-def test_a_gallery_replaces_no_readme_but_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gallery_replaces_no_readme_but_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def stop() -> None:
         raise RuntimeError("reached")
 
     monkeypatch.setattr(gallery, "require_simulator", stop)
-    cfg = SimpleNamespace(tasks="StopCube", task=None, episodes=[2], split="test", tiles=8, output=str(tmp_path))
+    cfg = SimpleNamespace(
+        tasks="StopCube", task=None, episodes=[2], split="test", tiles=8, output=str(tmp_path)
+    )
     monkeypatch.setattr(gallery, "named_tasks", lambda cfg: "StopCube")
     page = tmp_path / "README.md"
     page.write_text("# My project\n")

@@ -54,8 +54,17 @@ def tree(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("model=tokendrp_expert", "Unknown model 'tokendrp_expert'. Did you mean 'tokendrop_expert'? Known: small,"),
-        ("train.lrr=1", "Unknown config key 'train.lrr'. In 'train': Did you mean 'lr'? Known: clip, lr, note, steps."),
+        (
+            "model=tokendrp_expert",
+            "Unknown model 'tokendrp_expert'. Did you mean 'tokendrop_expert'? Known: small,",
+        ),
+        (
+            "train.lrr=1",
+            (
+                "Unknown config key 'train.lrr'. In 'train': Did you mean 'lr'? Known: clip, lr,"
+                " note, steps."
+            ),
+        ),
         ("~train.lrr", "Did you mean 'lr'?"),
         ("lr=1", "Unknown config key 'lr'. Did you mean 'train.lr'?"),
         ("modle=small", "Unknown config key 'modle'. Did you mean 'model'?"),
@@ -63,7 +72,10 @@ def tree(tmp_path: Path) -> Path:
         ("train.clip.norm.x=1", "'train.clip.norm' is a value"),
         ("train.steps=many", "'train.steps' is a number (default 10)"),
         ("train.clip=1", "'train.clip' is a section with the keys norm"),
-        ("train.clip={nrm: 1}", "Unknown config key 'train.clip.nrm'. In 'train.clip': Did you mean 'norm'?"),
+        (
+            "train.clip={nrm: 1}",
+            "Unknown config key 'train.clip.nrm'. In 'train.clip': Did you mean 'norm'?",
+        ),
         ("train.clip={of: 1}", "Known: norm. To add it: +train.clip.of=…"),
         ("fast=1", "'fast' is true or false"),
         ("train=3", "names no config of the group. Known: default."),
@@ -78,7 +90,11 @@ def test_a_mistake_is_answered_with_the_near_names(tree: Path, override: str, me
 
 
 @pytest.mark.parametrize(
-    "words", [["model=framesamp_modul", "~memory.name"], ["model=pi05", "integration=modulator", "+memory.budget=64"]]
+    "words",
+    [
+        ["model=framesamp_modul", "~memory.name"],
+        ["model=pi05", "integration=modulator", "+memory.budget=64"],
+    ],
 )
 def test_a_memory_without_a_name_is_reported(words: list[str]) -> None:
     with pytest.raises(UserError, match="`memory` has no name, only budget"):
@@ -114,21 +130,34 @@ def test_options_may_stand_anywhere(words: list[str]) -> None:
 def test_every_choice_of_a_sweep_is_checked(tree: Path) -> None:
     check_overrides(
         "demo",
-        ["model=small,tokendrop_expert", "train.steps=range(1,4)", "seed=choice(1,2)", "train.lr=interval(0,1)"],
+        [
+            "model=small,tokendrop_expert",
+            "train.steps=range(1,4)",
+            "seed=choice(1,2)",
+            "train.lr=interval(0,1)",
+        ],
         directory=tree,
     )
     with pytest.raises(UserError, match="Unknown model 'third'"):
-        check_overrides("demo", ["model=small,tokendrop_expert,third", "train.lr=1,2"], directory=tree)
+        check_overrides(
+            "demo", ["model=small,tokendrop_expert,third", "train.lr=1,2"], directory=tree
+        )
 
 
 def test_a_sweep_of_any_command_writes_under_outputs() -> None:
     for file in config_dir().glob("*.yaml"):
         if "hydra" in (cfg := OmegaConf.load(file)):
-            assert str(OmegaConf.to_container(cfg.hydra)["sweep"]["dir"]).startswith("outputs/sweeps/"), file
+            assert str(OmegaConf.to_container(cfg.hydra)["sweep"]["dir"]).startswith(
+                "outputs/sweeps/"
+            ), file
 
 
 def test_the_same_words_give_equal_but_separate_configurations() -> None:
-    words = ["model=framesamp_modul", "train.steps=3", "output=runs/one"]  # the default folder's name holds the time
+    words = [
+        "model=framesamp_modul",
+        "train.steps=3",
+        "output=runs/one",
+    ]  # the default folder's name holds the time
     one, other = (compose("train", words) for _ in range(2))
     assert one == other
     one.train.steps = 7
@@ -155,15 +184,21 @@ def test_composing_leaves_a_running_hydra_as_it_was(tree: Path) -> None:
 
 def test_plugins_of_several_files_add_up(tmp_path: Path) -> None:
     custom = {
-        "model/own.yaml": "# @package _global_\ndefaults: [{/memory: mine}]\nname: own\nplugins: [one]\n",
+        "model/own.yaml": (
+            "# @package _global_\ndefaults: [{/memory: mine}]\nname: own\nplugins: [one]\n"
+        ),
         "memory/mine.yaml": "# @package _global_\nmemory: {name: framesamp}\nplugins: [two, one]\n",
     }
     mine = write_tree(tmp_path / "mine", custom)
     assert compose("train", ["model=own"], extra_dirs=[mine]).plugins == ["two", "one"]
-    assert compose("train", ["model=own", "plugins=[three]"], extra_dirs=[mine]).plugins == ["three"]
+    assert compose("train", ["model=own", "plugins=[three]"], extra_dirs=[mine]).plugins == [
+        "three"
+    ]
 
 
-def test_plugins_are_imported_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plugins_are_imported_from_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "my_plugin_module.py").write_text("import sys\nloaded = True\n")
     (tmp_path / "my_broken_plugin.py").write_text("import no_such_module_here\n")
     monkeypatch.chdir(tmp_path)
@@ -249,7 +284,12 @@ def test_hydras_switches_still_work(app: Path, tmp_path: Path) -> None:
     ],
 )
 def test_a_command_ends_before_it_starts_a_run(
-    words: list[str], code: int, message: str, tree: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+    words: list[str],
+    code: int,
+    message: str,
+    tree: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture,
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["app", *words])
     with pytest.raises(SystemExit) as ended:
@@ -259,9 +299,16 @@ def test_a_command_ends_before_it_starts_a_run(
 
 
 @pytest.mark.parametrize("file", sorted(config_dir().glob("*.yaml")), ids=lambda file: file.stem)
-def test_no_key_of_a_command_has_the_name_of_a_folder_that_it_does_not_choose_from(file: Path) -> None:
+def test_no_key_of_a_command_has_the_name_of_a_folder_that_it_does_not_choose_from(
+    file: Path,
+) -> None:
     # Hydra reads such a word of the command line as a choice, and refuses it.
     tree = OmegaConf.to_container(OmegaConf.load(file))
-    chosen = {str(key).split("@")[0] for entry in tree["defaults"] if isinstance(entry, dict) for key in entry}
+    chosen = {
+        str(key).split("@")[0]
+        for entry in tree["defaults"]
+        if isinstance(entry, dict)
+        for key in entry
+    }
     folders = {folder.name for folder in config_dir().iterdir() if folder.is_dir()}
     assert not (set(tree) & folders) - chosen

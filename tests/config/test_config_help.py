@@ -1,4 +1,6 @@
-"""What commands answer to `--help`, to options that do not exist, and to keys that are called otherwise here."""
+"""What commands answer to `--help`, to options that do not exist, and to keys that are called
+otherwise here.
+"""
 
 import re
 import subprocess
@@ -33,12 +35,16 @@ def test_help_tells_what_a_command_does_with_examples_and_every_key(name: str) -
 
 def test_help_names_the_files_of_a_group_and_custom_ones_too(tmp_path: Path) -> None:
     (tmp_path / "memory").mkdir()
-    (tmp_path / "memory" / "mine.yaml").write_text("# Remembers what I like.\nname: mine\nspacing: 4 # steps apart\n")
+    (tmp_path / "memory" / "mine.yaml").write_text(
+        "# Remembers what I like.\nname: mine\nspacing: 4 # steps apart\n"
+    )
     text = help_text("train", ["memory"], [config_dir(), tmp_path])
     assert "memory=mine\n  Remembers what I like.\n" in text
     assert re.search(r"memory.spacing=4 +steps apart", text)
     assert re.search(r"memory.budget=512 +memory tokens; a multiple of grid²", text)
-    with pytest.raises(UserError, match=r"'memori' is no group of this command\. Did you mean 'memory'\?"):
+    with pytest.raises(
+        UserError, match=r"'memori' is no group of this command\. Did you mean 'memory'\?"
+    ):
         help_text("train", ["memori"], [config_dir()])
 
 
@@ -47,7 +53,9 @@ def test_help_needs_no_torch() -> None:
     watch = "import sys, runpy; sys.argv = ['x', '--help']\n" \
             "try: runpy.run_module('mme_vla.train', run_name='__main__')\n" \
             "except SystemExit: pass\nprint('torch' in sys.modules, file=sys.stderr)"  # fmt: skip
-    done = subprocess.run([sys.executable, "-c", watch], capture_output=True, text=True, cwd=REPOSITORY)
+    done = subprocess.run(
+        [sys.executable, "-c", watch], capture_output=True, text=True, cwd=REPOSITORY
+    )
     assert done.stderr.split()[-1] == "False", done.stderr
 
 
@@ -60,7 +68,11 @@ def test_help_needs_no_torch() -> None:
     ],
 )
 def test_an_option_that_does_not_exist_is_answered_with_the_word_to_type(
-    command: str, words: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str,
+    words: list[str],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(sys, "argv", [command, *words])
     with pytest.raises(SystemExit) as ended:

@@ -44,7 +44,9 @@ def test_an_endless_device_in_a_logs_place_is_refused(tmp_path: Path) -> None:
         read_run(tmp_path)
 
 
-@pytest.mark.parametrize("damage", ['{"text": "a", "input_tokens": Infinity, "output_tokens": 1}', "null"])
+@pytest.mark.parametrize(
+    "damage", ['{"text": "a", "input_tokens": Infinity, "output_tokens": 1}', "null"]
+)
 def test_a_damaged_reply_is_requested_again(tmp_path: Path, damage: str, caplog) -> None:
     artefacts.write_answers(tmp_path)
     cached = next((tmp_path / "answers").rglob("*.json"))
@@ -56,7 +58,9 @@ def test_a_damaged_reply_is_requested_again(tmp_path: Path, damage: str, caplog)
     assert artefacts.read_answers(tmp_path) == ("pick up the cube at <1, 2>", 12, 7)
 
 
-@pytest.mark.parametrize("record", ['"x"', '{"episode": 0}', '{"episode": 0, "seed": 1e3, "difficulty": "easy"}'])
+@pytest.mark.parametrize(
+    "record", ['"x"', '{"episode": 0}', '{"episode": 0, "seed": 1e3, "difficulty": "easy"}']
+)
 def test_metadata_of_another_form_is_refused(tmp_path: Path, record: str) -> None:
     artefacts.write_metadata(tmp_path)
     next(tmp_path.rglob("*.json")).write_text(f'{{"records": [{record}]}}')

@@ -1,4 +1,6 @@
-"""A memory and a task of one's own, in a package of one's own: they work in every command, once the user says so."""
+"""A memory and a task of one's own, in a package of one's own: they work in every command, once the
+user says so.
+"""
 
 import os
 import subprocess
@@ -74,7 +76,9 @@ USER_PACKAGE = "own_parts"
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a package of one's own, and a checkpoint of its memory after one update, in `checkpoint`."""
+    """A folder with a package of one's own, and a checkpoint of its memory after one update, in
+    `checkpoint`.
+    """
     folder = tmp_path_factory.mktemp("place")
     (folder / USER_PACKAGE).mkdir()
     (folder / USER_PACKAGE / "__init__.py").write_text("")
@@ -82,8 +86,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / USER_PACKAGE / "task.py").write_text(TASK.format(name="Stay"))
     (folder / "configs" / "model").mkdir(parents=True)
     (folder / "configs" / "model" / "fading.yaml").write_text(
-        "# @package _global_\ndefaults: [{/integration: context}]\nname: fading\nmemory: {name: fading}\n"
-        f"plugins: [{USER_PACKAGE}.memory]\n"
+        "# @package _global_\ndefaults: [{/integration: context}]\nname: fading\nmemory: {name:"
+        f" fading}}\nplugins: [{USER_PACKAGE}.memory]\n"
     )
     before = list(sys.path)
     sys.path.insert(0, str(folder))
@@ -92,7 +96,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         policy = build_policy("fading", config_dir=folder / "configs", backbone=small)
     finally:
         sys.path[:] = before
-        plugins._imported.pop(f"{USER_PACKAGE}.memory", None)  # not asked of other tests' worker processes
+        plugins._imported.pop(
+            f"{USER_PACKAGE}.memory", None
+        )  # not asked of other tests' worker processes
     policy.require_processor().stats = unit_stats()
     policy(random_batch(policy, 1, valid=32))[0].backward()
     torch.optim.SGD(policy.parameters(), 1e-3).step()
@@ -123,16 +129,29 @@ def opened_by_convert(folder: Path, trust: bool) -> None:
 
 
 def opened_by_analyse(folder: Path, trust: bool) -> None:
-    words = ["attention", "--checkpoint", str(folder), "--episodes", "0", "--most", "1", *[TRUST_WORD] * trust]
+    words = [
+        "attention",
+        "--checkpoint",
+        str(folder),
+        "--episodes",
+        "0",
+        "--most",
+        "1",
+        *[TRUST_WORD] * trust,
+    ]
     arguments = analyse._parser().parse_args(analyse.trust_as_flag(words))
     arguments.run(arguments)
 
 
-@pytest.mark.parametrize("opened", [opened_by_python, opened_by_inspect, opened_by_convert, opened_by_analyse])
+@pytest.mark.parametrize(
+    "opened", [opened_by_python, opened_by_inspect, opened_by_convert, opened_by_analyse]
+)
 def test_a_checkpoints_plugins_are_imported_only_when_the_user_says_so(
     opened: Callable[[Path, bool], None], foreign_run: Path
 ) -> None:
-    with pytest.raises(UserError, match=rf"plugin {USER_PACKAGE}\.memory.*{TRUST_FLAG}.*trust_plugins=True"):
+    with pytest.raises(
+        UserError, match=rf"plugin {USER_PACKAGE}\.memory.*{TRUST_FLAG}.*trust_plugins=True"
+    ):
         opened(foreign_run / "checkpoint", False)
     assert f"{USER_PACKAGE}.memory" not in sys.modules
     opened(foreign_run / "checkpoint", True)
@@ -157,13 +176,19 @@ def test_plugins_are_names_of_modules(names: str) -> None:
         import_plugins(OmegaConf.create(f"plugins: {names}"))
 
 
-@pytest.mark.skipif(find_spec("mani_skill") is None, reason="the simulator (extra `sim`) is not installed")
-def test_a_memory_and_a_task_of_the_user_are_evaluated_in_a_worker_process(foreign_run: Path, tmp_path: Path) -> None:
+@pytest.mark.skipif(
+    find_spec("mani_skill") is None, reason="the simulator (extra `sim`) is not installed"
+)
+def test_a_memory_and_a_task_of_the_user_are_evaluated_in_a_worker_process(
+    foreign_run: Path, tmp_path: Path
+) -> None:
     policy = MMEPolicy.from_pretrained(foreign_run / "checkpoint", trust_plugins=True)
     import_modules([f"{USER_PACKAGE}.task"])
     settings = RolloutSettings(max_steps=3, execute=2, flow_steps=1, workers=1, render=False)
     facts = RunFacts("fading", 1, 42, max_steps=3)
-    records = evaluate(policy, choose_episodes("Stay", 1), tmp_path, facts, settings, show_progress=False).records
+    records = evaluate(
+        policy, choose_episodes("Stay", 1), tmp_path, facts, settings, show_progress=False
+    ).records
     assert [(r.task, r.outcome, r.steps) for r in records] == [("Stay", "timeout", 4)]
 
 
@@ -172,7 +197,9 @@ def test_episodes_of_a_custom_task_have_separate_seeds(foreign_run: Path) -> Non
         pytest.skip("the simulator (extra `sim`) is not installed")
     import_modules([f"{USER_PACKAGE}.task"])
     seeds = {spec.seed for split in ("val", "test") for spec in metadata.episodes("Stay", split)}
-    benchmark = {spec.seed for split in ("val", "test") for spec in metadata.episodes("PickXtimes", split)}
+    benchmark = {
+        spec.seed for split in ("val", "test") for spec in metadata.episodes("PickXtimes", split)
+    }
     assert len(seeds) == 100
     assert not seeds & benchmark
     assert [job.episode for job in choose_episodes("Stay", [3], "val")] == [3]
@@ -181,8 +208,13 @@ def test_episodes_of_a_custom_task_have_separate_seeds(foreign_run: Path) -> Non
 @pytest.mark.slow
 def test_hydra_imports_nothing_from_the_folder_one_stands_in(tmp_path: Path) -> None:
     (tmp_path / "hydra_plugins" / "strange").mkdir(parents=True)
-    (tmp_path / "hydra_plugins" / "strange" / "__init__.py").write_text("open('ran', 'w').close()\n")
-    code = "import mme_vla.config.composition; from hydra.core.plugins import Plugins; Plugins.instance()"
+    (tmp_path / "hydra_plugins" / "strange" / "__init__.py").write_text(
+        "open('ran', 'w').close()\n"
+    )
+    code = (
+        "import mme_vla.config.composition; from hydra.core.plugins import Plugins;"
+        " Plugins.instance()"
+    )
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
     assert not (tmp_path / "ran").exists()
@@ -192,7 +224,9 @@ def test_a_file_where_one_stands_takes_no_place_of_an_installed_module(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "own_plugin_beside.py").write_text("import tabnanny\n")
-    (tmp_path / "tabnanny.py").write_text("raise AssertionError('this is not the installed module')\n")
+    (tmp_path / "tabnanny.py").write_text(
+        "raise AssertionError('this is not the installed module')\n"
+    )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     for name in ("tabnanny", "own_plugin_beside"):

@@ -12,8 +12,13 @@ from mme_vla.registry import Registry
 def test_a_name_that_ships_is_not_taken_before_it_is_used() -> None:
     """In a fresh process, in which nothing has been imported yet."""
     script = "import mme_vla\nmme_vla.register('memory', 'framesamp')(type('Mine', (), {}))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
-    assert "UserError: memory 'framesamp' ships with the library (mme_vla.memory.framesamp)" in done.stderr
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120
+    )
+    assert (
+        "UserError: memory 'framesamp' ships with the library (mme_vla.memory.framesamp)"
+        in done.stderr
+    )
 
 
 def test_a_name_is_taken_once() -> None:
@@ -35,7 +40,9 @@ class Named(Base):
 def test_an_option_that_is_passed_on_is_named_where_no_constructor_takes_it() -> None:
     parts: Registry[type] = Registry("part")
     parts.register("named")(Named)
-    with pytest.raises(UserError, match=r"part 'named' does not take these options: gird=4 .*Did you mean 'grid'"):
+    with pytest.raises(
+        UserError, match=r"part 'named' does not take these options: gird=4 .*Did you mean 'grid'"
+    ):
         parts.build({"name": "named", "gird": 4})
     with pytest.raises(TypeError, match="negative"):
         parts.build({"name": "named", "grid": -1})

@@ -1,4 +1,6 @@
-"""One reader turns a section into its dataclass; every mistake names the key, the value and what was expected."""
+"""One reader turns a section into its dataclass; every mistake names the key, the value and what
+was expected.
+"""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
@@ -35,9 +37,16 @@ class Outer:
 
 
 def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
-    options = {"name": "a", "inner": {"width": 3, "share": 1}, "other": {"width": 2}, "betas": [0, 1.0],
+    options = {
+        "name": "a",
+        "inner": {"width": 3, "share": 1},
+        "other": {"width": 2},
+        "betas": [0, 1.0],
         "places": [4, 5],
-             "fast": True, "limit": None, "anything": [{"x": 1}]}  # fmt: skip
+        "fast": True,
+        "limit": None,
+        "anything": [{"x": 1}],
+    }
     read = read_section(Outer, options, "outer")
     assert read == Outer("a", Inner(3, 1), Inner(2), (0, 1.0), (4, 5), True, None, None, [{"x": 1}])
     assert read_section(Outer, {"name": "a", "inner": Inner(7)}) == Outer("a", Inner(7))
@@ -48,8 +57,14 @@ def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
     ("given", "message"),
     [
         ({"name": "a", "fats": True}, r"Unknown key outer\.fats\. Did you mean 'fast'"),
-        ({"name": "a", "inner": {"width": 1, "shar": 1}}, r"Unknown key outer\.inner\.shar\. Did you mean 'share'"),
-        ({"name": "a", "other": {"widht": 1}}, r"Unknown key outer\.other\.widht\. Did you mean 'width'"),
+        (
+            {"name": "a", "inner": {"width": 1, "shar": 1}},
+            r"Unknown key outer\.inner\.shar\. Did you mean 'share'",
+        ),
+        (
+            {"name": "a", "other": {"widht": 1}},
+            r"Unknown key outer\.other\.widht\. Did you mean 'width'",
+        ),
         ({"fast": True}, r"outer lacks the key 'name'; it has fast"),
         ({"name": "a", "inner": {}}, r"outer\.inner lacks the key 'width'; it has none"),
         ({"name": 3}, r"outer\.name=3 must be a text"),
@@ -59,9 +74,15 @@ def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
         ({"name": "a", "inner": {"width": "3"}}, r"outer\.inner\.width='3' must be a whole number"),
         ({"name": "a", "inner": 3}, r"outer\.inner must be a section of keys, got 3"),
         ({"name": "a", "other": 3}, r"outer\.other=3 must be a section of keys or null"),
-        ({"name": "a", "betas": [0.1]}, r"outer\.betas=\[0\.1\] must be a list of 2 values: a number, a number"),
+        (
+            {"name": "a", "betas": [0.1]},
+            r"outer\.betas=\[0\.1\] must be a list of 2 values: a number, a number",
+        ),
         ({"name": "a", "betas": "ab"}, r"outer\.betas='ab' must be a list of 2"),
-        ({"name": "a", "places": [1, "x"]}, r"outer\.places=.* must be a list, each a whole number"),
+        (
+            {"name": "a", "places": [1, "x"]},
+            r"outer\.places=.* must be a list, each a whole number",
+        ),
         ({"name": "a", "port": 10}, r"outer\.port=10 must be a whole number from 0 to 9 or null"),
         ({"name": "a", "seconds": 0}, r"outer\.seconds=0 must be a number above 0"),
         ({"name": "a", "seconds": float("nan")}, r"outer\.seconds=nan must be a number above 0"),
@@ -69,7 +90,7 @@ def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
         ({"name": "a", "kind": 3}, r"outer\.kind=3 must be simple or grounded or null"),
         ([1], r"outer must be a section of keys, got \[1\]"),
     ],
-)  # fmt: skip
+)
 def test_a_mistake_names_key_value_and_expectation(given: Any, message: str) -> None:
     with pytest.raises(UserError, match=message):
         read_section(Outer, given, "outer")
@@ -87,12 +108,16 @@ def test_commands_read_their_settings_with_it() -> None:
     with pytest.raises(UserError, match=r"Unknown key train\.kepe\. Did you mean 'keep'"):
         TrainSettings.from_dict({"steps": 1, "batch_size": 1, "lr": 1, "kepe": {}})
     for wrong, message in (
-        ({"render": "no"}, "render='no' must be true or false"), ({"workers": 0}, "workers=0"),
-        ({"max_steps": 1.5}, "max_steps=1.5"), ({"split": "tset"}, "tset"),
+        ({"render": "no"}, "render='no' must be true or false"),
+        ({"workers": 0}, "workers=0"),
+        ({"max_steps": 1.5}, "max_steps=1.5"),
+        ({"split": "tset"}, "tset"),
         ({"env": "robome"}, "Unknown environment 'robome'"),
-        ({"video": "some"}, "video='some'"), ({"timeout_s": 0}, "timeout_s=0"), ({"draw": "need"}, "'needed'"),
+        ({"video": "some"}, "video='some'"),
+        ({"timeout_s": 0}, "timeout_s=0"),
+        ({"draw": "need"}, "'needed'"),
         ({"env": "official", "render": False}, "env=official"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(UserError, match=message):
             RolloutSettings.from_config({"model": "x", **wrong})
     with pytest.raises(UserError, match="MME_VLA_API_KEY"):

@@ -19,19 +19,53 @@ TOWER = {"width": 8, "depth": 2, "mlp_dim": 8, "num_heads": 2}
 @pytest.mark.parametrize(
     ("config", "section", "message"),
     [
-        (BackboneConfig, {"vision": {"image_size": 225}}, r"backbone\.vision\.image_size=225 must be a multiple of"),
-        (BackboneConfig, {"action": {"width": 16, "mlp_dim": -1}}, r"backbone\.action\.mlp_dim=-1 must be at least 1"),
-        (NanoConfig, {"vlm": {"width": 0, "mlp_dim": 16}}, r"backbone\.vlm\.width=0 must be at least 1"),
-        (NanoConfig, {"vision": {"width_8": 9}}, r"backbone\.vision\.width_8=9 must be a multiple of"),
-        (OpenVlaConfig, {"vision": {"patch_size": 0}}, r"backbone\.vision\.patch_size=0 must be at least 1"),
-        (OpenVlaConfig, {"vision": {"dino": TOWER | {"depth": 1}}}, r"backbone\.vision\.dino\.depth=1 has no block"),
-        (OpenVlaConfig, {"vision": {"siglip": TOWER | {"width": 9}}}, r"backbone\.vision\.siglip\.width=9 must be a"),
+        (
+            BackboneConfig,
+            {"vision": {"image_size": 225}},
+            r"backbone\.vision\.image_size=225 must be a multiple of",
+        ),
+        (
+            BackboneConfig,
+            {"action": {"width": 16, "mlp_dim": -1}},
+            r"backbone\.action\.mlp_dim=-1 must be at least 1",
+        ),
+        (
+            NanoConfig,
+            {"vlm": {"width": 0, "mlp_dim": 16}},
+            r"backbone\.vlm\.width=0 must be at least 1",
+        ),
+        (
+            NanoConfig,
+            {"vision": {"width_8": 9}},
+            r"backbone\.vision\.width_8=9 must be a multiple of",
+        ),
+        (
+            OpenVlaConfig,
+            {"vision": {"patch_size": 0}},
+            r"backbone\.vision\.patch_size=0 must be at least 1",
+        ),
+        (
+            OpenVlaConfig,
+            {"vision": {"dino": TOWER | {"depth": 1}}},
+            r"backbone\.vision\.dino\.depth=1 has no block",
+        ),
+        (
+            OpenVlaConfig,
+            {"vision": {"siglip": TOWER | {"width": 9}}},
+            r"backbone\.vision\.siglip\.width=9 must be a",
+        ),
         (OpenVlaConfig, {"vlm": {"width": 96}}, r"backbone\.vlm\.width=96 must be a multiple of"),
         (MemoryVlaConfig, {"vlm": {"depth": 0}}, r"backbone\.vlm\.depth=0 must be at least 1"),
-        (MemoryVlaConfig, {"head": {"num_heads": 3}}, r"backbone\.head\.width=1024 must be a multiple of"),
+        (
+            MemoryVlaConfig,
+            {"head": {"num_heads": 3}},
+            r"backbone\.head\.width=1024 must be a multiple of",
+        ),
     ],
 )
-def test_an_impossible_size_names_its_key(config: type, section: Mapping[str, Any], message: str) -> None:
+def test_an_impossible_size_names_its_key(
+    config: type, section: Mapping[str, Any], message: str
+) -> None:
     with pytest.raises(UserError, match=message):
         read_section(config, section, "backbone")
 

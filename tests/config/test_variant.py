@@ -1,4 +1,6 @@
-"""A composition is called what it is, in folders, configurations and records, and results keep compositions apart."""
+"""A composition is called what it is, in folders, configurations and records, and results keep
+compositions apart.
+"""
 
 import json
 import textwrap
@@ -38,7 +40,10 @@ def name_of(*words: str, extra: Path | None = None) -> str:
         (["model=hybrid"], "hybrid"),
         (["model=rmt_expert", "integration=context"], "rmt_context"),
         (["model=framesamp_modul", "memory.pooling=max"], "framesamp_modul-pooling_max"),
-        (["memory=framesamp", "integration=modulator", "memory.pooling=max"], "framesamp_modul-pooling_max"),
+        (
+            ["memory=framesamp", "integration=modulator", "memory.pooling=max"],
+            "framesamp_modul-pooling_max",
+        ),
         (["model=tokendrop_expert", "memory.causal=false"], "tokendrop_expert-causal_false"),
         (["model=pi05", "name=my_own", "processor.prompt=subgoal"], "my_own"),
     ],
@@ -57,7 +62,10 @@ def config_folder(tmp_path: Path) -> Path:
 
 def test_custom_memories_are_named_by_their_files_and_components(config_folder: Path) -> None:
     assert name_of("model=mine_context", extra=config_folder) == "mine_context"
-    assert name_of("model=mine_context", "memory.spacing=2", extra=config_folder) == "mine_context-spacing_2"
+    assert (
+        name_of("model=mine_context", "memory.spacing=2", extra=config_folder)
+        == "mine_context-spacing_2"
+    )
     assert name_of("memory=mine", "integration=modulator", extra=config_folder) == "mine_modulator"
     assert (
         name_of("memory=mine", "integration=modulator", "memory.spacing=2", extra=config_folder)
@@ -70,13 +78,15 @@ def test_custom_memories_are_named_by_their_files_and_components(config_folder: 
 def test_a_command_and_its_sweep_work_in_folders_of_the_true_name(tmp_path: Path) -> None:
     app = tmp_path / "app.py"
     app.write_text(
-        'from mme_vla.cli.command import cli\n@cli("train")\ndef main(cfg):\n'
-        "    from hydra.core.hydra_config import HydraConfig\n"
-        '    print("at", cfg.name, cfg.output.split("/")[1], HydraConfig.get().runtime.output_dir)\nmain()\n'
+        'from mme_vla.cli.command import cli\n@cli("train")\ndef main(cfg):\n    from'
+        ' hydra.core.hydra_config import HydraConfig\n    print("at", cfg.name,'
+        ' cfg.output.split("/")[1], HydraConfig.get().runtime.output_dir)\nmain()\n'
     )
     words = ["integration=modulator", "memory=framesamp"]
     done = commands.run(str(app), *words, cwd=tmp_path)
-    assert done.stdout.startswith(f"at framesamp_modul framesamp_modul {tmp_path}/outputs/framesamp_modul/"), done
+    assert done.stdout.startswith(
+        f"at framesamp_modul framesamp_modul {tmp_path}/outputs/framesamp_modul/"
+    ), done
     words = ["--multirun", "integration=modulator", "memory=framesamp,tokendrop"]
     done = commands.run(str(app), *words, cwd=tmp_path)
     lines = [line.split() for line in done.stdout.splitlines() if line.startswith("at ")]
@@ -89,38 +99,62 @@ def test_a_command_and_its_sweep_work_in_folders_of_the_true_name(tmp_path: Path
 def test_the_digest_tells_compositions_apart_and_nothing_else() -> None:
     config = json.loads(json.dumps(build_policy("framesamp_modul", device="meta").config))
     digest = composition_digest(config)
-    unrelated = {**config, "name": "x", "card": {"data": "y"}, "plugins": ["z"], "later_option": None}
+    unrelated = {
+        **config,
+        "name": "x",
+        "card": {"data": "y"},
+        "plugins": ["z"],
+        "later_option": None,
+    }
     unrelated["processor"] = {**config["processor"], "tokenizer": "tokenizer.model"}
     unrelated["memory"] = {**config["memory"], "later_option": None}
     assert composition_digest(unrelated) == digest
-    for section, change in (("memory", {"grid": 8}), ("integration", {"num_heads": 2}), ("backbone", {"depth": 9})):
+    for section, change in (
+        ("memory", {"grid": 8}),
+        ("integration", {"num_heads": 2}),
+        ("backbone", {"depth": 9}),
+    ):
         assert composition_digest({**config, section: {**config[section], **change}}) != digest
 
 
 def record(episode: int, won: bool, **more: object) -> EpisodeRecord:
     outcome = "success" if won else "fail"
-    return EpisodeRecord("tokendrop_expert", 350, 7, "BinFill", episode, episode, "easy", outcome, 9, **more)  # type: ignore[arg-type]
+    return EpisodeRecord(
+        "tokendrop_expert", 350, 7, "BinFill", episode, episode, "easy", outcome, 9, **more
+    )  # type: ignore[arg-type]
 
 
 def test_results_never_average_two_configurations_of_one_name() -> None:
     records = [
-        record(e, won, composition=digest) for digest, won in (("a" * 12, True), ("b" * 12, False)) for e in (0, 1)
+        record(e, won, composition=digest)
+        for digest, won in (("a" * 12, True), ("b" * 12, False))
+        for e in (0, 1)
     ]
     results = aggregate(records, Protocol(("BinFill",), 2))
     assert {m.label: m.average.mean for m in results.methods} == {
         "tokendrop_expert#aaaaaaaaaa": 100.0,
         "tokendrop_expert#bbbbbbbbbb": 0.0,
     }
-    assert "2 different configurations are called tokendrop_expert; they are not averaged" in results.notes[0]
+    assert (
+        "2 different configurations are called tokendrop_expert; they are not averaged"
+        in results.notes[0]
+    )
 
 
 def test_records_of_earlier_versions_load_and_stay_apart_from_new_ones(tmp_path: Path) -> None:
     old = json.loads(record(0, True).to_json())
     del old["composition"], old["crc32"]
     assert EpisodeRecord.from_json(json.dumps(old)).composition is None
-    mixed = [record(0, True), record(1, True), *(record(e, False, composition="c" * 12) for e in (0, 1))]
+    mixed = [
+        record(0, True),
+        record(1, True),
+        *(record(e, False, composition="c" * 12) for e in (0, 1)),
+    ]
     results = aggregate(mixed, Protocol(("BinFill",), 2))
-    assert [m.label for m in results.methods] == ["tokendrop_expert#unrecorded", "tokendrop_expert#cccccccccc"]
+    assert [m.label for m in results.methods] == [
+        "tokendrop_expert#unrecorded",
+        "tokendrop_expert#cccccccccc",
+    ]
     alone = aggregate(mixed[:2], Protocol(("BinFill",), 2))
     assert [m.label for m in alone.methods] == ["tokendrop_expert"]
 
@@ -132,5 +166,9 @@ def test_a_run_begun_before_there_were_digests_is_one_run(tmp_path: Path) -> Non
     ):
         (tmp_path / name).write_text(digest.to_json() + "\n")
     assert {r.composition for r in read_folders(sorted(tmp_path.glob("*.jsonl")))} == {"d" * 12}
-    two = [record(0, True), record(1, True, composition="d" * 12), record(2, True, composition="e" * 12)]
+    two = [
+        record(0, True),
+        record(1, True, composition="d" * 12),
+        record(2, True, composition="e" * 12),
+    ]
     assert complete_compositions(two)[0].composition is None

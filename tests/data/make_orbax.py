@@ -1,10 +1,13 @@
-"""How the Orbax checkpoints in this folder were made: by Orbax itself, of golden parameters of the released code.
+"""How the Orbax checkpoints in this folder were made: by Orbax itself, of golden parameters of the
+released code.
 
-    python make_orbax.py GOLDEN_FOLDER     (needs orbax-checkpoint, jax and safetensors; nothing of this library)
+    # needs orbax-checkpoint, jax and safetensors; nothing of this library
+    python make_orbax.py GOLDEN_FOLDER
 
-`orbax_run`: a run as the released code leaves it (OCDBT), parameters of the golden TokenDrop-modulator model.
-`orbax_plain`: three leaves in the plain zarr layout, without the outer `params` and `value`, one of them in bfloat16.
-`orbax_run.json`: sha256 of every leaf's float32 bytes, shape and name.
+`orbax_run`: a run as the released code leaves it (OCDBT), parameters of the golden
+TokenDrop-modulator model. `orbax_plain`: three leaves in the plain zarr layout, without the outer
+`params` and `value`, one of them in bfloat16. `orbax_run.json`: sha256 of every leaf's float32
+bytes, shape and name.
 """
 
 import hashlib
@@ -36,7 +39,11 @@ def nested(leaves: dict[str, Any]) -> dict[str, Any]:
 
 def main(golden: Path) -> None:
     stored = load_file(golden / f"model_{CASE}.safetensors")
-    leaves = {name.removeprefix("params/"): leaf for name, leaf in stored.items() if name.startswith("params/")}
+    leaves = {
+        name.removeprefix("params/"): leaf
+        for name, leaf in stored.items()
+        if name.startswith("params/")
+    }
     run, base = HERE / "orbax_run", HERE / "orbax_plain"
     for folder in (run, base):
         shutil.rmtree(folder, ignore_errors=True)
@@ -46,7 +53,9 @@ def main(golden: Path) -> None:
     (run / "history_config.txt").write_text(f"{CASE}.yaml")
     assets = run / "100" / "assets" / "robomme"
     assets.mkdir(parents=True)
-    (assets / "norm_stats.json").write_text(json.dumps({"norm_stats": {"state": STATS, "actions": STATS}}))
+    (assets / "norm_stats.json").write_text(
+        json.dumps({"norm_stats": {"state": STATS, "actions": STATS}})
+    )
     sums = {
         name: hashlib.sha256(f"{name}{leaf.shape}".encode() + leaf.tobytes()).hexdigest()
         for name, leaf in sorted(leaves.items())

@@ -47,20 +47,29 @@ def ensure(source: EpisodeSource, memory: LastFrames, root: Path, **options) -> 
     ("keep_every", "scored", "dtype"),
     [(1, False, "float32"), (1, True, "float32"), (4, False, "bfloat16"), (4, True, "bfloat16")],
 )
-def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, scored, dtype) -> None:
-    tolerance = 1e-6 if dtype == "float32" else 0  # in batches of other sizes MKL may add in another order
+def test_cached_and_online_histories_are_the_same(
+    source, tmp_path, keep_every, scored, dtype
+) -> None:
+    tolerance = (
+        1e-6 if dtype == "float32" else 0
+    )  # in batches of other sizes MKL may add in another order
     memory = LastFrames(keep_every=keep_every, scored=scored)
     cache = ensure(source, memory, tmp_path, dtype=dtype)
     assert cache.width == WIDTH
     for episode in range(3):
         history = cache.history(episode)
-        online = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[episode]))
+        online = OnlineHistory(
+            memory.storage, make_scorer(memory), int(source.exec_starts[episode])
+        )
         for t in range(int(source.lengths[episode])):
             frame = source.frames(episode, [t])
             expected = frame[online.to_encode(1)]
             tokens = encode(expected) if len(expected) else torch.zeros(0, 4, WIDTH)
             online.append(frame, tokens.to(torch.bfloat16) if dtype == "bfloat16" else tokens)
-            cached, streamed = memory.gather_selection(history, t), memory.gather_selection(online, t)
+            cached, streamed = (
+                memory.gather_selection(history, t),
+                memory.gather_selection(online, t),
+            )
             for one, other in zip(cached.tensors(), streamed.tensors(), strict=True):
                 torch.testing.assert_close(one, other, rtol=0, atol=tolerance)
         assert (len(history), history.exec_start) == (len(online), online.exec_start)
@@ -80,7 +89,8 @@ def test_an_interrupted_build_continues_with_the_missing_episodes(source, tmp_pa
     with pytest.raises(KeyboardInterrupt):
         build_cache(source, memory, killed, folder, expected, batch_size=3)
     with pytest.raises(
-        CacheMissingError, match=rf"half-written: 2 of 3 episodes are missing. Finish it with: {COMMAND}$"
+        CacheMissingError,
+        match=rf"half-written: 2 of 3 episodes are missing. Finish it with: {COMMAND}$",
     ):
         VisionCache(folder, source, expected, COMMAND)
     first = token_file(folder, 0).stat().st_mtime_ns
@@ -89,7 +99,9 @@ def test_an_interrupted_build_continues_with_the_missing_episodes(source, tmp_pa
     straight = ensure(source, memory, tmp_path / "whole")
     resumed = VisionCache(folder, source, expected)
     for episode in range(3):
-        assert np.array_equal(np.load(token_file(straight.folder, episode)), np.load(token_file(folder, episode)))
+        assert np.array_equal(
+            np.load(token_file(straight.folder, episode)), np.load(token_file(folder, episode))
+        )
     assert resumed.width == straight.width
 
 
@@ -106,8 +118,13 @@ def test_processes_share_the_episodes(source, tmp_path, monkeypatch) -> None:
     VisionCache(folder, source, expected)
 
 
-def test_training_builds_small_caches_and_names_the_command_for_large_ones(source, tmp_path) -> None:
-    with pytest.raises(UserError, match=rf"There is no vision cache at .* {COMMAND} .*55 frames.*max_build_frames=54"):
+def test_training_builds_small_caches_and_names_the_command_for_large_ones(
+    source, tmp_path
+) -> None:
+    with pytest.raises(
+        UserError,
+        match=rf"There is no vision cache at .* {COMMAND} .*55 frames.*max_build_frames=54",
+    ):
         ensure(source, LastFrames(), tmp_path, max_build_frames=54)
     assert not any(tmp_path.iterdir())
     ensure(source, LastFrames(), tmp_path, max_build_frames=55)
@@ -129,7 +146,9 @@ def test_a_stale_cache_is_refused_with_the_command_that_mends_it(source, tmp_pat
     cache = ensure(source, LastFrames(), tmp_path)
     content = json.loads((cache.folder / FINGERPRINT).read_text())
     (cache.folder / FINGERPRINT).write_text(json.dumps({**content, "encoder": "another"}))
-    with pytest.raises(UserError, match=rf"stale: encoder is 'another', expected 'abc'. .*{COMMAND} rebuild=true"):
+    with pytest.raises(
+        UserError, match=rf"stale: encoder is 'another', expected 'abc'. .*{COMMAND} rebuild=true"
+    ):
         ensure(source, LastFrames(), tmp_path)
     assert token_file(cache.folder, 0).exists()
 
@@ -144,7 +163,9 @@ def keep(count: int):
 
 
 def flip(path: Path) -> None:
-    path.write_bytes(b"".join(bytes([byte ^ 0xFF]) for byte in path.read_bytes()[:64]) + path.read_bytes()[64:])
+    path.write_bytes(
+        b"".join(bytes([byte ^ 0xFF]) for byte in path.read_bytes()[:64]) + path.read_bytes()[64:]
+    )
 
 
 @pytest.mark.parametrize(
@@ -179,5 +200,7 @@ def test_an_estimate_counts_frames_and_bytes_and_saves_nothing(source, tmp_path)
 
 def test_an_encoder_of_another_grid_is_noticed(source, tmp_path) -> None:
     with pytest.raises(ValueError, match="encode"):
-        ensure_cache(source, LastFrames(), lambda frames: encode(frames, grid=4), "abc", root=tmp_path)
+        ensure_cache(
+            source, LastFrames(), lambda frames: encode(frames, grid=4), "abc", root=tmp_path
+        )
     assert cache_build.process_rank() == (0, 1)

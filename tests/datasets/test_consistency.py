@@ -1,4 +1,6 @@
-"""A dataset is compared with itself when it is opened: contradictions are errors that name both sides."""
+"""A dataset is compared with itself when it is opened: contradictions are errors that name both
+sides.
+"""
 
 import json
 import logging
@@ -59,10 +61,18 @@ def test_a_dataset_without_faults_opens_without_a_word(tmp_path: Path, video: bo
 
 
 @pytest.mark.parametrize(
-    "listed", [None, pa.array([[], []], pa.list_(pa.string())), pa.array(TASKS), pa.array([None, None], pa.string())],
+    "listed",
+    [
+        None,
+        pa.array([[], []], pa.list_(pa.string())),
+        pa.array(TASKS),
+        pa.array([None, None], pa.string()),
+    ],
     ids=["no column", "empty lists", "one text", "nothing"],
-)  # fmt: skip
-def test_tasks_are_read_by_task_index_where_episodes_do_not_list_them_as_lerobot_does(tmp_path: Path, listed) -> None:
+)
+def test_tasks_are_read_by_task_index_where_episodes_do_not_list_them_as_lerobot_does(
+    tmp_path: Path, listed
+) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     change(write_dataset(tmp_path / "data"), EPISODES, "tasks", listed)
@@ -80,7 +90,9 @@ def test_the_goal_of_a_frame_is_its_own_task(tmp_path: Path) -> None:
     source = opened(tmp_path)
     assert [source.goal(0, frame) for frame in range(5)] == [TASKS[i] for i in (0, 0, 1, 1, 0)]
     assert source.goals(0) == TASKS and source.goal(1) == TASKS[1]
-    with pytest.raises(UserError, match=r"episode 0 have 2 tasks: 'open the drawer', 'close the drawer'"):
+    with pytest.raises(
+        UserError, match=r"episode 0 have 2 tasks: 'open the drawer', 'close the drawer'"
+    ):
         source.goal(0)
 
 
@@ -94,7 +106,9 @@ def test_a_training_step_has_the_goal_of_its_frame(tmp_path: Path) -> None:
     change(tmp_path, ROWS, "task_index", [0, 0, 1, 1, 1, 1, 1, 1, 1])
     change(tmp_path, EPISODES, "tasks", [list(TASKS), [TASKS[1]]])
     source = opened(tmp_path)
-    processor = Processor(32, Tokenizer.load("sample"), embodiment=source.robot, stats=unit_stats(source.robot))
+    processor = Processor(
+        32, Tokenizer.load("sample"), embodiment=source.robot, stats=unit_stats(source.robot)
+    )
     steps = TrainingDataset([source], processor)
     assert [steps.step(i).goal for i in range(4)] == [TASKS[0], TASKS[0], TASKS[1], TASKS[1]]
 
@@ -102,10 +116,14 @@ def test_a_training_step_has_the_goal_of_its_frame(tmp_path: Path) -> None:
 def test_what_tasks_are_listed_and_what_rows_say_must_agree(tmp_path: Path) -> None:
     write_dataset(tmp_path)
     change(tmp_path, ROWS, "task_index", [1] * 5 + [0] * 4)
-    with pytest.raises(UserError, match=r"row 0, frame 0 of episode 0, has task_index 1, 'close .*open the drawer"):
+    with pytest.raises(
+        UserError, match=r"row 0, frame 0 of episode 0, has task_index 1, 'close .*open the drawer"
+    ):
         opened(tmp_path)
     change(tmp_path, ROWS, "task_index", [0] * 5 + [7] * 4)
-    with pytest.raises(UserError, match=r"frame 0 of episode 1, has task_index 7, but .* holds 2 tasks"):
+    with pytest.raises(
+        UserError, match=r"frame 0 of episode 1, has task_index 7, but .* holds 2 tasks"
+    ):
         opened(tmp_path)
     change(tmp_path, ROWS, "task_index", None)
     assert opened(tmp_path).goal(1) == TASKS[1]
@@ -114,10 +132,14 @@ def test_what_tasks_are_listed_and_what_rows_say_must_agree(tmp_path: Path) -> N
         opened(tmp_path)
 
 
-def test_a_table_of_tasks_that_numbers_them_otherwise_than_by_row_is_refused(tmp_path: Path) -> None:
+def test_a_table_of_tasks_that_numbers_them_otherwise_than_by_row_is_refused(
+    tmp_path: Path,
+) -> None:
     write_dataset(tmp_path)
     index = pd.Index(TASKS[::-1], name="task")
-    pd.DataFrame({"task_index": [1, 0]}, index=index).to_parquet(tmp_path / "meta" / "tasks.parquet")
+    pd.DataFrame({"task_index": [1, 0]}, index=index).to_parquet(
+        tmp_path / "meta" / "tasks.parquet"
+    )
     with pytest.raises(UserError, match=r"row 0, 'close the drawer', has task_index 1"):
         opened(tmp_path)
 
@@ -129,14 +151,18 @@ def test_an_empty_goal_is_refused(tmp_path: Path, task: str) -> None:
         opened(tmp_path)
 
 
-def test_the_fingerprint_follows_the_table_of_tasks_where_goals_come_from_it(tmp_path: Path) -> None:
+def test_the_fingerprint_follows_the_table_of_tasks_where_goals_come_from_it(
+    tmp_path: Path,
+) -> None:
     write_dataset(tmp_path)
     listed = opened(tmp_path).fingerprint
     assert listed == content_fingerprint(tmp_path)  # as before
     change(tmp_path, EPISODES, "tasks", None)
     before = opened(tmp_path).fingerprint
     index = pd.Index(["lift the lid", TASKS[1]], name="task")
-    pd.DataFrame({"task_index": [0, 1]}, index=index).to_parquet(tmp_path / "meta" / "tasks.parquet")
+    pd.DataFrame({"task_index": [0, 1]}, index=index).to_parquet(
+        tmp_path / "meta" / "tasks.parquet"
+    )
     assert opened(tmp_path).fingerprint != before
 
 
@@ -146,18 +172,40 @@ def test_the_fingerprint_follows_the_table_of_tasks_where_goals_come_from_it(tmp
 @pytest.mark.parametrize(
     ("name", "values", "words"),
     [
-        ("frame_index", [0, 1, 4, 5, 6, 0, 1, 2, 3], r"row 2, frame 2 of episode 0, has frame_index 4; .* it is 2"),
-        ("frame_index", [0, 1, 2, 3, 4, 1, 2, 3, 4], r"row 5, frame 0 of episode 1, has frame_index 1"),
+        (
+            "frame_index",
+            [0, 1, 4, 5, 6, 0, 1, 2, 3],
+            r"row 2, frame 2 of episode 0, has frame_index 4; .* it is 2",
+        ),
+        (
+            "frame_index",
+            [0, 1, 2, 3, 4, 1, 2, 3, 4],
+            r"row 5, frame 0 of episode 1, has frame_index 1",
+        ),
         ("frame_index", [0, 1, 1, 3, 4, 0, 1, 2, 3], r"has frame_index 1; by its place it is 2"),
-        ("index", [0, 1, 2, 3, 4, 0, 1, 2, 3], r"row 5, frame 0 of episode 1, has index 0; expected 5"),
+        (
+            "index",
+            [0, 1, 2, 3, 4, 0, 1, 2, 3],
+            r"row 5, frame 0 of episode 1, has index 0; expected 5",
+        ),
         ("index", list(range(8, -1, -1)), r"has index 8; expected 0"),
         ("timestamp", [i / 9 for i in [*range(5), *range(4)]], "none"),  # within half a frame
-        ("timestamp", [0, 0.1, 0.26, 0.3, 0.4, 0, 0.1, 0.2, 0.3], r"row 2, .*timestamp 0.2600 s; at fps=10 .*0.2000 s"),
+        (
+            "timestamp",
+            [0, 0.1, 0.26, 0.3, 0.4, 0, 0.1, 0.2, 0.3],
+            r"row 2, .*timestamp 0.2600 s; at fps=10 .*0.2000 s",
+        ),
         ("timestamp", [3.0, 3.1, 3.2, 3.3, 3.4, 0, 0.1, 0.2, 0.3], r"row 0, .*timestamp 3.0000 s"),
-        ("timestamp", [0, 0.1, float("nan"), 0.3, 0.4, 0, 0.1, 0.2, 0.3], r"row 2, .*timestamp nan"),
+        (
+            "timestamp",
+            [0, 0.1, float("nan"), 0.3, 0.4, 0, 0.1, 0.2, 0.3],
+            r"row 2, .*timestamp nan",
+        ),
     ],
 )
-def test_rows_that_contradict_their_place_are_named(tmp_path: Path, name: str, values: list, words: str) -> None:
+def test_rows_that_contradict_their_place_are_named(
+    tmp_path: Path, name: str, values: list, words: str
+) -> None:
     write_dataset(tmp_path)
     change(tmp_path, ROWS, name, values)
     if words == "none":
@@ -167,7 +215,9 @@ def test_rows_that_contradict_their_place_are_named(tmp_path: Path, name: str, v
         opened(tmp_path)
 
 
-def test_a_clock_that_drifts_away_from_the_rate_is_named_at_the_first_row_that_is_another_frame(tmp_path: Path) -> None:
+def test_a_clock_that_drifts_away_from_the_rate_is_named_at_the_first_row_that_is_another_frame(
+    tmp_path: Path,
+) -> None:
     write_dataset(tmp_path, lengths=(40,), tasks=TASKS[:1], video=True)
     change(tmp_path, ROWS, "timestamp", np.float32(np.arange(40) / 9))
     with pytest.raises(UserError, match=r"row 5, .*0.5556 s; .*0.5000 s.*35 such rows"):
@@ -188,7 +238,12 @@ def test_rounded_time_stamps_of_long_episodes_are_in_order(tmp_path: Path, fps: 
 
     frames = np.arange(3 * 3600 * int(fps))  # three hours in float32
     dataset: Any = consistency.Description(
-        tmp_path, {"features": {}}, {"starts": np.array([0]), "lengths": np.array([len(frames)])}, fps, (), ()
+        tmp_path,
+        {"features": {}},
+        {"starts": np.array([0]), "lengths": np.array([len(frames)])},
+        fps,
+        (),
+        (),
     )
     consistency._check_rows(dataset, {"timestamp": np.float32(frames / fps).astype(np.float64)})
     with pytest.raises(UserError, match="timestamp"):
@@ -198,8 +253,14 @@ def test_rounded_time_stamps_of_long_episodes_are_in_order(tmp_path: Path, fps: 
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (lambda info: info.update(total_episodes=3), "total_episodes is 3, but meta/episodes describes 2"),
-        (lambda info: info.update(total_frames=8), "total_frames is 8, but meta/episodes describes 9"),
+        (
+            lambda info: info.update(total_episodes=3),
+            "total_episodes is 3, but meta/episodes describes 2",
+        ),
+        (
+            lambda info: info.update(total_frames=8),
+            "total_frames is 8, but meta/episodes describes 9",
+        ),
     ],
 )
 def test_totals_of_the_description_must_agree(tmp_path: Path, edit, words: str) -> None:
@@ -214,8 +275,12 @@ def test_the_length_of_an_episode_must_be_that_of_its_rows(tmp_path: Path) -> No
         opened(tmp_path)
 
 
-@pytest.mark.parametrize(("key", "value"), [("length", 9), ("exec_start_idx", 3), ("episode_index", 2)])
-def test_the_file_beside_the_tables_must_agree_with_them(tmp_path: Path, key: str, value: int) -> None:
+@pytest.mark.parametrize(
+    ("key", "value"), [("length", 9), ("exec_start_idx", 3), ("episode_index", 2)]
+)
+def test_the_file_beside_the_tables_must_agree_with_them(
+    tmp_path: Path, key: str, value: int
+) -> None:
     root = tmp_path / "copy"
     shutil.copytree(SAMPLE, root)
     path = root / "meta" / "robomme_episodes.json"
@@ -231,7 +296,9 @@ def test_both_marks_of_a_conditioning_video_must_agree(tmp_path: Path) -> None:
     shutil.copytree(SAMPLE, root)
     rows = pq.ParquetFile(root / ROWS).read()["exec_start_idx"].to_pylist()
     change(root, ROWS, "exec_start_idx", pa.array([60, *rows[1:]], pa.int32()))
-    with pytest.raises(UserError, match=r"row 0, .* has exec_start_idx 60, but is_demo marks the first 66 frames"):
+    with pytest.raises(
+        UserError, match=r"row 0, .* has exec_start_idx 60, but is_demo marks the first 66 frames"
+    ):
         EpisodeSource(root)
 
 
@@ -246,16 +313,27 @@ def test_other_statistics_than_the_rows_have_are_a_warning(tmp_path: Path, caplo
 # Videos
 
 
-def test_pictures_are_right_up_to_a_drift_of_half_a_frame_and_refused_beyond(tmp_path: Path) -> None:
+def test_pictures_are_right_up_to_a_drift_of_half_a_frame_and_refused_beyond(
+    tmp_path: Path,
+) -> None:
     write_dataset(tmp_path, video=True)
-    for drift, right in ((0.0, True), (0.4, True), (-0.4, True), (0.6, False), (1.0, False), (-0.6, False)):
+    for drift, right in (
+        (0.0, True),
+        (0.4, True),
+        (-0.4, True),
+        (0.6, False),
+        (1.0, False),
+        (-0.6, False),
+    ):
         begins = np.array([0, 0.5 + drift / FPS])
         change(tmp_path, EPISODES, f"videos/{CAMERA}/from_timestamp", begins)
         change(tmp_path, EPISODES, f"videos/{CAMERA}/to_timestamp", begins + np.array([5, 4]) / FPS)
         if right:
             assert frames_read(opened(tmp_path), 1) == [5, 6, 7, 8]
             continue
-        with pytest.raises(UserError, match=r"of episode 1 is looked for at|episodes 0 and 1 overlap"):
+        with pytest.raises(
+            UserError, match=r"of episode 1 is looked for at|episodes 0 and 1 overlap"
+        ):
             opened(tmp_path)
 
 
@@ -263,14 +341,18 @@ def test_episodes_that_share_pictures_are_named(tmp_path: Path) -> None:
     write_dataset(tmp_path, video=True)
     change(tmp_path, EPISODES, f"videos/{CAMERA}/from_timestamp", [0.0, 0.0])
     change(tmp_path, EPISODES, f"videos/{CAMERA}/to_timestamp", [0.5, 0.4])
-    with pytest.raises(UserError, match=r"episodes 0 and 1 overlap in the video file-000.mp4 of observation"):
+    with pytest.raises(
+        UserError, match=r"episodes 0 and 1 overlap in the video file-000.mp4 of observation"
+    ):
         opened(tmp_path)
 
 
 def test_the_end_of_a_span_must_be_where_its_frames_end(tmp_path: Path) -> None:
     write_dataset(tmp_path, video=True)
     change(tmp_path, EPISODES, f"videos/{CAMERA}/to_timestamp", [0.5, 1.0])
-    with pytest.raises(UserError, match=r"episode 1 lie between 0.5000 s and 1.0000 s, 5.00 frames .* has 4 frames"):
+    with pytest.raises(
+        UserError, match=r"episode 1 lie between 0.5000 s and 1.0000 s, 5.00 frames .* has 4 frames"
+    ):
         opened(tmp_path)
 
 
@@ -282,7 +364,9 @@ def test_the_end_of_a_span_must_be_where_its_frames_end(tmp_path: Path) -> None:
         (9, 20, "frame . of episode . is looked for at"),
     ],
 )
-def test_a_video_that_does_not_hold_the_rows_is_refused_on_opening(tmp_path: Path, frames, rate, words) -> None:
+def test_a_video_that_does_not_hold_the_rows_is_refused_on_opening(
+    tmp_path: Path, frames, rate, words
+) -> None:
     write_dataset(tmp_path, video=True)
     write_video(tmp_path / VIDEO, [picture(SHADE * i) for i in range(frames)], rate)
     with pytest.raises(UserError, match=words):
@@ -307,7 +391,9 @@ def test_a_rate_that_is_no_whole_number_is_read(tmp_path: Path) -> None:
     assert frames_read(opened(tmp_path), 1) == [6, 7, 8, 9, 10, 11]
 
 
-def test_a_missing_video_and_pictures_of_another_size_are_noticed_on_opening(tmp_path: Path, caplog) -> None:
+def test_a_missing_video_and_pictures_of_another_size_are_noticed_on_opening(
+    tmp_path: Path, caplog
+) -> None:
     write_dataset(tmp_path, video=True)
     change_info(tmp_path, lambda info: info["features"][CAMERA].update(shape=[64, 64, 3]))
     opened(tmp_path)
@@ -321,7 +407,9 @@ def test_a_missing_video_and_pictures_of_another_size_are_noticed_on_opening(tmp
 
 
 @pytest.mark.parametrize("key", ["info", "video_info"])
-@pytest.mark.parametrize("about", [{"is_depth_map": True}, {"video.is_depth_map": True}, {"video.pix_fmt": "gray12le"}])
+@pytest.mark.parametrize(
+    "about", [{"is_depth_map": True}, {"video.is_depth_map": True}, {"video.pix_fmt": "gray12le"}]
+)
 def test_a_camera_described_as_depth_is_refused(tmp_path: Path, key: str, about: dict) -> None:
     write_dataset(tmp_path)
     change_info(tmp_path, lambda info: info["features"][CAMERA].update({key: about}))
@@ -337,7 +425,9 @@ def test_a_camera_described_as_depth_is_refused(tmp_path: Path, key: str, about:
         (np.full((32, 32), 70000, np.int32), "tiff", "32-bit"),
     ],
 )
-def test_pictures_of_more_than_eight_bits_are_refused_wherever_they_are(tmp_path: Path, image, kind, words) -> None:
+def test_pictures_of_more_than_eight_bits_are_refused_wherever_they_are(
+    tmp_path: Path, image, kind, words
+) -> None:
     write_dataset(tmp_path)
     cells = [cell(picture(0))] * 9
     change(tmp_path, ROWS, CAMERA, pa.array([cells[0]] * 5 + [cell(image, kind)] + cells[:3]))
@@ -350,7 +440,12 @@ def test_pictures_of_more_than_eight_bits_are_refused_wherever_they_are(tmp_path
 
 def test_grey_pictures_of_eight_bits_are_colours(tmp_path: Path) -> None:
     write_dataset(tmp_path)
-    change(tmp_path, ROWS, CAMERA, pa.array([cell(np.full((32, 32), SHADE * i, np.uint8)) for i in range(9)]))
+    change(
+        tmp_path,
+        ROWS,
+        CAMERA,
+        pa.array([cell(np.full((32, 32), SHADE * i, np.uint8)) for i in range(9)]),
+    )
     assert frames_read(opened(tmp_path), 0) == [0, 1, 2, 3, 4]
 
 
@@ -377,22 +472,37 @@ def test_numbers_beyond_float32_are_named(tmp_path: Path, column: str, value: fl
 # Names and units
 
 
-def test_the_same_names_in_another_order_are_refused_and_other_names_named(tmp_path: Path, caplog) -> None:
+def test_the_same_names_in_another_order_are_refused_and_other_names_named(
+    tmp_path: Path, caplog
+) -> None:
     names = ["shoulder", "elbow", "gripper"]
-    roots = [write_dataset(tmp_path / str(i), names=other) for i, other in enumerate(
-        (names, ["elbow", "shoulder", "gripper"], {"motors": names}, ["hip", "knee", "toe"]))]  # fmt: skip
-    with pytest.raises(UserError, match=r"another order\. the source 0: shoulder, elbow.*the source 1: elbow"):
+    roots = [
+        write_dataset(tmp_path / str(i), names=other)
+        for i, other in enumerate(
+            (names, ["elbow", "shoulder", "gripper"], {"motors": names}, ["hip", "knee", "toe"])
+        )
+    ]
+    with pytest.raises(
+        UserError, match=r"another order\. the source 0: shoulder, elbow.*the source 1: elbow"
+    ):
         open_sources([str(roots[0]), str(roots[1])], own_robot())
     assert len(open_sources([str(roots[0]), str(roots[2])], own_robot())) == 2
     assert not caplog.text
     open_sources([str(roots[0]), str(roots[3])], own_robot())
-    assert "have different names. the source 0: shoulder, elbow, gripper; the source 3: hip" in caplog.text
+    assert (
+        "have different names. the source 0: shoulder, elbow, gripper; the source 3: hip"
+        in caplog.text
+    )
 
 
 def test_the_robots_names_are_compared_with_the_datasets(tmp_path: Path, caplog) -> None:
     write_dataset(tmp_path, names=["Shoulder", "el_bow", "gripper"])
-    assert opened(tmp_path, names=["shoulder", "el bow", "Gripper"]).robot.action.names[1] == "el bow"
-    with pytest.raises(UserError, match=r"numbers of the action have the same names in another order.*desk arm"):
+    assert (
+        opened(tmp_path, names=["shoulder", "el bow", "Gripper"]).robot.action.names[1] == "el bow"
+    )
+    with pytest.raises(
+        UserError, match=r"numbers of the action have the same names in another order.*desk arm"
+    ):
         opened(tmp_path, names=["el bow", "shoulder", "gripper"])
     assert not caplog.text
     opened(tmp_path, names=["a", "b", "c"])
@@ -401,7 +511,9 @@ def test_the_robots_names_are_compared_with_the_datasets(tmp_path: Path, caplog)
 
 def test_actions_relative_to_states_in_another_order_are_refused(tmp_path: Path) -> None:
     write_dataset(tmp_path, names=["a", "b", "c"])
-    change_info(tmp_path, lambda info: info["features"]["observation.state"].update(names=["b", "a", "c"]))
+    change_info(
+        tmp_path, lambda info: info["features"]["observation.state"].update(names=["b", "a", "c"])
+    )
     assert len(opened(tmp_path)) == 2
     with pytest.raises(UserError, match="subtracted from each other"):
         opened(tmp_path, relative=[0, 1])
@@ -424,7 +536,10 @@ def test_numbers_too_large_for_the_robots_unit_are_noticed(tmp_path: Path, caplo
     opened(tmp_path, units=["deg", "", "mm"])
     assert not caplog.text
     opened(tmp_path, units=["rad", "", "m"])
-    assert "the action's number 1 reaches 90.1, which is hardly in rad" in caplog.text and "(2 such" in caplog.text
+    assert (
+        "the action's number 1 reaches 90.1, which is hardly in rad" in caplog.text
+        and "(2 such" in caplog.text
+    )
 
 
 # Layout and caches
@@ -448,7 +563,10 @@ def test_files_are_ordered_by_their_numbers(tmp_path: Path, folder: str) -> None
         ("chunk-999", 999, reference.slice(0, cut)),
         ("chunk-1000", 1000, reference.slice(cut)),
     ):
-        table(tmp_path / folder / chunk / f"file-{number}.parquet", {n: part[n] for n in part.column_names})
+        table(
+            tmp_path / folder / chunk / f"file-{number}.parquet",
+            {n: part[n] for n in part.column_names},
+        )
     source = opened(tmp_path)
     assert source.states(0)[0].tolist() == pytest.approx(whole_state(tmp_path, folder))
     assert frames_read(source, 1) == [5, 6, 7, 8]
@@ -470,13 +588,17 @@ def test_files_that_macos_leaves_are_not_the_datasets(tmp_path: Path) -> None:
 
 def test_a_missing_column_is_named_and_not_called_damage(tmp_path: Path) -> None:
     change(write_dataset(tmp_path, video=True), EPISODES, f"videos/{CAMERA}/file_index", None)
-    with pytest.raises(UserError, match=r"lacks the column videos/observation.images.top/file_index") as error:
+    with pytest.raises(
+        UserError, match=r"lacks the column videos/observation.images.top/file_index"
+    ) as error:
         opened(tmp_path)
     assert "damaged" not in str(error.value)
 
 
 @pytest.mark.parametrize("video", [False, True])
-def test_replaced_tables_are_read_though_time_and_size_are_kept(tmp_path: Path, video: bool) -> None:
+def test_replaced_tables_are_read_though_time_and_size_are_kept(
+    tmp_path: Path, video: bool
+) -> None:
     root = tmp_path / "data"
     write_dataset(root, video=video, states=np.full((9, 3), 1.0))
     before = (root / ROWS).stat()
@@ -496,7 +618,11 @@ def test_a_change_in_the_middle_of_a_large_table_is_read(tmp_path: Path) -> None
     source = opened(tmp_path)
     content = bytearray((tmp_path / ROWS).read_bytes())
     value = np.float32(source.states(0)[:, 0])
-    place = next(at for at in range(len(value)) if 70_000 < content.find(value[at].tobytes()) < len(content) // 3)
+    place = next(
+        at
+        for at in range(len(value))
+        if 70_000 < content.find(value[at].tobytes()) < len(content) // 3
+    )
     at = content.find(value[place].tobytes())
     content[at : at + 4] = np.float32(0.125).tobytes()
     (tmp_path / ROWS).write_bytes(content)
@@ -522,7 +648,9 @@ def test_datasets_that_lerobot_edited_are_in_order(tmp_path: Path, caplog) -> No
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     reference = LeRobotDataset("local/sample", root=SAMPLE, video_backend="pyav")
-    shorter = delete_episodes(reference, [1], output_dir=tmp_path / "shorter", repo_id="local/shorter")
+    shorter = delete_episodes(
+        reference, [1], output_dir=tmp_path / "shorter", repo_id="local/shorter"
+    )
     merge_datasets([reference, shorter], "local/both", output_dir=tmp_path / "both")
     with caplog.at_level(logging.WARNING, logger="mme_vla"):
         sources = [EpisodeSource(tmp_path / name) for name in ("shorter", "both")]

@@ -62,7 +62,10 @@ def test_columns_may_be_spelt_as_lerobots_policies_ask_for(tmp_path: Path, recor
     convert(refs, tmp_path / "out", ConvertOptions(images="png", names="lerobot"))
     source = EpisodeSource(tmp_path / "out")
     check(source, episodes, tolerance=0)
-    assert dict(source.columns) == {"front": "observation.images.image", "wrist": "observation.images.wrist_image"}
+    assert dict(source.columns) == {
+        "front": "observation.images.image",
+        "wrist": "observation.images.wrist_image",
+    }
     features = json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
     assert {"observation.state", "action", "is_demo"} <= set(features)
     assert not {"image", "wrist_image", "state", "actions"} & set(features)
@@ -82,7 +85,9 @@ def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(video
     assert np.array_equal(frames[:, :, 8:], np.repeat(frames[:1, :, 8:], 12, axis=0))
 
 
-def test_an_interrupted_conversion_continues_with_the_missing_episodes(tmp_path: Path, recorded, monkeypatch) -> None:
+def test_an_interrupted_conversion_continues_with_the_missing_episodes(
+    tmp_path: Path, recorded, monkeypatch
+) -> None:
     refs, episodes = recorded
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -128,7 +133,9 @@ def test_a_kill_during_the_merge_loses_nothing(tmp_path: Path, recorded, monkeyp
     check(EpisodeSource(tmp_path / "out"), episodes, tolerance=0)
 
 
-def test_a_finished_conversion_is_recognised_and_nothing_foreign_is_overwritten(tmp_path: Path, recorded) -> None:
+def test_a_finished_conversion_is_recognised_and_nothing_foreign_is_overwritten(
+    tmp_path: Path, recorded
+) -> None:
     refs, _ = recorded
     convert(refs[:1], tmp_path / "out", PNG)
     assert convert(refs[:1], tmp_path / "out", PNG) == 0

@@ -1,4 +1,6 @@
-"""Datasets, caches and rows that are not what was written: reported, and before anything is trained on them."""
+"""Datasets, caches and rows that are not what was written: reported, and before anything is trained
+on them.
+"""
 
 import os
 import shutil
@@ -47,16 +49,46 @@ def at(row: int, value: Any) -> Callable[[list[Any]], list[Any]]:
 @pytest.mark.parametrize(
     ("file", "name", "edit", "kind", "message"),
     [
-        (FRAMES, "actions", lambda rows: [row[:7] for row in rows], None, "cannot be read as tables of frames"),
-        (FRAMES, "actions", lambda rows: [str(row) for row in rows], pa.string(), "cannot be read as tables of frames"),
+        (
+            FRAMES,
+            "actions",
+            lambda rows: [row[:7] for row in rows],
+            None,
+            "cannot be read as tables of frames",
+        ),
+        (
+            FRAMES,
+            "actions",
+            lambda rows: [str(row) for row in rows],
+            pa.string(),
+            "cannot be read as tables of frames",
+        ),
         (FRAMES, "actions", at(300, None), None, "row 300 has actions None"),
-        (FRAMES, "state", at(5, [float("nan")] * 8), None, "row 5 has state .*nan"),  # of a conditioning video
-        (FRAMES, "actions", at(900, [float("inf")] * 8), None, "row 900 has actions .*inf"),  # held out
+        (
+            FRAMES,
+            "state",
+            at(5, [float("nan")] * 8),
+            None,
+            "row 5 has state .*nan",
+        ),  # of a conditioning video
+        (
+            FRAMES,
+            "actions",
+            at(900, [float("inf")] * 8),
+            None,
+            "row 900 has actions .*inf",
+        ),  # held out
         (EPISODES, "dataset_to_index", at(3, 0), None, "dataset_to_index of episode 3 is 0"),
         (EPISODES, "dataset_to_index", at(1, 0), None, "dataset_from_index of episode 2 is"),
         (EPISODES, "dataset_to_index", at(3, 2**62), None, "dataset_to_index of episode 3"),
         (EPISODES, "dataset_from_index", at(2, 7), None, "dataset_from_index of episode 2 is 7"),
-        (EPISODES, "tasks", at(2, ["something else"]), None, "task_index 2, 'pick up .*something else"),
+        (
+            EPISODES,
+            "tasks",
+            at(2, ["something else"]),
+            None,
+            "task_index 2, 'pick up .*something else",
+        ),
         (
             EPISODES,
             "tasks",
@@ -65,9 +97,21 @@ def at(row: int, value: Any) -> Callable[[list[Any]], list[Any]]:
             "tasks of episode 0 is .*list of texts",
         ),
         (EPISODES, "episode_index", at(0, 9), None, "episode_index of episode 0 is 9"),
-        (EPISODES, "videos/image/from_timestamp", at(0, float("nan")), None, "from_timestamp of episode 0 is nan"),
+        (
+            EPISODES,
+            "videos/image/from_timestamp",
+            at(0, float("nan")),
+            None,
+            "from_timestamp of episode 0 is nan",
+        ),
         (EPISODES, "videos/image/chunk_index", at(0, -1), None, "chunk_index of episode 0 is -1"),
-        (EPISODES, "videos/image/file_index", lambda rows: ["a"] * len(rows), pa.string(), "tables of episodes"),
+        (
+            EPISODES,
+            "videos/image/file_index",
+            lambda rows: ["a"] * len(rows),
+            pa.string(),
+            "tables of episodes",
+        ),
     ],
 )
 def test_damaged_tables_are_reported_on_opening(copy, file, name, edit, kind, message) -> None:
@@ -76,7 +120,9 @@ def test_damaged_tables_are_reported_on_opening(copy, file, name, edit, kind, me
         EpisodeSource(copy)
 
 
-def test_what_stands_in_a_files_place_is_reported_without_waiting_and_without_the_hub(copy: Path) -> None:
+def test_what_stands_in_a_files_place_is_reported_without_waiting_and_without_the_hub(
+    copy: Path,
+) -> None:
     (copy / EPISODES).unlink()
     os.mkfifo(copy / EPISODES)
     with pytest.raises(UserError, match="is not a file"):
@@ -86,7 +132,9 @@ def test_what_stands_in_a_files_place_is_reported_without_waiting_and_without_th
         EpisodeSource(copy)
 
 
-@pytest.mark.parametrize("template", ["../{video_key}.mp4", "{video_key.__class__}", "{chunk_index:99999999d}", 7])
+@pytest.mark.parametrize(
+    "template", ["../{video_key}.mp4", "{video_key.__class__}", "{chunk_index:99999999d}", 7]
+)
 def test_a_template_of_videos_stays_in_the_dataset(copy: Path, template: object) -> None:
     from mme_vla.data.lerobot_files import video_file
 
@@ -94,7 +142,9 @@ def test_a_template_of_videos_stays_in_the_dataset(copy: Path, template: object)
         video_file(copy, template, "image", 0, 0)
 
 
-def test_a_dataset_with_sums_is_checked_where_it_is_read_and_entirely_on_request(copy: Path) -> None:
+def test_a_dataset_with_sums_is_checked_where_it_is_read_and_entirely_on_request(
+    copy: Path,
+) -> None:
     assert EpisodeSource(copy).verify() == 0  # without sums there is nothing to compare
     write_sums(copy)
     assert EpisodeSource(copy).verify() > 5
@@ -118,7 +168,9 @@ def opened(folder: Path) -> VisionCache:
     return VisionCache(folder, source, artefacts.expected_fingerprint())
 
 
-def test_a_flipped_bit_in_cached_tokens_is_detected_when_the_episode_is_first_read(cache: Path) -> None:
+def test_a_flipped_bit_in_cached_tokens_is_detected_when_the_episode_is_first_read(
+    cache: Path,
+) -> None:
     path = token_file(cache, 1)
     content = path.read_bytes()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
@@ -138,10 +190,17 @@ def test_a_cache_without_sums_still_opens(cache: Path) -> None:
 @pytest.mark.parametrize(
     "row",
     [
-        '{"messages": [1, 2, 3]}', '{"messages": "abc"}', "[]", '{"messages": []}', "[" * 100_000,
-        '{"messages": [{"role": "system", "content": 1}, {"role": "user", "content": ""}, {"role": "assistant"}]}',
+        '{"messages": [1, 2, 3]}',
+        '{"messages": "abc"}',
+        "[]",
+        '{"messages": []}',
+        "[" * 100_000,
+        (
+            '{"messages": [{"role": "system", "content": 1}, {"role": "user", "content": ""},'
+            ' {"role": "assistant"}]}'
+        ),
     ],
-)  # fmt: skip
+)
 def test_rows_of_another_form_are_refused_by_line(tmp_path: Path, row: str) -> None:
     from mme_vla.subgoal.finetuning.rows import read_rows
 

@@ -1,4 +1,6 @@
-"""Training samples: as the released pipeline makes them, deterministic, from several sources, with their history."""
+"""Training samples: as the released pipeline makes them, deterministic, from several sources, with
+their history.
+"""
 
 import json
 import zipfile
@@ -30,7 +32,9 @@ from mme_vla.training.data import prepare_data
 PNG = ConvertOptions(images="png")
 
 
-def make_source(folder: Path, task: str, lengths: list[int], videos: list[int]) -> tuple[EpisodeSource, list[Recorded]]:
+def make_source(
+    folder: Path, task: str, lengths: list[int], videos: list[int]
+) -> tuple[EpisodeSource, list[Recorded]]:
     recorded = write_file(folder / f"record_dataset_{task}.h5", lengths, videos)
     convert(list_episodes(find_files([folder / f"record_dataset_{task}.h5"])), folder / task, PNG)
     return EpisodeSource(folder / task), recorded
@@ -45,20 +49,27 @@ def data(tmp_path_factory) -> tuple[list[EpisodeSource], list[list[Recorded]]]:
 
 @pytest.fixture(scope="module")
 def processor(data) -> Processor:
-    return Processor(image_size=28, tokenizer=Tokenizer.load("sample"), stats=compute_norm_stats(data[0]))
+    return Processor(
+        image_size=28, tokenizer=Tokenizer.load("sample"), stats=compute_norm_stats(data[0])
+    )
 
 
 @pytest.fixture(scope="module")
 def caches(data, tmp_path_factory) -> list[VisionCache]:
     root = tmp_path_factory.mktemp("caches")
-    return [ensure_cache(source, LastFrames(), encode, "abc", root=root, dtype="float32") for source in data[0]]
+    return [
+        ensure_cache(source, LastFrames(), encode, "abc", root=root, dtype="float32")
+        for source in data[0]
+    ]
 
 
 def test_golden_samples_are_reproduced(parity: Path, tmp_path: Path) -> None:
     golden = json.loads((parity / "pipeline_datasets.json").read_text())["policy_dataset"]
     with zipfile.ZipFile(parity / "pipeline_h5.zip") as archive:
         archive.extractall(tmp_path / "h5")
-    convert(list_episodes(find_files([tmp_path / "h5"])), tmp_path / "out")  # no pixel is compared here
+    convert(
+        list_episodes(find_files([tmp_path / "h5"])), tmp_path / "out"
+    )  # no pixel is compared here
     source = EpisodeSource(tmp_path / "out")
     horizon = len(golden["samples"][0]["actions"])
     dataset = TrainingDataset([source], Processor(28, Tokenizer.load("sample"), horizon=horizon))
@@ -72,14 +83,19 @@ def test_golden_samples_are_reproduced(parity: Path, tmp_path: Path) -> None:
         assert [step.exec_start] == sample["exec_start_idx"]
         assert [step.index < step.exec_start] == sample["is_demo"]
         assert step.goal == sample["prompt"]
-        assert step.subgoals == {name: sample[name] for name in step.subgoals} and len(step.subgoals) == 4
+        assert (
+            step.subgoals == {name: sample[name] for name in step.subgoals}
+            and len(step.subgoals) == 4
+        )
 
 
 def test_items_are_the_execution_steps_of_all_sources_in_order(data, processor) -> None:
     dataset = TrainingDataset(data[0], processor)
     places = [dataset.locate(i) for i in range(len(dataset))]
     assert places == [
-        (s, e, t) for s, e, start, stop in ((0, 0, 6, 30), (0, 1, 0, 12), (1, 0, 2, 9)) for t in range(start, stop)
+        (s, e, t)
+        for s, e, start, stop in ((0, 0, 6, 30), (0, 1, 0, 12), (1, 0, 2, 9))
+        for t in range(start, stop)
     ]
     for index in (-1, len(dataset)):
         with pytest.raises(IndexError):
@@ -87,7 +103,9 @@ def test_items_are_the_execution_steps_of_all_sources_in_order(data, processor) 
 
 
 @pytest.mark.parametrize("offset", [0, 1])
-def test_a_chunk_starts_at_the_offset_and_repeats_the_last_action(data, processor, offset: int) -> None:
+def test_a_chunk_starts_at_the_offset_and_repeats_the_last_action(
+    data, processor, offset: int
+) -> None:
     dataset = TrainingDataset(data[0], processor, action_offset=offset, mask_padding=True)
     actions = data[1][0][0].actions.astype(np.float32)
     for index, t in ((0, 6), (23, 29)):
@@ -102,9 +120,16 @@ def test_a_chunk_starts_at_the_offset_and_repeats_the_last_action(data, processo
 def test_an_item_holds_the_current_images_and_words(data, processor) -> None:
     item = TrainingDataset(data[0], processor)[10]
     frames = [data[0][0].frames(0, [16], view)[0] for view in ("front", "wrist")]
-    assert torch.equal(item["images"], processor.images(frames)) and item["images"].dtype == torch.uint8
+    assert (
+        torch.equal(item["images"], processor.images(frames))
+        and item["images"].dtype == torch.uint8
+    )
     assert torch.equal(item["prompt"], processor.prompt("do task 0")[0])
-    assert item["subgoals"]["grounded_subgoal"] == "pick up 4 at <1, 2>" and item["place"] == (0, 0, 16)
+    assert item["subgoals"]["grounded_subgoal"] == "pick up 4 at <1, 2>" and item["place"] == (
+        0,
+        0,
+        16,
+    )
 
 
 def test_the_history_is_the_memorys_selection_up_to_the_step(data, processor, caches) -> None:
@@ -131,11 +156,20 @@ def test_items_depend_on_seed_epoch_and_index_alone(data, processor, caches) -> 
 def test_workers_give_the_same_batches_as_the_main_process(data, processor, caches) -> None:
     dataset = TrainingDataset(data[0], processor, LastFrames(), caches, mask_padding=True)
     dataset[0]  # files and maps are open before the workers start
-    batches = [list(DataLoader(dataset, batch_size=8, collate_fn=collate, num_workers=workers)) for workers in (0, 2)]
+    batches = [
+        list(DataLoader(dataset, batch_size=8, collate_fn=collate, num_workers=workers))
+        for workers in (0, 2)
+    ]
     for alone, parallel in zip(*batches, strict=True):
-        assert all(torch.equal(a, b) for a, b in zip(alone.tensors(), parallel.tensors(), strict=True))
+        assert all(
+            torch.equal(a, b) for a, b in zip(alone.tensors(), parallel.tensors(), strict=True)
+        )
     batch = batches[0][0]
-    assert batch.images.shape == (8, 2, 3, 28, 28) and batch.image_mask.all() and batch.actions.shape == (8, 20, 32)
+    assert (
+        batch.images.shape == (8, 2, 3, 28, 28)
+        and batch.image_mask.all()
+        and batch.actions.shape == (8, 20, 32)
+    )
     assert batch.history.features.shape == (8, 12, 6) and batch.action_mask.shape == (8, 20)
     assert batch.state.shape == (8, 8) and batch.prompt.shape == batch.prompt_mask.shape == (8, 16)
 
@@ -144,15 +178,21 @@ def test_an_item_decodes_its_two_current_images_only(data, processor, caches, mo
     requests = []
     frames = EpisodeSource.frames
     monkeypatch.setattr(
-        EpisodeSource, "frames", lambda self, e, i, view=None: (requests.append(i), frames(self, e, i, view))[1]
+        EpisodeSource,
+        "frames",
+        lambda self, e, i, view=None: (requests.append(i), frames(self, e, i, view))[1],
     )
     TrainingDataset(data[0], processor, LastFrames(), caches)[10]
     assert requests == [[16], [16]]
 
 
 def test_subgoals_reach_the_prompt_through_the_choice(data) -> None:
-    processor = Processor(28, Tokenizer.load("sample"), prompt="subgoal", stats=compute_norm_stats(data[0]))
-    dataset = TrainingDataset(data[0], processor, subgoal=SubgoalText("simple_subgoal", online_probability=1.0))
+    processor = Processor(
+        28, Tokenizer.load("sample"), prompt="subgoal", stats=compute_norm_stats(data[0])
+    )
+    dataset = TrainingDataset(
+        data[0], processor, subgoal=SubgoalText("simple_subgoal", online_probability=1.0)
+    )
     assert torch.equal(dataset[0]["prompt"], processor.prompt("do task 0", "pick up 1 online")[0])
 
 
@@ -174,7 +214,9 @@ def test_splits_hold_out_full_episodes(data, processor) -> None:
 
 
 @pytest.mark.parametrize(("named", "held_out"), [([], set()), (["sample"], {(1, 3)})])
-def test_only_the_sample_holds_out_an_episode_by_default(named: list[str], held_out: set, tmp_path: Path) -> None:
+def test_only_the_sample_holds_out_an_episode_by_default(
+    named: list[str], held_out: set, tmp_path: Path
+) -> None:
     make_source(tmp_path, "Alpha", [6, 5, 4, 3], [0, 0, 0, 0])
     sources = ",".join([str(tmp_path / "Alpha"), *named])
     data = compose("train", [f"data.sources=[{sources}]"]).data

@@ -1,4 +1,6 @@
-"""Reading LeRobot v3.0 datasets: images or videos, offline, and clear words where they do not fit."""
+"""Reading LeRobot v3.0 datasets: images or videos, offline, and clear words where they
+do not fit.
+"""
 
 import json
 import shutil
@@ -83,7 +85,9 @@ def test_open_videos_are_bounded_and_not_shared_with_other_processes(sample: Epi
             assert np.array_equal(frames, expected)
 
 
-def test_the_fingerprint_follows_the_content_not_the_place(sample: EpisodeSource, copy: Path) -> None:
+def test_the_fingerprint_follows_the_content_not_the_place(
+    sample: EpisodeSource, copy: Path
+) -> None:
     assert EpisodeSource(copy).fingerprint == sample.fingerprint
     video = next(copy.glob("videos/image/**/*.mp4"))
     content = bytearray(video.read_bytes())
@@ -95,18 +99,28 @@ def test_the_fingerprint_follows_the_content_not_the_place(sample: EpisodeSource
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (without("wrist_image", "actions"), "lacks the features wrist_image, actions; it has image, state"),
+        (
+            without("wrist_image", "actions"),
+            "lacks the features wrist_image, actions; it has image, state",
+        ),
         (lambda info: info["features"]["state"].update(shape=[7]), r"state has shape \[7\]"),
-        (lambda info: info.update(codebase_version="v2.1"), "convert_dataset_v21_to_v30 --repo-id=copy"),
+        (
+            lambda info: info.update(codebase_version="v2.1"),
+            "convert_dataset_v21_to_v30 --repo-id=copy",
+        ),
     ],
 )
-def test_a_dataset_that_does_not_fit_is_refused(copy: Path, change: Callable[[dict], object], words: str) -> None:
+def test_a_dataset_that_does_not_fit_is_refused(
+    copy: Path, change: Callable[[dict], object], words: str
+) -> None:
     edit_info(copy, change)
     with pytest.raises(UserError, match=words):
         EpisodeSource(copy)
 
 
-def test_a_dataset_without_demonstration_flag_needs_a_side_file(copy: Path, sample: EpisodeSource) -> None:
+def test_a_dataset_without_demonstration_flag_needs_a_side_file(
+    copy: Path, sample: EpisodeSource
+) -> None:
     edit_info(copy, without("is_demo", "exec_start_idx"))
     with pytest.raises(UserError, match="neither is_demo nor exec_start_idx"):
         EpisodeSource(copy)
@@ -130,7 +144,9 @@ def test_exec_start_idx_alone_is_enough_and_reported(copy: Path, caplog) -> None
     assert "has no is_demo" in caplog.text
 
 
-def test_no_or_half_a_dataset_is_refused_before_the_hub_is_queried(copy: Path, tmp_path: Path) -> None:
+def test_no_or_half_a_dataset_is_refused_before_the_hub_is_queried(
+    copy: Path, tmp_path: Path
+) -> None:
     with pytest.raises(UserError, match=r"No LeRobot dataset at .*hf download"):
         EpisodeSource(tmp_path / "nothing")
     shutil.rmtree(copy / "meta" / "episodes")

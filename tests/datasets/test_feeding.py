@@ -1,4 +1,6 @@
-"""Data for many processes: read ahead within bounds, files held open, rows on pages; and what is computed again."""
+"""Data for many processes: read ahead within bounds, files held open, rows on pages; and what is
+computed again.
+"""
 
 import resource
 import threading
@@ -87,11 +89,16 @@ def test_as_many_files_are_open_as_the_system_allows(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("limit", [64, 65, 100, 512, 2048])
 def test_ranking_no_more_than_can_stay_changes_no_choice(limit: int) -> None:
     rng = np.random.default_rng(limit)
-    values = rng.choice([0.0, THRESHOLD / 2, 0.1, 0.2, 0.3, 0.5], (40, 64)).astype(np.float32)  # many ties
+    values = rng.choice([0.0, THRESHOLD / 2, 0.1, 0.2, 0.3, 0.5], (40, 64)).astype(
+        np.float32
+    )  # many ties
     scores = FrameScores(np.arange(7, 320, 8), values)
     rows, patches = np.nonzero(values >= THRESHOLD)
     every = [(FIRST_FRAME_SCORE, 0, patch) for patch in range(64)]
-    every += [(values[row, patch], scores.frames[row], patch) for row, patch in zip(rows, patches, strict=True)]
+    every += [
+        (values[row, patch], scores.frames[row], patch)
+        for row, patch in zip(rows, patches, strict=True)
+    ]
     expected = [(frame, patch) for _, frame, patch in sorted(every)[-limit:]]
     assert ranked_patches(scores, 64, limit).tolist() == [list(map(int, pair)) for pair in expected]
 
@@ -136,7 +143,9 @@ def test_what_does_not_learn_may_be_stored_in_bfloat16() -> None:
     built = policy("framesamp_modul", policy={"compute_dtype": "bfloat16"})
     apply_finetuning(built, "expert_only", frozen_dtype="bfloat16")
     for name, parameter in built.named_parameters():
-        assert parameter.dtype == (torch.float32 if parameter.requires_grad else torch.bfloat16), name
+        assert parameter.dtype == (torch.float32 if parameter.requires_grad else torch.bfloat16), (
+            name
+        )
     loss, _ = built.train()(built.full_batch())
     loss.backward()
     with pytest.raises(UserError, match=r"policy\.compute_dtype=bfloat16 too"):

@@ -15,14 +15,24 @@ def test_files_come_sorted_and_episodes_numerically(tmp_path: Path) -> None:
     write_file(tmp_path / "record_dataset_Zeta.h5", [4])
     write_file(tmp_path / "record_dataset_Alpha.h5", [4, 4, 4], numbers=[10, 2, 1])
     refs = list_episodes(find_files([tmp_path]))
-    assert [(ref.task, ref.index) for ref in refs] == [("Alpha", 1), ("Alpha", 2), ("Alpha", 10), ("Zeta", 0)]
+    assert [(ref.task, ref.index) for ref in refs] == [
+        ("Alpha", 1),
+        ("Alpha", 2),
+        ("Alpha", 10),
+        ("Zeta", 0),
+    ]
 
 
 def test_episode_fields_are_decoded(tmp_path: Path) -> None:
     path = tmp_path / "record_dataset_Alpha.h5"
     (recorded,) = write_file(path, [12], videos=[5], numbers=[3])
     with open_episode(EpisodeRef(path, 3, "Alpha")) as episode:
-        assert (len(episode), episode.exec_start, episode.seed, episode.difficulty) == (12, 5, 300, "easy")
+        assert (len(episode), episode.exec_start, episode.seed, episode.difficulty) == (
+            12,
+            5,
+            300,
+            "easy",
+        )
         assert episode.goals == ["do task 3", "another wording"]
         frames = list(episode)
     assert np.array_equal(np.stack([frame.state for frame in frames]), recorded.state)
@@ -45,8 +55,14 @@ def test_subgoals_of_a_completed_task_stay_the_last_ones(tmp_path: Path) -> None
     [
         (lambda e: e.pop("timestep_3"), "without gaps"),
         (lambda e: e["timestep_0"].pop("obs/wrist_rgb"), "lacks timestep_0/obs/wrist_rgb"),
-        (lambda e: e["timestep_4"].pop("action/joint_action"), "timestep_4/action/joint_action is damaged"),
-        (lambda e: e["timestep_5/info/is_video_demo"].write_direct(np.array(True)), "video frames must come first"),
+        (
+            lambda e: e["timestep_4"].pop("action/joint_action"),
+            "timestep_4/action/joint_action is damaged",
+        ),
+        (
+            lambda e: e["timestep_5/info/is_video_demo"].write_direct(np.array(True)),
+            "video frames must come first",
+        ),
     ],
 )
 def test_a_damaged_episode_is_named(tmp_path: Path, damage, message: str) -> None:
@@ -54,7 +70,10 @@ def test_a_damaged_episode_is_named(tmp_path: Path, damage, message: str) -> Non
     write_file(path, [8])
     with h5py.File(path, "a") as file:
         damage(file["episode_0"])
-    with pytest.raises(UserError, match=message), open_episode(EpisodeRef(path, 0, "Alpha")) as episode:
+    with (
+        pytest.raises(UserError, match=message),
+        open_episode(EpisodeRef(path, 0, "Alpha")) as episode,
+    ):
         list(episode)
 
 
@@ -81,7 +100,10 @@ def test_official_files_are_read(h5_folder: Path) -> None:
     for ref in list_episodes(find_files([h5_folder])):
         with open_episode(ref) as episode:
             frame = next(iter(episode))
-            assert frame.front.shape == frame.wrist.shape == (256, 256, 3) and frame.front.dtype == np.uint8
+            assert (
+                frame.front.shape == frame.wrist.shape == (256, 256, 3)
+                and frame.front.dtype == np.uint8
+            )
             assert frame.state.shape == frame.action.shape == (8,)
             episodes[ref.task, ref.index] = (len(episode), episode.exec_start, episode.difficulty)
     assert episodes == {

@@ -1,4 +1,6 @@
-"""The layouts in which RoboMME is published for LeRobot, made manually: what each has, lacks, and how it is read."""
+"""The layouts in which RoboMME is published for LeRobot, made manually: what each has, lacks, and
+how it is read.
+"""
 
 import json
 import logging
@@ -29,29 +31,49 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def publish(root: Path, recordings: Path, image_format: str, order: tuple[int, ...]) -> Path:
-    """A dataset of these recordings in the published columns, at 10 frames per second, without demonstration flags."""
+    """A dataset of these recordings in the published columns, at 10 frames per second, without
+    demonstration flags.
+    """
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from mme_vla.data.hdf5 import open_episode
 
     view = {"dtype": image_format, "shape": (64, 64, 3), "names": ["height", "width", "channel"]}
-    features = {"image": view, "wrist_image": view, "state": VECTOR, "actions": VECTOR, "simple_subgoal": TEXT}
+    features = {
+        "image": view,
+        "wrist_image": view,
+        "state": VECTOR,
+        "actions": VECTOR,
+        "simple_subgoal": TEXT,
+    }
     as_video = image_format == "video"
     dataset = LeRobotDataset.create(
-        "lerobot/robomme", 10, features, root=root, robot_type="panda", use_videos=as_video,
+        "lerobot/robomme",
+        10,
+        features,
+        root=root,
+        robot_type="panda",
+        use_videos=as_video,
         video_backend="pyav",
-        rgb_encoder=RGBEncoderConfig(vcodec="libsvtav1", crf=30, pix_fmt="yuv420p") if as_video else None,
-    )  # fmt: skip
+        rgb_encoder=RGBEncoderConfig(vcodec="libsvtav1", crf=30, pix_fmt="yuv420p")
+        if as_video
+        else None,
+    )
     refs = list_episodes(find_files([recordings]))
     for number in order:
         with open_episode(refs[number]) as episode:
             for frame in episode:
-                dataset.add_frame({
-                    "image": frame.front, "wrist_image": frame.wrist, "state": frame.state,
-                    "actions": frame.action.astype(np.float32), "simple_subgoal": frame.subgoals["simple_subgoal"],
-                    "task": episode.goals[0],
-                })  # fmt: skip
+                dataset.add_frame(
+                    {
+                        "image": frame.front,
+                        "wrist_image": frame.wrist,
+                        "state": frame.state,
+                        "actions": frame.action.astype(np.float32),
+                        "simple_subgoal": frame.subgoals["simple_subgoal"],
+                        "task": episode.goals[0],
+                    }
+                )
         dataset.save_episode()
     dataset.finalize()
     return root
@@ -60,13 +82,17 @@ def publish(root: Path, recordings: Path, image_format: str, order: tuple[int, .
 @pytest.fixture(scope="module")
 def av1(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Episodes 2, 0 and 1 of the recordings, as videos."""
-    return publish(tmp_path_factory.mktemp("published") / "av1", recordings, "video", order=(2, 0, 1))
+    return publish(
+        tmp_path_factory.mktemp("published") / "av1", recordings, "video", order=(2, 0, 1)
+    )
 
 
 @pytest.fixture(scope="module")
 def tables(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Episodes 1, 2 and 0 of the recordings, as images in the tables."""
-    return publish(tmp_path_factory.mktemp("published") / "tables", recordings, "image", order=(1, 2, 0))
+    return publish(
+        tmp_path_factory.mktemp("published") / "tables", recordings, "image", order=(1, 2, 0)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +103,9 @@ def converted(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return folder
 
 
-def make_side_file(recordings: Path, dataset: Path, output: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def make_side_file(
+    recordings: Path, dataset: Path, output: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
     words = [f"input={recordings}", f"dataset={dataset}", f"output={output}"]
     monkeypatch.setattr("sys.argv", ["exec_starts", *words])
     main()
@@ -108,16 +136,22 @@ def test_a_memory_that_scores_patches_is_warned_of_lossy_videos(
         caplog.clear()
         policy = small_policy(model)
         with caplog.at_level(logging.WARNING):
-            ensure_cache(source, policy.require_memory(), policy.encode_frames, "x", root=tmp_path / "cache")
+            ensure_cache(
+                source, policy.require_memory(), policy.encode_frames, "x", root=tmp_path / "cache"
+            )
         assert ("passes for motion" in caplog.text) == warned
 
 
-def test_images_inside_the_tables_are_read_as_they_are(tmp_path: Path, tables: Path, converted: Path) -> None:
+def test_images_inside_the_tables_are_read_as_they_are(
+    tmp_path: Path, tables: Path, converted: Path
+) -> None:
     (tmp_path / "starts.json").write_text('{"0": 0, "1": 2, "2": 4}')
     source = EpisodeSource(tables, exec_starts=tmp_path / "starts.json")
     assert source.video_cameras == () and source.lossy == {}
     expected = EpisodeSource(converted)
-    np.testing.assert_array_equal(source.frames(1, range(9), "wrist"), expected.frames(2, range(9), "wrist"))
+    np.testing.assert_array_equal(
+        source.frames(1, range(9), "wrist"), expected.frames(2, range(9), "wrist")
+    )
 
 
 def test_our_demonstrations_mark_videos_too_and_unauthenticated_clients_are_named(
@@ -125,5 +159,7 @@ def test_our_demonstrations_mark_videos_too_and_unauthenticated_clients_are_name
 ) -> None:
     assert first_frames(tables, annotated_episodes([converted])) == [0, 2, 4]
     write_file(tmp_path / "record_dataset_AnotherSeed.h5", LENGTHS, videos=VIDEOS, size=16)
-    with pytest.raises(UserError, match=r"episode 0 .*is not among the 3 episodes given: the nearest is .* rad"):
+    with pytest.raises(
+        UserError, match=r"episode 0 .*is not among the 3 episodes given: the nearest is .* rad"
+    ):
         first_frames(tables, annotated_episodes([tmp_path]))

@@ -14,7 +14,9 @@ from mme_vla.utils import with_checksum, write_json
 def test_the_pages_are_those_of_the_committed_rows() -> None:
     made = nano_board.boards()
     for path, text in nano_board.pages(made).items():
-        assert path.read_text() == text, f"run `python scripts/nano_board.py`: {path.name} differs from the rows"
+        assert path.read_text() == text, (
+            f"run `python scripts/nano_board.py`: {path.name} differs from the rows"
+        )
     assert not made or nano_board.FIGURE.is_file()
 
 
@@ -26,7 +28,10 @@ def test_committed_rows_are_compressed_and_small() -> None:
 
 @pytest.mark.slow
 def test_receipts_of_committed_rows_fit_their_records() -> None:
-    paths = [*nano_board.ROWS.rglob("receipt.json"), *nano_board.ROWS.parent.glob("reserved/*/receipt.json")]
+    paths = [
+        *nano_board.ROWS.rglob("receipt.json"),
+        *nano_board.ROWS.parent.glob("reserved/*/receipt.json"),
+    ]
     assert paths
     for path in paths:
         differences, *_ = verify(path)
@@ -36,34 +41,54 @@ def test_receipts_of_committed_rows_fit_their_records() -> None:
         assert not any(folder.startswith("/") for folder in folders), path
 
 
-def test_rows_of_a_run_are_added_and_reach_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_a_run_are_added_and_reach_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Rows that are not there yet are named, and no number is written for them."""
-    assert nano_board.block(None).startswith("Not run yet: `demonstrator`, ") and "|" not in nano_board.block(None)
+    assert nano_board.block(None).startswith(
+        "Not run yet: `demonstrator`, "
+    ) and "|" not in nano_board.block(None)
     assert len(nano_board.VARIANTS) == 14
     monkeypatch.setattr(nano_board, "ROOT", tmp_path)
     monkeypatch.setattr(nano_board, "ROWS", tmp_path / "rows")
     for seed, won in enumerate((3, 2)):
         write_training(tmp_path / "run", "framesamp_modul", seed, won)
     write_training(tmp_path / "run", "pi05", 0, {TASKS[0]: 1})
-    write_json(tmp_path / "run" / "scenes.json", {"split": "further", "tried": {f"{TASKS[0]} 0": ""}})
+    write_json(
+        tmp_path / "run" / "scenes.json", {"split": "further", "tried": {f"{TASKS[0]} 0": ""}}
+    )
     conditions = {"checkpoint": {"folder": "/somewhere/pi05/0", "files": {}}}
-    receipt = {"settings": {"source": "pi05/0"}, "conditions": [conditions], "records": {}, "scenes": "", "score": {}}
+    receipt = {
+        "settings": {"source": "pi05/0"},
+        "conditions": [conditions],
+        "records": {},
+        "scenes": "",
+        "score": {},
+    }
     write_json(tmp_path / "run" / "pi05" / "0" / "receipt.json", with_checksum(receipt))
     nano_board.add(tmp_path / "run" / "pi05")
     added = read_receipt(tmp_path / "rows" / "further" / "pi05" / "0" / "receipt.json")
     assert added["conditions"][0]["checkpoint"]["folder"] == "pi05/0"
-    assert [path.name for path in sorted((tmp_path / "rows" / "further").iterdir())] == ["pi05", "scenes.json"]
+    assert [path.name for path in sorted((tmp_path / "rows" / "further").iterdir())] == [
+        "pi05",
+        "scenes.json",
+    ]
     packed = tmp_path / "run" / "pi05" / "0" / "episodes.jsonl"
     packed.with_suffix(".jsonl.xz").write_bytes(lzma.compress(packed.read_bytes()))
     packed.unlink()
     nano_board.add(tmp_path / "run")
     (board,) = nano_board.boards()
     text = nano_board.block(board)
-    assert "| framesamp_modul | 1 [1, 1] | 2 | 83.33 ± 23.57 |" in text and "Not run yet: `demonstrator`" in text
+    assert (
+        "| framesamp_modul | 1 [1, 1] | 2 | 83.33 ± 23.57 |" in text
+        and "Not run yet: `demonstrator`" in text
+    )
     assert "`framesamp_modul`" not in text.partition("Not run yet")[2]
     write_training(tmp_path / "motions", "framesamp_modul", 0, 1, action_space="waypoint")
     nano_board.add(tmp_path / "motions")
-    assert (tmp_path / "rows" / "further-waypoint" / "framesamp_modul" / "0" / "trained.json").is_file()
+    assert (
+        tmp_path / "rows" / "further-waypoint" / "framesamp_modul" / "0" / "trained.json"
+    ).is_file()
     both = nano_board.boards()
     assert [made.action_space for made in both] == ["multi_choice", "waypoint"]
     page = nano_board.evidence(both)

@@ -23,12 +23,16 @@ def prose(text: str) -> str:
 
 def pages() -> list[Path]:
     """Pages written for users."""
-    stored = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] != "evidence"]
+    stored = [
+        page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] != "evidence"
+    ]
     return [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *stored]
 
 
 def test_pages_are_short() -> None:
-    words = {str(page.relative_to(REPOSITORY)): len(prose(page.read_text()).split()) for page in pages()}
+    words = {
+        str(page.relative_to(REPOSITORY)): len(prose(page.read_text()).split()) for page in pages()
+    }
     assert {page: count for page, count in words.items() if count > MAX_WORDS} == {}
     assert sum(words.values()) <= MAX_WORDS_OF_ALL
     assert len((REPOSITORY / "README.md").read_text().splitlines()) <= 120
@@ -49,7 +53,17 @@ def test_a_page_begins_with_one_title_and_its_purpose(page: Path) -> None:
 
 def test_the_navigation_has_the_tasks_of_a_user() -> None:
     titles = [title for entry in navigation() for title in entry]
-    assert titles == ["Start", "Train", "Evaluate", "Serve", "Probe", "Extend", "Benchmark", "Evidence", "Reference"]
+    assert titles == [
+        "Start",
+        "Train",
+        "Evaluate",
+        "Serve",
+        "Probe",
+        "Extend",
+        "Benchmark",
+        "Evidence",
+        "Reference",
+    ]
 
 
 def test_every_page_is_in_the_navigation_once() -> None:
@@ -65,7 +79,9 @@ def test_the_documentation_workflow_builds_the_site() -> None:
 
 def test_the_test_workflow_runs_the_commands_of_the_readme() -> None:
     readme = (REPOSITORY / "README.md").read_text()
-    commands = re.findall(r"^((?:pip install uv && .*|)uv run (?:--extra dev|python).*)$", readme, re.MULTILINE)
+    commands = re.findall(
+        r"^((?:pip install uv && .*|)uv run (?:--extra dev|python).*)$", readme, re.MULTILINE
+    )
     assert len(commands) == 3
     assert set(commands) <= set(steps("tests.yml"))
 
@@ -79,7 +95,9 @@ def steps(workflow: str) -> list[str]:
     jobs = content["jobs"].values()
     for job in jobs:
         assert all(set(step) & {"run", "uses"} for step in job["steps"])
-        assert all(re.fullmatch(r"[\w/-]+@v\d+", step["uses"]) for step in job["steps"] if "uses" in step)
+        assert all(
+            re.fullmatch(r"[\w/-]+@v\d+", step["uses"]) for step in job["steps"] if "uses" in step
+        )
     return [step["run"] for job in jobs for step in job["steps"] if "run" in step]
 
 

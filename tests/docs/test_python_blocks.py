@@ -1,4 +1,6 @@
-"""The Python blocks of each page run in order, in an empty folder, with what the reader has at that point."""
+"""The Python blocks of each page run in order, in an empty folder, with what the reader has at that
+point.
+"""
 
 import re
 import subprocess
@@ -45,22 +47,29 @@ NOT_RUN = {
 INSTEAD = {
     "docs/evaluate/evaluation.md": [
         ('"outputs/framesamp_modul/latest"', 'MMEPolicy.from_pretrained("policy")'),
-        ("episodes=5", "episodes=1, max_steps=1, render=False"), ("workers=4", "workers=1"),
+        ("episodes=5", "episodes=1, max_steps=1, render=False"),
+        ("workers=4", "workers=1"),
     ],
     "docs/benchmark/benchmark.md": [
-        ("episode=0,", "episode=0, max_steps=2,"), ("action = ...", "action = np.zeros(8)"),
+        ("episode=0,", "episode=0, max_steps=2,"),
+        ("action = ...", "action = np.zeros(8)"),
     ],
     "docs/start/getting-started.md": [("outputs/tokendrop_expert/latest", "policy")],
     "docs/serve/serving.md": [("8001", "PORT")],
     "docs/train/subgoals.md": [
-        ('"adapter": "outputs/subgoal/grounded/adapter"', '"model": "tiny", "dtype": "float32", "device": "cpu"')
+        (
+            '"adapter": "outputs/subgoal/grounded/adapter"',
+            '"model": "tiny", "dtype": "float32", "device": "cpu"',
+        )
     ],
-}  # fmt: skip
+}
 """Page → texts of its blocks and what the test runs instead: small sizes and paths."""
 
 
 def blocks(page: str) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", (REPOSITORY / page).read_text(), re.DOTALL | re.MULTILINE)
+    return re.findall(
+        r"^```python\n(.*?)^```", (REPOSITORY / page).read_text(), re.DOTALL | re.MULTILINE
+    )
 
 
 def pages() -> list[str]:
@@ -87,7 +96,9 @@ def robot(space: dict[str, Any]) -> None:
         past = np.zeros((len(actions), 8), np.float32)
         return (images, past) if "client" in space else (images, images, past)
 
-    space.update(video=frames, wrist_video=frames, video_states=states, states=states, done=False, run=run)
+    space.update(
+        video=frames, wrist_video=frames, video_states=states, states=states, done=False, run=run
+    )
     space.update(front=frames[0], wrist=frames[0], state=states[0], goal="pick up the red cube")
 
 
@@ -119,7 +130,12 @@ def evaluation(space: dict[str, Any]) -> None:
 
 def built_rows(space: dict[str, Any]) -> None:
     done = commands.run(
-        "mme_vla", "subgoal-build", "input=sample", "output=subgoal_data", "sets=[grounded]", cwd=Path.cwd()
+        "mme_vla",
+        "subgoal-build",
+        "input=sample",
+        "output=subgoal_data",
+        "sets=[grounded]",
+        cwd=Path.cwd(),
     )
     assert done.returncode == 0, done.stderr
 
@@ -132,7 +148,9 @@ def simulated(space: dict[str, Any]) -> None:
 PREPARE: dict[str, Callable[[dict[str, Any]], None]] = {
     "docs/evaluate/evaluation.md": evaluation,
     "docs/evaluate/play.md": simulated,
-    "docs/evaluate/results.md": lambda space: space.update(folder=REPOSITORY / "benchmarks/nano/VideoUnmask/rmt_modul"),
+    "docs/evaluate/results.md": lambda space: space.update(
+        folder=REPOSITORY / "benchmarks/nano/VideoUnmask/rmt_modul"
+    ),
     "docs/probe/analyses.md": analyses,
     "docs/benchmark/benchmark.md": simulated,
     "docs/start/getting-started.md": lambda space: (saved_policy(), robot(space)),
@@ -151,7 +169,12 @@ def server(request: pytest.FixtureRequest) -> Iterator[str]:
         return
     pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
     process = commands.start(
-        "mme_vla.serve", "model=pi05", "backbone=tiny", "port=0", "device=cpu", stderr=subprocess.STDOUT
+        "mme_vla.serve",
+        "model=pi05",
+        "backbone=tiny",
+        "port=0",
+        "device=cpu",
+        stderr=subprocess.STDOUT,
     )
     try:
         assert process.stdout is not None
@@ -162,8 +185,12 @@ def server(request: pytest.FixtureRequest) -> Iterator[str]:
         process.communicate()
 
 
-@pytest.mark.parametrize("page", [page for page in pages() if page not in TESTED_BY.keys() | NOT_RUN.keys()])
-def test_the_blocks_of_a_page_run(page: str, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "page", [page for page in pages() if page not in TESTED_BY.keys() | NOT_RUN.keys()]
+)
+def test_the_blocks_of_a_page_run(
+    page: str, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["page"])
     space: dict[str, Any] = {"__name__": "page"}

@@ -17,7 +17,9 @@ from mme_vla.cli import help as cli_help
 
 
 def test_every_public_name_has_a_description() -> None:
-    pytest.importorskip("gymnasium", reason="the environments' signatures: uv sync --inexact --extra sim")
+    pytest.importorskip(
+        "gymnasium", reason="the environments' signatures: uv sync --inexact --extra sim"
+    )
     page = api_pages.page()
     names = [name for names in api_pages.GROUPS.values() for name in names]
     assert [name for name in names if f"### `{name}`" not in page] == []
@@ -33,7 +35,10 @@ def test_a_public_name_without_a_group_is_an_error(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_long_signature_has_a_line_for_each_argument() -> None:
-    call = "evaluate(policy: Policy, tasks: tuple[str, ...] = (), *, seed: int = 42, output: Path | None = None) -> Run"
+    call = (
+        "evaluate(policy: Policy, tasks: tuple[str, ...] = (), *, seed: int = 42, output: Path |"
+        " None = None) -> Run"
+    )
     assert api_pages.wrapped(call).splitlines() == [
         "evaluate(",
         "    policy: Policy,",
@@ -59,13 +64,19 @@ def test_every_key_has_a_comment_in_one_file_of_its_group() -> None:
         for group in [[file] for file in files] if folder == configs else [files]:
             rows = [(file, key.name, key.comment) for file in group for key in cli_help.keys(file)]
             explained = {key for _, key, comment in rows if comment}
-            sections = {key for _, key, _ in rows if any(other.startswith(f"{key}.") for other in explained)}
-            unexplained += [f"{file.name}: {key}" for file, key, _ in rows if key not in explained | sections]
+            sections = {
+                key for _, key, _ in rows if any(other.startswith(f"{key}.") for other in explained)
+            }
+            unexplained += [
+                f"{file.name}: {key}" for file, key, _ in rows if key not in explained | sections
+            ]
     assert sorted(set(unexplained)) == []
 
 
 def test_comments_are_rendered_completely() -> None:
-    """Outside of backticks and code blocks no tag opens, and a row of a table has as many columns as its head."""
+    """Outside of backticks and code blocks no tag opens, and a row of a table has as many columns
+    as its head.
+    """
     for path, page in config_pages.pages().items():
         text = re.sub(r"```.*?```", "", page, flags=re.DOTALL)
         assert re.findall(r"<[^>\n]*>", re.sub(r"`[^`]*`", "", text)) == [], path
@@ -75,7 +86,10 @@ def test_comments_are_rendered_completely() -> None:
 
 
 def test_comments_become_markdown() -> None:
-    assert config_pages.prose("train | val, `a|b` in <folder>, 2*3") == r"train \| val, `a\|b` in &lt;folder&gt;, 2\*3"
+    assert (
+        config_pages.prose("train | val, `a|b` in <folder>, 2*3")
+        == r"train \| val, `a\|b` in &lt;folder&gt;, 2\*3"
+    )
 
 
 def test_each_command_has_a_page_with_its_options() -> None:
@@ -106,7 +120,11 @@ def test_links_beside_the_pages_lead_to_pages_of_the_site() -> None:
     assert hooks.outside("train/data.md", page) == {"configs/train.yaml"}
     linked = hooks.relink("train/data.md", page + "```text\n[a](../../configs/train.yaml)\n```\n")
     assert "[a](../source/configs/train.yaml.md)" in linked
-    assert "[b](models.md#x)" in linked and "[c](../index.md)" in linked and "[d](https://x.y)" in linked
+    assert (
+        "[b](models.md#x)" in linked
+        and "[c](../index.md)" in linked
+        and "[d](https://x.y)" in linked
+    )
     assert linked.endswith("```text\n[a](../../configs/train.yaml)\n```\n")
     with pytest.raises(Exception, match=r"no\.yaml, which does not exist"):
         hooks.outside("train/data.md", "[a](../../configs/no.yaml)")
@@ -118,7 +136,10 @@ def test_a_notebook_is_shown_with_its_outputs(tmp_path: Path) -> None:
         {
             "cell_type": "code",
             "source": ["print(1)"],
-            "outputs": [{"text": ["\x1b[1m1\x1b[0m\n"]}, {"data": {"image/png": "QUJD\n", "text/plain": ["<Figure>"]}}],
+            "outputs": [
+                {"text": ["\x1b[1m1\x1b[0m\n"]},
+                {"data": {"image/png": "QUJD\n", "text/plain": ["<Figure>"]}},
+            ],
         },
     ]
     file = tmp_path / "a.ipynb"

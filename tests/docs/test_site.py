@@ -1,4 +1,6 @@
-"""The site: builds without a warning, loads nothing from another host, and finds pages from a file in the browser."""
+"""The site: builds without a warning, loads nothing from another host, and finds pages from a file
+in the browser.
+"""
 
 import re
 from html.parser import HTMLParser
@@ -60,8 +62,15 @@ def test_each_command_and_group_has_a_page(site: Path) -> None:
 
 def test_the_site_loads_nothing_from_another_host(site: Path, pages: dict[Path, Page]) -> None:
     assert len(pages) > 60
-    foreign = {(page.name, address) for page, read in pages.items() for address in read.loaded if "//" in address}
-    assert {(page, address) for page, address in foreign if not address.startswith("data:")} == set()
+    foreign = {
+        (page.name, address)
+        for page, read in pages.items()
+        for address in read.loaded
+        if "//" in address
+    }
+    assert {
+        (page, address) for page, address in foreign if not address.startswith("data:")
+    } == set()
     for style in site.rglob("*.css"):
         assert re.findall(r"url\([\"']?(?:https?:)?//|@import", style.read_text()) == [], style
 
@@ -75,7 +84,9 @@ def test_links_and_anchors_resolve(pages: dict[Path, Page]) -> None:
                 continue
             target = (page.parent / unquote(address)).resolve() if address else page
             if not target.exists() or (
-                anchor and target in pages and unquote(anchor) not in pages[target].anchors | {"__top"}
+                anchor
+                and target in pages
+                and unquote(anchor) not in pages[target].anchors | {"__top"}
             ):
                 broken.append(f"{page.name}: {link}")
     assert broken == []
@@ -90,7 +101,10 @@ def test_a_search_leads_to_a_page(site: Path, tmp_path: Path) -> None:
         browser.wait(f"{results}.length > 3")
         first = browser.run(f"{results}[0].href")
         browser.run(f"{results}[0].click()")
-        browser.wait(f"location.href.split('?')[0] === {first.split('?')[0]!r} && document.readyState === 'complete'")
+        browser.wait(
+            f"location.href.split('?')[0] === {first.split('?')[0]!r} && document.readyState ==="
+            " 'complete'"
+        )
         assert "tokendrop" in browser.text("article").lower()
         assert browser.problems == []
 
@@ -105,7 +119,9 @@ def test_a_broken_link_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         docs.build_site(tmp_path / "site")
 
 
-def test_an_installed_package_without_pages_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_installed_package_without_pages_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("material", reason="the extra `docs` is not installed")
     monkeypatch.setattr(docs, "SETTINGS", tmp_path / "mkdocs.yml")
     with pytest.raises(UserError, match="in the repository"):

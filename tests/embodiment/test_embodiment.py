@@ -1,4 +1,6 @@
-"""The robot as a part: its YAML, what it refuses, what old checkpoints mean, and what its numbers become."""
+"""The robot as a part: its YAML, what it refuses, what old checkpoints mean, and what its numbers
+become.
+"""
 
 import json
 import math
@@ -26,7 +28,9 @@ TINY = {"vision": {**SMALL_VISION, "patch_size": 16}}
 
 
 def shipped(name: str) -> Embodiment:
-    section: Any = OmegaConf.to_container(compose("policy", [f"embodiment={name}"]).embodiment, resolve=True)
+    section: Any = OmegaConf.to_container(
+        compose("policy", [f"embodiment={name}"]).embodiment, resolve=True
+    )
     return Embodiment.from_dict(section)
 
 
@@ -80,7 +84,9 @@ def test_every_shipped_robot_survives_json_and_builds_a_policy(name: str) -> Non
         (action(frames=2), "expected 1; null if"),
     ],
 )
-def test_impossible_robots_are_refused_by_the_key_in_few_words(options: dict[str, Any], message: str) -> None:
+def test_impossible_robots_are_refused_by_the_key_in_few_words(
+    options: dict[str, Any], message: str
+) -> None:
     with pytest.raises(UserError, match=message) as caught:
         Embodiment.from_dict(options)
     assert len(str(caught.value)) < 300
@@ -121,11 +127,15 @@ def test_a_checkpoint_saved_before_robots_could_be_selected_is_the_panda(tmp_pat
     file = tmp_path / "processor.json"
     settings = json.loads(file.read_text())
     del settings["embodiment"]
-    file.write_text(json.dumps({**settings, "horizon": 20, "views": ["base_0_rgb", "left_wrist_0_rgb"]}))
+    file.write_text(
+        json.dumps({**settings, "horizon": 20, "views": ["base_0_rgb", "left_wrist_0_rgb"]})
+    )
     loaded = MMEPolicy.from_pretrained(tmp_path)
     assert loaded.embodiment == ROBOMME_JOINT and "embodiment" not in loaded.config
     batch, noise = random_batch(policy), torch.zeros(2, 20, 32)
-    assert torch.equal(loaded.sample_actions(batch, noise, 2), policy.sample_actions(batch, noise, 2))
+    assert torch.equal(
+        loaded.sample_actions(batch, noise, 2), policy.sample_actions(batch, noise, 2)
+    )
 
 
 def test_a_checkpoint_keeps_its_robot(tmp_path: Path) -> None:
@@ -157,11 +167,18 @@ def test_absolute_actions_stay_as_they_are_recorded() -> None:
 def test_angles_do_not_jump_and_the_gripper_of_a_waypoint_is_exactly_open_or_closed() -> None:
     space = shipped("robomme_waypoint").action
     recorded = torch.tensor(
-        [[0.1, 0.2, 0.3, math.pi - 0.01, 0.0, -0.1, -1.0], [0.1, 0.2, 0.3, 0.01 - math.pi, 0.0, 0.1, 1.0]]
+        [
+            [0.1, 0.2, 0.3, math.pi - 0.01, 0.0, -0.1, -1.0],
+            [0.1, 0.2, 0.3, 0.01 - math.pi, 0.0, 0.1, 1.0],
+        ]
     )
     predicted = space.to_relative(recorded[None], torch.zeros(1, 8))[0]
-    assert torch.allclose(predicted[:, 3], torch.tensor([math.pi - 0.01, math.pi + 0.01]), atol=1e-5)
-    assert torch.allclose(predicted[:, [0, 1, 2, 4, 5, 6]], recorded[:, [0, 1, 2, 4, 5, 6]], atol=1e-6)
+    assert torch.allclose(
+        predicted[:, 3], torch.tensor([math.pi - 0.01, math.pi + 0.01]), atol=1e-5
+    )
+    assert torch.allclose(
+        predicted[:, [0, 1, 2, 4, 5, 6]], recorded[:, [0, 1, 2, 4, 5, 6]], atol=1e-6
+    )
     noisy = predicted + 0.3
     assert space.to_absolute(noisy[None], torch.zeros(1, 8))[0, :, 6].tolist() == [-1.0, 1.0]
 
@@ -173,7 +190,9 @@ def test_robots_that_the_benchmark_does_not_have_are_not_evaluated_on_it() -> No
         check_benchmark(Embodiment.from_dict(section(cameras={"front": {}, "side": {}})), SPACES)
 
 
-def test_a_single_number_may_stand_without_a_list_and_is_checked_all_the_same(tmp_path: Path) -> None:
+def test_a_single_number_may_stand_without_a_list_and_is_checked_all_the_same(
+    tmp_path: Path,
+) -> None:
     class Table:
         def __init__(self, *values: float | None) -> None:
             self.data = {"gripper": pa.chunked_array([pa.array(values, pa.float32())])}

@@ -1,4 +1,6 @@
-"""docs/extend/your-robot.md, run as it stands on a generated dataset: two arms, 14 numbers, three cameras, no video."""
+"""docs/extend/your-robot.md, run as it stands on a generated dataset: two arms, 14 numbers, three
+cameras, no video.
+"""
 
 import json
 import re
@@ -31,10 +33,24 @@ from mme_vla.testing.small import SMALL_VISION, unit_stats
 EXAMPLE = REPOSITORY / "examples" / "bimanual"
 PAGE = (REPOSITORY / "docs" / "extend" / "your-robot.md").read_text()
 CAMERAS = ("top", "left_wrist", "right_wrist")
-BRIEF = ["train.steps=2", "train.batch_size=2", "train.val_samples=0", "train.open_loop_chunks=1", "train.workers=0",
-         "train.device=cpu", "logger=none"]  # fmt: skip
-SMALL = ["backbone.depth=1", "memory.budget=64", "backbone.vision.depth=1", "backbone.vision.image_size=16",
-         "backbone.vision.patch_size=1", "backbone.vision.width=16", "backbone.vision.mlp_dim=16"]  # fmt: skip
+BRIEF = [
+    "train.steps=2",
+    "train.batch_size=2",
+    "train.val_samples=0",
+    "train.open_loop_chunks=1",
+    "train.workers=0",
+    "train.device=cpu",
+    "logger=none",
+]
+SMALL = [
+    "backbone.depth=1",
+    "memory.budget=64",
+    "backbone.vision.depth=1",
+    "backbone.vision.image_size=16",
+    "backbone.vision.patch_size=1",
+    "backbone.vision.width=16",
+    "backbone.vision.mlp_dim=16",
+]
 
 
 def blocks(language: str) -> list[str]:
@@ -50,13 +66,22 @@ def write_dataset(root: Path) -> None:
     view = {"dtype": "image", "shape": (24, 32, 3), "names": ["height", "width", "channels"]}
     views = {f"observation.images.{camera}": view for camera in CAMERAS}
     features = {**views, "observation.state": numbers, "action": numbers}
-    dataset = LeRobotDataset.create("local/bimanual", fps=10, features=features, root=root, use_videos=False)
+    dataset = LeRobotDataset.create(
+        "local/bimanual", fps=10, features=features, root=root, use_videos=False
+    )
     rng = np.random.default_rng(0)
     for length in (14, 11):
         for _ in range(length):
             images = {name: rng.integers(0, 255, (24, 32, 3), np.uint8) for name in views}
             state = rng.normal(size=14).astype(np.float32)
-            dataset.add_frame({**images, "observation.state": state, "action": state + 0.1, "task": "Fold the towel"})
+            dataset.add_frame(
+                {
+                    **images,
+                    "observation.state": state,
+                    "action": state + 0.1,
+                    "task": "Fold the towel",
+                }
+            )
         dataset.save_episode()
     dataset.finalize()
 
@@ -93,7 +118,9 @@ def test_the_page_shows_the_file_that_is_tested() -> None:
     assert blocks("yaml") == [(EXAMPLE / "configs" / "embodiment" / "two_arms.yaml").read_text()]
 
 
-def test_the_page_from_the_dataset_to_a_served_policy(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_page_from_the_dataset_to_a_served_policy(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     inspecting, cached, training = (shlex.split(line) for line in blocks("bash")[0].splitlines())
     assert inspecting[:5] == ["python", "-m", "mme_vla.inspect", "--config-dir", "configs"]
     assert cached[:4] == ["mme-vla", "cache", "--config-dir", "configs"]
@@ -123,34 +150,61 @@ def test_the_page_from_the_dataset_to_a_served_policy(place: Path, capsys: pytes
 
     robot = Robot()
     with Served(policy, seed=0, flow_steps=10) as served:
-        assert served.server.metadata["cameras"] == list(CAMERAS) and served.server.metadata["action_dim"] == 14
-        exec(asking.replace("ws://127.0.0.1:8001", f"ws://127.0.0.1:{served.server.port}"), {"robot": robot})
+        assert (
+            served.server.metadata["cameras"] == list(CAMERAS)
+            and served.server.metadata["action_dim"] == 14
+        )
+        exec(
+            asking.replace("ws://127.0.0.1:8001", f"ws://127.0.0.1:{served.server.port}"),
+            {"robot": robot},
+        )
         with served.client() as client, pytest.raises(UserError, match="observation/left_wrist"):
             image = np.zeros((24, 32, 3), np.uint8)
-            client.infer({"observation/top": image, "observation/state": np.zeros(14), "prompt": "fold"})
+            client.infer(
+                {"observation/top": image, "observation/state": np.zeros(14), "prompt": "fold"}
+            )
     alone = policy.start_episode("fold the towel", seed=0)
     alone.observe(*Robot().new_observations())
     assert np.allclose(robot.executed[0], policy.act([alone])[0][:8], atol=1e-5)
 
 
 def test_columns_are_detected_in_both_spellings_joined_or_by_name(place: Path) -> None:
-    section = OmegaConf.to_container(OmegaConf.load(EXAMPLE / "configs" / "embodiment" / "two_arms.yaml"))
+    section = OmegaConf.to_container(
+        OmegaConf.load(EXAMPLE / "configs" / "embodiment" / "two_arms.yaml")
+    )
     assert isinstance(section, dict)
     robot = Embodiment.from_dict({str(key): value for key, value in section.items()})
     source = EpisodeSource("demonstrations", robot=robot)
     assert source.exec_starts.tolist() == [0, 0] and source.goal(1) == "fold the towel"
-    assert source.columns["top"] == "observation.images.top" and source.frames(1, [3, 10]).shape == (2, 24, 32, 3)
-    twice = {"state": {"key": ["state", "action"], "width": 28}, "action": {"key": "actions", "width": 14}}
-    joined = EpisodeSource("demonstrations", robot=Embodiment.from_dict({**robot.to_dict(), **twice}))
-    assert np.array_equal(joined.states(0), np.concatenate([source.states(0), source.actions(0)], axis=1))
+    assert source.columns["top"] == "observation.images.top" and source.frames(
+        1, [3, 10]
+    ).shape == (2, 24, 32, 3)
+    twice = {
+        "state": {"key": ["state", "action"], "width": 28},
+        "action": {"key": "actions", "width": 14},
+    }
+    joined = EpisodeSource(
+        "demonstrations", robot=Embodiment.from_dict({**robot.to_dict(), **twice})
+    )
+    assert np.array_equal(
+        joined.states(0), np.concatenate([source.states(0), source.actions(0)], axis=1)
+    )
     with pytest.raises(UserError, match=r"action has shape \[14\]; expected \[7\]"):
-        EpisodeSource("demonstrations", robot=Embodiment.from_dict({**robot.to_dict(), "action": {"width": 7}}))
-    with pytest.raises(UserError, match=r"lacks the features image, wrist_image.*choose embodiment="):
+        EpisodeSource(
+            "demonstrations",
+            robot=Embodiment.from_dict({**robot.to_dict(), "action": {"width": 7}}),
+        )
+    with pytest.raises(
+        UserError, match=r"lacks the features image, wrist_image.*choose embodiment="
+    ):
         EpisodeSource("demonstrations")
     hand = EpisodeSource(
-        "demonstrations", robot=Embodiment.from_dict({**robot.to_dict(), "memory_camera": "left_wrist"})
+        "demonstrations",
+        robot=Embodiment.from_dict({**robot.to_dict(), "memory_camera": "left_wrist"}),
     )
-    places = [cache_folder(place, s, fingerprint(s, StorageSpec(4), "encoder")) for s in (source, hand)]
+    places = [
+        cache_folder(place, s, fingerprint(s, StorageSpec(4), "encoder")) for s in (source, hand)
+    ]
     assert places[0] != places[1], "tokens of two cameras lie beside each other"
     video = Embodiment.from_dict({**robot.to_dict(), "conditioning_video": True})
     with pytest.raises(UserError, match="does not mark its conditioning videos"):
@@ -159,24 +213,36 @@ def test_columns_are_detected_in_both_spellings_joined_or_by_name(place: Path) -
 
 def test_a_third_camera_is_visible_in_rollouts_and_another_can_feed_memory(tmp_path: Path) -> None:
     (tmp_path / "embodiment").mkdir()
-    yaml = "defaults: [robomme_joint, _self_]\nname: watched\ncameras: {side: {}}\nmemory_camera: side\n"
+    yaml = (
+        "defaults: [robomme_joint, _self_]\nname: watched\ncameras: {side: {}}\nmemory_camera:"
+        " side\n"
+    )
     (tmp_path / "embodiment" / "watched.yaml").write_text(yaml)
     backbone = {"vision": SMALL_VISION}
     policy = build_policy(
-        "framesamp_modul", config_dir=tmp_path, embodiment="watched", backbone=backbone, memory={"budget": 64}
+        "framesamp_modul",
+        config_dir=tmp_path,
+        embodiment="watched",
+        backbone=backbone,
+        memory={"budget": 64},
     )
     robot = policy.embodiment
     assert robot.camera_names == ("front", "wrist", "side") and robot.action == ROBOMME_JOINT.action
     policy.require_processor().stats = unit_stats(robot)
     encoded: list[np.ndarray] = []
     encode = policy.encode_frames
-    policy.encode_frames = lambda frames, *arguments: (encoded.append(frames), encode(frames, *arguments))[1]  # type: ignore
+    policy.encode_frames = lambda frames, *arguments: (
+        encoded.append(frames),
+        encode(frames, *arguments),
+    )[1]  # type: ignore
     job = Job("PickXtimes", "test", 0)
     with pytest.raises(UserError, match="The environment has no camera 'side'"):
         roll(policy, [job], InlineEnvs(robot=robot))
     (record,) = roll(policy, [job], InlineEnvs(robot=robot, base=make_watched_env, max_steps=20))
     assert record.outcome == "timeout" and record.steps == 21
-    assert encoded and all((frames == 77).all() for frames in encoded), "memory is fed by the third camera alone"
+    assert encoded and all((frames == 77).all() for frames in encoded), (
+        "memory is fed by the third camera alone"
+    )
 
 
 def make_watched_env(**options: Any) -> ScriptedEnv:
@@ -194,9 +260,17 @@ def make_watched_env(**options: Any) -> ScriptedEnv:
 
 def test_the_papers_real_robot_is_one_word() -> None:
     cfg = compose("train", ["experiment=real_robot", "data.sources=[somewhere]"])
-    assert (cfg.memory.budget, cfg.train.steps, cfg.train.batch_size, float(cfg.train.lr)) == (2048, 50000, 64, 5e-5)
+    assert (cfg.memory.budget, cfg.train.steps, cfg.train.batch_size, float(cfg.train.lr)) == (
+        2048,
+        50000,
+        64,
+        5e-5,
+    )
     section: Any = OmegaConf.to_container(cfg.embodiment, resolve=True)
     robot = Embodiment.from_dict(section)
     assert robot.memory_camera == "right_shoulder" and len(robot.cameras) == 3 and robot.fps == 15
-    baseline = compose("train", ["experiment=real_robot", "model=pi05", "~memory.budget", "data.sources=[somewhere]"])
+    baseline = compose(
+        "train",
+        ["experiment=real_robot", "model=pi05", "~memory.budget", "data.sources=[somewhere]"],
+    )
     assert not baseline.memory and baseline.name == "pi05"

@@ -17,11 +17,21 @@ pytestmark = pytest.mark.slow
 
 STEPS, WINDOW = 30, 6
 SMALL = [
-    "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=2",
-    "backbone.vision.width=16", "backbone.vision.mlp_dim=16", "policy.augment=false", "logger=none",
-    "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.log_every=1", "train.val_samples=0",
+    "backbone.depth=1",
+    "backbone.vision.depth=1",
+    "backbone.vision.image_size=16",
+    "backbone.vision.patch_size=2",
+    "backbone.vision.width=16",
+    "backbone.vision.mlp_dim=16",
+    "policy.augment=false",
+    "logger=none",
+    "train.batch_size=2",
+    "train.workers=0",
+    "train.device=cpu",
+    "train.log_every=1",
+    "train.val_samples=0",
     "train.open_loop_chunks=0",
-]  # fmt: skip
+]
 SHORT_MEMORY = {
     "framesamp": ["memory.budget=64"],
     "hybrid": ["memory.budget=64"],
@@ -50,7 +60,9 @@ def caches(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(model: str, folder: Path, caches: Path, *overrides: str) -> None:
     """Train in this process."""
     memory = SHORT_MEMORY[model.rsplit("_", 1)[0]] if model in [*NEURAL, *BEYOND, "hybrid"] else []
-    cfg = compose("train", [f"model={model}", *SMALL, *memory, f"data.cache.root={caches}", *overrides])
+    cfg = compose(
+        "train", [f"model={model}", *SMALL, *memory, f"data.cache.root={caches}", *overrides]
+    )
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     train(cfg, config, folder, begun=time.perf_counter())
 
@@ -64,5 +76,11 @@ def test_every_model_trains_on_the_sample(model: str, tmp_path: Path, caches: Pa
     loss = [line["train/loss"] for line in lines if "train/loss" in line]
     assert len(loss) == STEPS
     assert np.mean(loss[-WINDOW:]) < 0.6 * np.mean(loss[:WINDOW])
-    reported = {key for key in lines[-1] if key.startswith(("train/memory/", "memory/")) and key != "memory/gib"}
-    assert bool(reported) == (model in RECURRENT), "recurrent memories report what happens inside them"
+    reported = {
+        key
+        for key in lines[-1]
+        if key.startswith(("train/memory/", "memory/")) and key != "memory/gib"
+    }
+    assert bool(reported) == (model in RECURRENT), (
+        "recurrent memories report what happens inside them"
+    )

@@ -1,7 +1,8 @@
 """Files that an earlier version wrote are still read, and still mean the same.
 
-`scripts/make_compatibility_files.py` wrote them. Everything is opened through `mme_vla` and the published commands, so
-that modules may move. Files that cannot be read any more are not to be written again: users have such files too.
+`scripts/make_compatibility_files.py` wrote them. Everything is opened through `mme_vla` and the
+published commands, so that modules may move. Files that cannot be read any more are not to be
+written again: users have such files too.
 """
 
 import json
@@ -24,14 +25,20 @@ TOLERANCE = 1e-5
 
 @pytest.fixture(autouse=True)
 def in_the_repository(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Paths of the folder are relative to the repository: runs keep the end of their checkpoint's path."""
+    """Paths of the folder are relative to the repository: runs keep the end of their checkpoint's
+    path.
+    """
     monkeypatch.chdir(REPOSITORY)
     monkeypatch.syspath_prepend(REPOSITORY / "scripts")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
     """All files below a folder but locks."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
+    files = [
+        path
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not path.name.startswith(".")
+    ]
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
@@ -51,21 +58,29 @@ def assert_rows_equal(rows: list[dict[str, str]], expected: list[dict[str, str]]
                 assert row[key] == value, (key, required)
 
 
-@pytest.mark.parametrize("place", [name for name in EXPECTED["actions"] if not name.startswith("names/")])
+@pytest.mark.parametrize(
+    "place", [name for name in EXPECTED["actions"] if not name.startswith("names/")]
+)
 def test_checkpoint_loads_and_acts_as_before(place: str) -> None:
     from make_compatibility_files import actions
 
     policy = mme_vla.Policy.from_pretrained(FOLDER / place)
-    np.testing.assert_allclose(actions(policy), EXPECTED["actions"][place], atol=TOLERANCE, rtol=TOLERANCE)
+    np.testing.assert_allclose(
+        actions(policy), EXPECTED["actions"][place], atol=TOLERANCE, rtol=TOLERANCE
+    )
 
 
-@pytest.mark.parametrize("place", [name for name in EXPECTED["actions"] if name.startswith("names/")])
+@pytest.mark.parametrize(
+    "place", [name for name in EXPECTED["actions"] if name.startswith("names/")]
+)
 def test_checkpoint_with_generated_weights_acts_as_before(place: str, tmp_path: Path) -> None:
     from make_compatibility_files import actions, load_named
 
     policy = load_named(FOLDER / place, tmp_path)
     chunks = actions(policy, depth=place.endswith("sam2act_plus"))
-    np.testing.assert_allclose(chunks, EXPECTED["actions"][place], atol=10 * TOLERANCE, rtol=10 * TOLERANCE)
+    np.testing.assert_allclose(
+        chunks, EXPECTED["actions"][place], atol=10 * TOLERANCE, rtol=10 * TOLERANCE
+    )
 
 
 def test_vision_tower_of_nano_is_the_same() -> None:
@@ -75,19 +90,27 @@ def test_vision_tower_of_nano_is_the_same() -> None:
 
 
 @pytest.mark.parametrize("name", EXPECTED["losses"])
-def test_training_resumes_with_the_same_losses_and_the_same_cache(name: str, tmp_path: Path) -> None:
+def test_training_resumes_with_the_same_losses_and_the_same_cache(
+    name: str, tmp_path: Path
+) -> None:
     from make_compatibility_files import resumed_losses
 
     losses = resumed_losses(FOLDER, name, EXPECTED["words"][name], tmp_path)
     assert losses == pytest.approx(EXPECTED["losses"][name], rel=TOLERANCE)
-    assert contents(tmp_path / "cache") == contents(FOLDER / "cache"), "the vision cache was computed again"
+    assert contents(tmp_path / "cache") == contents(FOLDER / "cache"), (
+        "the vision cache was computed again"
+    )
 
 
 def test_cache_command_finds_every_episode(tmp_path: Path) -> None:
     from make_compatibility_files import command, places
 
     cache = copied("cache", tmp_path / "cache")
-    selection = [word for word in EXPECTED["words"]["framesamp"] if word.startswith(("model=", "backbone.", "memory."))]
+    selection = [
+        word
+        for word in EXPECTED["words"]["framesamp"]
+        if word.startswith(("model=", "backbone.", "memory."))
+    ]
     start = f"init_from={FOLDER / 'training' / 'framesamp'}"
     assert ": 0 episodes encoded, 2 in all" in command(
         "cache", *selection, "data=lerobot", *places(FOLDER, cache), start
@@ -109,7 +132,9 @@ def test_export_converts_back_to_the_same_weights(format: str, tmp_path: Path) -
 
     source = FOLDER / "pretrained" / "pi05_past_actions"
     command("weights", FOLDER / "exports" / format, tmp_path / "ours", *EXPECTED["export_words"])
-    tensors, expected = (load_file(folder / "model.safetensors") for folder in (tmp_path / "ours", source))
+    tensors, expected = (
+        load_file(folder / "model.safetensors") for folder in (tmp_path / "ours", source)
+    )
     assert tensors.keys() == expected.keys()
     for name, tensor in expected.items():
         assert tensor.equal(tensors[name]), name
@@ -119,7 +144,10 @@ def test_export_converts_back_to_the_same_weights(format: str, tmp_path: Path) -
 def test_results_have_the_same_figures(name: str, tmp_path: Path) -> None:
     from make_compatibility_files import FINISHED, result_rows
 
-    assert_rows_equal(result_rows(FOLDER / "evaluation" / name, FINISHED[name], tmp_path), EXPECTED["results"][name])
+    assert_rows_equal(
+        result_rows(FOLDER / "evaluation" / name, FINISHED[name], tmp_path),
+        EXPECTED["results"][name],
+    )
 
 
 def test_finished_run_is_recognised_from_python(tmp_path: Path) -> None:
@@ -131,7 +159,9 @@ def test_finished_run_is_recognised_from_python(tmp_path: Path) -> None:
     assert contents(run) == before
 
 
-@pytest.mark.skipif(find_spec("mani_skill") is None, reason="needs the simulator: uv sync --inexact --extra sim")
+@pytest.mark.skipif(
+    find_spec("mani_skill") is None, reason="needs the simulator: uv sync --inexact --extra sim"
+)
 @pytest.mark.parametrize("name", EXPECTED["evaluations"])
 def test_finished_run_is_recognised_by_the_command(name: str, tmp_path: Path) -> None:
     from make_compatibility_files import command

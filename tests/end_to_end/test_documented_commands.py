@@ -29,12 +29,21 @@ from mme_vla.config.plugins import trust_as_override
 pytestmark = pytest.mark.slow
 
 EXAMPLES = {
-    "add-a-memory.md": "last_frames", "add-a-backbone.md": "regression", "add-an-integration.md": "gist",
-    "add-a-task.md": "two_buttons", "your-robot.md": "bimanual", "first-hour.md": "first_hour",
-    "auxiliary-losses.md": "write_head", "cached-keys-and-values.md": "fifo", "notes.md": "scratchpad",
-    "environments.md": "blink", "trajectories.md": "trajectories",
-}  # fmt: skip
-"""The folder that the commands of a page are typed in; of other pages it is the repository's root."""
+    "add-a-memory.md": "last_frames",
+    "add-a-backbone.md": "regression",
+    "add-an-integration.md": "gist",
+    "add-a-task.md": "two_buttons",
+    "your-robot.md": "bimanual",
+    "first-hour.md": "first_hour",
+    "auxiliary-losses.md": "write_head",
+    "cached-keys-and-values.md": "fifo",
+    "notes.md": "scratchpad",
+    "environments.md": "blink",
+    "trajectories.md": "trajectories",
+}
+"""The folder that the commands of a page are typed in; of other pages it is the
+repository's root.
+"""
 NOT_RUN = {
     r"^(pip install|uv |python3 -m venv)": "installs packages",
     r"^(cd |IMAGE_MAX_TOKEN_NUM)": "needs ms-swift and GPUs",
@@ -43,25 +52,37 @@ NOT_RUN = {
     r"<|…": "has a place for a file or folder of the reader's own",
     r"mme_vla\.train ": "trains for minutes or hours",
     r"mme(_vla\.|-vla )nano( |$)": "trains for minutes or hours",
-    r"mme-vla vision-pretrain ": "trains for minutes; tests/nano/test_vision_pretrain.py runs it on few scenes",
-    r"mme_vla\.(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": "needs a policy that was trained before",
+    r"mme-vla vision-pretrain ": (
+        "trains for minutes; tests/nano/test_vision_pretrain.py runs it on few scenes"
+    ),
+    r"mme_vla\.(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": (
+        "needs a policy that was trained before"
+    ),
     r"--checkpoint outputs/": "needs a policy that was trained before",
     r"mme_vla\.results outputs/|mme-vla results verify": "needs the records of an evaluation",
     r"mme-vla probe card": "needs recorded episodes",
-    r"analyse writing --memories anchors": "demonstrates 48 episodes; tests/probing/test_writing.py runs it on one",
+    r"analyse writing --memories anchors": (
+        "demonstrates 48 episodes; tests/probing/test_writing.py runs it on one"
+    ),
     r"benchmarks/\w+\.py (memory|update|chunk)": "needs a GPU, or a mock driver",
-    r"python (dagger|grpo|reward_weighted)\.py": "tests/evaluation/test_rollouts.py or test_dagger_example.py runs it",
+    r"python (dagger|grpo|reward_weighted)\.py": (
+        "tests/evaluation/test_rollouts.py or test_dagger_example.py runs it"
+    ),
     r"mme_vla\.serve ": "serves until it is stopped",
     r"mme-vla harness ": "serves until it is stopped",
     r"mme-vla docs$": "opens a browser; tests/docs builds the site",
     r"mme_vla\.play ": "waits for a player, or plays hundreds of episodes",
     r"mme-vla record ": "records for minutes or hours",
-    r"mme_vla\.evaluate .*checkpoint=nano|tasks=\[PickXtimes,VideoUnmask\]": "evaluates for minutes",
+    r"mme_vla\.evaluate .*checkpoint=nano|tasks=\[PickXtimes,VideoUnmask\]": (
+        "evaluates for minutes"
+    ),
     r"mme_vla\.probe (checkpoint=nano|compare=)": "needs recorded episodes or finished probes",
     r"mme-vla (convert|cache) |subgoal-build input=(path|datasets)": "needs a full dataset",
     r"--config-dir configs embodiment=two_arms": "needs a robot's dataset",
     r"mme-vla weights ": "needs released weights",
-    r"benchmarks/(gpu|episode_seeds|nano_simplememvla)\.py|benchmarks/simplememvla\.py count": "measures for minutes",
+    r"benchmarks/(gpu|episode_seeds|nano_simplememvla)\.py|benchmarks/simplememvla\.py count": (
+        "measures for minutes"
+    ),
 }
 """Pattern → why the commands that it matches are not run here."""
 
@@ -70,7 +91,9 @@ NOT_RUN = {
 def documented() -> list[tuple[str, str]]:
     """Page and command of every shell command in the documentation, continued lines joined."""
     pages = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
-    return list(dict.fromkeys((page.name, line) for page in pages for line in commands_of(page.read_text())))
+    return list(
+        dict.fromkeys((page.name, line) for page in pages for line in commands_of(page.read_text()))
+    )
 
 
 def commands_of(text: str) -> Iterator[str]:
@@ -84,8 +107,16 @@ def reason(command: str) -> str | None:
     return next((why for pattern, why in NOT_RUN.items() if re.search(pattern, command)), None)
 
 
-RUN = list({command: (page, command) for page, command in reversed(documented()) if reason(command) is None}.values())
-OTHERS = list({command: (page, command) for page, command in documented() if reason(command)}.values())
+RUN = list(
+    {
+        command: (page, command)
+        for page, command in reversed(documented())
+        if reason(command) is None
+    }.values()
+)
+OTHERS = list(
+    {command: (page, command) for page, command in documented() if reason(command)}.values()
+)
 
 
 @cache
@@ -109,16 +140,26 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_documented_command_runs_as_printed(
     page: str, command: str, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if (words := shlex.split(command))[:3] == ["python", "-m", "mme_vla.results"]:  # in this process: it only reads
+    if (words := shlex.split(command))[:3] == [
+        "python",
+        "-m",
+        "mme_vla.results",
+    ]:  # in this process: it only reads
         monkeypatch.chdir(folder_of(page, root))
         results(words[3:])
         return
     if re.search(r"mme_vla\.evaluate|mme-vla gallery", command):
-        pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
+        pytest.importorskip(
+            "mani_skill", reason="the simulator is not installed: the extra `sim` has it"
+        )
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PATH": path, "PYTHONPATH": str(REPOSITORY)}
     done = subprocess.run(
-        ["bash", "-c", command], cwd=folder_of(page, root), env=environment, capture_output=True, text=True
+        ["bash", "-c", command],
+        cwd=folder_of(page, root),
+        env=environment,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
@@ -126,9 +167,13 @@ def test_a_documented_command_runs_as_printed(
 
 @pytest.mark.parametrize(("page", "command"), OTHERS)
 def test_the_words_of_other_documented_commands_are_valid(page: str, command: str) -> None:
-    filled = re.sub(r"<the words[^>]*>|(?<= )(…|\$B)", "", command)  # what means several words, and may be none
+    filled = re.sub(
+        r"<the words[^>]*>|(?<= )(…|\$B)", "", command
+    )  # what means several words, and may be none
     words = shlex.split(re.sub(r"<[^>]*>|…", "x", filled), comments=True)
-    start = next((i for i, word in enumerate(words) if re.match(r"mme-vla$|mme_vla(\.|$)", word)), None)
+    start = next(
+        (i for i, word in enumerate(words) if re.match(r"mme-vla$|mme_vla(\.|$)", word)), None
+    )
     if start is None:
         return
     program, arguments = words[start], words[start + 1 :]
@@ -142,9 +187,15 @@ def test_the_words_of_other_documented_commands_are_valid(page: str, command: st
     if name is None:  # it takes options instead of a configuration
         return
     arguments = trust_as_override(arguments)
-    args = get_args_parser().parse_intermixed_args(with_settings(arguments) if name == "nano" else arguments)
+    args = get_args_parser().parse_intermixed_args(
+        with_settings(arguments) if name == "nano" else arguments
+    )
     example = REPOSITORY / "examples" / EXAMPLES.get(page, "")
-    trees = [example / args.config_dir] if args.config_dir and (example / args.config_dir).is_dir() else []
+    trees = (
+        [example / args.config_dir]
+        if args.config_dir and (example / args.config_dir).is_dir()
+        else []
+    )
     if args.config_dir and not trees:  # the reader's own
         return
     # Launchers need the extra `sweep`.
@@ -153,4 +204,9 @@ def test_the_words_of_other_documented_commands_are_valid(page: str, command: st
     if not args.multirun and name != "nano":  # it composes its models by itself
         plugins = compose(name, args.overrides, extra_dirs=trees).get("plugins", [])
         assert all((example / f"{plugin}.py").is_file() for plugin in plugins)
-        assert plugins or page not in EXAMPLES or page in ("your-robot.md", "first-hour.md") or "checkpoint=" in command
+        assert (
+            plugins
+            or page not in EXAMPLES
+            or page in ("your-robot.md", "first-hour.md")
+            or "checkpoint=" in command
+        )

@@ -1,4 +1,6 @@
-"""From a policy to results with the commands a user types, in the real simulator; needs the extra `sim` and Vulkan."""
+"""From a policy to results with the commands a user types, in the real simulator; needs the extra
+`sim` and Vulkan.
+"""
 
 from pathlib import Path
 
@@ -8,7 +10,13 @@ from helpers import commands
 from mme_vla.evaluation.store import read_records
 from mme_vla.testing.small import small_policy
 
-EPISODES = ["tasks=[PickXtimes,StopCube]", "episodes=2", "max_steps=18", "max_batch=1", "flow_steps=3"]
+EPISODES = [
+    "tasks=[PickXtimes,StopCube]",
+    "episodes=2",
+    "max_steps=18",
+    "max_batch=1",
+    "flow_steps=3",
+]
 ONE = "workers=1"
 
 
@@ -24,19 +32,41 @@ def test_a_policy_is_evaluated_in_two_parts_with_the_same_results(tmp_path: Path
     saved = tmp_path / "policy"
     small_policy("framesamp_modul").save_pretrained(saved)
 
-    output = call("evaluate", f"checkpoint={saved}", *EPISODES, ONE, f"output={tmp_path / 'whole'}", "video=all")
+    output = call(
+        "evaluate",
+        f"checkpoint={saved}",
+        *EPISODES,
+        ONE,
+        f"output={tmp_path / 'whole'}",
+        "video=all",
+    )
     assert "python -m mme_vla.results" in output
-    straight = {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "whole")}
+    straight = {
+        r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "whole")
+    }
     assert len(straight) == 4 and len({digest for _, _, digest in straight.values()}) == 4
-    assert all(outcome in ("timeout", "fail", "success") for outcome, _, _ in straight.values()), straight
+    assert all(outcome in ("timeout", "fail", "success") for outcome, _, _ in straight.values()), (
+        straight
+    )
     assert len(list((tmp_path / "whole" / "videos").glob("*.mp4"))) == 4
 
-    call("evaluate", f"checkpoint={saved}", *EPISODES, "episodes=1", ONE, f"output={tmp_path / 'part'}")
+    call(
+        "evaluate",
+        f"checkpoint={saved}",
+        *EPISODES,
+        "episodes=1",
+        ONE,
+        f"output={tmp_path / 'part'}",
+    )
     output = call("evaluate", f"checkpoint={saved}", *EPISODES, ONE, f"output={tmp_path / 'part'}")
     assert "holds 2 of 4 episodes: continuing" in output
-    assert {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "part")} == straight
+    assert {
+        r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "part")
+    } == straight
 
-    table = call("results", str(tmp_path / "part"), "--tasks", "PickXtimes", "StopCube", "--episodes", "2")
+    table = call(
+        "results", str(tmp_path / "part"), "--tasks", "PickXtimes", "StopCube", "--episodes", "2"
+    )
     assert "framesamp_modul" in table and "18" in table
 
 

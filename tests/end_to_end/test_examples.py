@@ -1,4 +1,6 @@
-"""Each example trains, is saved and reopened by the commands that reach its code, from another folder."""
+"""Each example trains, is saved and reopened by the commands that reach its code, from another
+folder.
+"""
 
 import json
 import re
@@ -13,10 +15,25 @@ from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.serving.client import Client
 from mme_vla.training.logging import read_metrics
 
-SMALL = ("backbone=tiny", "backbone.depth=2", "backbone.vision.depth=1", "backbone.vision.image_size=16",
-         "backbone.vision.patch_size=1", "backbone.vision.width=16", "backbone.vision.mlp_dim=16")  # fmt: skip
-BRIEF = ("train.steps=2", "train.batch_size=2", "train.val_samples=0", "train.open_loop_chunks=0", "train.workers=0",
-         "train.device=cpu", "train.log_every=1", "logger=none")  # fmt: skip
+SMALL = (
+    "backbone=tiny",
+    "backbone.depth=2",
+    "backbone.vision.depth=1",
+    "backbone.vision.image_size=16",
+    "backbone.vision.patch_size=1",
+    "backbone.vision.width=16",
+    "backbone.vision.mlp_dim=16",
+)
+BRIEF = (
+    "train.steps=2",
+    "train.batch_size=2",
+    "train.val_samples=0",
+    "train.open_loop_chunks=0",
+    "train.workers=0",
+    "train.device=cpu",
+    "train.log_every=1",
+    "logger=none",
+)
 PROBE = ("recordings=sample", "recorded=[0]", "draws=2", "moments=2", "scan=false", "flow_steps=2")
 
 
@@ -24,8 +41,9 @@ PROBE = ("recordings=sample", "recorded=[0]", "draws=2", "moments=2", "scan=fals
 class Row:
     """One example: its folder and file, its model, and words of its training.
 
-    logged: a metric of its training. arms: interventions of the probe that reach it. served, evaluated: whether the
-    server and the evaluation run it too. page: of docs/extend, which shows the file.
+    logged: a metric of its training. arms: interventions of the probe that reach it. served,
+    evaluated: whether the server and the evaluation run it too. page: of docs/extend, which shows
+    the file.
     """
 
     name: str
@@ -73,8 +91,8 @@ SHORT = [
     *(EXAMPLES / name / f"{name}.py" for name in ("blink", *(row.name for row in ROWS))),
     *sorted((EXAMPLES / "trajectories").glob("*.py")),
 ]
-MOST_LINES = {"repeat_frames": 25, "blink": 45}
-"""File → most lines; of others 60."""
+MOST_LINES = {"repeat_frames": 30, "blink": 55}
+"""File → most lines; of others 75."""
 
 
 def environment(row: Row) -> dict[str, str]:
@@ -90,13 +108,18 @@ def run(folder: Path, row: Row, module: str, *words: str) -> str:
 @pytest.mark.parametrize("file", SHORT, ids=lambda file: file.stem)
 def test_an_example_is_short_and_uses_no_private_name(file: Path) -> None:
     text = file.read_text()
-    assert len(text.splitlines()) <= MOST_LINES.get(file.stem, 60)
+    assert len(text.splitlines()) <= MOST_LINES.get(file.stem, 75)
     assert not re.findall(r"(?<!\w)(?<!self\.)(?<!def )_[a-z]\w*", text)
 
 
 @PARAMETERS
-def test_the_page_of_an_example_shows_its_files_and_its_code_runs(row: Row, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, page = EXAMPLES / row.name, (REPOSITORY / "docs" / "extend" / f"{row.page}.md").read_text()
+def test_the_page_of_an_example_shows_its_files_and_its_code_runs(
+    row: Row, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, page = (
+        EXAMPLES / row.name,
+        (REPOSITORY / "docs" / "extend" / f"{row.page}.md").read_text(),
+    )
     assert (folder / f"{row.name}.py").read_text().strip() in page
     monkeypatch.syspath_prepend(folder)
     monkeypatch.chdir(folder)
@@ -106,10 +129,23 @@ def test_the_page_of_an_example_shows_its_files_and_its_code_runs(row: Row, monk
 
 @pytest.mark.slow
 @PARAMETERS
-def test_an_example_works_in_its_commands(row: Row, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_an_example_works_in_its_commands(
+    row: Row, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     configs = str(EXAMPLES / row.name / "configs")
-    run(tmp_path, row, "train", "--config-dir", configs, f"model={row.model}", *SMALL, *BRIEF, *row.words,
-        f"data.cache.root={tmp_path / 'caches'}", "output=run")  # fmt: skip
+    run(
+        tmp_path,
+        row,
+        "train",
+        "--config-dir",
+        configs,
+        f"model={row.model}",
+        *SMALL,
+        *BRIEF,
+        *row.words,
+        f"data.cache.root={tmp_path / 'caches'}",
+        "output=run",
+    )
     metrics = [line[row.logged] for line in read_metrics(tmp_path / "run") if row.logged in line]
     assert len(metrics) == 2 and np.isfinite(metrics).all()
     trained = ("checkpoint=run/checkpoints/step_000002", "--trust-plugins")
@@ -127,22 +163,40 @@ def served(folder: Path, row: Row, *words: str) -> None:
     """Two chunks of a server in a process of its own."""
     image = np.zeros((256, 256, 3), np.uint8)
     with (
-        commands.serving("mme_vla.serve", *words, "flow_steps=2", cwd=folder, env=environment(row)) as port,
+        commands.serving(
+            "mme_vla.serve", *words, "flow_steps=2", cwd=folder, env=environment(row)
+        ) as port,
         Client(f"ws://127.0.0.1:{port}") as client,
     ):
         client.reset()
         for first in (True, False):
-            chunk = client.infer({
-                "task_goal": ["press the button"], "is_first_step": first, "front_rgb_list": [image],
-                "wrist_rgb_list": [image], "joint_state_list": [np.zeros(7)], "gripper_state_list": [np.zeros(2)],
-            })["actions"]  # fmt: skip
+            chunk = client.infer(
+                {
+                    "task_goal": ["press the button"],
+                    "is_first_step": first,
+                    "front_rgb_list": [image],
+                    "wrist_rgb_list": [image],
+                    "joint_state_list": [np.zeros(7)],
+                    "gripper_state_list": [np.zeros(2)],
+                }
+            )["actions"]
             assert np.isfinite(chunk).all()
 
 
 def evaluated(folder: Path, row: Row, *words: str) -> None:
     """One short episode of the simulator."""
-    run(folder, row, "evaluate", *words, "tasks=StopCube", "episodes=1", "max_steps=18", "workers=1", "flow_steps=2",
-        "output=evaluated")  # fmt: skip
+    run(
+        folder,
+        row,
+        "evaluate",
+        *words,
+        "tasks=StopCube",
+        "episodes=1",
+        "max_steps=18",
+        "workers=1",
+        "flow_steps=2",
+        "output=evaluated",
+    )
     (record,) = read_folders(find_records([folder / "evaluated"]))
     assert record.outcome in ("success", "fail", "timeout"), record.error
     if row.name == "scratchpad":

@@ -1,4 +1,6 @@
-"""docs/start/first-hour.md: its notebooks and its shortest path run, and it shows the files that run."""
+"""docs/start/first-hour.md: its notebooks and its shortest path run, and it shows the files that
+run.
+"""
 
 import json
 import os
@@ -16,16 +18,26 @@ from mme_vla.evaluation.store import find_records, read_folders
 
 EXAMPLE = REPOSITORY / "examples" / "first_hour"
 PAGE = REPOSITORY / "docs" / "start" / "first-hour.md"
-SMALL_POLICY = "train.steps=2 train.val_samples=2 train.open_loop_chunks=1 backbone.depth=1 backbone.vision.depth=1"
+SMALL_POLICY = (
+    "train.steps=2 train.val_samples=2 train.open_loop_chunks=1 backbone.depth=1"
+    " backbone.vision.depth=1"
+)
 SETTINGS = {
     "01_train.ipynb": {"OPTIONS": f'"{SMALL_POLICY}"'},
     "02_closed_loop.ipynb": {"EPISODES": "[0]", "MAX_STEPS": "3"},
     "03_own_memory.ipynb": {
-        "DEMONSTRATIONS": "2", "UPDATES": "1", "EPISODES": "1",
+        "DEMONSTRATIONS": "2",
+        "UPDATES": "1",
+        "EPISODES": "1",
         "MORE": '"videos=false train.batch_size=2 train.val_samples=2"',
     },
-    "04_probe.ipynb": {"POLICY": '"nano"', "EPISODES": '"[4]"', "ARMS": '["drop:all"]', "DRAWS, DECISIONS": "2, 1"},
-}  # fmt: skip
+    "04_probe.ipynb": {
+        "POLICY": '"nano"',
+        "EPISODES": '"[4]"',
+        "ARMS": '["drop:all"]',
+        "DRAWS, DECISIONS": "2, 1",
+    },
+}
 """Notebook → values of its first cell that shorten the run."""
 
 
@@ -100,8 +112,12 @@ def test_the_shortest_path_leads_to_a_memory_in_closed_loop(tmp_path: Path) -> N
     clone = copytree(REPOSITORY, tmp_path / "clone", ignore=unneeded)
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PATH": path, "PYTHONPATH": str(clone)}
-    script = "\n".join(["set -e", *shortest_path(), "python -c 'import mme_vla; print(mme_vla.__file__)'"])
-    done = subprocess.run(["bash", "-c", script], cwd=clone, env=environment, capture_output=True, text=True)
+    script = "\n".join(
+        ["set -e", *shortest_path(), "python -c 'import mme_vla; print(mme_vla.__file__)'"]
+    )
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=clone, env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip().endswith(f"{clone}/mme_vla/__init__.py")
     output = clone / "examples" / "first_hour" / "outputs" / "small"

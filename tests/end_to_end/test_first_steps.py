@@ -36,8 +36,14 @@ def test_the_papers_recipe_asks_for_the_weights_it_starts_from() -> None:
     start = compose("train", ["experiment=robomme"]).init_from
     with pytest.raises(UserError, match="init_from=none"):
         weights_to_start_from(start)
-    assert weights_to_start_from(compose("train", ["experiment=robomme", "init_from=none"]).init_from) is None
-    assert weights_to_start_from(compose("train", ["experiment=robomme", "init_from=x/y"]).init_from) == "x/y"
+    assert (
+        weights_to_start_from(compose("train", ["experiment=robomme", "init_from=none"]).init_from)
+        is None
+    )
+    assert (
+        weights_to_start_from(compose("train", ["experiment=robomme", "init_from=x/y"]).init_from)
+        == "x/y"
+    )
     assert weights_to_start_from(compose("train", []).init_from) is None
 
 
@@ -55,7 +61,9 @@ def test_the_average_of_nothing_but_failures_has_an_interval(won: bool) -> None:
 
 
 def test_a_narrow_terminal_cuts_no_number(capsys: pytest.CaptureFixture[str]) -> None:
-    print_table(Table("t", ["method", *"abcdefgh"], [["framesamp_modul", *["64.94 ± 1.99"] * 8]]), 40)
+    print_table(
+        Table("t", ["method", *"abcdefgh"], [["framesamp_modul", *["64.94 ± 1.99"] * 8]]), 40
+    )
     printed = capsys.readouterr().out
     assert printed.count("64.94 ± 1.99") == 8
     assert "framesamp_modul" in printed
@@ -92,7 +100,9 @@ def test_a_terminal_gets_a_line_before_the_imports(
 def test_help_ends_quietly_where_its_reader_is_gone(words: list[str]) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    ended = subprocess.run([sys.executable, "-m", "mme_vla", *words], stdout=writing, stderr=subprocess.PIPE, text=True)
+    ended = subprocess.run(
+        [sys.executable, "-m", "mme_vla", *words], stdout=writing, stderr=subprocess.PIPE, text=True
+    )
     os.close(writing)
     assert (ended.returncode, ended.stderr) == (0, "")
 

@@ -1,4 +1,6 @@
-"""Concepts, comparisons and FAQ of the documentation: their Python runs, their messages and figures are real."""
+"""Concepts, comparisons and FAQ of the documentation: their Python runs, their messages and figures
+are real.
+"""
 
 import ast
 import csv
@@ -15,7 +17,9 @@ from helpers import REPOSITORY
 DOCS = REPOSITORY / "docs"
 BLOCKS = re.compile(r"```python\n(.*?)```", re.DOTALL)
 PRINTED = re.compile(r"^ *print\(.*\)  # (.+)$", re.MULTILINE)
-GUIDES = [page for page in sorted((DOCS / "concepts").glob("*.md")) if PRINTED.search(page.read_text())]
+GUIDES = [
+    page for page in sorted((DOCS / "concepts").glob("*.md")) if PRINTED.search(page.read_text())
+]
 
 
 @pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.stem)
@@ -39,7 +43,9 @@ def messages() -> str:
     for path in sorted((REPOSITORY / "mme_vla").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.JoinedStr):
-                parts.append("".join(v.value if isinstance(v, ast.Constant) else "…" for v in node.values))
+                parts.append(
+                    "".join(v.value if isinstance(v, ast.Constant) else "…" for v in node.values)
+                )
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
                 parts.append(node.value)
     return re.sub(r"\s+", " ", "\n".join(parts))
@@ -68,14 +74,21 @@ def test_every_task_has_a_video_in_the_gallery() -> None:
 
     page = (DOCS / "benchmark" / "gallery.md").read_text()
     assert set(re.findall(r"\(gallery/(\w+)\.webp\)", page)) == set(TASK_NAMES)
-    assert {path.stem for path in (DOCS / "benchmark" / "gallery").glob("*.webp")} == set(TASK_NAMES)
+    assert {path.stem for path in (DOCS / "benchmark" / "gallery").glob("*.webp")} == set(
+        TASK_NAMES
+    )
 
 
 def test_published_numbers_of_the_comparison_are_the_papers() -> None:
     with (REPOSITORY / "mme_vla" / "assets" / "paper" / "suites.csv").open() as file:
         averages = {row["method"]: row["average"] for row in csv.DictReader(file)}
     page = (DOCS / "compare" / "memories.md").read_text()
-    for memory, method in {"framesamp": "FrameSamp", "tokendrop": "TokenDrop", "ttt": "TTT", "rmt": "RMT"}.items():
+    for memory, method in {
+        "framesamp": "FrameSamp",
+        "tokendrop": "TokenDrop",
+        "ttt": "TTT",
+        "rmt": "RMT",
+    }.items():
         row = next(line for line in page.splitlines() if line.startswith(f"| `{memory}`"))
         published = ", ".join(averages[f"{method}+{way}"] for way in ("Modul", "Context", "Expert"))
         assert row.split("|")[-2].strip() == published
@@ -83,7 +96,17 @@ def test_published_numbers_of_the_comparison_are_the_papers() -> None:
 
 @pytest.mark.slow
 def test_the_figures_come_from_the_sample(tmp_path: Path) -> None:
-    command = [sys.executable, str(REPOSITORY / "scripts" / "figures.py"), "--output", str(tmp_path)]
+    command = [
+        sys.executable,
+        str(REPOSITORY / "scripts" / "figures.py"),
+        "--output",
+        str(tmp_path),
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert {path.stem for path in tmp_path.glob("*.webp")} == {"memory", "history", "budget", "integration"}
+    assert {path.stem for path in tmp_path.glob("*.webp")} == {
+        "memory",
+        "history",
+        "budget",
+        "integration",
+    }

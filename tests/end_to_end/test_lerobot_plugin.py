@@ -1,4 +1,6 @@
-"""plugins/lerobot_policy_mme_vla in one process: the numbers are those of the policy itself, and folders come back."""
+"""plugins/lerobot_policy_mme_vla in one process: the numbers are those of the policy itself, and
+folders come back.
+"""
 
 import json
 import shutil
@@ -17,21 +19,31 @@ from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.errors import UserError
 from mme_vla.testing.small import small_policy
 
-gym = pytest.importorskip("gymnasium", reason="LeRobot's environments: uv sync --inexact --extra sim")
+gym = pytest.importorskip(
+    "gymnasium", reason="LeRobot's environments: uv sync --inexact --extra sim"
+)
 VIDEOS = {0: 21, 1: 3}
 """Frames of the conditioning video, by episode."""
 MODEL, STEPS = "tokendrop_expert", 26
 
 
 class MediaPart:
-    """The benchmark's interface: a square that stands where the first joint is, over noise of the episode's own."""
+    """The benchmark's interface: a square that stands where the first joint is, over noise of the
+    episode's own.
+    """
 
     def __init__(self, episode: int) -> None:
         self.episode, self.joints, self.count = episode, np.zeros(8, np.float32), 0
 
     def reset(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        self.rng, self.joints, self.count = np.random.default_rng(self.episode), np.zeros(8, np.float32), 0
-        return self._lists(VIDEOS[self.episode] + 1), {"task_goal": [f"touch square {self.episode}"]}
+        self.rng, self.joints, self.count = (
+            np.random.default_rng(self.episode),
+            np.zeros(8, np.float32),
+            0,
+        )
+        return self._lists(VIDEOS[self.episode] + 1), {
+            "task_goal": [f"touch square {self.episode}"]
+        }
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         self.joints, self.count = np.asarray(action, np.float32), self.count + 1
@@ -45,9 +57,11 @@ class MediaPart:
         at = int(abs(self.joints[0]) * 50) % 200
         images[:, :, at : at + 40, 60:100] = 255
         return {
-            "front_rgb_list": list(images[0]), "wrist_rgb_list": list(images[1]),
-            "joint_state_list": [self.joints[:7]] * count, "gripper_state_list": [self.joints[6:]] * count,
-        }  # fmt: skip
+            "front_rgb_list": list(images[0]),
+            "wrist_rgb_list": list(images[1]),
+            "joint_state_list": [self.joints[:7]] * count,
+            "gripper_state_list": [self.joints[6:]] * count,
+        }
 
 
 @pytest.fixture(scope="module")
@@ -84,25 +98,37 @@ def in_process(folder: Path) -> np.ndarray:
     while len(done) < STEPS:
         for episode, lists in zip(episodes, waiting, strict=True):
             count = len(lists["front_rgb_list"])
-            states = np.stack(list(map(benchmark_state, lists["joint_state_list"], lists["gripper_state_list"])))
+            states = np.stack(
+                list(map(benchmark_state, lists["joint_state_list"], lists["gripper_state_list"]))
+            )
             frames = {name: np.stack(lists[f"{name}_rgb_list"]) for name in ("front", "wrist")}
             first = episode.n_observed_frames == 0
             episode.observe(frames, states, np.arange(count) < count - 1 if first else False)
-        # Their videos differ in length, so LeRobot's loop reads them one after the other, and so does this.
-        chunks = np.stack([policy.act(episode) for episode in episodes])[:, : min(16, STEPS - len(done))]
-        taken = [[env.step(action)[0] for action in chunk] for env, chunk in zip(envs, chunks, strict=True)]
+        # Their videos differ in length, so LeRobot's loop reads them one after the other, and so
+        # does this.
+        chunks = np.stack([policy.act(episode) for episode in episodes])[
+            :, : min(16, STEPS - len(done))
+        ]
+        taken = [
+            [env.step(action)[0] for action in chunk]
+            for env, chunk in zip(envs, chunks, strict=True)
+        ]
         waiting = [{key: [step[key][0] for step in steps] for key in steps[0]} for steps in taken]
         done += list(chunks.transpose(1, 0, 2))
     return np.stack(done, 1)
 
 
-def through_lerobot(package: ModuleType, folder: Path, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
+def through_lerobot(
+    package: ModuleType, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> np.ndarray:
     """The same through its factory, pipelines and vectorised environments."""
     from lerobot.configs import PreTrainedConfig
     from lerobot.envs import preprocess_observation
     from lerobot.policies import make_policy, make_pre_post_processors
 
-    monkeypatch.setattr(package.env_mme_vla, "make_env", lambda task, split, episode, max_steps: MediaPart(episode))
+    monkeypatch.setattr(
+        package.env_mme_vla, "make_env", lambda task, split, episode, max_steps: MediaPart(episode)
+    )
     config = PreTrainedConfig.from_pretrained(folder)
     config.pretrained_path = folder
     settings = package.MMEVLAEnvConfig(task="VideoUnmask", max_steps=STEPS)
@@ -135,9 +161,12 @@ def test_actions_are_those_of_the_policy_in_process(
 def test_a_checkpoint_goes_there_and_back(
     package: ModuleType, our_folder: Path, lerobot_folder: Path, tmp_path: Path
 ) -> None:
-    assert {"policy_preprocessor.json", "policy_postprocessor.json", "processor.json", "norm_stats.json"} <= {
-        file.name for file in lerobot_folder.iterdir()
-    }
+    assert {
+        "policy_preprocessor.json",
+        "policy_postprocessor.json",
+        "processor.json",
+        "norm_stats.json",
+    } <= {file.name for file in lerobot_folder.iterdir()}
     package.convert.main([str(lerobot_folder), str(tmp_path / "back")])
     first, second = Policy.from_pretrained(our_folder), Policy.from_pretrained(tmp_path / "back")
     assert first.config == second.config
@@ -152,12 +181,16 @@ def test_an_earlier_folder_whose_sums_lack_the_configuration_is_converted(
 ) -> None:
     folder = Path(shutil.copytree(lerobot_folder, tmp_path / "earlier"))
     lines = (folder / "SHA256SUMS").read_text().splitlines(keepends=True)
-    (folder / "SHA256SUMS").write_text("".join(line for line in lines if not line.endswith("  config.json\n")))
+    (folder / "SHA256SUMS").write_text(
+        "".join(line for line in lines if not line.endswith("  config.json\n"))
+    )
     package.convert.main([str(folder), str(tmp_path / "back")])
     assert (tmp_path / "back" / "model.safetensors").is_file()
 
 
-def test_damage_and_strange_code_are_refused(package: ModuleType, lerobot_folder: Path, tmp_path: Path) -> None:
+def test_damage_and_strange_code_are_refused(
+    package: ModuleType, lerobot_folder: Path, tmp_path: Path
+) -> None:
     from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
 
     config = json.loads((lerobot_folder / "config.json").read_text())
@@ -188,7 +221,11 @@ def test_a_chunk_matches_the_one_under_way(package: ModuleType, lerobot_folder: 
     assert policy.supports_rtc()
     views = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     names = ("observation.images.image", "observation.images.wrist_image")
-    batch = {**dict.fromkeys(names, views), "observation.state": torch.zeros(1, 8), "task": ["touch it"]}
+    batch = {
+        **dict.fromkeys(names, views),
+        "observation.state": torch.zeros(1, 8),
+        "task": ["touch it"],
+    }
     left = torch.linspace(0.2, 0.4, 8 * 6).reshape(6, 8)
     policy.reset()
     free = policy.predict_action_chunk(batch)
@@ -204,11 +241,20 @@ def test_a_chunk_matches_the_one_under_way(package: ModuleType, lerobot_folder: 
 
 def test_an_episode_that_ends_in_an_error_says_why(package: ModuleType) -> None:
     class Failing:
-        def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-            info = {"status": "error", "error_message": "no way to this pose", "exception_type": "PlanningError"}
+        def step(
+            self, action: np.ndarray
+        ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+            info = {
+                "status": "error",
+                "error_message": "no way to this pose",
+                "exception_type": "PlanningError",
+            }
             return {}, 0.0, True, False, info
 
     env = package.env_mme_vla.RoboMMEWithVideo("StopCube", "test", 0, 10)
     env._env = Failing()
     *_, over, _, info = env.step(np.zeros(8))
-    assert over and (info["error_message"], info["exception_type"]) == ("no way to this pose", "PlanningError")
+    assert over and (info["error_message"], info["exception_type"]) == (
+        "no way to this pose",
+        "PlanningError",
+    )

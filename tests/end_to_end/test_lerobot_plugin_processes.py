@@ -1,4 +1,6 @@
-"""Several processes that train behind LeRobot's interface build a vision cache once, and read the same."""
+"""Several processes that train behind LeRobot's interface build a vision cache once, and read the
+same.
+"""
 
 import json
 import socket
@@ -16,10 +18,15 @@ pytest.importorskip("gymnasium", reason="LeRobot's environments: uv sync --inexa
 def test_the_first_process_builds_the_cache_and_the_others_open_it(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        rendezvous = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": "2"}
+        rendezvous = {
+            "MASTER_ADDR": "127.0.0.1",
+            "MASTER_PORT": str(free.getsockname()[1]),
+            "WORLD_SIZE": "2",
+        }
     words = ["helpers.lerobot_two_processes", str(tmp_path)]
     started = [
-        commands.start(*words, env={**rendezvous, "RANK": str(rank), "LOCAL_RANK": str(rank)}) for rank in range(2)
+        commands.start(*words, env={**rendezvous, "RANK": str(rank), "LOCAL_RANK": str(rank)})
+        for rank in range(2)
     ]
     ended = [commands.finish(process) for process in started]
     assert [end.returncode for end in ended] == [0, 0], ended[0].stderr + ended[1].stderr

@@ -1,4 +1,6 @@
-"""examples/blink and examples/pick_cube: environments of the user's own in every command, in fresh processes."""
+"""examples/blink and examples/pick_cube: environments of the user's own in every command, in fresh
+processes.
+"""
 
 import json
 from pathlib import Path
@@ -14,15 +16,25 @@ from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.serving.client import Client
 from mme_vla.utils import read_json
 
-SMALL = ("backbone.depth=1", "memory.budget=64", "backbone.vision.depth=1", "backbone.vision.image_size=16",
-         "backbone.vision.patch_size=1", "backbone.vision.width=16", "backbone.vision.mlp_dim=16")  # fmt: skip
+SMALL = (
+    "backbone.depth=1",
+    "memory.budget=64",
+    "backbone.vision.depth=1",
+    "backbone.vision.image_size=16",
+    "backbone.vision.patch_size=1",
+    "backbone.vision.width=16",
+    "backbone.vision.mlp_dim=16",
+)
 BRIEF = ("train.batch_size=2", "train.val_samples=0", "train.open_loop_chunks=0", "train.workers=0",
          "train.device=cpu", "logger=none")  # fmt: skip
 BLINK = ("env=blink", "plugins=[blink]")
 
 
 def environment_of(example: str) -> dict[str, str]:
-    return {"PYTHONPATH": f"{REPOSITORY}:{REPOSITORY / 'examples' / example}", "OMP_NUM_THREADS": "1"}
+    return {
+        "PYTHONPATH": f"{REPOSITORY}:{REPOSITORY / 'examples' / example}",
+        "OMP_NUM_THREADS": "1",
+    }
 
 
 def run(folder: Path, example: str, command: str, *words: str) -> str:
@@ -38,11 +50,23 @@ def test_the_example_is_the_one_on_the_page() -> None:
 
 
 @pytest.mark.slow
-def test_an_environment_of_ones_own_works_in_every_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_environment_of_ones_own_works_in_every_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run(tmp_path, "blink", "record", *BLINK, "tasks=all", "episodes=4", "output=data")
     assert read_json(tmp_path / "data" / "meta" / "info.json", "a dataset")["total_episodes"] == 4
-    run(tmp_path, "blink", "train", *BLINK, "data.sources=[data]", "model=framesamp_modul", *SMALL, *BRIEF,
-        "train.steps=2", "output=run")  # fmt: skip
+    run(
+        tmp_path,
+        "blink",
+        "train",
+        *BLINK,
+        "data.sources=[data]",
+        "model=framesamp_modul",
+        *SMALL,
+        *BRIEF,
+        "train.steps=2",
+        "output=run",
+    )
     trained = ("checkpoint=run/checkpoints/step_000002", "--trust-plugins")
     (saved,) = (tmp_path / "run").rglob("step_000002/config.json")
     assert json.loads(saved.read_text())["embodiment"]["name"] == "blink"
@@ -50,7 +74,9 @@ def test_an_environment_of_ones_own_works_in_every_command(tmp_path: Path, capsy
     loop = (*BLINK, *trained, "tasks=all", "workers=1")
     run(tmp_path, "blink", "evaluate", *loop, "episodes=2", "output=evaluated", "video=all")
     records = read_folders(find_records([tmp_path / "evaluated"]))
-    assert [(r.task, r.episode, r.seed, r.extra["env"], r.extra["video_frames"]) for r in records] == [
+    assert [
+        (r.task, r.episode, r.seed, r.extra["env"], r.extra["video_frames"]) for r in records
+    ] == [
         ("Blink", 0, 500_000, "blink", 4),
         ("Blink", 1, 500_001, "blink", 4),
     ]
@@ -58,18 +84,39 @@ def test_an_environment_of_ones_own_works_in_every_command(tmp_path: Path, capsy
     results([str(tmp_path / "evaluated")])  # this process does not know the environment
     assert "Recall" in capsys.readouterr().out
 
-    online = ("online=true", "episodes=1", "recordings=data", "recorded=1", "draws=2", "moments=1", "scan=false")
+    online = (
+        "online=true",
+        "episodes=1",
+        "recordings=data",
+        "recorded=1",
+        "draws=2",
+        "moments=1",
+        "scan=false",
+    )
     run(tmp_path, "blink", "probe", *loop, *online, "with=[shuffle]", "output=probed")
     assert (tmp_path / "probed" / "page.html").is_file()
 
-    run(tmp_path, "blink", "play", *BLINK, "tasks=all", "episodes=4", "player=random", "output=played")
+    run(
+        tmp_path,
+        "blink",
+        "play",
+        *BLINK,
+        "tasks=all",
+        "episodes=4",
+        "player=random",
+        "output=played",
+    )
     played = read_folders(find_records([tmp_path / "played"]))
     assert len(played) == 4 and {r.outcome for r in played} <= {"success", "fail"}
 
 
 @pytest.mark.slow
-def test_a_policy_of_an_environment_of_ones_own_is_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("websockets", reason="the server's packages are not installed: the extra `serve` has them")
+def test_a_policy_of_an_environment_of_ones_own_is_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip(
+        "websockets", reason="the server's packages are not installed: the extra `serve` has them"
+    )
     monkeypatch.syspath_prepend(REPOSITORY / "examples" / "blink")
     import_plugins(["blink"])
     source = environment("blink")
@@ -95,10 +142,34 @@ def test_maniskills_pick_cube_is_recorded_trained_and_evaluated(tmp_path: Path) 
     words = ("env=pick_cube", "plugins=[pick_cube]")
     out = run(tmp_path, "pick_cube", "record", *words, "tasks=all", "episodes=2", "output=data")
     assert "2 episodes" in out and "0 did not succeed" in out
-    run(tmp_path, "pick_cube", "train", *words, "data.sources=[data]", "model=pi05", "backbone=nano",
-        "train=nano", "train.steps=2", "train.save_every=2", "train.val_samples=0",
-        "train.batch_size=4", "logger=none", "output=run")  # fmt: skip
-    run(tmp_path, "pick_cube", "evaluate", *words, "checkpoint=run/checkpoints/step_000002", "--trust-plugins",
-        "tasks=all", "episodes=1", "workers=1", "max_steps=4", "output=evaluated")  # fmt: skip
+    run(
+        tmp_path,
+        "pick_cube",
+        "train",
+        *words,
+        "data.sources=[data]",
+        "model=pi05",
+        "backbone=nano",
+        "train=nano",
+        "train.steps=2",
+        "train.save_every=2",
+        "train.val_samples=0",
+        "train.batch_size=4",
+        "logger=none",
+        "output=run",
+    )
+    run(
+        tmp_path,
+        "pick_cube",
+        "evaluate",
+        *words,
+        "checkpoint=run/checkpoints/step_000002",
+        "--trust-plugins",
+        "tasks=all",
+        "episodes=1",
+        "workers=1",
+        "max_steps=4",
+        "output=evaluated",
+    )
     (record,) = read_folders(find_records([tmp_path / "evaluated"]))
     assert (record.task, record.extra["env"], record.steps) == ("PickCube-v1", "pick_cube", 4)

@@ -21,7 +21,9 @@ def test_pins_for_pip_and_for_uv_are_the_same() -> None:
     for_uv = pyproject()["tool"]["uv"]["constraint-dependencies"]
     assert for_pip == set(for_uv)
     assert len(for_uv) == len(for_pip), "a pin stands twice"
-    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", pin) for pin in for_pip), "only name==version: no addresses, no ranges"
+    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", pin) for pin in for_pip), (
+        "only name==version: no addresses, no ranges"
+    )
 
 
 def test_ci_runs_the_commands_of_the_readme() -> None:
@@ -43,7 +45,9 @@ def test_links_in_the_documentation_lead_to_files() -> None:
 
 def test_no_file_names_a_place_on_somebodys_machine() -> None:
     # Bracketed so that the pattern does not find itself.
-    places = re.compile(r"(?<![\w.~])/(?:wor[k]|roo[t]|hom[e]|User[s]|opt/\w+)/\w|index-ur[l]|find-link[s]|pypi\.or[g]")
+    places = re.compile(
+        r"(?<![\w.~])/(?:wor[k]|roo[t]|hom[e]|User[s]|opt/\w+)/\w|index-ur[l]|find-link[s]|pypi\.or[g]"
+    )
     hits = []
     for file in project_files():
         try:
@@ -67,10 +71,17 @@ def test_every_exported_name_can_be_reached() -> None:
 def project_files() -> Iterator[Path]:
     """What git tracks or would track; without git, the package and what stands beside it."""
     listed = subprocess.run(
-        ["git", "ls-files", "-co", "--exclude-standard", "-z"], cwd=REPOSITORY, capture_output=True, text=True
+        ["git", "ls-files", "-co", "--exclude-standard", "-z"],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
     )
     if listed.returncode == 0:
-        yield from (REPOSITORY / name for name in listed.stdout.split("\0") if name and (REPOSITORY / name).is_file())
+        yield from (
+            REPOSITORY / name
+            for name in listed.stdout.split("\0")
+            if name and (REPOSITORY / name).is_file()
+        )
     else:
         for pattern in ("*.*", "mme_vla/**/*.*", "configs/**/*.*", "tests/**/*.*", "docs/**/*.*"):
             yield from (file for file in REPOSITORY.glob(pattern) if file.is_file())

@@ -10,7 +10,9 @@ LEFT_OUT = "left out by the test"
 
 
 def test_the_blocks_of_the_page_run(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / "start" / "python.md").read_text(), re.DOTALL)
+    blocks = re.findall(
+        r"```python\n(.*?)```", (REPOSITORY / "docs" / "start" / "python.md").read_text(), re.DOTALL
+    )
     run = [block for block in blocks if LEFT_OUT not in block]
     assert len(blocks) - 1 == len(run) >= 5
     monkeypatch.chdir(tmp_path)

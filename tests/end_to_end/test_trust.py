@@ -1,4 +1,6 @@
-"""A untrusted checkpoint: nothing it says leaves its folder, runs, or takes more memory than it has bytes."""
+"""A untrusted checkpoint: nothing it says leaves its folder, runs, or takes more memory than it has
+bytes.
+"""
 
 import json
 import os
@@ -24,7 +26,9 @@ from mme_vla.weights.orbax import read_orbax, write_orbax
 
 @pytest.fixture(scope="module")
 def policy() -> MMEPolicy:
-    return small_policy("framesamp_context", backbone={"vision": {**SMALL_VISION, "patch_size": 16}})
+    return small_policy(
+        "framesamp_context", backbone={"vision": {**SMALL_VISION, "patch_size": 16}}
+    )
 
 
 @pytest.fixture
@@ -58,15 +62,23 @@ def processor_says(folder: Path, **values: Any) -> None:
 
 OUTSIDE: dict[str, Callable[[Path], None]] = {
     "index above": lambda folder: index_names(folder, "../outside.safetensors"),
-    "index absolute": lambda folder: index_names(folder, str(folder.parent / "outside.safetensors")),
+    "index absolute": lambda folder: index_names(
+        folder, str(folder.parent / "outside.safetensors")
+    ),
     "linked weights": lambda folder: move_out(folder, "model.safetensors"),
     "linked config": lambda folder: move_out(folder, "config.json"),
     "linked processor": lambda folder: move_out(folder, "processor.json"),
     "linked tokenizer": lambda folder: move_out(folder, "tokenizer.model"),
     "linked statistics": lambda folder: move_out(folder, "norm_stats.json"),
-    "absolute tokenizer": lambda folder: processor_says(folder, tokenizer=str(folder / "tokenizer.model")),
-    "tokenizer above": lambda folder: processor_says(folder, tokenizer="../checkpoint/tokenizer.model"),
-    "absolute statistics": lambda folder: processor_says(folder, stats=str(folder / "norm_stats.json")),
+    "absolute tokenizer": lambda folder: processor_says(
+        folder, tokenizer=str(folder / "tokenizer.model")
+    ),
+    "tokenizer above": lambda folder: processor_says(
+        folder, tokenizer="../checkpoint/tokenizer.model"
+    ),
+    "absolute statistics": lambda folder: processor_says(
+        folder, stats=str(folder / "norm_stats.json")
+    ),
 }
 
 
@@ -88,7 +100,9 @@ def test_statistics_of_foreign_checkpoints_stay_in_their_folder(tmp_path: Path) 
     folder.mkdir()
     save_file({"x": torch.zeros(1)}, tmp_path / "secret.safetensors")
     for place in ("../secret.safetensors", str(tmp_path / "secret.safetensors")):
-        (folder / "policy_preprocessor.json").write_text(json.dumps({"steps": [{"state_file": place}]}))
+        (folder / "policy_preprocessor.json").write_text(
+            json.dumps({"steps": [{"state_file": place}]})
+        )
         with pytest.raises(UserError, match="lies outside of it"):
             read_stats(folder)
     (folder / "policy_preprocessor.json").unlink()
@@ -99,7 +113,9 @@ def test_statistics_of_foreign_checkpoints_stay_in_their_folder(tmp_path: Path) 
         read_stats(folder)
 
 
-def test_a_snapshot_of_the_hubs_cache_loads_through_its_links(folder: Path, policy: MMEPolicy, tmp_path: Path) -> None:
+def test_a_snapshot_of_the_hubs_cache_loads_through_its_links(
+    folder: Path, policy: MMEPolicy, tmp_path: Path
+) -> None:
     repository = tmp_path / "models--group--policy"
     snapshot = repository / "snapshots" / "0123abc"
     snapshot.mkdir(parents=True)
@@ -109,7 +125,10 @@ def test_a_snapshot_of_the_hubs_cache_loads_through_its_links(folder: Path, poli
         shutil.move(file, repository / "blobs" / f"blob{number}")
         (snapshot / file.name).symlink_to(Path("..", "..", "blobs", f"blob{number}"))
     loaded = MMEPolicy.from_pretrained(snapshot)
-    assert all(torch.equal(tensor, loaded.state_dict()[name]) for name, tensor in policy.state_dict().items())
+    assert all(
+        torch.equal(tensor, loaded.state_dict()[name])
+        for name, tensor in policy.state_dict().items()
+    )
     assert check_sums(snapshot)
 
     outside = tmp_path / "outside.json"
@@ -123,7 +142,9 @@ def test_a_snapshot_of_the_hubs_cache_loads_through_its_links(folder: Path, poli
         inside(snapshot, "../../blobs/blob0")
 
 
-def test_a_folder_that_imitates_the_hubs_cache_opens_nothing_else(folder: Path, tmp_path: Path) -> None:
+def test_a_folder_that_imitates_the_hubs_cache_opens_nothing_else(
+    folder: Path, tmp_path: Path
+) -> None:
     not_the_cache = tmp_path / "runs" / "snapshots" / "one"
     not_the_cache.parent.mkdir(parents=True)
     folder.rename(not_the_cache)
@@ -146,7 +167,9 @@ def test_the_network_is_requested_nothing_but_the_librarys_tokenizer(
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", fetch)
     (folder / "tokenizer.model").rename(folder.parent / "tokenizer.model")
     processor_says(folder, tokenizer="hf://evil/group/tokenizer.model")
-    with pytest.raises(UserError, match=r"hf://evil/group/tokenizer\.model.*tokenizer=.*as tokenizer\.model"):
+    with pytest.raises(
+        UserError, match=r"hf://evil/group/tokenizer\.model.*tokenizer=.*as tokenizer\.model"
+    ):
         MMEPolicy.from_pretrained(folder)
     assert requests == []
     (folder.parent / "tokenizer.model").rename(folder / "tokenizer.model")  # as the message says
@@ -181,23 +204,37 @@ def test_nothing_is_resolved_from_the_environment(
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_weights_that_are_no_numbers_are_refused_by_name(value: float, folder: Path, policy: MMEPolicy) -> None:
+def test_weights_that_are_no_numbers_are_refused_by_name(
+    value: float, folder: Path, policy: MMEPolicy
+) -> None:
     tensors = load_file(folder / "model.safetensors")
     tensors["backbone.time_in.bias"][3] = value
     save_file(tensors, folder / "model.safetensors")
-    for load in (MMEPolicy.from_pretrained, lambda place: load_weights(small_policy("framesamp_context"), place)):
-        with pytest.raises(UserError, match=r"NaN or infinities in 1 tensors: backbone\.time_in\.bias|misshapen"):
+    for load in (
+        MMEPolicy.from_pretrained,
+        lambda place: load_weights(small_policy("framesamp_context"), place),
+    ):
+        with pytest.raises(
+            UserError, match=r"NaN or infinities in 1 tensors: backbone\.time_in\.bias|misshapen"
+        ):
             load(folder)
 
 
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("depth", 10**12), ("depth", 2), ("head_dim", 10**30), ("horizon", 7), ("depth", "2"), ("vlm", []),
+        ("depth", 10**12),
+        ("depth", 2),
+        ("head_dim", 10**30),
+        ("horizon", 7),
+        ("depth", "2"),
+        ("vlm", []),
         ("depth", None),
     ],
-)  # fmt: skip
-def test_a_configuration_that_says_other_things_than_the_weights_is_refused(key: str, value: Any, folder: Path) -> None:
+)
+def test_a_configuration_that_says_other_things_than_the_weights_is_refused(
+    key: str, value: Any, folder: Path
+) -> None:
     change(folder / "config.json", lambda config: config["backbone"].update({key: value}))
     with pytest.raises(UserError) as caught:
         MMEPolicy.from_pretrained(folder)

@@ -1,4 +1,6 @@
-"""The built wheel is complete: from an empty environment, away from the repository, a policy builds and trains."""
+"""The built wheel is complete: from an empty environment, away from the repository, a policy builds
+and trains.
+"""
 
 import os
 import shutil
@@ -13,9 +15,15 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 TRAIN = [
-    "model=tokendrop_expert", "train.steps=3", "train.val_samples=2", "train.open_loop_chunks=1",
-    "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=2", "hydra.run.dir=run",
-]  # fmt: skip
+    "model=tokendrop_expert",
+    "train.steps=3",
+    "train.val_samples=2",
+    "train.open_loop_chunks=1",
+    "backbone.vision.depth=1",
+    "backbone.vision.image_size=16",
+    "backbone.vision.patch_size=2",
+    "hydra.run.dir=run",
+]
 USE = """
 import runpy
 import sys
@@ -30,18 +38,25 @@ print("lerobot.datasets" in sys.modules)
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    pytest.importorskip("hatchling", reason="building the wheel needs hatchling (the dev extra has it)")
+    pytest.importorskip(
+        "hatchling", reason="building the wheel needs hatchling (the dev extra has it)"
+    )
     folder = tmp_path_factory.mktemp("wheel")
-    run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)], cwd=REPOSITORY)
+    run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)],
+        cwd=REPOSITORY,
+    )
     return next(folder.glob("*.whl"))
 
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The Python of a new environment that holds the wheel and its dependencies, at their pinned versions.
+    """The Python of a new environment that holds the wheel and its dependencies, at their pinned
+    versions.
 
-    They come from uv's cache, without network. Where that lacks them (no uv, or torch from elsewhere), they are the
-    running environment's: its folder joins the path, but not what its own .pth files add, so never the repository.
+    They come from uv's cache, without network. Where that lacks them (no uv, or torch from
+    elsewhere), they are the running environment's: its folder joins the path, but not what its own
+    .pth files add, so never the repository.
     """
     folder = tmp_path_factory.mktemp("empty")
     run([sys.executable, "-m", "venv", "--without-pip", str(folder)], cwd=folder)
@@ -49,11 +64,28 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     uv = os.environ.get("UV") or shutil.which("uv")
     if uv is not None:
         pins = str(REPOSITORY / "constraints.txt")
-        order = [uv, "pip", "install", "--offline", "--link-mode", "symlink", "--python", str(python), "-c", pins]
-        if subprocess.run([*order, str(wheel)], cwd=REPOSITORY, capture_output=True).returncode == 0:
+        order = [
+            uv,
+            "pip",
+            "install",
+            "--offline",
+            "--link-mode",
+            "symlink",
+            "--python",
+            str(python),
+            "-c",
+            pins,
+        ]
+        if (
+            subprocess.run([*order, str(wheel)], cwd=REPOSITORY, capture_output=True).returncode
+            == 0
+        ):
             return python
     site_packages = Path(
-        run([str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"], cwd=folder).strip()
+        run(
+            [str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
+            cwd=folder,
+        ).strip()
     )
     zipfile.ZipFile(wheel).extractall(site_packages)
     (site_packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
@@ -70,11 +102,20 @@ def test_the_wheel_holds_every_file_of_the_package_and_the_configs(wheel: Path) 
 @pytest.mark.slow
 def test_the_source_archive_holds_what_the_wheel_is_made_of(tmp_path: Path) -> None:
     pytest.importorskip("hatchling", reason="building needs hatchling (the dev extra has it)")
-    run([sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(tmp_path)], cwd=REPOSITORY)
+    run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(tmp_path)],
+        cwd=REPOSITORY,
+    )
     with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as archive:
         packed = {name.partition("/")[2] for name in archive.getnames()}
     assert source_files("mme_vla", "mme_vla") | source_files("configs", "configs") <= packed
-    assert {"pyproject.toml", "README.md", "LICENSE", "constraints.txt", "tests/end_to_end/test_wheel.py"} <= packed
+    assert {
+        "pyproject.toml",
+        "README.md",
+        "LICENSE",
+        "constraints.txt",
+        "tests/end_to_end/test_wheel.py",
+    } <= packed
 
 
 @pytest.mark.slow
@@ -88,13 +129,23 @@ def test_a_policy_builds_and_trains_from_the_wheel_alone(installed: Path, tmp_pa
 
 
 def source_files(folder: str, inside: str) -> set[str]:
-    files = (file for file in (REPOSITORY / folder).rglob("*") if file.is_file() and "__pycache__" not in file.parts)
+    files = (
+        file
+        for file in (REPOSITORY / folder).rglob("*")
+        if file.is_file() and "__pycache__" not in file.parts
+    )
     return {f"{inside}/{file.relative_to(REPOSITORY / folder).as_posix()}" for file in files}
 
 
 def run(command: list[str], cwd: Path) -> str:
     """Run without any way back to the repository or out to a hub, and return what was printed."""
-    clean = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL_ENV"))}
-    done = subprocess.run(command, cwd=cwd, env={**clean, "HF_HUB_OFFLINE": "1"}, capture_output=True, text=True)
+    clean = {
+        key: value
+        for key, value in os.environ.items()
+        if not key.startswith(("PYTHON", "VIRTUAL_ENV"))
+    }
+    done = subprocess.run(
+        command, cwd=cwd, env={**clean, "HF_HUB_OFFLINE": "1"}, capture_output=True, text=True
+    )
     assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
     return done.stdout

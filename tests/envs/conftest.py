@@ -49,7 +49,9 @@ def make_unrendered() -> Iterator[Build]:
 
     envs = []
 
-    def build(task: str = "PickXtimes", split: str = "train", episode: int = 8, *args: Any, **options: Any) -> Any:
+    def build(
+        task: str = "PickXtimes", split: str = "train", episode: int = 8, *args: Any, **options: Any
+    ) -> Any:
         envs.append(make_env(task, split, episode, *args, **{"render": False} | options))
         return envs[-1]
 
@@ -60,7 +62,9 @@ def make_unrendered() -> Iterator[Build]:
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two converted episodes with poses and choices, the first with a conditioning video of 8 of its 24 frames."""
+    """Two converted episodes with poses and choices, the first with a conditioning video of 8 of
+    its 24 frames.
+    """
     from helpers.h5_files import write_file
     from mme_vla.data.convert import ConvertOptions, convert
     from mme_vla.data.hdf5 import find_files, list_episodes

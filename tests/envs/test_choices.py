@@ -1,4 +1,6 @@
-"""A robot that chooses among options: its numbers, its data, training, rollouts and serving, and real recordings."""
+"""A robot that chooses among options: its numbers, its data, training, rollouts and serving, and
+real recordings.
+"""
 
 import json
 import warnings
@@ -31,7 +33,7 @@ CHOOSER = robomme_robot("robomme_choice")
 SPACE = CHOOSER.action
 
 
-# Numbers ------------------------------------------------------------------------------------------------------------
+# Numbers ------------------------------------------------------------------------------------------
 
 
 def test_a_choice_survives_the_way_through_the_robots_numbers() -> None:
@@ -61,7 +63,9 @@ def test_other_robots_decide_nothing_and_say_nothing_of_options() -> None:
     joints = robomme_robot("robomme_joint").action
     actions = torch.randn(3, 8)
     assert joints.decide(actions, ()) is actions and joints.worded("go", ()) == "go"
-    assert "choice" not in joints.to_dict(), "configurations of earlier versions stay what they were"
+    assert "choice" not in joints.to_dict(), (
+        "configurations of earlier versions stay what they were"
+    )
 
 
 @pytest.mark.parametrize(
@@ -82,16 +86,25 @@ def test_impossible_choices_are_refused_by_the_key(changes: dict[str, Any], mess
 
 @pytest.mark.parametrize(
     "given",
-    [None, [], "abc", [{"label": "z", "action": "go"}], [{"label": "a"}], EIGHT + EIGHT[:1], EIGHT[:1] * 2,
-     [{"label": "a", "action": "go", "possible": False}],
-     [{"label": "a", "action": "go", "need_parameter": "yes"}], [{"label": "a", "action": "go " * 200}]],
-)  # fmt: skip
+    [
+        None,
+        [],
+        "abc",
+        [{"label": "z", "action": "go"}],
+        [{"label": "a"}],
+        EIGHT + EIGHT[:1],
+        EIGHT[:1] * 2,
+        [{"label": "a", "action": "go", "possible": False}],
+        [{"label": "a", "action": "go", "need_parameter": "yes"}],
+        [{"label": "a", "action": "go " * 200}],
+    ],
+)
 def test_options_that_nobody_can_choose_among_are_refused(given: Any) -> None:
     with pytest.raises(UserError, match="option"):
         read_options(given, 8)
 
 
-# Data ---------------------------------------------------------------------------------------------------------------
+# Data ---------------------------------------------------------------------------------------------
 
 
 def test_every_choice_is_decided_on_one_frame_before_it_begins_even_the_same_twice() -> None:
@@ -99,7 +112,11 @@ def test_every_choice_is_decided_on_one_frame_before_it_begins_even_the_same_twi
     for frame, letter in ((2, "a"), (5, "b"), (9, "b")):
         rows[frame] = choice_row(letter, [])
     choices = find_choices(rows, 50, SPACE.choice)
-    assert choices.decisions.tolist() == [50, 54, 58] and choices.targets[:, 1].tolist() == [0, 1, 1]
+    assert choices.decisions.tolist() == [50, 54, 58] and choices.targets[:, 1].tolist() == [
+        0,
+        1,
+        1,
+    ]
     assert find_choices(np.zeros((3, 10), np.float32), 0, SPACE.choice).decisions.tolist() == []
 
 
@@ -107,7 +124,12 @@ def test_recorded_choices_are_converted_and_read_as_decisions(folder: Path) -> N
     source = EpisodeSource(folder, robot=CHOOSER)
     assert [option.to_dict() for option in source.options(0)] == OPTIONS
     # Chosen at every fourth frame, but at 12 nothing; the execution of episode 0 begins at frame 8.
-    assert source.decisions(0).tolist() == [8, 15, 19] and source.decisions(1).tolist() == [0, 3, 7, 15]
+    assert source.decisions(0).tolist() == [8, 15, 19] and source.decisions(1).tolist() == [
+        0,
+        3,
+        7,
+        15,
+    ]
     chunk, recorded = source.action_chunk(0, 15, 4)
     assert recorded.tolist() == [True, True, False, False]
     expected = [choice_at(number) for number in (4, 5, 5, 5)]
@@ -124,17 +146,24 @@ def test_letters_that_are_seldom_selected_stay_numbers_of_ordinary_size(folder: 
     assert len(data) == 7
     item = data[0]
     assert item["actions"].abs().max() < 2, "letters are −1 and 1; the point is about as large"
-    back = SPACE.decide(processor.absolute_actions(item["actions"], item["state"]), source.options(0))
+    back = SPACE.decide(
+        processor.absolute_actions(item["actions"], item["state"]), source.options(0)
+    )
     assert torch.allclose(back, torch.from_numpy(source.action_chunk(0, 8, 4)[0]), atol=1e-5)
 
 
 def test_the_prompt_lists_what_is_offered(folder: Path) -> None:
     tokenizer = Tokenizer.load("sample")
     source = EpisodeSource(folder, robot=CHOOSER)
-    processor = Processor(28, tokenizer, embodiment=CHOOSER, stats=compute_norm_stats([source], robot=CHOOSER))
+    processor = Processor(
+        28, tokenizer, embodiment=CHOOSER, stats=compute_norm_stats([source], robot=CHOOSER)
+    )
     item = TrainingDataset([source], processor)[0]
     words = tokenizer.decode(item["prompt"][item["prompt_mask"]].tolist())
-    assert words.strip() == "do task 0. Options: a pick up the cube (point), b press the button, c wait"
+    assert (
+        words.strip()
+        == "do task 0. Options: a pick up the cube (point), b press the button, c wait"
+    )
     assert item["goal"] == "do task 0"
 
 
@@ -147,7 +176,10 @@ def test_the_longest_options_of_the_benchmark_fit_the_prompt() -> None:
         for side in ("left", "right")
     ]
     options = tuple(Option("abcd"[i], text) for i, text in enumerate(texts))
-    goal = "watch the video carefully, then use the stick attached to the robot to navigate around the sticks on the "
+    goal = (
+        "watch the video carefully, then use the stick attached to the robot to navigate around the"
+        " sticks on the "
+    )
     goal += "table, following the same path shown in the video"
     processor = Processor(28, Tokenizer.load("sample"), embodiment=CHOOSER)
     with warnings.catch_warnings():
@@ -158,7 +190,9 @@ def test_the_longest_options_of_the_benchmark_fit_the_prompt() -> None:
 
 def test_a_dataset_that_lost_its_options_says_so(folder: Path) -> None:
     source = EpisodeSource(folder, robot=CHOOSER)
-    source.__dict__["records"] = [{key: v for key, v in r.items() if key != "options"} for r in source.records]
+    source.__dict__["records"] = [
+        {key: v for key, v in r.items() if key != "options"} for r in source.records
+    ]
     with pytest.raises(UserError, match="does not say which options episode 1 offered"):
         source.options(1)
 
@@ -186,7 +220,7 @@ def test_a_damaged_choice_is_reported_with_its_place(tmp_path: Path) -> None:
         episode.choice_actions()
 
 
-# Training, rollouts, serving ------------------------------------------------------------------------------------------
+# Training, rollouts, serving ----------------------------------------------------------------------
 
 
 class ChoiceEnvs(InlineEnvs):
@@ -221,7 +255,9 @@ class Offering(ChoiceEnvs):
 
 
 def test_a_rollout_asks_after_each_choice_and_takes_what_is_offered_only() -> None:
-    policy = quick_policy("framesamp_modul", patch_size=8, embodiment="robomme_choice", memory={"budget": 64})
+    policy = quick_policy(
+        "framesamp_modul", patch_size=8, embodiment="robomme_choice", memory={"budget": 64}
+    )
     envs = Offering(robot=CHOOSER)
     (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=9)
     assert record.outcome in ("success", "timeout") and record.action_space == "multi_choice"
@@ -235,7 +271,9 @@ def test_choices_that_move_nothing_come_to_an_end() -> None:
         offered = OPTIONS[2:]
 
     policy = quick_policy("pi05", embodiment="robomme_choice")
-    (record,) = roll(policy, [Job("PickXtimes", "test", 0)], Idle(robot=CHOOSER, max_steps=5), max_steps=5)
+    (record,) = roll(
+        policy, [Job("PickXtimes", "test", 0)], Idle(robot=CHOOSER, max_steps=5), max_steps=5
+    )
     assert (record.outcome, record.extra["chunks"], record.steps) == ("timeout", 6, 0)
 
 
@@ -251,29 +289,49 @@ def test_a_policy_that_chooses_is_served_with_its_choices_in_words() -> None:
     request = challenge(frames, frames, states, True)
     with Served(policy) as served, served.client() as client:
         about = client.metadata
-        assert (about["action_space"], about["action_dim"], about["execute"]) == ("multi_choice", 10, 1)
+        assert (about["action_space"], about["action_dim"], about["execute"]) == (
+            "multi_choice",
+            10,
+            1,
+        )
         reply = client.infer({**request, "available_multi_choices": OPTIONS[1:2]})
         assert reply["actions"].shape == (1, 10) and reply["actions"][0, 1] == 1
         assert reply["choices"][0]["choice"] == "B"
         assert np.allclose(reply["choices"][0]["point"], reply["actions"][0, 8:] * 256)
         later = client.infer({**challenge(frames[:1], frames[:1], states[:1], False)})
-        assert later["choices"][0]["choice"] == "B", "options stay as they were until others are given"
+        assert later["choices"][0]["choice"] == "B", (
+            "options stay as they were until others are given"
+        )
         with pytest.raises(UserError, match="cannot be chosen"):
             client.infer({**request, "available_multi_choices": [{"label": "Z", "action": "go"}]})
-    with Served(policy) as served, served.client() as client, pytest.raises(UserError, match="offers none"):
+    with (
+        Served(policy) as served,
+        served.client() as client,
+        pytest.raises(UserError, match="offers none"),
+    ):
         client.infer(request)
 
 
-# Real recordings ------------------------------------------------------------------------------------------------------
+# Real recordings ----------------------------------------------------------------------------------
 
 
 def test_choices_of_real_episodes_are_those_of_the_official_files(h5_folder: Path) -> None:
     counts = {}
     for task, number in (("PickXtimes", 8), ("PatternLock", 8)):
-        with open_episode(EpisodeRef(h5_folder / f"record_dataset_{task}.h5", number, task)) as episode:
+        with open_episode(
+            EpisodeRef(h5_folder / f"record_dataset_{task}.h5", number, task)
+        ) as episode:
             rows, first = episode.choice_actions()[episode.exec_start :], episode.exec_start
             motions = find_choices(rows, first, SPACE.choice)
             actions = [benchmark_action(SPACE, row) for row in motions.targets]
-            counts[task] = (motions.decisions.tolist(), [c["choice"] for c in actions], [c["point"] for c in actions])
-    assert counts["PickXtimes"] == ([0, 143, 237], ["A", "B", "C"], [[54, 145], [93, 109], [66, 101]])
+            counts[task] = (
+                motions.decisions.tolist(),
+                [c["choice"] for c in actions],
+                [c["point"] for c in actions],
+            )
+    assert counts["PickXtimes"] == (
+        [0, 143, 237],
+        ["A", "B", "C"],
+        [[54, 145], [93, 109], [66, 101]],
+    )
     assert counts["PatternLock"][:2] == ([74, 109], ["A", "H"])

@@ -38,7 +38,9 @@ def test_the_right_numbers_then_the_button_are_success(env, hand):
 def test_a_cube_in_the_bin_leaves_the_table(env, hand):
     cube = env.cubes[env.order[-1]][0]  # any cube will do, whatever is asked for
     put(env, hand, cube)
-    assert env.progress.index == 2 and cube.position[0] > 9 and env.filled == Counter({cube.colour: 1})
+    assert (
+        env.progress.index == 2 and cube.position[0] > 9 and env.filled == Counter({cube.colour: 1})
+    )
 
 
 def test_a_cube_beside_the_bin_or_near_the_gripper_is_not_filled_in(env, hand, monkeypatch):

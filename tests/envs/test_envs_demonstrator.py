@@ -1,4 +1,6 @@
-"""The demonstrator: what each primitive does to a scene, and whole demonstrations against the recorded ones."""
+"""The demonstrator: what each primitive does to a scene, and whole demonstrations against the
+recorded ones.
+"""
 
 from collections.abc import Callable
 
@@ -14,7 +16,13 @@ from helpers.env_scenes import Scene
 from mme_vla.envs.robot.demonstrator import Demonstrator, PlanningError, arc
 from mme_vla.envs.robot.gripper_skills import failing_offset, grasp_orientation
 from mme_vla.envs.scene.articulated import PEG_COLOUR, build_button, build_peg
-from mme_vla.envs.scene.objects import build_aperture_box, build_board, build_container, build_cube, build_disc
+from mme_vla.envs.scene.objects import (
+    build_aperture_box,
+    build_board,
+    build_container,
+    build_cube,
+    build_disc,
+)
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.task import Task
 
@@ -105,7 +113,9 @@ def test_failing_offsets_point_somewhere() -> None:
     offsets = np.array([failing_offset("xy", 0.04, seed) for seed in range(40)])
     assert set(np.unique(np.round(offsets[:, :2] / 0.04))) == {-1, 0, 1}
     assert (np.abs(offsets).sum(1) > 0).all() and (offsets[:, 2] == 0).all()
-    np.testing.assert_allclose(failing_offset("xy", 0.035, 6400), [-0.035, 0, 0])  # as VideoUnmask's fourth episode
+    np.testing.assert_allclose(
+        failing_offset("xy", 0.035, 6400), [-0.035, 0, 0]
+    )  # as VideoUnmask's fourth episode
 
 
 def test_the_hand_takes_the_nearer_of_two_equal_sides() -> None:
@@ -119,7 +129,9 @@ def test_the_hand_takes_the_nearer_of_two_equal_sides() -> None:
 
 
 def test_a_container_is_lifted_by_its_handle() -> None:
-    env, _, demonstrator = scene(lambda env: env.add(build_container(env, "container", (0.1, -0.1), 0.5)))
+    env, _, demonstrator = scene(
+        lambda env: env.add(build_container(env, "container", (0.1, -0.1), 0.5))
+    )
     container = things(env)["container"]
     demonstrator.pick_container(container)
     assert container.position[2] > 0.15
@@ -173,15 +185,24 @@ def test_a_hard_reset_returns_the_arm() -> None:
     demonstrator.move_to(demonstrator.at([-0.2, 0.2, 0.2]))
     before = len(log.actions)
     flags = []
-    demonstrator._step = lambda action: (log._step(action), flags.append((env.reset_in_progress, env.after_video)))
+    demonstrator._step = lambda action: (
+        log._step(action),
+        flags.append((env.reset_in_progress, env.after_video)),
+    )
     demonstrator.hard_reset()
     assert len(log.actions) - before == 36
     # Objects are restored after every step of the way back but the first.
-    assert flags == [(False, False)] * 7 + [(True, False)] * 29 and env.after_video and not env.reset_in_progress
+    assert (
+        flags == [(False, False)] * 7 + [(True, False)] * 29
+        and env.after_video
+        and not env.reset_in_progress
+    )
     assert np.abs(env.qpos[:7] - env.reset_action[:7]).max() < 0.01
 
 
-@pytest.mark.parametrize(("cube", "goal"), [((-0.1, 0.05), (0.02, 0.12)), ((0.05, 0.0), (-0.1, 0.02))])
+@pytest.mark.parametrize(
+    ("cube", "goal"), [((-0.1, 0.05), (0.02, 0.12)), ((0.05, 0.0), (-0.1, 0.02))]
+)
 def test_a_cube_is_pushed_to_a_goal(cube: tuple[float, float], goal: tuple[float, float]) -> None:
     def fill(env: Scene) -> None:
         env.add(build_cube(env, "cube", "red", cube))
@@ -195,8 +216,12 @@ def test_a_cube_is_pushed_to_a_goal(cube: tuple[float, float], goal: tuple[float
     assert abs(log.waypoints[0][5]) <= np.pi / 2
 
 
-@pytest.mark.parametrize(("cube", "goal"), [((0.0, 0.1), (-0.05, -0.03)), ((-0.02, -0.1), (-0.05, 0.04))])
-def test_a_cube_is_hooked_to_a_goal_with_a_peg(cube: tuple[float, float], goal: tuple[float, float]) -> None:
+@pytest.mark.parametrize(
+    ("cube", "goal"), [((0.0, 0.1), (-0.05, -0.03)), ((-0.02, -0.1), (-0.05, 0.04))]
+)
+def test_a_cube_is_hooked_to_a_goal_with_a_peg(
+    cube: tuple[float, float], goal: tuple[float, float]
+) -> None:
     def fill(env: Scene) -> None:
         env.add(build_cube(env, "cube", "red", cube))
         env.add(build_disc(env, "goal", 0.04, 0.005, "purple", goal))
@@ -213,12 +238,23 @@ def test_a_cube_is_hooked_to_a_goal_with_a_peg(cube: tuple[float, float], goal: 
 
 @pytest.mark.parametrize(
     ("grasped", "side", "motion"),
-    [("tail", 1, "insert_peg"), ("head", 1, "insert_peg"), ("head", -1, "insert_peg"), ("head", 1, "insert_peg_fully")],
+    [
+        ("tail", 1, "insert_peg"),
+        ("head", 1, "insert_peg"),
+        ("head", -1, "insert_peg"),
+        ("head", 1, "insert_peg_fully"),
+    ],
 )
-def test_a_peg_is_inserted_from_the_side_that_was_requested(grasped: str, side: int, motion: str) -> None:
+def test_a_peg_is_inserted_from_the_side_that_was_requested(
+    grasped: str, side: int, motion: str
+) -> None:
     def fill(env: Scene) -> None:
         env.add(build_aperture_box(env, (0.0, 0.0), np.pi / 2))
-        env.add(build_peg(env, "peg", 0.05, 0.01, (1, 0, 0), (0, 1, 0), (-0.15, -0.15 * side), 0.4 * side))
+        env.add(
+            build_peg(
+                env, "peg", 0.05, 0.01, (1, 0, 0), (0, 1, 0), (-0.15, -0.15 * side), 0.4 * side
+            )
+        )
 
     env, _, demonstrator = scene(fill)
     peg, box = things(env)["peg"], things(env)["box"]

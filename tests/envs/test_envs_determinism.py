@@ -11,8 +11,13 @@ from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.subtasks import Progress, SubTask
 from mme_vla.errors import UserError
 
-STEPS, EVERY = {"VideoUnmaskSwap": 220, "ButtonUnmaskSwap": 220, "VideoUnmask": 80, "ButtonUnmask": 80}, 4
-"""Of others 40. In 80 steps objects are covered (64). A state that differs once differs until the end."""
+STEPS, EVERY = (
+    {"VideoUnmaskSwap": 220, "ButtonUnmaskSwap": 220, "VideoUnmask": 80, "ButtonUnmask": 80},
+    4,
+)
+"""Of others 40. In 80 steps objects are covered (64). A state that differs once differs until the
+end.
+"""
 
 
 def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:
@@ -35,7 +40,9 @@ def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:
 def test_the_same_seed_gives_bit_equal_states_twice(task: str) -> None:
     (first, words), (second, same_words) = states(task, "hard"), states(task, "hard")
     assert np.array_equal(first, second) and words == same_words
-    assert len(first) == STEPS.get(task, 40) // EVERY + 1 and not np.array_equal(first[0], first[-1]), "nothing moved"
+    assert len(first) == STEPS.get(task, 40) // EVERY + 1 and not np.array_equal(
+        first[0], first[-1]
+    ), "nothing moved"
 
 
 @pytest.mark.slow
@@ -71,7 +78,9 @@ def test_the_benchmarks_words_ask_for_a_recovery_demonstration() -> None:
 
 
 def test_success_stays_whatever_happens_afterwards() -> None:
-    progress = Progress([SubTask("wait", done=lambda: True, run=lambda demo: None)], latch_failure=True)
+    progress = Progress(
+        [SubTask("wait", done=lambda: True, run=lambda demo: None)], latch_failure=True
+    )
     progress.update()
     assert progress.succeeded and not progress.failed
     progress.update(failed=True)

@@ -20,7 +20,9 @@ VIDEO_GRASPING, VIDEO_INSERTING = 0, 1
 OTHER = {"head": "tail", "tail": "head"}
 
 
-@pytest.fixture(params=[("head", 1), ("head", -1), ("tail", 1), ("tail", -1)], ids=lambda p: f"{p[0]}{p[1]:+}")
+@pytest.fixture(
+    params=[("head", 1), ("head", -1), ("tail", 1), ("tail", -1)], ids=lambda p: f"{p[0]}{p[1]:+}"
+)
 def env(build_task, request, monkeypatch) -> InsertPeg:
     """At the grasp of the execution; whatever is in the air is in the hand."""
     env = build_task(InsertPeg, 13602, "medium")
@@ -39,7 +41,9 @@ def raise_peg(env: InsertPeg, peg: Peg, end: str) -> tuple[bool, bool]:
 
 
 def insert(env: InsertPeg, grasped: str, side: int, short: float = 0.0) -> tuple[bool, bool]:
-    """Put the end that is not grasped into the box, the tool on the given side of the box, and do a step."""
+    """Put the end that is not grasped into the box, the tool on the given side of the box, and do a
+    step.
+    """
     env.box.move_to(at((0.0, 0.1 * side), env.box.position[2], np.pi / 2))
     along = -short if grasped == "tail" else env.peg.length + short
     env.peg.move_to(env.box.pose * sapien.Pose([along, 0, 0]))
@@ -77,7 +81,10 @@ def test_an_insertion_is_displayed_in_red_for_twenty_steps_after_it(env):
 
 def test_the_wrong_end_up_fails_but_not_in_the_video(env):
     env.progress.index = VIDEO_GRASPING
-    assert raise_peg(env, env.peg, OTHER[env.end]) == (False, False) and env.progress.index == VIDEO_GRASPING
+    assert (
+        raise_peg(env, env.peg, OTHER[env.end]) == (False, False)
+        and env.progress.index == VIDEO_GRASPING
+    )
     env.progress.index = GRASPING
     assert raise_peg(env, env.peg, OTHER[env.end]) == (False, True)
 
@@ -95,7 +102,9 @@ def test_the_wrong_end_in_the_box_fails(env):
 
 def test_from_the_other_side_fails_but_not_in_the_video(env):
     env.progress.index = VIDEO_INSERTING
-    assert insert(env, env.end, -env.side) == (False, False) and env.progress.index == VIDEO_INSERTING
+    assert (
+        insert(env, env.end, -env.side) == (False, False) and env.progress.index == VIDEO_INSERTING
+    )
     env.progress.index = INSERTING
     assert insert(env, env.end, -env.side) == (False, True)
 
@@ -108,7 +117,9 @@ def test_on_the_way_back_from_the_video_the_pegs_are_where_they_were(env):
         np.testing.assert_allclose(peg.pose.p, peg.initial_pose.p, atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", [710002, 9000063, 9000014], ids=["beside the box", "flung off", "out of reach"])
+@pytest.mark.parametrize(
+    "seed", [710002, 9000063, 9000014], ids=["beside the box", "flung off", "out of reach"]
+)
 def test_where_the_official_demonstrator_fails_the_local_one_retries(build_task, seed: int):
     env = build_task(InsertPeg, seed, "easy")
     assert steps_of_demonstration(env) is not None

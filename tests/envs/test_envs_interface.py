@@ -1,4 +1,6 @@
-"""The environment's contract: lists, infos, statuses, step counting, the conditioning video, errors."""
+"""The environment's contract: lists, infos, statuses, step counting, the conditioning video,
+errors.
+"""
 
 import gc
 import sys
@@ -9,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
+pytest.importorskip(
+    "mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim"
+)
 
 from mme_vla.envs import make, make_env, rendering
 from mme_vla.envs.grounding import Grounding, centroid, ground, project
@@ -44,7 +48,7 @@ def test_the_stick_s_video_leaves_out_what_is_not_recorded(make_unrendered) -> N
     assert info["simple_subgoal_online"].startswith("move ")
 
 
-# The contract -----------------------------------------------------------------------------------------------------
+# The contract -------------------------------------------------------------------------------------
 
 
 def test_a_step_gives_lists_of_one_frame_and_the_official_info(make_unrendered) -> None:
@@ -61,16 +65,24 @@ def test_a_step_gives_lists_of_one_frame_and_the_official_info(make_unrendered) 
     }
     assert (reward.shape, terminated.shape, truncated.shape) == ((), (), ())
     assert set(info) == {
-        "task_goal", "simple_subgoal_online", "grounded_subgoal_online", "status", "success", "fail", "elapsed_steps",
+        "task_goal",
+        "simple_subgoal_online",
+        "grounded_subgoal_online",
+        "status",
+        "success",
+        "fail",
+        "elapsed_steps",
         "front_camera_intrinsic",
-    }  # fmt: skip
+    }
     assert info["status"] == "ongoing"
     assert info["elapsed_steps"].tolist() == [2]
     assert info["grounded_subgoal_online"] == info["simple_subgoal_online"]
 
 
 def test_multi_choice_provides_what_is_needed_to_choose(make_unrendered) -> None:
-    env = make_unrendered("PickXtimes", "train", 8, "multi_choice", include_front_camera_extrinsic=False)
+    env = make_unrendered(
+        "PickXtimes", "train", 8, "multi_choice", include_front_camera_extrinsic=False
+    )
     observation, info = env.reset()
     assert "front_camera_extrinsic_list" in observation
     assert info["front_camera_intrinsic"].shape == (3, 3)
@@ -111,7 +123,9 @@ def test_an_unreachable_pose_is_an_error_status(make_unrendered) -> None:
     assert "IK failed" in info["error_message"]
 
 
-def test_a_motion_that_cannot_be_planned_is_an_error_status(make_unrendered, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_motion_that_cannot_be_planned_is_an_error_status(
+    make_unrendered, monkeypatch: pytest.MonkeyPatch
+) -> None:
     env = make_unrendered("PickXtimes", "train", 8, "waypoint")
     env.reset()
 
@@ -123,7 +137,9 @@ def test_a_motion_that_cannot_be_planned_is_an_error_status(make_unrendered, mon
     assert (observation, terminated, info["exception_type"]) == (None, True, "PlanningError")
 
 
-def test_one_unplanned_video_motion_does_not_stop_the_video(make_unrendered, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_unplanned_video_motion_does_not_stop_the_video(
+    make_unrendered, monkeypatch: pytest.MonkeyPatch
+) -> None:
     env = make_unrendered("VideoUnmask", "train", 4)
 
     def fail(*_: Any) -> None:
@@ -146,7 +162,7 @@ def test_a_closed_or_unstarted_environment_says_so(make_unrendered) -> None:
             use()
 
 
-# Making -----------------------------------------------------------------------------------------------------------
+# Making -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -180,7 +196,11 @@ SUMMARY = "GPU: llvmpipe (LLVM 15)\n  Supported: {}\n  Present:   0\n"
 
 @pytest.mark.parametrize(
     ("summary", "mesa", "words"),
-    [(None, 25, "cannot render"), (SUMMARY.format(0), 25, "new enough"), (SUMMARY.format(1), 22, "too old")],
+    [
+        (None, 25, "cannot render"),
+        (SUMMARY.format(0), 25, "new enough"),
+        (SUMMARY.format(1), 22, "too old"),
+    ],
 )
 def test_missing_or_old_vulkan_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, summary: str | None, mesa: int, words: str
@@ -212,11 +232,19 @@ class _Builder:
     def get_episode_num(self) -> int:
         return 3
 
-    def make_env_for_episode(self, episode: int, max_steps: int | None = None, **include: bool) -> Any:
+    def make_env_for_episode(
+        self, episode: int, max_steps: int | None = None, **include: bool
+    ) -> Any:
         type(self).made |= {"episode": episode, "limit": max_steps, **include}
         frame = np.zeros((256, 256, 3), np.uint8)
         observation_ = {"front_rgb_list": [frame, frame + 1]}
-        outcome = (observation_, 0.0, False, False, {"task_goal": "press the button", "status": "ongoing"})
+        outcome = (
+            observation_,
+            0.0,
+            False,
+            False,
+            {"task_goal": "press the button", "status": "ongoing"},
+        )
         return SimpleNamespace(
             reset=lambda: (observation_, {"task_goal": ["press the button"]}),
             step=lambda action: outcome,
@@ -224,7 +252,9 @@ class _Builder:
         )
 
 
-def test_the_official_package_comes_through_the_same_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_official_package_comes_through_the_same_interface(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with pytest.raises(UserError, match="robomme is not installed"):
         make_env("StopCube", env="official")
     wrapper = ModuleType("robomme.env_record_wrapper")
@@ -237,11 +267,19 @@ def test_the_official_package_comes_through_the_same_interface(monkeypatch: pyte
         make_env("StopCube", episode=3, env="official")
     with pytest.raises(UserError, match="leave out seed"):
         make_env("StopCube", seed=3, env="official")
-    env = make_env("StopCube", "val", 2, "waypoint", env="official", max_steps=7, include_front_depth=True)
+    env = make_env(
+        "StopCube", "val", 2, "waypoint", env="official", max_steps=7, include_front_depth=True
+    )
     assert _Builder.made == {
-        "env_id": "StopCube", "dataset": "val", "action_space": "waypoint", "gui_render": False, "max_steps": 7,
-        "episode": 2, "limit": 7, "include_front_depth": True,
-    }  # fmt: skip
+        "env_id": "StopCube",
+        "dataset": "val",
+        "action_space": "waypoint",
+        "gui_render": False,
+        "max_steps": 7,
+        "episode": 2,
+        "limit": 7,
+        "include_front_depth": True,
+    }
     with pytest.raises(UserError, match="call reset"):
         env.step([0] * 7)
     observation, _ = env.reset()
@@ -253,7 +291,7 @@ def test_the_official_package_comes_through_the_same_interface(monkeypatch: pyte
         env.reset()
 
 
-# Parts ------------------------------------------------------------------------------------------------------------
+# Parts --------------------------------------------------------------------------------------------
 
 
 def test_angles_exceed_half_a_rotation() -> None:
@@ -261,7 +299,9 @@ def test_angles_exceed_half_a_rotation() -> None:
 
     track = AngleTrack()
     yaws = np.linspace(3.0, 7.0, 30)
-    quaternions = [Rotation.from_euler("xyz", [np.pi, 0, yaw]).as_quat(scalar_first=True) for yaw in yaws]
+    quaternions = [
+        Rotation.from_euler("xyz", [np.pi, 0, yaw]).as_quat(scalar_first=True) for yaw in yaws
+    ]
     angles = np.array([track.follow(q * (-1) ** k) for k, q in enumerate(quaternions)])
     np.testing.assert_allclose(np.diff(angles[:, 2]), np.diff(yaws), atol=1e-6)
     assert np.abs(np.diff(angles[:, :2])).max() < 7
@@ -270,7 +310,11 @@ def test_angles_exceed_half_a_rotation() -> None:
 
 
 def test_the_front_camera_is_the_official_one() -> None:
-    expected = [[0, 1, 0, 0], [0.894427, 0, -0.447214, -0.089443], [-0.447214, 0, -0.894427, 0.491935]]
+    expected = [
+        [0, 1, 0, 0],
+        [0.894427, 0, -0.447214, -0.089443],
+        [-0.447214, 0, -0.894427, 0.491935],
+    ]
     np.testing.assert_allclose(front_extrinsic(), expected, atol=2e-6)
     np.testing.assert_allclose(project(np.array([0.0, 0.0, -0.2])), [128, 128], atol=1e-4)
     assert project(np.array([0.0, 0.1, 0.0]))[1] > 128

@@ -48,14 +48,20 @@ def test_where_the_official_demonstrator_failed_the_seed_is_the_benchmarks(
     assert (spec.seed, spec.difficulty) == (seed, difficulty)
 
 
-@pytest.mark.parametrize(("split", "counts"), [("train", (50, 25, 25)), ("val", (26, 12, 12)), ("test", (26, 12, 12))])
-def test_difficulties_are_distributed_as_the_benchmark_says(split: str, counts: tuple[int, int, int]) -> None:
+@pytest.mark.parametrize(
+    ("split", "counts"), [("train", (50, 25, 25)), ("val", (26, 12, 12)), ("test", (26, 12, 12))]
+)
+def test_difficulties_are_distributed_as_the_benchmark_says(
+    split: str, counts: tuple[int, int, int]
+) -> None:
     n_by_difficulty = Counter(spec.difficulty for spec in episodes("MoveCube", split))
     assert (n_by_difficulty["easy"], n_by_difficulty["medium"], n_by_difficulty["hard"]) == counts
 
 
 def test_the_first_six_train_episodes_are_recovery_demonstrations() -> None:
-    assert [episode("BinFill", "train", index).recovery for index in range(7)] == ["z"] * 3 + ["xy"] * 3 + [None]
+    assert [episode("BinFill", "train", index).recovery for index in range(7)] == ["z"] * 3 + [
+        "xy"
+    ] * 3 + [None]
     assert episode("BinFill", "test", 0).recovery is None
 
 
@@ -86,7 +92,9 @@ def test_official_episodes_match_the_table(h5_folder: Path) -> None:
     assert compared > 0
 
 
-def test_official_metadata_overrules_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_official_metadata_overrules_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "test"
     folder.mkdir()
     records = [{"task": "StopCube", "episode": 0, "seed": 520_003, "difficulty": "hard"}]
@@ -103,7 +111,9 @@ def test_official_metadata_overrules_the_table(tmp_path: Path, monkeypatch: pyte
 
 def test_a_broken_official_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "test").mkdir()
-    (tmp_path / "test" / "record_dataset_StopCube_metadata.json").write_text('{"records": [{"episode": 0}]}')
+    (tmp_path / "test" / "record_dataset_StopCube_metadata.json").write_text(
+        '{"records": [{"episode": 0}]}'
+    )
     with pytest.raises(UserError, match="not official metadata"):
         episodes("StopCube", "test", tmp_path)
 
@@ -136,4 +146,6 @@ def test_a_seed_lies_close_above_the_formulas_and_has_its_difficulty(split: str)
             ahead = (spec.seed - formula(task, split, spec.episode)[0]) // 100
             seed, difficulty = formula(task, split, spec.episode + ahead)
             assert 0 <= spec.seed - seed <= 7 and spec.difficulty == difficulty
-            assert ahead == 0 or (split == "val" and task in ("StopCube", "VideoPlaceButton") and 0 < ahead <= 2)
+            assert ahead == 0 or (
+                split == "val" and task in ("StopCube", "VideoPlaceButton") and 0 < ahead <= 2
+            )

@@ -18,7 +18,9 @@ PICK_CUBE, PLACE_CUBE = "Pick up the cube", "place the cube onto the target"
 
 
 def begin(env: MoveCube, monkeypatch: pytest.MonkeyPatch, text: str) -> list[Thing]:
-    """Go to a sub-task of the execution with nothing in the hand; what is put into the list is held."""
+    """Go to a sub-task of the execution with nothing in the hand; what is put into the list is
+    held.
+    """
     go_to(env, text)
     in_hand: list[Thing] = []
     monkeypatch.setattr(env, "is_grasping", lambda thing: thing in in_hand)
@@ -29,7 +31,9 @@ def put(thing: Thing, place: np.ndarray, aside: float = 0.0, z: float = H) -> No
     thing.move_to(sapien.Pose([place[0] + aside, place[1], z], thing.pose.q))
 
 
-def lift(env: MoveCube, in_hand: list[Thing], thing: Thing, parts: list[Thing]) -> tuple[bool, bool]:
+def lift(
+    env: MoveCube, in_hand: list[Thing], thing: Thing, parts: list[Thing]
+) -> tuple[bool, bool]:
     in_hand += parts
     put(thing, thing.position, z=0.2)
     return wait(env)
@@ -40,7 +44,9 @@ def yaw_of(thing: Thing) -> float:
 
 
 @pytest.mark.parametrize("seed", [HOOK, PUSH, GRASP])
-def test_on_the_way_back_from_the_video_everything_goes_to_its_place_in_the_execution(build_task, seed):
+def test_on_the_way_back_from_the_video_everything_goes_to_its_place_in_the_execution(
+    build_task, seed
+):
     env = build_task(MoveCube, seed, "easy")
     layout = env.scene_values()["spec"]["layout"]["execution"]
     env.reset_in_progress = True
@@ -87,13 +93,21 @@ def test_grasping_and_placing_is_success(build_task, monkeypatch):
 
 @pytest.mark.parametrize(
     ("seed", "text", "wrong"),
-    [(HOOK, PICK_PEG, "cube"), (PUSH, PUSH_CUBE, "cube"), (PUSH, PUSH_CUBE, "peg"), (GRASP, PICK_CUBE, "peg")],
+    [
+        (HOOK, PICK_PEG, "cube"),
+        (PUSH, PUSH_CUBE, "cube"),
+        (PUSH, PUSH_CUBE, "peg"),
+        (GRASP, PICK_CUBE, "peg"),
+    ],
 )
 def test_another_thing_in_the_hand_fails(build_task, monkeypatch, seed, text, wrong):
     env = build_task(MoveCube, seed, "easy")
     in_hand = begin(env, monkeypatch, text)
     thing = getattr(env, wrong)
-    assert lift(env, in_hand, thing, [thing] if wrong == "cube" else [env.peg.head]) == (False, True)
+    assert lift(env, in_hand, thing, [thing] if wrong == "cube" else [env.peg.head]) == (
+        False,
+        True,
+    )
 
 
 @pytest.mark.parametrize(("seed", "text"), [(HOOK, PICK_PEG), (GRASP, PICK_CUBE)])
@@ -104,7 +118,9 @@ def test_the_cube_on_the_target_too_early_fails(build_task, monkeypatch, seed, t
     assert wait(env) == (False, True)
 
 
-@pytest.mark.parametrize(("seed", "text", "thing"), [(HOOK, HOOK_CUBE, "cube"), (GRASP, PLACE_CUBE, "peg")])
+@pytest.mark.parametrize(
+    ("seed", "text", "thing"), [(HOOK, HOOK_CUBE, "cube"), (GRASP, PLACE_CUBE, "peg")]
+)
 def test_in_the_last_stage_nothing_fails(build_task, monkeypatch, seed, text, thing):
     env = build_task(MoveCube, seed, "easy")
     in_hand = begin(env, monkeypatch, text)

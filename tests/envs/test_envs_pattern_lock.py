@@ -9,7 +9,16 @@ from helpers.env_tasks import Ear, Tip, wait
 from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.tasks.pattern_lock import DIRECTIONS, PatternLock
 
-WORDS = ("forward", "backward", "left", "right", "forward-left", "forward-right", "backward-left", "backward-right")
+WORDS = (
+    "forward",
+    "backward",
+    "left",
+    "right",
+    "forward-left",
+    "forward-right",
+    "backward-left",
+    "backward-right",
+)
 LENGTHS = {"easy": {2, 3, 4}, "medium": {3, 4, 5}, "hard": {4, 5, 6, 7, 8}}
 
 SCENE = (PatternLock, 3, "hard")
@@ -23,7 +32,9 @@ def watch(env: PatternLock, tip: Tip) -> None:
 
 
 @pytest.mark.parametrize(("difficulty", "n"), [("easy", 3), ("medium", 4), ("hard", 5)])
-def test_paths_go_over_neighbours_and_have_the_lengths_of_the_difficulty(env, monkeypatch, difficulty, n):
+def test_paths_go_over_neighbours_and_have_the_lengths_of_the_difficulty(
+    env, monkeypatch, difficulty, n
+):
     monkeypatch.setattr(env, "difficulty", difficulty)
     paths = [env._draw_path(Draws(seed), n) for seed in range(60)]
     assert {len(path) for path in paths} == LENGTHS[difficulty]
@@ -38,7 +49,9 @@ def test_the_same_path_again_is_success(env, tip):
     assert results == [(False, False)] * (len(env.path) - 1) + [(True, False)]
 
 
-@pytest.mark.parametrize(("aside", "z", "motion"), [(0.009, 0.099, 1), (0.011, 0.07, 0), (0, 0.101, 0)])
+@pytest.mark.parametrize(
+    ("aside", "z", "motion"), [(0.009, 0.099, 1), (0.011, 0.07, 0), (0, 0.101, 0)]
+)
 def test_a_disc_is_visited_within_a_centimetre_and_below_ten(env, tip, aside, z, motion):
     tip.put(env.path[0], z=z, aside=(0, aside))
     assert env.progress.index == motion
@@ -52,7 +65,10 @@ def test_a_disc_that_is_not_due_fails_in_every_move(env, tip, stage):
         assert tip.put(previous) == (False, False)
         wrong = [disc for disc in env.discs if disc not in (previous, goal)]
         assert {tip.put(disc) for disc in wrong} == {(False, True)}
-        assert tip.put(wrong[0], z=0.11) == (False, False)  # judged anew: passing high above is no visit
+        assert tip.put(wrong[0], z=0.11) == (
+            False,
+            False,
+        )  # judged anew: passing high above is no visit
         tip.put(goal)
 
 
@@ -93,4 +109,6 @@ def test_a_direction_means_the_neighbour_on_that_side(env, tip, here):
         row, column = np.add(divmod(here, 5), DIRECTIONS[word])
         ear = Ear()
         option.run(ear, None)
-        assert ear.calls == ([(env.discs[5 * row + column],)] if 0 <= row < 5 and 0 <= column < 5 else [])
+        assert ear.calls == (
+            [(env.discs[5 * row + column],)] if 0 <= row < 5 and 0 <= column < 5 else []
+        )

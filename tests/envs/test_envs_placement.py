@@ -1,4 +1,6 @@
-"""Random places: the order of the draws, what counts as too near, and what happens when there is no room."""
+"""Random places: the order of the draws, what counts as too near, and what happens when there is no
+room.
+"""
 
 from collections.abc import Iterator
 
@@ -59,7 +61,9 @@ def test_boxes_that_only_touch_intersect_and_boxes_apart_in_one_direction_do_not
     assert box.intersects(Box2D.aligned((2, 0), (1, 1)))
     assert not box.intersects(Box2D.aligned((2.001, 0), (1, 1)))
     corner = Box2D.square(np.array([2.3, 0.0]), 1.0, np.pi / 4)  # its corner reaches to 0.886
-    assert box.intersects(corner) and not box.intersects(Box2D.square(np.array([2.5, 0.0]), 1.0, np.pi / 4))
+    assert box.intersects(corner) and not box.intersects(
+        Box2D.square(np.array([2.5, 0.0]), 1.0, np.pi / 4)
+    )
 
 
 def test_distance_to_a_box_is_zero_inside_and_counts_from_the_nearest_corner():
@@ -94,9 +98,14 @@ def test_a_cubes_full_square_is_turned_with_it(scene):
 
 def test_buttons_and_boards_have_separate_obstacles(scene):
     button = button_box(named(scene, "button"))
-    assert button.half == pytest.approx([0.05625, 0.05625]) and button.centre == pytest.approx([-0.2, 0.1])
+    assert button.half == pytest.approx([0.05625, 0.05625]) and button.centre == pytest.approx(
+        [-0.2, 0.1]
+    )
     strips = board_boxes(named(scene, "board"))
-    assert [strip.centre for strip in strips[:2]] == [pytest.approx([0.1, -0.055]), pytest.approx([0.1, -0.145])]
+    assert [strip.centre for strip in strips[:2]] == [
+        pytest.approx([0.1, -0.055]),
+        pytest.approx([0.1, -0.145]),
+    ]
     assert all((strip.axes == np.eye(2)).all() for strip in strips)
 
 
@@ -136,4 +145,6 @@ def test_a_container_counts_the_gap_twice_for_objects_but_once_for_ready_made_bo
     from_thing = [draw_container(Draws(s), REGION, [container], gap=0.04)[0] for s in range(200)]
     from_box = [draw_container(Draws(s), REGION, [box], gap=0.04)[0] for s in range(200)]
     assert min(box.grown(0.04).distance(xy) for xy in from_thing) >= CONTAINER_HALF + 0.04
-    assert CONTAINER_HALF + 0.04 <= min(box.distance(xy) for xy in from_box) < CONTAINER_HALF + 0.045
+    assert (
+        CONTAINER_HALF + 0.04 <= min(box.distance(xy) for xy in from_box) < CONTAINER_HALF + 0.045
+    )

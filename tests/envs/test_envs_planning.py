@@ -1,4 +1,6 @@
-"""Kinematics and motion plans: the same poses, steps and joint targets as in the official recordings."""
+"""Kinematics and motion plans: the same poses, steps and joint targets as in the official
+recordings.
+"""
 
 import itertools
 from collections.abc import Iterator
@@ -15,13 +17,34 @@ from scipy.spatial.transform import Rotation
 from helpers.env_scenes import Scene, recorded
 from mme_vla.envs.robot.control import LIMITS
 from mme_vla.envs.robot.kinematics import Arm, pose_distance
-from mme_vla.envs.robot.planning import CONTROL_STEP, Obstacles, plan_free, plan_screw, sample_path, twist_of
+from mme_vla.envs.robot.planning import (
+    CONTROL_STEP,
+    Obstacles,
+    plan_free,
+    plan_screw,
+    sample_path,
+    twist_of,
+)
 from mme_vla.envs.scene.stage import RESET_QPOS
 
 EPISODES = [("PickXtimes", 8), ("VideoUnmask", 4), ("PatternLock", 8)]
 # Where planned motions begin in the recordings, and how many steps they take.
 MOTIONS = [
-    ("PickXtimes", 8, [(6, 57), (69, 33), (108, 36), (144, 36), (180, 26), (212, 26), (238, 28), (272, 33), (305, 27)]),
+    (
+        "PickXtimes",
+        8,
+        [
+            (6, 57),
+            (69, 33),
+            (108, 36),
+            (144, 36),
+            (180, 26),
+            (212, 26),
+            (238, 28),
+            (272, 33),
+            (305, 27),
+        ],
+    ),
     ("VideoUnmask", 4, [(78, 43), (121, 25), (152, 24), (182, 15), (203, 27), (236, 27)]),
     ("PatternLock", 8, [(32, 4), (70, 4), (106, 4), (144, 4)]),
 ]
@@ -47,7 +70,10 @@ def test_forward_kinematics_gives_the_recorded_poses(
     arm = arms[task == "PatternLock"]
     joints = recorded(h5_folder, task, episode, "action/joint_action")[::5]
     poses = recorded(h5_folder, task, episode, "action/eef_action")[::5]
-    assert max(pose_distance(arm.forward(q), pose(p)) for q, p in zip(joints, poses, strict=True)) < 3e-6
+    assert (
+        max(pose_distance(arm.forward(q), pose(p)) for q, p in zip(joints, poses, strict=True))
+        < 3e-6
+    )
 
 
 @pytest.mark.parametrize(("task", "episode"), EPISODES)
@@ -82,7 +108,9 @@ def test_the_jacobian_is_the_derivative_of_the_pose(arms: dict[bool, Arm]) -> No
     arm, q, step = arms[False], np.array([0.1, 0.3, -0.2, -1.9, 0.1, 2.1, 0.6]), 5e-3
     jacobian = arm.jacobian(q)
     for i, nudge in enumerate(step * np.eye(7)):
-        ahead, behind = (arm.forward_in_base(q + s * nudge).to_transformation_matrix() for s in (1, -1))
+        ahead, behind = (
+            arm.forward_in_base(q + s * nudge).to_transformation_matrix() for s in (1, -1)
+        )
         twist = twist_of(ahead.astype(float) @ np.linalg.inv(behind.astype(float)))
         assert twist is not None and np.linalg.norm(twist[3:]) > 0
         np.testing.assert_allclose(twist / (2 * step), jacobian[:, i], atol=1e-3)
@@ -104,9 +132,14 @@ def test_screw_plans_are_the_recorded_ones(
 
 def test_plans_keep_the_limits_and_end_at_the_target(arms: dict[bool, Arm]) -> None:
     arm, start = arms[False], RESET_QPOS.astype(np.float64)
-    target = sapien.Pose([-0.1, 0.2, 0.1], np.roll(Rotation.from_euler("xyz", [np.pi, 0, 0.5]).as_quat(), 1))
+    target = sapien.Pose(
+        [-0.1, 0.2, 0.1], np.roll(Rotation.from_euler("xyz", [np.pi, 0, 0.5]).as_quat(), 1)
+    )
     # A screw is followed in steps, which add up to a little less than exact.
-    for plan, exactness in ((plan_screw(arm, start, target), 0.03), (plan_free(arm, start, target), 1e-4)):
+    for plan, exactness in (
+        (plan_screw(arm, start, target), 0.03),
+        (plan_free(arm, start, target), 1e-4),
+    ):
         assert plan is not None
         np.testing.assert_array_equal(plan[0], start)
         assert pose_distance(arm.forward(plan[-1]), target) < exactness
@@ -136,9 +169,16 @@ def test_orientations_that_hardly_differ_are_left_alone() -> None:
 
 def test_sampling_goes_around_what_is_in_the_way(arms: dict[bool, Arm]) -> None:
     arm = arms[False]
-    start, goal = np.array([-2.8, -0.1, -1.8, -0.2, 2.3, 3.6, 0.6]), np.array([0.1, 1.2, 0.9, -2.3, 2.5, 1.6, 1.6])
+    start, goal = (
+        np.array([-2.8, -0.1, -1.8, -0.2, 2.3, 3.6, 0.6]),
+        np.array([0.1, 1.2, 0.9, -2.3, 2.5, 1.6, 1.6]),
+    )
     obstacles = Obstacles(arm, [start, goal])
-    assert obstacles.clear(start) and obstacles.clear(goal) and not obstacles.clear_between(start, goal)
+    assert (
+        obstacles.clear(start)
+        and obstacles.clear(goal)
+        and not obstacles.clear_between(start, goal)
+    )
     path = sample_path(arm, start, goal, seed=0)
     assert path is not None
     np.testing.assert_array_equal(path[0], start)

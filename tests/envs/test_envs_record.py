@@ -20,7 +20,9 @@ from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.errors import UserError
 from mme_vla.utils.media import GAP, MARGIN, TILE
 
-SHORT = record.Job("PatternLock", 0, seed=0, difficulty="easy", recovery=None, retries=3)  # a single move
+SHORT = record.Job(
+    "PatternLock", 0, seed=0, difficulty="easy", recovery=None, retries=3
+)  # a single move
 
 
 pytestmark = pytest.mark.usefixtures("renderer")
@@ -49,10 +51,16 @@ def test_a_recorded_episode_reads_as_an_official_one(recorded: Path) -> None:
 
 
 def test_the_command_saves_both_layouts_and_only_what_is_missing(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    recorded: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     output = tmp_path / "dataset"
-    cfg = compose("record", ["task=PatternLock", "episodes=1", f"output={output}", f"hdf5={tmp_path / 'official'}"])
+    cfg = compose(
+        "record",
+        ["task=PatternLock", "episodes=1", f"output={output}", f"hdf5={tmp_path / 'official'}"],
+    )
     jobs = [SHORT]
     monkeypatch.setattr(record, "plan", lambda cfg: jobs)
     work = output.with_name("dataset.recording")
@@ -60,7 +68,9 @@ def test_the_command_saves_both_layouts_and_only_what_is_missing(
     (work / "episodes").mkdir()
     for path in recorded.glob(f"{SHORT.name}.*"):
         (work / "episodes" / path.name).write_bytes(path.read_bytes())
-    monkeypatch.setattr(record, "record_episode", lambda *_: pytest.fail("a finished episode was recorded again"))
+    monkeypatch.setattr(
+        record, "record_episode", lambda *_: pytest.fail("a finished episode was recorded again")
+    )
     record.run(cfg)
     assert not work.exists()
     assert "1 episodes" in capsys.readouterr().out
@@ -116,7 +126,9 @@ def test_the_first_waypoint_of_the_execution_is_not_lost_with_those_of_the_video
     recorded = Recorder(env, render=False).record()
     env.close()
     assert recorded.success
-    named = [step.action["waypoint_action"] for step in recorded.frames if not step.info["is_video_demo"]]
+    named = [
+        step.action["waypoint_action"] for step in recorded.frames if not step.info["is_video_demo"]
+    ]
     distinct = [w for i, w in enumerate(named) if i == 0 or not np.array_equal(w, named[i - 1])]
     assert not np.isnan(distinct[0]).any()
     moves = sum(subtask.choice != "" and not subtask.video for subtask in env.progress.subtasks)

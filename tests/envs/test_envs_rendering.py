@@ -1,4 +1,6 @@
-"""Images: rendered where they are requested, by a renderer that stays, equal without what no camera sees."""
+"""Images: rendered where they are requested, by a renderer that stays, equal without what no camera
+sees.
+"""
 
 from collections import Counter
 from pathlib import Path
@@ -24,10 +26,14 @@ from mme_vla.envs.scene import stage
 HOLD = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4, 1], np.float32)
 DOWN = np.array([-0.0605, 0, 0.47, np.pi, 0, 0, -1], np.float32)
 STOCK = Path(sapien.__file__).parent / "vulkan_shader" / PACK
-SQUARE = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]]], np.float32)
-SHOWN_FROM_THE_FRONT = np.array([-0.06, 0.356, -0.323, -2.108, -0.115, 1.209, 0.294, 0.04, 0.04], np.float32)
+SQUARE = np.array(
+    [[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]]], np.float32
+)
+SHOWN_FROM_THE_FRONT = np.array(
+    [-0.06, 0.356, -0.323, -2.108, -0.115, 1.209, 0.294, 0.04, 0.04], np.float32
+)
 
-# Requests -----------------------------------------------------------------------------------------------------------
+# Requests -----------------------------------------------------------------------------------------
 
 
 def run_episode(
@@ -53,15 +59,20 @@ def displayed(frames: dict[str, list[Any]], camera: str) -> list[int]:
 
 @pytest.mark.usefixtures("renderer")
 @pytest.mark.parametrize(("space", "actions"), [("joint_angle", [HOLD] * 4), ("waypoint", [DOWN])])
-def test_frames_are_rendered_where_they_are_requested(space: str, actions: list[np.ndarray]) -> None:
+def test_frames_are_rendered_where_they_are_requested(
+    space: str, actions: list[np.ndarray]
+) -> None:
     full, infos = run_episode(space, actions, None)
     count = len(full["joint_state_list"])
-    # The newest frame of each call. The number of the last frame of a motion that ends with a grip is unknown before.
+    # The newest frame of each call. The number of the last frame of a motion that ends with a grip
+    # is unknown before.
     request = RenderRequest({"front": frozenset({2, 3})}, now=("wrist",), grounded=False)
     some, fewer = run_episode(space, actions, request)
     assert displayed(full, "front") == displayed(full, "wrist") == list(range(count))
     assert displayed(some, "front") == [2, 3]
-    assert displayed(some, "wrist") == (list(range(count)) if space == "joint_angle" else [0, count - 1])
+    assert displayed(some, "wrist") == (
+        list(range(count)) if space == "joint_angle" else [0, count - 1]
+    )
     for key in ("joint_state_list", "eef_state_list", "gripper_state_list"):
         assert np.array_equal(full[key], some[key])
     for camera in ("front", "wrist"):
@@ -81,11 +92,13 @@ def test_a_text_with_pixels_renders_its_frame() -> None:
     assert "<" in texts[0] and texts == [info["grounded_subgoal_online"] for info in blind]
 
 
-# The renderer's life ------------------------------------------------------------------------------------------------
+# The renderer's life ------------------------------------------------------------------------------
 
 
 def first_images(episode: int) -> np.ndarray:
-    """Front and wrist image an episode begins with, [2, 256, 256, 3]; its environment is gone afterwards."""
+    """Front and wrist image an episode begins with, [2, 256, 256, 3]; its environment is gone
+    afterwards.
+    """
     env = make_env("PickXtimes", "test", episode)
     observation, _ = env.reset()
     env.close()
@@ -112,14 +125,16 @@ def test_later_episodes_use_the_renderer_of_the_first_and_its_failure_is_detecte
     assert not renderer_works()
 
 
-# Shaders ------------------------------------------------------------------------------------------------------------
+# Shaders ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def software(renderer: str) -> dict[str, object]:
     """Options of a scene that renders on the CPU."""
     if renderer != "sapien_cpu":
-        pytest.skip("the table costs nothing worth saving on a GPU, where the stock shaders are used")
+        pytest.skip(
+            "the table costs nothing worth saving on a GPU, where the stock shaders are used"
+        )
     return {"obs_mode": "rgb+depth+segmentation", "render_backend": renderer}
 
 
@@ -130,7 +145,11 @@ def pack(scene: Scene) -> str:
 def sensor_images(scene: Scene) -> dict[str, np.ndarray]:
     scene.reset()
     observed = scene.get_obs()["sensor_data"]
-    return {f"{view}.{kind}": value.numpy() for view, kinds in observed.items() for kind, value in kinds.items()}
+    return {
+        f"{view}.{kind}": value.numpy()
+        for view, kinds in observed.items()
+        for kind, value in kinds.items()
+    }
 
 
 def test_images_depth_and_segmentation_are_those_of_the_stock_shaders(
@@ -141,14 +160,18 @@ def test_images_depth_and_segmentation_are_those_of_the_stock_shaders(
     stock = Scene(lambda _: None, **software)
     assert pack(lean) != PACK == pack(stock)
     actual, expected = sensor_images(lean), sensor_images(stock)
-    assert actual.keys() == expected.keys() and any(name.endswith("segmentation") for name in actual)
+    assert actual.keys() == expected.keys() and any(
+        name.endswith("segmentation") for name in actual
+    )
     for name, values in expected.items():
         assert np.array_equal(actual[name], values), name
     lean.close()
     stock.close()
 
 
-def test_scenes_with_an_environment_map_or_other_shaders_keep_them(software: dict[str, object], tmp_path: Path) -> None:
+def test_scenes_with_an_environment_map_or_other_shaders_keep_them(
+    software: dict[str, object], tmp_path: Path
+) -> None:
     faces = [str(tmp_path / f"{face}.png") for face in range(6)]
     for face in faces:
         Image.new("RGBA", (4, 4), "white").save(face)
@@ -177,10 +200,12 @@ def test_nothing_but_the_table_leaves_the_shaders_and_unknown_ones_are_unchanged
     rendering._pipeline_folder.cache_clear()
 
 
-# What is out of sight -----------------------------------------------------------------------------------------------
+# What is out of sight -----------------------------------------------------------------------------
 
 
-def test_hiding_links_out_of_sight_and_reading_without_a_copy_change_no_pixel(software: dict[str, object]) -> None:
+def test_hiding_links_out_of_sight_and_reading_without_a_copy_change_no_pixel(
+    software: dict[str, object],
+) -> None:
     scene = Scene(lambda _: None, **software)
     scene.reset()
     rng, hidden = np.random.default_rng(0), Counter[str]()
@@ -192,7 +217,9 @@ def test_hiding_links_out_of_sight_and_reading_without_a_copy_change_no_pixel(so
             actual = read_images(scene, name, rgb=True, depth=True, segmentation=True)
             sensor = scene.scene.sensors[sensor_name]
             with scene.rendering(sensor.camera):
-                bodies = [entity.find_component_by_type(RenderBodyComponent) for entity in links(scene)]
+                bodies = [
+                    entity.find_component_by_type(RenderBodyComponent) for entity in links(scene)
+                ]
                 hidden[name] += sum(body is not None and not body.visibility for body in bodies)
             assert all(body is None or body.visibility == 1 for body in bodies)
             sensor.capture()
@@ -206,14 +233,16 @@ def links(scene: Scene) -> list[sapien.Entity]:
     return [link._objs[0].entity for link in scene.agent.robot.links]
 
 
-# Meshes -------------------------------------------------------------------------------------------------------------
+# Meshes -------------------------------------------------------------------------------------------
 
 
 def test_a_coarse_mesh_is_left_as_it_is_and_a_fine_one_loses_what_lies_in_one_cell() -> None:
     same = coarsen(SQUARE, 0.4)
     as_sets = [{frozenset(map(tuple, triangle)) for triangle in mesh} for mesh in (same, SQUARE)]
     assert as_sets[0] == as_sets[1]
-    assert (np.cross(same[:, 1] - same[:, 0], same[:, 2] - same[:, 0]) == [0, 0, 1]).all(), "a triangle was turned over"
+    assert (np.cross(same[:, 1] - same[:, 0], same[:, 2] - same[:, 0]) == [0, 0, 1]).all(), (
+        "a triangle was turned over"
+    )
     tiny = SQUARE * 0.1 + 5
     assert len(coarsen(np.concatenate([SQUARE, tiny]), 0.4)) == 2
     assert len(coarsen(tiny, 0.4)) == 0
@@ -237,7 +266,12 @@ def test_a_mesh_file_is_read_as_saved(tmp_path: Path) -> None:
 
 
 def test_the_cameras_body_keeps_its_size_and_a_twentieth_of_its_triangles() -> None:
-    stock = read_stl(Path(robots.PandaWristCam.urdf_path).parent / "realsense2_description" / "meshes" / "d415.stl")
+    stock = read_stl(
+        Path(robots.PandaWristCam.urdf_path).parent
+        / "realsense2_description"
+        / "meshes"
+        / "d415.stl"
+    )
     coarse = coarsen(stock)
     assert len(coarse) < len(stock) / 20
     for extreme in (np.min, np.max):
@@ -245,7 +279,9 @@ def test_the_cameras_body_keeps_its_size_and_a_twentieth_of_its_triangles() -> N
 
 
 @pytest.mark.usefixtures("renderer")
-def test_images_are_equal_and_where_the_body_shows_all_but_equal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_are_equal_and_where_the_body_shows_all_but_equal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     coarse, n_visible = images_of_the_body()
     monkeypatch.setattr(robots, "_CAMERA_MESH", "none")
     robots.description.cache_clear()
@@ -257,7 +293,9 @@ def test_images_are_equal_and_where_the_body_shows_all_but_equal(monkeypatch: py
 
 
 def images_of_the_body() -> tuple[np.ndarray, int]:
-    """Both views [2, 2, 256, 256, 3] at rest and with the body in the front view; pixels of it in the latter."""
+    """Both views [2, 2, 256, 256, 3] at rest and with the body in the front view; pixels of it in
+    the latter.
+    """
     env: Any = make_env("PickXtimes", "test", 0)
     env.reset()
     task = env.task

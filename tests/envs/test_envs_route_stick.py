@@ -26,7 +26,10 @@ def circle(tip: Tip, start: Disc, goal: Disc, direction: str) -> Flags:
 
 def follow(env: RouteStick, tip: Tip) -> list[Flags]:
     """Do every move as it is to be done."""
-    return [circle(tip, *leg, direction) for leg, direction in zip(pairwise(env.route), env.directions, strict=True)]
+    return [
+        circle(tip, *leg, direction)
+        for leg, direction in zip(pairwise(env.route), env.directions, strict=True)
+    ]
 
 
 def watch(env: RouteStick, tip: Tip) -> None:
@@ -40,7 +43,9 @@ def watch(env: RouteStick, tip: Tip) -> None:
 def test_obstacles_are_thin_along_the_row(env):
     obstacles = [thing for thing in env.things if thing.name.startswith("obstacle")]
     shapes = [thing.entity._bodies[0].collision_shapes[0] for thing in obstacles]
-    assert [shape.half_size for shape in shapes] == [pytest.approx([0.03, 0.015, 0.05])] * 4  # the row is their y
+    assert [shape.half_size for shape in shapes] == [
+        pytest.approx([0.03, 0.015, 0.05])
+    ] * 4  # the row is their y
 
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
@@ -51,8 +56,13 @@ def test_routes_go_to_neighbours_and_may_return_only_where_they_may(env, monkeyp
     for seed in range(100):
         env._draw_route(Draws(seed))
         route = [env.discs.index(disc) for disc in env.route]
-        assert all(abs(a - b) == 1 for a, b in pairwise(route)) and len(env.directions) == len(route) - 1
-        returns += sum(a == c and 0 < b < 4 for a, b, c in zip(route, route[1:], route[2:], strict=False))
+        assert (
+            all(abs(a - b) == 1 for a, b in pairwise(route))
+            and len(env.directions) == len(route) - 1
+        )
+        returns += sum(
+            a == c and 0 < b < 4 for a, b, c in zip(route, route[1:], route[2:], strict=False)
+        )
         counts.add(len(env.directions))
     assert counts == set(range(moves[0], moves[1] + 1)) and (returns > 0) == may_return
 
@@ -72,7 +82,10 @@ def test_a_target_is_reached_within_three_centimetres_and_below_fifteen(env, tip
     for z, aside in ((0.151, 0), (0.149, 0.031)):
         tip.put(env.route[1], z=z, aside=(aside, 0))
         assert env.progress.index == 1
-    assert tip.put(env.route[1], z=0.149, aside=(0.029, 0)) == (False, False) and env.progress.index == 2
+    assert (
+        tip.put(env.route[1], z=0.149, aside=(0.029, 0)) == (False, False)
+        and env.progress.index == 2
+    )
 
 
 @pytest.mark.parametrize("stage", ["video", "execution"])
@@ -83,7 +96,9 @@ def test_the_wrong_way_around_fails_at_the_target_and_stays_failed(env, tip, sta
     for leg, direction in legs[:move]:
         assert circle(tip, *leg, direction) == (False, False)
     (start, goal), direction = legs[move]
-    assert [tip.put(point) for point in arc(start.position, goal.position, OTHER[direction])[:30]][-1] == (False, False)
+    assert [tip.put(point) for point in arc(start.position, goal.position, OTHER[direction])[:30]][
+        -1
+    ] == (False, False)
     assert tip.put(goal) == (False, True)
     assert circle(tip, start, goal, direction) == (False, True)
 
@@ -109,7 +124,11 @@ def test_a_target_is_highlighted_for_40_steps_after_the_tip_was_near(env, tip):
 
 
 def test_an_option_goes_to_the_neighbour_on_its_side(env, tip):
-    order = [(side, direction) for direction in ("clockwise", "counterclockwise") for side in ("left", "right")]
+    order = [
+        (side, direction)
+        for direction in ("clockwise", "counterclockwise")
+        for side in ("left", "right")
+    ]
     for here in range(5):
         tip.put(env.discs[here], aside=(0.02, 0.02))
         for option, (side, direction) in zip(env.choices(), order, strict=True):

@@ -1,4 +1,6 @@
-"""Robots, objects and scenes against the official episodes: same places, same images, same motion."""
+"""Robots, objects and scenes against the official episodes: same places, same images,
+same motion.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,7 +61,9 @@ def test_objects_stay_where_they_were_put(everything):
     distances = {t.name: np.abs(t.position - t.initial_pose.p) for t in everything.things}
     # A peg is put down half sunk in the table, a container a little too low over its cube.
     settles = {"peg": 0.0101, "container": 0.0015, "button": 0.0075}
-    assert {name: d.max() for name, d in distances.items() if d.max() > settles.get(name, 1e-4)} == {}
+    assert {
+        name: d.max() for name, d in distances.items() if d.max() > settles.get(name, 1e-4)
+    } == {}
     assert distances["peg"][2] == pytest.approx(0.01, abs=1e-4)
 
 
@@ -98,13 +102,11 @@ def test_a_pressed_button_springs_back(everything):
 def test_scenes_can_be_built_without_a_vulkan_driver(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
-        "from helpers.env_scenes import Scene, one_of_everything\n"
-        "for stick in (False, True):\n"
-        "    env = Scene(one_of_everything, stick=stick); env.reset(); env.step(env.reset_action); env.close()\n"
-        "import sapien.render\n"
-        "try: sapien.render.RenderMaterial()\n"
-        "except RuntimeError: print('built')"
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\nfrom"
+        " helpers.env_scenes import Scene, one_of_everything\nfor stick in (False, True):\n    env"
+        " = Scene(one_of_everything, stick=stick); env.reset(); env.step(env.reset_action);"
+        " env.close()\nimport sapien.render\ntry: sapien.render.RenderMaterial()\nexcept"
+        " RuntimeError: print('built')"
     )
     hidden = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
     result = commands.run(str(script), env=hidden)
@@ -158,7 +160,9 @@ def test_the_stick_robot_has_the_recorded_wrist_camera_and_tool(h5_folder):
 
 def test_the_stick_robot_moves_as_recorded(h5_folder):
     env = Scene(lambda _: None, stick=True)
-    states, actions = (recorded(h5_folder, *LOCK, key) for key in ("obs/joint_state", "action/joint_action"))
+    states, actions = (
+        recorded(h5_folder, *LOCK, key) for key in ("obs/joint_state", "action/joint_action")
+    )
     env.agent.robot.set_qpos(states[0][None])
     joints, _ = play(env, actions[1:74])
     # The velocity of the first recorded frame is unknown; its effect dies out.
@@ -168,8 +172,12 @@ def test_the_stick_robot_moves_as_recorded(h5_folder):
 
 
 def test_objects_have_their_pixels_where_the_official_images_show_them(h5_folder, renderer):
-    env = PickXtimes(obs_mode="rgb+depth+segmentation", render_backend=renderer, seed=1800, difficulty="easy")
-    sensors = env.step(recorded(h5_folder, *PICK, "action/joint_action")[0].astype(np.float32))[0]["sensor_data"]
+    env = PickXtimes(
+        obs_mode="rgb+depth+segmentation", render_backend=renderer, seed=1800, difficulty="easy"
+    )
+    sensors = env.step(recorded(h5_folder, *PICK, "action/joint_action")[0].astype(np.float32))[0][
+        "sensor_data"
+    ]
     pixels = sensors["base_camera"]["segmentation"][0, ..., 0].numpy()
     assert centroid(pixels, env.cube.segmentation_ids) == (53, 144)
     assert centroid(pixels, env.target.segmentation_ids) == (92, 108)
@@ -177,7 +185,9 @@ def test_objects_have_their_pixels_where_the_official_images_show_them(h5_folder
     env.close()
 
 
-def test_what_waits_under_the_floor_is_left_out_of_the_images_until_it_is_displayed(renderer: str) -> None:
+def test_what_waits_under_the_floor_is_left_out_of_the_images_until_it_is_displayed(
+    renderer: str,
+) -> None:
     from mme_vla.envs.scene.motions import Mark, build_mark
 
     def fill(env: Scene) -> None:
@@ -185,7 +195,9 @@ def test_what_waits_under_the_floor_is_left_out_of_the_images_until_it_is_displa
         env.add(build_mark(env, "mark", 0.0402, 0.014))
 
     env = Scene(fill, obs_mode="rgb", render_backend=renderer, sim_backend="physx_cpu")
-    target, disc = (next(thing for thing in env.things if thing.name == name) for name in ("target", "mark"))
+    target, disc = (
+        next(thing for thing in env.things if thing.name == name) for name in ("target", "mark")
+    )
     body = disc.entity._objs[0].find_component_by_type(sapien.render.RenderBodyComponent)
 
     def redness() -> float:

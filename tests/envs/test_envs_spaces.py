@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-sapien = pytest.importorskip("sapien", reason="the simulator is not installed: uv sync --inexact --extra sim")
+sapien = pytest.importorskip(
+    "sapien", reason="the simulator is not installed: uv sync --inexact --extra sim"
+)
 
 from mme_vla.envs.grounding import project  # noqa: E402
 from mme_vla.envs.spaces import Control, UnreachableError, action_space  # noqa: E402
@@ -47,7 +49,9 @@ def control(stick: bool = False, reachable: bool = True) -> tuple[Control, list,
         Choice("a", "pick up the cube", lambda demo, thing: demo.done.append(thing), lambda: cubes),
         Choice("b", "press the button", lambda demo, thing: demo.done.append("pressed")),
     ]
-    task = SimpleNamespace(stick=stick, qpos=np.zeros(7 if stick else 9), choices=lambda: choices, cubes=cubes)
+    task = SimpleNamespace(
+        stick=stick, qpos=np.zeros(7 if stick else 9), choices=lambda: choices, cubes=cubes
+    )
     return Control(task, steps.append, hand), steps, hand  # type: ignore[arg-type]
 
 
@@ -62,7 +66,9 @@ def control(stick: bool = False, reachable: bool = True) -> tuple[Control, list,
         ("ee_pose", True, POSE, [0, 1, 2, 3, 4, 5, 6]),
     ],
 )
-def test_joints_and_poses_are_one_step(name: str, stick: bool, action: list[float], step: list[float]) -> None:
+def test_joints_and_poses_are_one_step(
+    name: str, stick: bool, action: list[float], step: list[float]
+) -> None:
     targets, steps, _ = control(stick)
     action_space(name).act(targets, action)
     np.testing.assert_array_equal(steps, [step])
@@ -70,9 +76,17 @@ def test_joints_and_poses_are_one_step(name: str, stick: bool, action: list[floa
 
 @pytest.mark.parametrize(
     ("stick", "gripper", "expected"),
-    [(False, -1.0, ["close"]), (False, 1.0, ["open"]), (False, 0.3, []), (False, -0.99, []), (True, -1.0, [])],
+    [
+        (False, -1.0, ["close"]),
+        (False, 1.0, ["open"]),
+        (False, 0.3, []),
+        (False, -0.99, []),
+        (True, -1.0, []),
+    ],
 )
-def test_a_waypoint_moves_a_gripper_only_at_exactly_one(stick: bool, gripper: float, expected: list[str]) -> None:
+def test_a_waypoint_moves_a_gripper_only_at_exactly_one(
+    stick: bool, gripper: float, expected: list[str]
+) -> None:
     targets, _, hand = control(stick)
     action_space("waypoint").act(targets, [*POSE, gripper])
     assert hand.done == [[0.1, 0.0, 0.2], *expected]
@@ -100,7 +114,9 @@ def test_a_waypoint_moves_a_gripper_only_at_exactly_one(stick: bool, gripper: fl
         ("multi_choice", False, {"choice": "A", "point": [np.nan, 2]}, r"not finite"),
     ],
 )
-def test_malformed_actions_are_refused_without_a_step(name: str, stick: bool, action: Any, words: str) -> None:
+def test_malformed_actions_are_refused_without_a_step(
+    name: str, stick: bool, action: Any, words: str
+) -> None:
     targets, steps, hand = control(stick)
     with pytest.raises(UserError, match=words):
         action_space(name).act(targets, action)
@@ -120,7 +136,9 @@ def test_an_unreachable_pose_says_so() -> None:
 def test_a_choice_takes_the_object_nearest_to_the_point(index: int, label: str) -> None:
     targets, _, hand = control()
     expected = targets.task.cubes[index]  # type: ignore[attr-defined]
-    action_space("multi_choice").act(targets, {"choice": label, "point": project(expected.position) + 3})
+    action_space("multi_choice").act(
+        targets, {"choice": label, "point": project(expected.position) + 3}
+    )
     assert hand.done == [expected]
 
 

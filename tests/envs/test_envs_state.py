@@ -29,7 +29,15 @@ def resume(env: RoboMMEEnv, actions: list[Any]) -> list[Any]:
         observation, reward, terminated, truncated, info = env.step(action)
         state = env.task.get_state().cpu().numpy()
         observations.append(
-            (observation, float(reward), bool(terminated), bool(truncated), info, state, env.steps_counted)
+            (
+                observation,
+                float(reward),
+                bool(terminated),
+                bool(truncated),
+                info,
+                state,
+                env.steps_counted,
+            )
         )
     return observations
 
@@ -42,11 +50,17 @@ def same(one: Any, other: Any) -> bool:
     return bool(np.array_equal(one, other)) if isinstance(one, np.ndarray) else bool(one == other)
 
 
-# A task with a video and scripted motion, and one whose choices are planned motions that end in a grasp; a tally of its
-# twin goes down.
+# A task with a video and scripted motion, and one whose choices are planned motions that end in a
+# grasp; a tally of its twin goes down.
 CASES = [
     ("VideoUnmaskSwap", "test", "joint_angle", [None] * 12, [None] * 8),
-    ("PickXtimes", "twin", "multi_choice", [{"choice": "a", "point": [94, 110]}], [{"choice": "b"}, {"choice": "c"}]),
+    (
+        "PickXtimes",
+        "twin",
+        "multi_choice",
+        [{"choice": "a", "point": [94, 110]}],
+        [{"choice": "b"}, {"choice": "c"}],
+    ),
     ("StopCube", "test", "joint_angle", [None] * 3 + [Hold(6)], [Hold(4), *[None] * 2]),
 ]
 
@@ -57,7 +71,9 @@ def test_a_restored_episode_goes_on_to_the_last_bit(
 ) -> None:
     env = make_env(task, split, 3, space, render=False, reward="subtask")
     assert isinstance(env, RoboMMEEnv)
-    first, last = [[joints(env, k) if a is None else a for k, a in enumerate(some)] for some in (before, after)]
+    first, last = [
+        [joints(env, k) if a is None else a for k, a in enumerate(some)] for some in (before, after)
+    ]
     env.reset()
     reached = resume(env, first)[-1]
     state = env.save_state()
@@ -72,7 +88,9 @@ def test_a_restored_episode_goes_on_to_the_last_bit(
     fresh = make_env(task, split, 3, space, render=False, reward="subtask")
     assert isinstance(fresh, RoboMMEEnv)
     fresh.restore_state(pickle.loads(pickle.dumps(state)))
-    assert same(resume(fresh, last), expected), "another environment, in another process for all it knows"
+    assert same(resume(fresh, last), expected), (
+        "another environment, in another process for all it knows"
+    )
     fresh.close()
 
 
@@ -115,7 +133,7 @@ def test_a_state_survives_later_steps_and_fits_its_scene_only() -> None:
         other.close()
 
 
-# Rewards --------------------------------------------------------------------------------------------------------------
+# Rewards ------------------------------------------------------------------------------------------
 
 
 def test_rewards_are_shares_of_the_executions_subtasks() -> None:
@@ -123,7 +141,9 @@ def test_rewards_are_shares_of_the_executions_subtasks() -> None:
     progress = Progress(steps, latch_failure=False)
     rewards = []
     for _ in range(6):
-        rewards.append([REWARDS[name](progress, progress.succeeded) for name in ("none", "sparse", "subtask")])
+        rewards.append(
+            [REWARDS[name](progress, progress.succeeded) for name in ("none", "sparse", "subtask")]
+        )
         progress.update()
     assert [row[0] for row in rewards] == [0] * 6 and [row[1] for row in rewards] == [0] * 5 + [1]
     assert [row[2] for row in rewards] == [0, 0, 0.25, 0.5, 0.75, 1]
@@ -149,4 +169,6 @@ def test_an_episode_that_is_done_has_earned_one_and_the_benchmarks_none() -> Non
         assert info["status"] == "success"
         totals[reward] = rewards
     assert sum(totals["none"]) == 0 and sum(totals["sparse"]) == totals["sparse"][-1] == 1
-    assert sum(totals["subtask"]) == pytest.approx(1) and all(share > 0 for share in totals["subtask"])
+    assert sum(totals["subtask"]) == pytest.approx(1) and all(
+        share > 0 for share in totals["subtask"]
+    )

@@ -13,7 +13,9 @@ from mme_vla.envs.tasks.stop_cube import StopCube
 
 
 def a_seed(interval: int, visit: int) -> int:
-    """A seed whose cube takes `interval` steps for a pass and is to be stopped on its `visit`th one."""
+    """A seed whose cube takes `interval` steps for a pass and is to be stopped on its `visit`th
+    one.
+    """
     for seed in range(1000):
         stream = Draws(seed)
         stream.integer(27, 33)
@@ -47,7 +49,15 @@ def test_the_cube_goes_back_and_forth_five_times_and_then_rests(env):
     for k in range(1, 320):
         wait(env)
         places[k] = env.cube.position
-    for k, expected in {30: target, 60: end, 90: target, 120: start, 270: target, 300: end, 319: end}.items():
+    for k, expected in {
+        30: target,
+        60: end,
+        90: target,
+        120: start,
+        270: target,
+        300: end,
+        319: end,
+    }.items():
         np.testing.assert_allclose(places[k][:2], expected[:2], atol=1e-6)
     share = np.linalg.norm(places[15] - start) / np.linalg.norm(end - start)
     assert share == pytest.approx(3 * 0.25**2 - 2 * 0.25**3, abs=1e-5)
@@ -88,7 +98,9 @@ def test_stopped_in_time_but_not_announced_is_not_yet_success(env):
     [(60, 2, [60]), (80, 2, [90]), (60, 4, [100, 180]), (120, 3, [100, 200, 270]),
      (120, 5, [100, 200, 300, 400, 500, 510])],
 )  # fmt: skip
-def test_waiting_is_cut_at_every_100th_step_and_ends_before_the_crossing(env, monkeypatch, interval, visit, steps):
+def test_waiting_is_cut_at_every_100th_step_and_ends_before_the_crossing(
+    env, monkeypatch, interval, visit, steps
+):
     monkeypatch.setattr(env, "interval", interval)
     monkeypatch.setattr(env, "visit", visit)
     assert env.checkpoints() == steps

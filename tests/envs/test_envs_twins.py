@@ -1,4 +1,6 @@
-"""Twins of the test scenes: the needed fact is in view, a tally agrees with the judge, and nothing else is changed."""
+"""Twins of the test scenes: the needed fact is in view, a tally agrees with the judge, and nothing
+else is changed.
+"""
 
 from collections import Counter
 from typing import Any
@@ -20,7 +22,9 @@ from mme_vla.envs.scene.motions import TALLY_RADIUS, TALLY_X
 
 TALLIED = ("BinFill", "PickXtimes", "SwingXtimes", "StopCube", "VideoRepick")
 FOREMOST = 0.28
-"""Nothing is nearer to the front: StopCube's cube at the end of a line as far forward and as slanted as any; metres."""
+"""Nothing is nearer to the front: StopCube's cube at the end of a line as far forward and as
+slanted as any; metres.
+"""
 
 
 def lying(env: Any) -> list[tuple[str, float, np.ndarray]]:
@@ -40,8 +44,12 @@ def test_in_a_twin_the_fact_is_in_view_and_nothing_else_is_changed(task: str) ->
     for env in (original, twin):
         wait(env, 40)
     for one, other in zip(original.things, twin.things, strict=True):
-        assert one.name == other.name and np.array_equal([*one.pose.p, *one.pose.q], [*other.pose.p, *other.pose.q])
-    assert [step.text for step in original.progress.subtasks] == [step.text for step in twin.progress.subtasks]
+        assert one.name == other.name and np.array_equal(
+            [*one.pose.p, *one.pose.q], [*other.pose.p, *other.pose.q]
+        )
+    assert [step.text for step in original.progress.subtasks] == [
+        step.text for step in twin.progress.subtasks
+    ]
     assert np.array_equal(original.qpos, twin.qpos) and not original._cues
     in_words = task in ("MoveCube", "PatternLock", "InsertPeg")
     assert (original.goals() != twin.goals()) == in_words and (twin._cues or in_words)
@@ -49,7 +57,9 @@ def test_in_a_twin_the_fact_is_in_view_and_nothing_else_is_changed(task: str) ->
         body = disc.entity._objs[0].find_component_by_type(physx.PhysxRigidDynamicComponent)
         assert not body.collision_shapes, "a disc can be touched"
         place = cue.place()
-        assert disc.position[2] < 0 if place is None else np.allclose(disc.position, place, atol=1e-3)
+        assert (
+            disc.position[2] < 0 if place is None else np.allclose(disc.position, place, atol=1e-3)
+        )
     original.close()
     twin.close()
 
@@ -67,13 +77,22 @@ def test_a_tally_lies_in_the_image_below_all_that_the_task_is_about(task: str) -
 @pytest.mark.parametrize("task", ["PickXtimes", "SwingXtimes", "VideoRepick"])
 def test_a_tally_is_what_the_pointer_has_still_to_come_to(task: str) -> None:
     env = built(task, in_view=True)
-    words = {"PickXtimes": "place ", "SwingXtimes": "move to the top", "VideoRepick": "put it down"}[task]
+    words = {
+        "PickXtimes": "place ",
+        "SwingXtimes": "move to the top",
+        "VideoRepick": "put it down",
+    }[task]
     texts = [step.text for step in env.progress.subtasks]
     tallies = []
     for env.progress.index in range(len(texts) + 1):
-        assert len(tallied(env)) == sum(text.startswith(words) for text in texts[env.progress.index :])
+        assert len(tallied(env)) == sum(
+            text.startswith(words) for text in texts[env.progress.index :]
+        )
         tallies.append([round(float(place[1] / 0.045), 1) for place in tallied(env)])
-    assert len(tallies[0]) == env.repetitions * (2 if task == "SwingXtimes" else 1) and tallies[-1] == []
+    assert (
+        len(tallies[0]) == env.repetitions * (2 if task == "SwingXtimes" else 1)
+        and tallies[-1] == []
+    )
     if task == "SwingXtimes":  # where the right one has fewer, the left target is next
         sides = [(sum(y < 0 for y in ys), sum(y > 0 for y in ys)) for ys in tallies[1:4]]
         assert sides == [(env.repetitions, env.repetitions), (env.repetitions - 1, env.repetitions),
@@ -81,7 +100,9 @@ def test_a_tally_is_what_the_pointer_has_still_to_come_to(task: str) -> None:
     env.close()
 
 
-def test_a_disc_goes_when_the_judge_has_counted_the_repetition(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disc_goes_when_the_judge_has_counted_the_repetition(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     env = built("PickXtimes", episode=3, in_view=True)
     hand = Hand(env, monkeypatch)
     left = [len(tallied(env))]
@@ -89,7 +110,9 @@ def test_a_disc_goes_when_the_judge_has_counted_the_repetition(monkeypatch: pyte
         hand.carry(env.cube)
         hand.release(place)
         left.append(len(tallied(env)))
-    assert left == [env.repetitions, env.repetitions, env.repetitions - 1] and env.progress.index == 2
+    assert (
+        left == [env.repetitions, env.repetitions, env.repetitions - 1] and env.progress.index == 2
+    )
     env.reset()
     assert len(tallied(env)) == env.repetitions
     env.close()
@@ -138,5 +161,7 @@ def test_the_next_move_of_the_route_is_highlighted_and_none_during_the_video() -
 def test_a_tally_stands_on_the_tables_edge_from_the_first_frame_on() -> None:
     env: Any = make_env("PickXtimes", "twin", 1, render=False)
     env.reset()
-    assert [float(place[0]) for place in tallied(env.task)] == pytest.approx([TALLY_X] * env.task.repetitions)
+    assert [float(place[0]) for place in tallied(env.task)] == pytest.approx(
+        [TALLY_X] * env.task.repetitions
+    )
     env.close()

@@ -29,12 +29,18 @@ def scene(env: Task) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize(("dial", "task"), PAIRS)
 def test_at_zero_a_dial_changes_nothing_and_beyond_it_the_scene_stays(dial: str, task: str) -> None:
-    assert metadata.episodes(task, f"stress:{dial}=0")[7].seed == metadata.episodes(task, "test")[7].seed
+    assert (
+        metadata.episodes(task, f"stress:{dial}=0")[7].seed
+        == metadata.episodes(task, "test")[7].seed
+    )
     scenes = {}
     for turned in (None, 0, 2):
         env = built(task, stress=None if turned is None else {dial: turned})
         wait(env, STEPS)
-        homes = {thing.name: np.concatenate([thing.initial_pose.p, thing.initial_pose.q]) for thing in env.things}
+        homes = {
+            thing.name: np.concatenate([thing.initial_pose.p, thing.initial_pose.q])
+            for thing in env.things
+        }
         scenes[turned] = scene(env), homes, len(env.progress.subtasks)
         env.close()
     (official, places, steps), (at_zero, _, _), (_, more, more_steps) = scenes.values()
@@ -48,15 +54,25 @@ def test_at_zero_a_dial_changes_nothing_and_beyond_it_the_scene_stays(dial: str,
 
 
 def test_what_a_dial_changes_is_present_in_the_stated_number() -> None:
-    for task, attribute in (("PickXtimes", "repetitions"), ("SwingXtimes", "repetitions"), ("StopCube", "visit"),
-                            ("VideoUnmaskSwap", "swap_count")):  # fmt: skip
+    for task, attribute in (
+        ("PickXtimes", "repetitions"),
+        ("SwingXtimes", "repetitions"),
+        ("StopCube", "visit"),
+        ("VideoUnmaskSwap", "swap_count"),
+    ):
         dial = "swaps" if "Swap" in task else "count"
         scenes = [built(task, stress={dial: turned}) for turned in (0, 12)]
         original, more = (getattr(env, attribute) for env in scenes)
         assert more == original + 12
         for env in scenes:
             env.close()
-    assert (ordinal(9), ordinal(11), ordinal(20), number(10), number(12)) == ("tenth", "12th", "21st", "ten", "12")
+    assert (ordinal(9), ordinal(11), ordinal(20), number(10), number(12)) == (
+        "tenth",
+        "12th",
+        "21st",
+        "ten",
+        "12",
+    )
     original, late = built("VideoUnmask"), built("VideoUnmask", stress={"delay": 40})
     static = [env.progress.subtasks[0].done for env in (original, late)]
     for env, done, steps in zip((original, late), static, (64, 104), strict=True):

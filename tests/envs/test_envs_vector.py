@@ -74,12 +74,16 @@ def test_a_long_video_arrives_completely_and_in_order(envs: VecEnv) -> None:
     reply = only(envs.recv())
     frames = reply.observation["front_rgb_list"]
     assert [int(frame[0, 0, 0]) for frame in frames] == [7 + k for k in range(21)]
-    assert all(frame.shape == FRAME and frame.dtype == np.uint8 and frame.std() == 0 for frame in frames)
+    assert all(
+        frame.shape == FRAME and frame.dtype == np.uint8 and frame.std() == 0 for frame in frames
+    )
     assert reply.reward is None
     envs.send(0, "go")
     later = only(envs.recv())
     assert int(later.observation["front_rgb_list"][0].max()) == 1
-    assert [int(frame[0, 0, 0]) for frame in frames] == [7 + k for k in range(21)], "earlier frames were overwritten"
+    assert [int(frame[0, 0, 0]) for frame in frames] == [7 + k for k in range(21)], (
+        "earlier frames were overwritten"
+    )
 
 
 def test_whoever_is_ready_comes_first(envs: VecEnv, tmp_path: Path) -> None:
@@ -91,8 +95,12 @@ def test_whoever_is_ready_comes_first(envs: VecEnv, tmp_path: Path) -> None:
     assert only(envs.recv()).worker == 0
 
 
-@pytest.mark.parametrize(("action", "words"), [("die", "exit code 3"), ("hang", "gave no result within 4 s")])
-def test_a_lost_worker_is_reported_and_replaced_while_others_continue(envs: VecEnv, action: str, words: str) -> None:
+@pytest.mark.parametrize(
+    ("action", "words"), [("die", "exit code 3"), ("hang", "gave no result within 4 s")]
+)
+def test_a_lost_worker_is_reported_and_replaced_while_others_continue(
+    envs: VecEnv, action: str, words: str
+) -> None:
     envs.send(1, "go")
     envs.timeout = 4.0
     envs.send(0, action)
@@ -169,7 +177,9 @@ def test_closing_ends_all_processes_even_busy_ones() -> None:
 
 def tell(file: Path) -> None:
     """What a process finds when it begins."""
-    file.write_text(f"{os.environ.get('SETTING')} {gc.get_freeze_count()} {'sapien' in sys.modules}")
+    file.write_text(
+        f"{os.environ.get('SETTING')} {gc.get_freeze_count()} {'sapien' in sys.modules}"
+    )
 
 
 def test_processes_begin_with_the_settings_of_their_time_and_all_imports_left_out_of_collections(
@@ -178,7 +188,9 @@ def test_processes_begin_with_the_settings_of_their_time_and_all_imports_left_ou
     pytest.importorskip("sapien", reason="needs the simulator: uv sync --inexact --extra sim")
     for value in ("first", "second"):
         monkeypatch.setenv("SETTING", value)
-        process = simulating_processes().Process(target=begin, args=(settings(), tell, tmp_path / value))
+        process = simulating_processes().Process(
+            target=begin, args=(settings(), tell, tmp_path / value)
+        )
         process.start()
         process.join(60)
         setting, frozen, imported = (tmp_path / value).read_text().split()
@@ -205,12 +217,16 @@ def test_unknown_names_are_refused_before_any_process_starts(
 
 
 def test_real_environments_run_in_workers() -> None:
-    pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
+    pytest.importorskip(
+        "mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim"
+    )
     with make_vec_env("VideoUnmask", [4], workers=1, split="train", render=False) as envs:
         envs.start_next(0)
         reply = only(envs.recv())
         assert len(reply.observation["joint_state_list"]) == 67
-        assert reply.info["task_goal"] == ["watch the video carefully, then pick up the container hiding the blue cube"]
+        assert reply.info["task_goal"] == [
+            "watch the video carefully, then pick up the container hiding the blue cube"
+        ]
         envs.send(0, np.append(reply.observation["joint_state_list"][-1], 1.0))
         reply = only(envs.recv())
         assert reply.info["status"] == "ongoing"

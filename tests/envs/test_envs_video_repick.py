@@ -1,4 +1,6 @@
-"""VideoRepick: the swaps after the first pick, which picks count, and when the button may be pressed."""
+"""VideoRepick: the swaps after the first pick, which picks count, and when the button may be
+pressed.
+"""
 
 import numpy as np
 import pytest
@@ -32,17 +34,23 @@ def test_the_video_ends_with_the_swaps_one_after_another(build_task):
     video = [*SHOWN, *["static"] * 4, "NO RECORD"]
     assert [step.text for step in env.progress.subtasks] == [*video, FIRST, PUT, PRESS]
     assert env.goals() == [
-        "watch the video carefully, then pick up the same block that was previously picked up again, "
-        "finally put it down and press the button to stop",
-        "watch the video carefully, then pick up the same cube that was previously picked up again, "
-        "finally press the button to stop",
+        (
+            "watch the video carefully, then pick up the same block that was previously picked up"
+            " again, finally put it down and press the button to stop"
+        ),
+        (
+            "watch the video carefully, then pick up the same cube that was previously picked up"
+            " again, finally press the button to stop"
+        ),
     ]
     env.progress.index = 3
     wait(env)  # the swaps begin in the step after the one in which the stage was seen
     for initiator in env.initiators:
         start = {cube: cube.position for cube in env.cubes}
         remaining = [cube for cube in env.cubes if cube is not initiator]
-        partner, third = sorted(remaining, key=lambda cube: distance_xy(start[cube], start[initiator]))
+        partner, third = sorted(
+            remaining, key=lambda cube: distance_xy(start[cube], start[initiator])
+        )
         wait(env, 26)
         middle = (start[initiator] + start[partner]) / 2
         assert distance_xy(initiator.position, middle) == pytest.approx(0.07, abs=5e-3)
@@ -75,13 +83,20 @@ def test_another_cube_picked_up_is_a_lasting_failure(env, hand, stage):
 @pytest.mark.parametrize("right", [True, False])
 def test_any_cube_picked_up_instead_of_pressing_fails(env, hand, right):
     go_to(env, PRESS)
-    assert hand.carry(env.cube if right else env.cubes[env.cubes.index(env.cube) - 1]) == (False, True)
+    assert hand.carry(env.cube if right else env.cubes[env.cubes.index(env.cube) - 1]) == (
+        False,
+        True,
+    )
     assert push_down(env, env.button) == (False, True)
 
 
 @pytest.mark.parametrize("stage", [FIRST, PUT])
-@pytest.mark.parametrize(("steps", "fails"), [(0, False), (49, False), (50, True), (500, True), (501, False)])
-def test_pressing_too_early_fails_from_50_to_500_steps_after_the_stage_was_entered(env, hand, stage, steps, fails):
+@pytest.mark.parametrize(
+    ("steps", "fails"), [(0, False), (49, False), (50, True), (500, True), (501, False)]
+)
+def test_pressing_too_early_fails_from_50_to_500_steps_after_the_stage_was_entered(
+    env, hand, stage, steps, fails
+):
     go_to(env, stage)
     if stage == PUT:
         hand.carry(env.cube)  # which enters the stage, too

@@ -1,4 +1,6 @@
-"""Scenes beyond the official ones: their seeds, and that figures of them stand apart from the benchmark's."""
+"""Scenes beyond the official ones: their seeds, and that figures of them stand apart from the
+benchmark's.
+"""
 
 from pathlib import Path
 
@@ -15,9 +17,13 @@ from mme_vla.evaluation.store import RecordLog
 
 
 def test_they_continue_where_the_rule_of_the_test_split_ends() -> None:
-    seeds, difficulties = zip(*(metadata.formula("MoveCube", "test", n) for n in range(50, 150)), strict=True)
+    seeds, difficulties = zip(
+        *(metadata.formula("MoveCube", "test", n) for n in range(50, 150)), strict=True
+    )
     further = metadata.episodes("MoveCube", FURTHER)
-    assert [spec.seed for spec in further] == list(seeds) and [spec.difficulty for spec in further] == [*difficulties]
+    assert [spec.seed for spec in further] == list(seeds) and [
+        spec.difficulty for spec in further
+    ] == [*difficulties]
     assert (further[0].split, further[0].episode, further[0].recovery) == (FURTHER, 0, None)
 
 
@@ -26,19 +32,25 @@ def test_those_of_one_difficulty_are_picked_from_the_same_rule_in_its_order(leve
     rule = [metadata.formula("MoveCube", "test", n) for n in range(50, 1650)]
     expected = [seed for seed, difficulty in rule if difficulty == level][:400]
     specs = metadata.episodes("MoveCube", f"further_{level}")
-    assert [spec.seed for spec in specs] == expected and {spec.difficulty for spec in specs} == {level}
+    assert [spec.seed for spec in specs] == expected and {spec.difficulty for spec in specs} == {
+        level
+    }
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_no_other_split_of_the_task_has_them(task: str) -> None:
-    others = {spec.seed for split in (*metadata.SPLITS, MORE) for spec in metadata.episodes(task, split)}
+    others = {
+        spec.seed for split in (*metadata.SPLITS, MORE) for spec in metadata.episodes(task, split)
+    }
     further = {spec.seed for spec in metadata.episodes(task, FURTHER)}
     assert len(further) == FURTHER_EPISODES and not further & others
 
 
 def records(split: str, count: int) -> list[EpisodeRecord]:
     return [
-        EpisodeRecord("pi05", 1, 7, "StopCube", n, n, "easy", "success" if n % 2 else "fail", 9, split=split)
+        EpisodeRecord(
+            "pi05", 1, 7, "StopCube", n, n, "easy", "success" if n % 2 else "fail", 9, split=split
+        )
         for n in range(count)
     ]
 
@@ -59,4 +71,7 @@ def test_results_counts_a_hundred_of_them_and_sets_no_figure_of_the_paper_beside
     table = capsys.readouterr().out
     assert "100" in table and "Incomplete" not in table and "none of the benchmark's" in table
     methods = aggregate(records(FURTHER, 100), Protocol(("StopCube",), 100)).methods
-    assert methods[0].paper is None and aggregate(records("test", 50), Protocol(("StopCube",))).methods[0].paper
+    assert (
+        methods[0].paper is None
+        and aggregate(records("test", 50), Protocol(("StopCube",))).methods[0].paper
+    )

@@ -1,6 +1,8 @@
-"""Every wording of every goal is the benchmark's, in its order: `tests/data/goal_texts.json`, by task and variant.
+"""Every wording of every goal is the benchmark's, in its order: `tests/data/goal_texts.json`, by
+task and variant.
 
-The file has the texts of `setup/task_goal` in the official recordings, with `{}` around what a scene decides.
+The file has the texts of `setup/task_goal` in the official recordings, with `{}` around what a
+scene decides.
 """
 
 import json
@@ -18,12 +20,16 @@ from helpers.env_tasks import built
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import TASK_NAMES
 
-TEXTS: dict[str, dict[str, list[str]]] = json.loads((REPOSITORY / "tests" / "data" / "goal_texts.json").read_text())
+TEXTS: dict[str, dict[str, list[str]]] = json.loads(
+    (REPOSITORY / "tests" / "data" / "goal_texts.json").read_text()
+)
 FACTS = REPOSITORY.parent / "shared" / "spec" / "goals.json"
 COLOURS = ("red", "blue", "green")
 NUMBERS = ("one", "two", "three", "four", "five")
 ORDINALS = ("first", "second", "third", "fourth", "fifth")
-SCENES = [(task, episode) for task in TASK_NAMES for episode in (0, 2, 3)]  # of the test split: every difficulty
+SCENES = [
+    (task, episode) for task in TASK_NAMES for episode in (0, 2, 3)
+]  # of the test split: every difficulty
 
 Case = tuple[dict[str, Any], str, dict[str, str]]
 """What a scene has, which variant of the texts that is, and what fills them."""
@@ -38,7 +44,13 @@ def repetitions(most: int, variants: dict[int, str]) -> list[Case]:
     cases: list[Case] = []
     for colour, count in product(COLOURS, range(1, most + 1)):
         facts = {"cube": object_of(colour), "repetitions": count}
-        cases.append((facts, variants.get(count, variants[0]), {"colour": colour, "number": NUMBERS[count - 1]}))
+        cases.append(
+            (
+                facts,
+                variants.get(count, variants[0]),
+                {"colour": colour, "number": NUMBERS[count - 1]},
+            )
+        )
     return cases
 
 
@@ -47,7 +59,13 @@ def bin_contents() -> list[Case]:
     cases: list[Case] = []
     for counts in product(range(6), repeat=3):
         if 1 <= sum(counts) <= 5:
-            cases.append(({"goal": Counter(dict(zip(COLOURS, counts, strict=True)))}, "every", bin_words(counts)))
+            cases.append(
+                (
+                    {"goal": Counter(dict(zip(COLOURS, counts, strict=True)))},
+                    "every",
+                    bin_words(counts),
+                )
+            )
     return cases
 
 
@@ -88,7 +106,11 @@ def placed_by_the_button() -> list[Case]:
 
 def placed_in_order() -> list[Case]:
     return [
-        ({"cube": object_of(colour), "rank": rank}, "every", {"colour": colour, "ordinal": ORDINALS[rank - 1]})
+        (
+            {"cube": object_of(colour), "rank": rank},
+            "every",
+            {"colour": colour, "ordinal": ORDINALS[rank - 1]},
+        )
         for colour, rank in product(COLOURS, range(1, 5))
     ]
 
@@ -102,8 +124,12 @@ CASES: dict[str, list[Case]] = {
     "StopCube": visits(),
     "VideoPlaceButton": placed_by_the_button(),
     "VideoPlaceOrder": placed_in_order(),
-    **dict.fromkeys(("VideoUnmask", "VideoUnmaskSwap", "ButtonUnmask", "ButtonUnmaskSwap"), hidden()),
-    **dict.fromkeys(("PickHighlight", "InsertPeg", "MoveCube", "PatternLock", "RouteStick"), ONE_GOAL),
+    **dict.fromkeys(
+        ("VideoUnmask", "VideoUnmaskSwap", "ButtonUnmask", "ButtonUnmaskSwap"), hidden()
+    ),
+    **dict.fromkeys(
+        ("PickHighlight", "InsertPeg", "MoveCube", "PatternLock", "RouteStick"), ONE_GOAL
+    ),
 }
 
 
@@ -116,7 +142,9 @@ def official(task: str, variant: str, words: dict[str, str]) -> list[str]:
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
-def test_a_goal_has_every_official_wording_in_order(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_goal_has_every_official_wording_in_order(
+    task: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     env = built(task, 0)
     for facts, variant, words in CASES[task]:
         for name, value in facts.items():

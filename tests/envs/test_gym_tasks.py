@@ -1,4 +1,6 @@
-"""The tasks as plain Gymnasium environments: Gymnasium's own check, and PPO of stable-baselines3."""
+"""The tasks as plain Gymnasium environments: Gymnasium's own check, and PPO of
+stable-baselines3.
+"""
 
 import os
 import re
@@ -56,7 +58,9 @@ def test_images_and_the_conditioning_video_are_numpy_arrays() -> None:
 
 
 def test_the_code_of_the_page_runs() -> None:
-    (block,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs/extend/gymnasium.md").read_text(), re.DOTALL)
+    (block,) = re.findall(
+        r"```python\n(.*?)```", (REPOSITORY / "docs/extend/gymnasium.md").read_text(), re.DOTALL
+    )
     names: dict[str, object] = {}
     exec(compile(block, "docs/extend/gymnasium.md", "exec"), names)
     assert names["info"]["status"] == "ongoing"  # type: ignore[index]
@@ -68,15 +72,23 @@ FRESH = {
 }
 """How the page says that a task is made."""
 VECTORS = {
-    "sync": "envs = gymnasium.make_vec(name, num_envs=2, vectorization_mode='sync', images=False, episode=0)",
-    "async": "envs = gymnasium.make_vec(name, num_envs=2, vectorization_mode='async', images=True, episode=0)",
+    "sync": (
+        "envs = gymnasium.make_vec(name, num_envs=2, vectorization_mode='sync', images=False,"
+        " episode=0)"
+    ),
+    "async": (
+        "envs = gymnasium.make_vec(name, num_envs=2, vectorization_mode='async', images=True,"
+        " episode=0)"
+    ),
 }
 
 
 def run_fresh(code: str, seconds: int = 300) -> str:
     """What a new process prints, which has imported nothing before."""
     command = [sys.executable, "-W", "ignore", "-c", code]
-    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=seconds)
+    finished = subprocess.run(
+        command, cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=seconds
+    )
     assert finished.returncode == 0, finished.stderr[-2000:]
     return finished.stdout
 
@@ -84,7 +96,10 @@ def run_fresh(code: str, seconds: int = 300) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("beginning", FRESH.values(), ids=FRESH)
 def test_a_fresh_process_makes_a_task(beginning: str) -> None:
-    code = f"{beginning}\nenv = gymnasium.make(name, images=False)\nprint(env.reset(seed=0)[1]['status'])\nenv.close()"
+    code = (
+        f"{beginning}\nenv = gymnasium.make(name,"
+        " images=False)\nprint(env.reset(seed=0)[1]['status'])\nenv.close()"
+    )
     assert run_fresh(code).split() == ["ongoing"]
 
 
@@ -101,7 +116,9 @@ if __name__ == "__main__":
     assert run_fresh(code).strip() == "['ongoing', 'ongoing']"
 
 
-def test_a_process_forked_after_rendering_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_forked_after_rendering_is_refused_by_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(rendering, "_process", os.getpid() + 1)
     with pytest.raises(UserError, match="spawn"):
         rendering.render_backend()
@@ -112,7 +129,9 @@ def test_making_a_task_opens_no_simulator() -> None:
     assert env._env is None and env.action_space.shape == (7,)
 
 
-@pytest.mark.parametrize("bad", [[np.nan] * 8, [0.0] * 7, [np.inf] * 8], ids=["NaN", "seven numbers", "infinite"])
+@pytest.mark.parametrize(
+    "bad", [[np.nan] * 8, [0.0] * 7, [np.inf] * 8], ids=["NaN", "seven numbers", "infinite"]
+)
 def test_an_episode_that_ends_in_an_error_says_why(bad: list[float]) -> None:
     env = mme_vla.envs.gym.GymTask("StopCube", images=False, episode=0)
     try:
@@ -127,7 +146,9 @@ def test_an_exception_without_a_text_is_named(monkeypatch: pytest.MonkeyPatch) -
     env = mme_vla.envs.gym.GymTask("StopCube", images=False, episode=0)
     try:
         env.reset()
-        monkeypatch.setattr(env._env._space, "act", lambda control, action: (_ for _ in ()).throw(RuntimeError))
+        monkeypatch.setattr(
+            env._env._space, "act", lambda control, action: (_ for _ in ()).throw(RuntimeError)
+        )
         info = env.step(np.zeros(8))[4]
         assert info["status"] == "error" and info["error_message"].startswith("RuntimeError")
     finally:
@@ -151,7 +172,9 @@ def test_ppo_runs_on_a_task() -> None:
     sb3 = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
     env = gymnasium.make("mme_vla/StopCube-v0", images=False, max_steps=40, reward="subtask")
     try:
-        model = sb3.PPO("MultiInputPolicy", env, n_steps=50, batch_size=25, n_epochs=1, device="cpu", seed=0)
+        model = sb3.PPO(
+            "MultiInputPolicy", env, n_steps=50, batch_size=25, n_epochs=1, device="cpu", seed=0
+        )
         model.learn(100)
         assert model.num_timesteps == 100
     finally:

@@ -22,7 +22,9 @@ from mme_vla.envs.scene.placement import Draws, rotated_anchors
 from mme_vla.envs.task import Task
 from mme_vla.errors import UserError
 
-FOLDER = Path(os.environ.get("MME_VLA_OOD") or Path(__file__).resolve().parents[3] / "shared" / "ood")
+FOLDER = Path(
+    os.environ.get("MME_VLA_OOD") or Path(__file__).resolve().parents[3] / "shared" / "ood"
+)
 CELLS = {
     ("PickXtimes", "RouteStick", "PatternLock"): (17, 17, 16),
     ("SwingXtimes", "StopCube"): (10, 10, 10, 10, 10),
@@ -81,9 +83,13 @@ def test_anchors_sampled_from_the_seeds_are_the_published_ones() -> None:
     for spec in metadata.episodes("VideoUnmaskSwap", "ood"):
         draws = Draws(spec.seed)
         anchor = rotated_anchors(draws, 4)[0]
-        place = [anchor[axis] - 0.07 + 0.0275 + draws.uniform() * 2 * (0.07 - 0.0275) for axis in (0, 1)]
+        place = [
+            anchor[axis] - 0.07 + 0.0275 + draws.uniform() * 2 * (0.07 - 0.0275) for axis in (0, 1)
+        ]
         assert spec.row is not None
-        np.testing.assert_allclose(spec.row["spec"]["layout"]["bins"][0][:2], place, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(
+            spec.row["spec"]["layout"]["bins"][0][:2], place, rtol=0, atol=1e-15
+        )
 
 
 def test_other_splits_and_their_limits_of_steps() -> None:
@@ -91,13 +97,29 @@ def test_other_splits_and_their_limits_of_steps() -> None:
     assert [spec.seed for spec in hard] == [spec.seed for spec in test[3::4]]
     assert {spec.difficulty for spec in hard} == {"hard"}
     challenge = [spec for task in TASK_NAMES for spec in metadata.episodes(task, "challenge")]
-    assert Counter(spec.difficulty for spec in challenge) == {"easy": 160, "medium": 320, "hard": 320}
+    assert Counter(spec.difficulty for spec in challenge) == {
+        "easy": 160,
+        "medium": 320,
+        "hard": 320,
+    }
     known = {
-        (s.task, s.seed) for task in TASK_NAMES for split in metadata.SPLITS for s in metadata.episodes(task, split)
+        (s.task, s.seed)
+        for task in TASK_NAMES
+        for split in metadata.SPLITS
+        for s in metadata.episodes(task, split)
     }
     assert not known & {(spec.task, spec.seed) for spec in challenge}
-    limits = {"test": 1300, "hard": 1300, "challenge": 1500, "ood": 1800, "ood:xhard3": 1800, "twin:ood": 1800,
-              "stress:count=2": 1300, "twin": 1300, "mine.jsonl": 1800}  # fmt: skip
+    limits = {
+        "test": 1300,
+        "hard": 1300,
+        "challenge": 1500,
+        "ood": 1800,
+        "ood:xhard3": 1800,
+        "twin:ood": 1800,
+        "stress:count=2": 1300,
+        "twin": 1300,
+        "mine.jsonl": 1800,
+    }
     assert {split: step_limit(split) for split in limits} == limits
     env = make_env("StopCube", "ood:xhard3", 2, render=False)
     assert env.max_steps == 1800
@@ -120,7 +142,9 @@ def test_values_become_goals() -> None:
     assert goals["StopCube"].endswith("for the tenth time")
     assert goals["BinFill"].startswith("put two red cubes, one blue cube and three green cubes")
     picks = ("blue", "next", "red", "finally", "green")
-    assert [goals["VideoUnmask"].find(word) for word in picks] == sorted(goals["VideoUnmask"].find(w) for w in picks)
+    assert [goals["VideoUnmask"].find(word) for word in picks] == sorted(
+        goals["VideoUnmask"].find(w) for w in picks
+    )
     assert goals["VideoPlaceButton"].endswith("last placed before the button was pressed")
     assert goals["VideoPlaceOrder"].endswith("on the second target it was previously placed on")
 
@@ -132,11 +156,16 @@ def test_sub_tasks_that_only_ood_has() -> None:
         assert [choice.action for choice in env.choices()].count("wait") == 1
     with scene("PickHighlight") as env:
         assert texts(env)[0] == texts(env)[-1] == "press the button"
-        assert texts(env)[1:3] == ["pick up the first highlighted cube", "place the cube onto the table"]
+        assert texts(env)[1:3] == [
+            "pick up the first highlighted cube",
+            "place the cube onto the table",
+        ]
         assert len(texts(env)) == 2 + 2 * 4
     for task, count in (("VideoPlaceButton", 1), ("VideoPlaceOrder", 2)):
         with scene(task) as env:
-            assert texts(env, video=True).count("put the cube back to its original position") == count
+            assert (
+                texts(env, video=True).count("put the cube back to its original position") == count
+            )
             assert "drop the cube onto table" not in texts(env, video=True)
     with scene("VideoRepick", 49) as env:
         assert texts(env, video=True).count("static") == 7
@@ -151,7 +180,9 @@ def test_outer_containers_hide_cubes_and_may_not_be_lifted() -> None:
         outer = next(thing for thing in env.things if thing.name == "distractor_bin_0")
         home, inner = outer.position.copy(), env.containers[0]  # type: ignore[attr-defined]
         env.before_physics(0)
-        assert outer.position[0] > 15 < inner.position[0] and not np.allclose(outer.position, inner.position)
+        assert outer.position[0] > 15 < inner.position[0] and not np.allclose(
+            outer.position, inner.position
+        )
         env.before_physics(COVER_STEPS // 2)
         np.testing.assert_allclose(outer.position, home, atol=1e-6)
         pick = next(subtask for subtask in env.progress.subtasks if subtask.pick)

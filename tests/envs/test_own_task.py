@@ -1,4 +1,6 @@
-"""The worked example of docs/extend/add-a-task.md: checked, made, evaluated and recorded like the benchmark's own."""
+"""The worked example of docs/extend/add-a-task.md: checked, made, evaluated and recorded like the
+benchmark's own.
+"""
 
 from pathlib import Path
 
@@ -44,7 +46,9 @@ def test_make_env_gives_it_the_benchmarks_interface_and_draws_its_order() -> Non
 
 
 def test_a_policy_is_evaluated_on_it_in_a_worker_process(tmp_path: Path) -> None:
-    policy = small_policy("framesamp_context", backbone={"vision": {**SMALL_VISION, "patch_size": 16}})
+    policy = small_policy(
+        "framesamp_context", backbone={"vision": {**SMALL_VISION, "patch_size": 16}}
+    )
     run = evaluate(
         policy,
         "TwoButtons",
@@ -74,7 +78,9 @@ def test_its_demonstrations_are_recorded(tmp_path: Path) -> None:
     (file,) = (tmp_path / "h5").glob("*TwoButtons*.h5")
     with h5py.File(file) as recorded:
         (episode,) = recorded.values()
-        subgoals = {step["info/simple_subgoal"][()].decode() for step in episode.values() if "info" in step}
+        subgoals = {
+            step["info/simple_subgoal"][()].decode() for step in episode.values() if "info" in step
+        }
         first = episode["timestep_0/obs/front_rgb"][()]
     assert subgoals >= {"press the left button", "press the right button"}
     assert first.std() > 10, "the scene is not rendered"

@@ -1,4 +1,6 @@
-"""Actions that are differences to the tool's pose at their own step: converted, learned, executed and served."""
+"""Actions that are differences to the tool's pose at their own step: converted, learned, executed
+and served.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +24,9 @@ NAME = "robomme_ee_delta"
 
 
 def expected(number: int) -> np.ndarray:
-    """What is in the files: `tool_at` is so far short of `pose_at`, and a whole turn away in roll."""
+    """What is in the files: `tool_at` is so far short of `pose_at`, and a whole turn
+    away in roll.
+    """
     lag = [0.01, -0.02, 0.001 * number, 0.05, 0.1, -0.1]
     return np.array([*lag, pose_at(number)[6]])
 
@@ -36,7 +40,9 @@ def test_differences_are_to_each_steps_pose_by_the_shorter_way(folder: Path) -> 
 
 
 def test_past_the_end_nothing_moves_and_the_gripper_stays(folder: Path) -> None:
-    chunk, recorded = EpisodeSource(folder, robot=robomme_robot(NAME)).action_chunk(0, 20, 6, offset=1)
+    chunk, recorded = EpisodeSource(folder, robot=robomme_robot(NAME)).action_chunk(
+        0, 20, 6, offset=1
+    )
     assert recorded.tolist() == [True] * 3 + [False] * 3
     np.testing.assert_allclose(chunk[:3], [expected(t) for t in (21, 22, 23)], atol=1e-5)
     assert not chunk[3:, :6].any() and (chunk[3:, 6] == expected(23)[6]).all()
@@ -44,22 +50,48 @@ def test_past_the_end_nothing_moves_and_the_gripper_stays(folder: Path) -> None:
 
 def test_an_embodiment_says_which_numbers_they_are_and_keeps_it(folder: Path) -> None:
     panda = robomme_robot(NAME)
-    assert Embodiment.from_dict(panda.to_dict()) == panda and panda.action.of_pose == tuple(range(6))
+    assert Embodiment.from_dict(panda.to_dict()) == panda and panda.action.of_pose == tuple(
+        range(6)
+    )
     assert (panda.action.space, panda.action.answers) == ("ee_pose", "ee_delta")
-    assert "of_pose" not in replace(panda, action=replace(panda.action, of_pose=(), pose_key=())).to_dict()["action"]
+    assert (
+        "of_pose"
+        not in replace(panda, action=replace(panda.action, of_pose=(), pose_key=())).to_dict()[
+            "action"
+        ]
+    )
     for words in (["embodiment.action.pose_key=null"], ["embodiment.action.frames=null"]):
         with pytest.raises(UserError, match="of_pose"):
             robomme_robot(NAME, *words)
     with pytest.raises(UserError, match="lacks the feature eef_state"):
-        EpisodeSource("sample", robot=replace(panda, action=replace(panda.action, key=("actions",))))
+        EpisodeSource(
+            "sample", robot=replace(panda, action=replace(panda.action, key=("actions",)))
+        )
 
 
-def test_memoryvla_learns_them_and_is_executed_from_where_the_tool_is(folder: Path, tmp_path: Path) -> None:
-    small = ["backbone.vision.image_size=28", "processor.group_size=3", "train.batch_size=2", "backbone.head.depth=1"]
-    words = [f"embodiment={NAME}", f"data.sources=[{folder}]", "data.val_episodes=[1]", "train.steps=1"]
+def test_memoryvla_learns_them_and_is_executed_from_where_the_tool_is(
+    folder: Path, tmp_path: Path
+) -> None:
+    small = [
+        "backbone.vision.image_size=28",
+        "processor.group_size=3",
+        "train.batch_size=2",
+        "backbone.head.depth=1",
+    ]
+    words = [
+        f"embodiment={NAME}",
+        f"data.sources=[{folder}]",
+        "data.val_episodes=[1]",
+        "train.steps=1",
+    ]
     policy = Policy.from_pretrained(run("memoryvla", tmp_path / "run", *small, *words))
     panda = policy.embodiment
-    assert (panda.name, panda.action.horizon, panda.action.execute, policy.action_dim) == (NAME, 16, 8, 7)
+    assert (panda.name, panda.action.horizon, panda.action.execute, policy.action_dim) == (
+        NAME,
+        16,
+        8,
+        7,
+    )
     stats = policy.require_processor().require_stats().actions
     exact = np.array([expected(t) for t in range(24)])
     np.testing.assert_allclose(stats.max[:6], exact[:, :6].max(0), atol=1e-5)
@@ -69,12 +101,19 @@ def test_memoryvla_learns_them_and_is_executed_from_where_the_tool_is(folder: Pa
     assert record.action_space == "ee_delta" and len(env.actions) == record.steps > 8
     sent, stood = np.stack(env.actions), np.stack(env.poses[: len(env.actions)])
     low, high = stats.min[:6] - 1e-5, stats.max[:6] + 1e-5
-    assert ((sent[:, :6] - stood >= low) & (sent[:, :6] - stood <= high)).all(), "each beside its own step's pose"
-    assert (np.abs(stood).max(0) > 10 * np.abs(high)).all() and set(np.unique(sent[:, 6])) <= {-1.0, 1.0}
+    assert ((sent[:, :6] - stood >= low) & (sent[:, :6] - stood <= high)).all(), (
+        "each beside its own step's pose"
+    )
+    assert (np.abs(stood).max(0) > 10 * np.abs(high)).all() and set(np.unique(sent[:, 6])) <= {
+        -1.0,
+        1.0,
+    }
 
 
 class PosedEnv(ScriptedEnv):
-    """Says where the tool is: somewhere else at every frame, far from where any difference leads."""
+    """Says where the tool is: somewhere else at every frame, far from where any
+    difference leads.
+    """
 
     def _lists(self, frames: list[dict[str, Any]]) -> dict[str, Any]:
         rng = np.random.default_rng(len(self.frames))
@@ -89,8 +128,12 @@ def make_posed_env(task: str, split: str, episode: int, max_steps: int, **option
 
 def test_an_environment_that_does_not_tell_poses_is_refused_by_name() -> None:
     policy = quick_policy("pi05", embodiment=NAME)
-    with pytest.raises(UserError, match="differences to 'eef_state', which this environment does not deliver"):
-        roll(policy, [Job("PickXtimes", "test", 0)], InlineEnvs(robot=policy.embodiment), max_steps=3)
+    with pytest.raises(
+        UserError, match="differences to 'eef_state', which this environment does not deliver"
+    ):
+        roll(
+            policy, [Job("PickXtimes", "test", 0)], InlineEnvs(robot=policy.embodiment), max_steps=3
+        )
 
 
 def test_a_client_must_say_that_it_adds_the_pose() -> None:

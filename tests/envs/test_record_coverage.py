@@ -1,4 +1,6 @@
-"""Recording beyond the benchmark's episodes: their seeds, and which goals of the test split they cover."""
+"""Recording beyond the benchmark's episodes: their seeds, and which goals of the test split they
+cover.
+"""
 
 import json
 from pathlib import Path
@@ -19,12 +21,22 @@ from mme_vla.envs.recording.outputs import RecordingPlan
 
 
 def test_more_episodes_have_seeds_that_no_split_has() -> None:
-    seeds = {spec.seed for task in TASK_NAMES for split in metadata.SPLITS for spec in metadata.episodes(task, split)}
+    seeds = {
+        spec.seed
+        for task in TASK_NAMES
+        for split in metadata.SPLITS
+        for spec in metadata.episodes(task, split)
+    }
     more = [spec for task in TASK_NAMES for spec in metadata.episodes(task, MORE)]
     assert len({spec.seed for spec in more}) == len(more) == 900 * len(TASK_NAMES)
     # Where a demonstration fails the seed is raised by one, up to a hundred times.
     assert min(spec.seed for spec in more) > max(seeds) + 100
-    assert more[0].recovery is None and [spec.difficulty for spec in more[:4]] == ["easy", "easy", "medium", "hard"]
+    assert more[0].recovery is None and [spec.difficulty for spec in more[:4]] == [
+        "easy",
+        "easy",
+        "medium",
+        "hard",
+    ]
 
 
 def test_goals_without_a_demonstration_are_named_with_their_episodes() -> None:
@@ -40,7 +52,10 @@ def test_goals_without_a_demonstration_are_named_with_their_episodes() -> None:
         "  never shown: third (episode 0, 2)",
         "  never shown: fifth (episode 3)",
     ]
-    assert coverage.compare({"StopCube": {"second", "third", "fifth"}}, requests)["StopCube"].missing == {}
+    assert (
+        coverage.compare({"StopCube": {"second", "third", "fifth"}}, requests)["StopCube"].missing
+        == {}
+    )
 
 
 def test_a_goal_is_what_the_scene_says() -> None:
@@ -52,9 +67,14 @@ def test_a_goal_is_what_the_scene_says() -> None:
 
 @pytest.mark.parametrize("lerobot", [True, False])
 def test_a_recording_is_compared_with_the_test_split(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], lerobot: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    lerobot: bool,
 ) -> None:
-    write_file(tmp_path / "record_dataset_StopCube.h5", [6, 7])  # whose goals are "do task 0" and "do task 1"
+    write_file(
+        tmp_path / "record_dataset_StopCube.h5", [6, 7]
+    )  # whose goals are "do task 0" and "do task 1"
     refs = list_episodes(find_files([tmp_path]))
     jobs = [record.Job("StopCube", ref.index, 0, "easy", None, 1) for ref in refs]
     dataset = tmp_path / "data" if lerobot else None
@@ -64,7 +84,12 @@ def test_a_recording_is_compared_with_the_test_split(
     monkeypatch.setattr(coverage, "goal_of", lambda spec: f"do task {spec.episode % 3}")
     record.report_coverage("StopCube", request, tmp_path / "coverage.json", workers=1)
     result = json.loads((tmp_path / "coverage.json").read_text())["StopCube"]
-    assert (result["goals"], result["goals_covered"], result["episodes"], result["episodes_covered"]) == (3, 2, 50, 34)
+    assert (
+        result["goals"],
+        result["goals_covered"],
+        result["episodes"],
+        result["episodes_covered"],
+    ) == (3, 2, 50, 34)
     assert list(result["missing"]) == ["do task 2"] and result["missing"]["do task 2"][:2] == [2, 5]
     assert "StopCube: 2 of 3 goals of 'test', 34 of 50 episodes" in capsys.readouterr().out
 

@@ -1,4 +1,6 @@
-"""Recording an environment of the user's own: an interrupted command continues, and says when it cannot."""
+"""Recording an environment of the user's own: an interrupted command continues, and says when it
+cannot.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,7 +39,9 @@ def demonstrated(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return numbers
 
 
-def test_an_interrupted_recording_continues_with_the_missing_episodes(demonstrated: list[int], tmp_path: Path) -> None:
+def test_an_interrupted_recording_continues_with_the_missing_episodes(
+    demonstrated: list[int], tmp_path: Path
+) -> None:
     words = {
         "env": "blink",
         "tasks": "all",

@@ -1,4 +1,6 @@
-"""An episode shows the texts that its recording has: in the video, at the change to the execution, and after waits."""
+"""An episode shows the texts that its recording has: in the video, at the change to the execution,
+and after waits.
+"""
 
 import pytest
 
@@ -10,9 +12,16 @@ from mme_vla.envs.recording.recorder import RecordedStep, Recorder
 from mme_vla.envs.subtasks import NO_RECORD
 
 VIDEOS = [
-    ("MoveCube", 0), ("MoveCube", 6), ("MoveCube", 9), ("VideoPlaceOrder", 5), ("VideoPlaceButton", 4),
-    ("VideoRepick", 7), ("InsertPeg", 9), ("VideoUnmaskSwap", 6), ("PatternLock", 8),
-]  # fmt: skip
+    ("MoveCube", 0),
+    ("MoveCube", 6),
+    ("MoveCube", 9),
+    ("VideoPlaceOrder", 5),
+    ("VideoPlaceButton", 4),
+    ("VideoRepick", 7),
+    ("InsertPeg", 9),
+    ("VideoUnmaskSwap", 6),
+    ("PatternLock", 8),
+]
 """Episodes of the training split. The cube of MoveCube is hooked, pushed, and grasped."""
 
 
@@ -47,7 +56,8 @@ def test_a_video_has_the_texts_of_its_recording(task: str, episode: int) -> None
     env.reset()
     expected: list[str] = []
     for word in video:
-        # A frame whose recorded text is none goes on with the text of the sub-task that is demonstrated.
+        # A frame whose recorded text is none goes on with the text of the sub-task that is
+        # demonstrated.
         expected.append(word if word != NO_RECORD else expected[-1])
     execution = next(step.text for step in env.task.progress.subtasks if not step.video)
     assert not env.task.recording
@@ -76,6 +86,10 @@ def test_waits_end_at_the_recorded_actions_when_judged_as_recorded() -> None:
         env.close()
     recorded = [step.info["simple_subgoal_online"] for step in steps][: len(texts[True])]
     assert texts[True] == recorded
-    # The clock of an episode is one step ahead of its recording's, which lacks the step of the first observation.
-    begin = [words.index("press the button to stop the cube on the target") for words in (texts[False], recorded)]
+    # The clock of an episode is one step ahead of its recording's, which lacks the step of the
+    # first observation.
+    begin = [
+        words.index("press the button to stop the cube on the target")
+        for words in (texts[False], recorded)
+    ]
     assert begin[0] == begin[1] - 1

@@ -13,7 +13,9 @@ from helpers.plugins import plugin
 from mme_vla.envs import make_env, metadata
 from mme_vla.errors import UserError
 
-pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
+pytest.importorskip(
+    "mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim"
+)
 
 
 @pytest.fixture
@@ -23,7 +25,9 @@ def wrapper() -> Iterator[ModuleType]:
 
 
 def test_the_builder_knows_the_benchmarks_episodes(wrapper: ModuleType) -> None:
-    builder = wrapper.BenchmarkEnvBuilder("VideoUnmask", dataset="test", action_space="ee_pose", max_steps=7)
+    builder = wrapper.BenchmarkEnvBuilder(
+        "VideoUnmask", dataset="test", action_space="ee_pose", max_steps=7
+    )
     known = metadata.episodes("VideoUnmask", "test")
     assert wrapper.BenchmarkEnvBuilder.get_task_list()[:2] == ["PickXtimes", "StopCube"]
     assert len(builder.get_task_list()) == 16
@@ -42,14 +46,20 @@ def test_the_builder_knows_the_benchmarks_episodes(wrapper: ModuleType) -> None:
         ({"env_id": "StopCube", "gui_render": True}, "open no window"),
     ],
 )
-def test_what_cannot_be_is_refused_in_words(wrapper: ModuleType, options: dict, message: str) -> None:
+def test_what_cannot_be_is_refused_in_words(
+    wrapper: ModuleType, options: dict, message: str
+) -> None:
     with pytest.raises(UserError, match=message):
         wrapper.BenchmarkEnvBuilder(**options)
 
 
 def test_episodes_of_the_user_come_from_a_folder(wrapper: ModuleType, tmp_path: Path) -> None:
-    records = [{"task": "StopCube", "episode": i, "seed": 900 + i, "difficulty": "hard"} for i in (1, 0)]
-    (tmp_path / "record_dataset_StopCube_metadata.json").write_text(json.dumps({"records": records}))
+    records = [
+        {"task": "StopCube", "episode": i, "seed": 900 + i, "difficulty": "hard"} for i in (1, 0)
+    ]
+    (tmp_path / "record_dataset_StopCube_metadata.json").write_text(
+        json.dumps({"records": records})
+    )
     builder = wrapper.BenchmarkEnvBuilder("StopCube", override_metadata_path=tmp_path)
     assert builder.get_episode_num() == 2
     assert builder.resolve_episode(1) == (901, "hard")
@@ -61,7 +71,9 @@ def test_its_environment_is_make_envs(wrapper: ModuleType) -> None:
     benchmark_env = builder.make_env_for_episode(3, include_front_depth=True)
     local_env = make_env("StopCube", "val", 3, max_steps=5, include_front_depth=True)
     try:
-        assert benchmark_env.unwrapped.difficulty == metadata.episode("StopCube", "val", 3).difficulty
+        assert (
+            benchmark_env.unwrapped.difficulty == metadata.episode("StopCube", "val", 3).difficulty
+        )
         observation, info = benchmark_env.reset()
         expected, info_ = local_env.reset()
         assert info["task_goal"] == info_["task_goal"]

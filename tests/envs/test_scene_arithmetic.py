@@ -44,7 +44,9 @@ def test_roots_of_powers_of_four_are_exact() -> None:
 def test_a_fused_multiply_add_is_rounded_once() -> None:
     a, b, c = RNG.uniform(-2, 2, (3, 2000))
     c[:1000] = -a[:1000] * b[:1000]  # what is left is the product's rounding error alone
-    exact = [float(Fraction(x) * Fraction(y) + Fraction(z)) for x, y, z in zip(a, b, c, strict=True)]
+    exact = [
+        float(Fraction(x) * Fraction(y) + Fraction(z)) for x, y, z in zip(a, b, c, strict=True)
+    ]
     assert fused_multiply_add(a, b, c).tolist() == exact
 
 
@@ -84,14 +86,18 @@ def test_a_quaternion_about_the_vertical_turns_by_its_angle(yaw: float) -> None:
 
 def test_quaternions_have_the_recorded_bits() -> None:
     angles = np.linspace(-7, 7, 2000)
-    assert digest(np.stack([quaternion_about_z(float(yaw)) for yaw in angles])) == "791bfbcf9d33c6d4"
+    assert (
+        digest(np.stack([quaternion_about_z(float(yaw)) for yaw in angles])) == "791bfbcf9d33c6d4"
+    )
 
 
 def test_the_smallest_box_of_a_turned_box_has_its_widths_in_order_and_its_axes() -> None:
     widths = np.array([0.3, 0.1, 0.2])
     rotation = Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
     mesh = box(widths)
-    mesh.apply_transform(np.block([[rotation, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]))
+    mesh.apply_transform(
+        np.block([[rotation, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+    )
     axes, measured = smallest_box(mesh)
     assert measured == pytest.approx(sorted(widths), abs=1e-12)
     assert np.abs(axes @ rotation) == pytest.approx(np.eye(3)[[1, 2, 0]], abs=1e-9)
@@ -100,6 +106,10 @@ def test_the_smallest_box_of_a_turned_box_has_its_widths_in_order_and_its_axes()
 @pytest.mark.parametrize("yaw", [0.0, 0.4, 1.3])
 def test_the_smallest_box_is_as_large_as_trimeshs(yaw: float) -> None:
     mesh = box((0.04, 0.04, 0.04))
-    mesh.apply_transform(np.block([[Rotation.from_euler("z", yaw).as_matrix(), np.ones((3, 1))], [np.eye(4)[3:]]]))
+    mesh.apply_transform(
+        np.block([[Rotation.from_euler("z", yaw).as_matrix(), np.ones((3, 1))], [np.eye(4)[3:]]])
+    )
     _, widths = smallest_box(mesh)
-    assert widths.prod() == pytest.approx(mesh.bounding_box_oriented.primitive.extents.prod(), rel=1e-9)
+    assert widths.prod() == pytest.approx(
+        mesh.bounding_box_oriented.primitive.extents.prod(), rel=1e-9
+    )

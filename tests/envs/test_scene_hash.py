@@ -1,4 +1,6 @@
-"""The digest of a scene: equal for equal values and places, to the last bit, however the scene came to be."""
+"""The digest of a scene: equal for equal values and places, to the last bit, however the scene came
+to be.
+"""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -12,7 +14,10 @@ from mme_vla.envs.base import Environment, EpisodeEnv, environment
 from mme_vla.envs.metadata import EpisodeSpec, read_row
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
 
-VALUES: dict[str, Any] = {"layout": {"xy": [0.1, -0.25], "yaw": 1.5}, "objects": {"count": 3, "colours": ["red"]}}
+VALUES: dict[str, Any] = {
+    "layout": {"xy": [0.1, -0.25], "yaw": 1.5},
+    "objects": {"count": 3, "colours": ["red"]},
+}
 
 
 def test_the_digest_is_this_one_on_every_machine() -> None:
@@ -25,12 +30,20 @@ def test_neither_order_nor_spelling_of_numbers_counts() -> None:
     assert scene_digest(turned) == scene_digest(VALUES)
 
 
-@pytest.mark.parametrize("change", [
-    {"layout": {"xy": [np.nextafter(0.1, 1), -0.25], "yaw": 1.5}}, {"layout": {"xy": [-0.25, 0.1], "yaw": 1.5}},
-    {"layout": {"xy": [0.1], "yaw": [-0.25, 1.5]}}, {"objects": {"count": "3", "colours": ["red"]}},
-    {"objects": {"count": 3, "colours": ["r", "ed"]}}, {"objects": {"count": 3, "colours": "red"}}, {"more": None},
-    {"objects": {"count": True, "colours": ["red"]}},
-], ids=str)  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"layout": {"xy": [np.nextafter(0.1, 1), -0.25], "yaw": 1.5}},
+        {"layout": {"xy": [-0.25, 0.1], "yaw": 1.5}},
+        {"layout": {"xy": [0.1], "yaw": [-0.25, 1.5]}},
+        {"objects": {"count": "3", "colours": ["red"]}},
+        {"objects": {"count": 3, "colours": ["r", "ed"]}},
+        {"objects": {"count": 3, "colours": "red"}},
+        {"more": None},
+        {"objects": {"count": True, "colours": ["red"]}},
+    ],
+    ids=str,
+)
 def test_every_bit_counts(change: dict[str, Any]) -> None:
     assert scene_digest(VALUES | change) != scene_digest(VALUES)
 
@@ -41,13 +54,15 @@ def test_values_without_one_text_are_refused(value: Any) -> None:
         scene_digest({"value": value})
 
 
-# Environments -----------------------------------------------------------------------------------------------------
+# Environments -------------------------------------------------------------------------------------
 
 
 class Line(gymnasium.Env):
     """A place on a line, which steps move."""
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: Any = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         self.place = float(seed or 0)
         return self._frame(), {"goal": "move"}
 
@@ -91,10 +106,13 @@ def test_an_environment_with_values_is_named_by_those_of_its_reset() -> None:
 
 
 def test_the_official_package_has_no_values() -> None:
-    assert environment("official").scene_digest(EpisodeSpec("StopCube", "test", 0, 0, "easy")) == NO_VALUES
+    assert (
+        environment("official").scene_digest(EpisodeSpec("StopCube", "test", 0, 0, "easy"))
+        == NO_VALUES
+    )
 
 
-# The benchmark ----------------------------------------------------------------------------------------------------
+# The benchmark ------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -122,5 +140,7 @@ def test_a_scene_has_one_digest_however_it_is_built(task: str, tasks: list[Any])
     tasks.append(built)
     built.reset()
     assert scene_digest(built.placed_values()) == digest, "from its values"
-    assert source.scene_digest(source.episode(task, "twin", 0)) == digest, "what stays in view is no other scene"
+    assert source.scene_digest(source.episode(task, "twin", 0)) == digest, (
+        "what stays in view is no other scene"
+    )
     assert source.scene_digest(source.episode(task, "test", 1)) != digest

@@ -1,6 +1,8 @@
-"""The official episodes at hand, replayed: same words, same sub-tasks, same image, same success, in every action space.
+"""The official episodes at hand, replayed: same words, same sub-tasks, same image, same success, in
+every action space.
 
-`MME_VLA_ROBOMME_H5` names another folder of `record_dataset_<Task>.h5` files; every episode in it is replayed.
+`MME_VLA_ROBOMME_H5` names another folder of `record_dataset_<Task>.h5` files; every episode in it
+is replayed.
 """
 
 import json
@@ -27,21 +29,26 @@ from mme_vla.envs.recording.recorder import RecordedStep, Recorder
 from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
 
 FOLDER = Path(
-    os.environ.get("MME_VLA_ROBOMME_H5") or Path(__file__).resolve().parents[3] / "shared" / "robomme_h5"
+    os.environ.get("MME_VLA_ROBOMME_H5")
+    or Path(__file__).resolve().parents[3] / "shared" / "robomme_h5"
 ).expanduser()
 REFS = list_episodes(find_files([FOLDER])) if FOLDER.is_dir() else []
 RECOVERY = ("z", "z", "z", "xy", "xy", "xy")  # of train episodes 0 to 5
 SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
 BEFORE_CONTACT, AFTER_CONTACT, AFTER_CONTACT_STEPS = 1e-5, 2e-2, 10
-"""Differences allowed in states (rad, metres), and in the step at which a sub-task of a video or of a replay ends.
+"""Differences allowed in states (rad, metres), and in the step at which a sub-task of a video or of
+a replay ends.
 
-Until the robot first touches something, in the video or after it, only rounding differs: recorded states are single
-precision. From then on contacts amplify what differs by less: the execution begins one step after that of a recording,
-when objects have moved or settled for one step more, and makers of CPUs compute contacts between boxes with different
-reciprocals (`rcpps`). Before the first contact no step may differ.
+Until the robot first touches something, in the video or after it, only rounding differs: recorded
+states are single precision. From then on contacts amplify what differs by less: the execution
+begins one step after that of a recording, when objects have moved or settled for one step more, and
+makers of CPUs compute contacts between boxes with different reciprocals (`rcpps`). Before the first
+contact no step may differ.
 """
 WAITING = {"StopCube": "remain static"}
-"""Tasks whose demonstrations wait, and the text: no waypoint says so, and they are replayed at the recorded times."""
+"""Tasks whose demonstrations wait, and the text: no waypoint says so, and they are replayed at the
+recorded times.
+"""
 PIXELS = 1.0
 """Mean absolute difference allowed between the first images, of 255."""
 PIXELS_ALONG = 0.5
@@ -49,7 +56,11 @@ PIXELS_ALONG = 0.5
 MOST_PICTURES = 12
 
 
-@pytest.fixture(scope="module", params=REFS or [None], ids=lambda ref: f"{ref.task}-{ref.index}" if ref else "none")
+@pytest.fixture(
+    scope="module",
+    params=REFS or [None],
+    ids=lambda ref: f"{ref.task}-{ref.index}" if ref else "none",
+)
 def episode(request: pytest.FixtureRequest) -> Iterator["Episode"]:
     if request.param is None:
         pytest.skip(f"no official episodes: {FOLDER} is absent (set MME_VLA_ROBOMME_H5)")
@@ -74,11 +85,16 @@ class Episode:
         return self._group[f"timestep_{step}/{key}"][()]
 
     def image_steps(self, view: str, most: int) -> list[int]:
-        """Steps with an image of their own, spread over the episode; small files link others to the one before."""
+        """Steps with an image of their own, spread over the episode; small files link others to the
+        one before.
+        """
         paths = [f"timestep_{k}/obs/{view}" for k in range(self.length)]
         places = [h5py.h5o.get_info(self._group[path].id).addr for path in paths]
         changes = [k for k in range(self.length) if k == 0 or places[k] != places[k - 1]]
-        return [changes[i] for i in np.linspace(0, len(changes) - 1, min(most, len(changes))).astype(int)]
+        return [
+            changes[i]
+            for i in np.linspace(0, len(changes) - 1, min(most, len(changes))).astype(int)
+        ]
 
     def texts(self, key: str) -> list[str]:
         """The different texts in the order they appear, each once in a row."""
@@ -102,17 +118,25 @@ class Episode:
                 if self.at(k, "info/is_subgoal_boundary")
             ]
             return [(k, choice) for k, choice in choices if choice["choice"]]
-        key = {"joint_angle": "joint_action", "ee_pose": "eef_action", "waypoint": "waypoint_action"}[space]
+        key = {
+            "joint_angle": "joint_action",
+            "ee_pose": "eef_action",
+            "waypoint": "waypoint_action",
+        }[space]
         actions = [(k, self.at(k, f"action/{key}")) for k in steps]
         if space != "waypoint":
             return actions
         named = [(k, action) for k, action in actions if not np.isnan(action).any()]
-        return [a for i, a in enumerate(named) if i == 0 or not np.array_equal(a[1], named[i - 1][1])]
+        return [
+            a for i, a in enumerate(named) if i == 0 or not np.array_equal(a[1], named[i - 1][1])
+        ]
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A frame of a replay: its text, whether it belongs to the video, and whether the robot touches something."""
+    """A frame of a replay: its text, whether it belongs to the video, and whether the robot touches
+    something.
+    """
 
     text: str
     in_video: bool
@@ -129,7 +153,9 @@ def in_order(texts: Iterable[str]) -> list[str]:
 
 
 def first_contact(displayed: list[Shown]) -> int:
-    """The first frame in which the robot touches something; the number of frames where there is none."""
+    """The first frame in which the robot touches something; the number of frames where there is
+    none.
+    """
     return next((k for k, frame in enumerate(displayed) if frame.touches), len(displayed))
 
 
@@ -155,8 +181,17 @@ def test_the_goal_and_the_sub_tasks_have_the_recorded_words(episode: Episode) ->
 @pytest.mark.parametrize("space", SPACES)
 def test_replaying_the_execution_succeeds(episode: Episode, space: str) -> None:
     included = {"include_wrist_camera_extrinsic": True, "include_available_multi_choices": True}
-    env = make_env(episode.ref.task, action_space=space, render=False, max_steps=5000, **episode.scene, **included)
-    env.task.recording = space == "joint_angle"  # drops and waits are judged as when the episode was recorded
+    env = make_env(
+        episode.ref.task,
+        action_space=space,
+        render=False,
+        max_steps=5000,
+        **episode.scene,
+        **included,
+    )
+    env.task.recording = (
+        space == "joint_angle"
+    )  # drops and waits are judged as when the episode was recorded
     displayed: list[Shown] = []
     env.on_frame = lambda frame, info, in_video: displayed.append(
         Shown(info["simple_subgoal_online"], in_video, touches(env.task))
@@ -191,21 +226,28 @@ def check_video(episode: Episode, displayed: list[Shown], states: list[np.ndarra
     assert all(frame.in_video for frame in displayed)
     words, announced = [frame.text for frame in displayed], list[str]()
     for word in official:
-        # A frame whose recorded text is none goes on with the text of the sub-task that is demonstrated.
+        # A frame whose recorded text is none goes on with the text of the sub-task that is
+        # demonstrated.
         announced.append(word if word != NO_RECORD else announced[-1])
     assert in_order(words) == in_order(announced)
     check_ends(words, announced, contact)
-    assert abs(len(displayed) - len(official)) <= (AFTER_CONTACT_STEPS if contact < len(displayed) else 0)
+    assert abs(len(displayed) - len(official)) <= (
+        AFTER_CONTACT_STEPS if contact < len(displayed) else 0
+    )
     for k in range(min(len(displayed), len(official))):
         tolerance = BEFORE_CONTACT if k < contact else AFTER_CONTACT
-        np.testing.assert_allclose(states[k], episode.at(k, "obs/joint_state"), atol=tolerance, err_msg=f"video, {k}")
+        np.testing.assert_allclose(
+            states[k], episode.at(k, "obs/joint_state"), atol=tolerance, err_msg=f"video, {k}"
+        )
 
 
 def check_ends(words: list[str], recorded: list[str], contact: int) -> None:
     """Each sub-task but the last ends with the recorded step, after a contact nearly so."""
     for end, official in zip(ends(words), ends(recorded), strict=True):
         tolerance = 0 if end <= contact else AFTER_CONTACT_STEPS
-        assert abs(end - official) <= tolerance, f"a text begins at {end} instead of {official}; contact at {contact}"
+        assert abs(end - official) <= tolerance, (
+            f"a text begins at {end} instead of {official}; contact at {contact}"
+        )
 
 
 def check_states(episode: Episode, step: int, observation: dict[str, Any], touched: bool) -> None:
@@ -214,14 +256,21 @@ def check_states(episode: Episode, step: int, observation: dict[str, Any], touch
     for key in ("joint_state", "eef_state", "gripper_state", "wrist_camera_extrinsic"):
         (actual,) = observation[f"{key}_list"]
         official = episode.at(step, f"obs/{key}")
-        np.testing.assert_allclose(actual, official, atol=tolerance, err_msg=f"{key} of step {step}")
+        np.testing.assert_allclose(
+            actual, official, atol=tolerance, err_msg=f"{key} of step {step}"
+        )
 
 
 @pytest.mark.usefixtures("renderer")
 def test_images_along_the_replay_are_the_recorded_ones(episode: Episode) -> None:
-    steps_of = {view: episode.image_steps(view, MOST_PICTURES) for view in ("front_rgb", "wrist_rgb")}
+    steps_of = {
+        view: episode.image_steps(view, MOST_PICTURES) for view in ("front_rgb", "wrist_rgb")
+    }
     # The list that an episode begins with ends with a frame that no step was stored for.
-    numbers = {view: frozenset(k + (k >= episode.execution) for k in steps) for view, steps in steps_of.items()}
+    numbers = {
+        view: frozenset(k + (k >= episode.execution) for k in steps)
+        for view, steps in steps_of.items()
+    }
     env = make_env(episode.ref.task, max_steps=5000, **episode.scene)
     # An image takes as long as dozens of steps.
     env.render_request = RenderRequest(
@@ -239,10 +288,16 @@ def test_images_along_the_replay_are_the_recorded_ones(episode: Episode) -> None
     env.close()
     for view, images in views.items():
         steps = [k for k in steps_of[view] if k < len(images)]
-        assert len(steps) >= 0.8 * len(steps_of[view]), "the replay ends long before the recording does"
+        assert len(steps) >= 0.8 * len(steps_of[view]), (
+            "the replay ends long before the recording does"
+        )
         for k in steps:
-            difference = np.abs(images[k].astype(int) - episode.at(k, f"obs/{view}").astype(int)).mean()
-            assert difference < PIXELS_ALONG, f"{view} of step {k} differs by {difference:.2f} of 255 on average"
+            difference = np.abs(
+                images[k].astype(int) - episode.at(k, f"obs/{view}").astype(int)
+            ).mean()
+            assert difference < PIXELS_ALONG, (
+                f"{view} of step {k} differs by {difference:.2f} of 255 on average"
+            )
 
 
 def test_a_local_demonstration_is_stored_as_the_official_one(episode: Episode) -> None:
@@ -257,15 +312,22 @@ def test_a_local_demonstration_is_stored_as_the_official_one(episode: Episode) -
     Recorder(env, render=False, on_step=keep).record()
     env.close()
     if len(frames) != episode.length:
-        pytest.skip(f"this demonstration has {len(frames)} steps here and {episode.length} in the file")
+        pytest.skip(
+            f"this demonstration has {len(frames)} steps here and {episode.length} in the file"
+        )
     steps = list(enumerate(frames))
     for name in ("simple_subgoal", "simple_subgoal_online"):
-        assert [s.info[name] for _, s in steps] == [text(episode.at(k, f"info/{name}")) for k, _ in steps]
+        assert [s.info[name] for _, s in steps] == [
+            text(episode.at(k, f"info/{name}")) for k, _ in steps
+        ]
     for name in ("is_video_demo", "is_subgoal_boundary", "is_completed"):
-        assert [bool(s.info[name]) for _, s in steps] == [bool(episode.at(k, f"info/{name}")) for k, _ in steps]
+        assert [bool(s.info[name]) for _, s in steps] == [
+            bool(episode.at(k, f"info/{name}")) for k, _ in steps
+        ]
     for k, s in steps:
         local, official = (
-            json.loads(text(a)) for a in (s.action["choice_action"], episode.at(k, "action/choice_action"))
+            json.loads(text(a))
+            for a in (s.action["choice_action"], episode.at(k, "action/choice_action"))
         )
         assert local.get("choice") == official.get("choice")
         # A place that the robot has touched may round to the next pixel.
@@ -278,7 +340,9 @@ def test_a_local_demonstration_is_stored_as_the_official_one(episode: Episode) -
         for k, s in steps:
             tolerance = BEFORE_CONTACT if k < contact else AFTER_CONTACT
             actual, official = getattr(s, part)[name], episode.at(k, f"{part}/{name}")
-            np.testing.assert_allclose(actual, official, atol=tolerance, err_msg=f"{name} of step {k}")
+            np.testing.assert_allclose(
+                actual, official, atol=tolerance, err_msg=f"{name} of step {k}"
+            )
 
 
 class FirstStepError(Exception):
@@ -297,8 +361,12 @@ def test_the_first_image_is_the_recorded_one(episode: Episode) -> None:
     with pytest.raises(FirstStepError):
         Recorder(env, on_step=stop).record()
     env.close()
-    assert steps[0].info["grounded_subgoal_online"] == text(episode.at(0, "info/grounded_subgoal_online"))
+    assert steps[0].info["grounded_subgoal_online"] == text(
+        episode.at(0, "info/grounded_subgoal_online")
+    )
     for view in ("front_rgb", "wrist_rgb", "front_depth", "wrist_depth"):
         assert steps[0].obs[view].shape == episode.at(0, f"obs/{view}").shape
-        difference = np.abs(steps[0].obs[view].astype(int) - episode.at(0, f"obs/{view}").astype(int)).mean()
+        difference = np.abs(
+            steps[0].obs[view].astype(int) - episode.at(0, f"obs/{view}").astype(int)
+        ).mean()
         assert difference < PIXELS, f"{view} differs by {difference:.2f} of 255 on average"

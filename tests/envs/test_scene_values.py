@@ -1,4 +1,6 @@
-"""Scenes given as values: the same scene to the last bit, files of scenes, and rows that are refused."""
+"""Scenes given as values: the same scene to the last bit, files of scenes, and rows that are
+refused.
+"""
 
 import contextlib
 import copy
@@ -20,9 +22,16 @@ from mme_vla.envs.task import Task
 from mme_vla.errors import UserError
 
 Row = dict[str, Any]
-VARIED = [("PickXtimes", "stress:count=2"), ("VideoUnmask", "stress:containers=2"), ("StopCube", "stress:count=3"),
-          ("VideoUnmaskSwap", "stress:swaps=2"), ("MoveCube", "stress:delay=12"), ("PickHighlight", "twin"),
-          ("PickHighlight", "stress:distractors=2"), ("VideoRepick", "stress:delay=30")]  # fmt: skip
+VARIED = [
+    ("PickXtimes", "stress:count=2"),
+    ("VideoUnmask", "stress:containers=2"),
+    ("StopCube", "stress:count=3"),
+    ("VideoUnmaskSwap", "stress:swaps=2"),
+    ("MoveCube", "stress:delay=12"),
+    ("PickHighlight", "twin"),
+    ("PickHighlight", "stress:distractors=2"),
+    ("VideoRepick", "stress:delay=30"),
+]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -33,9 +42,16 @@ def _tasks() -> None:
 def scene_of(env: Task) -> dict[str, Any]:
     """Where everything stands and what is to be done."""
     env.reset()
-    places = {thing.name: np.concatenate([thing.pose.p, thing.pose.q]).tobytes() for thing in env.things}
+    places = {
+        thing.name: np.concatenate([thing.pose.p, thing.pose.q]).tobytes() for thing in env.things
+    }
     texts = [subtask.text for subtask in env.progress.subtasks]
-    return {"places": places, "texts": texts, "goals": env.goals(), "choices": [c.action for c in env.choices()]}
+    return {
+        "places": places,
+        "texts": texts,
+        "goals": env.goals(),
+        "choices": [c.action for c in env.choices()],
+    }
 
 
 def check_round_trip(task: str, options: Row) -> None:
@@ -69,7 +85,9 @@ def test_a_scene_built_from_its_values_is_the_same(task: str) -> None:
 def test_twenty_scenes_built_from_their_values_are_the_same(task: str) -> None:
     built = 0
     for episode in range(50):
-        with contextlib.suppress(SceneError):  # of two published test seeds an object finds no place here
+        with contextlib.suppress(
+            SceneError
+        ):  # of two published test seeds an object finds no place here
             check_round_trip(task, metadata.episode(task, "test", episode).options)
             built += 1
         if built == 20:
@@ -104,15 +122,23 @@ def test_steps_in_a_scene_from_values_are_the_same() -> None:
         action = np.append(observation["joint_state_list"][-1] + 0.02, 1.0)
         for _ in range(5):
             observation, *_ = env.step(action)
-        states.append([thing.pose.p.tobytes() + thing.pose.q.tobytes() for thing in env.task.things])
+        states.append(
+            [thing.pose.p.tobytes() + thing.pose.q.tobytes() for thing in env.task.things]
+        )
         env.close()
     assert states[0] == states[1]
 
 
 def test_a_file_of_scenes_is_a_split(tmp_path: Path) -> None:
     path = tmp_path / "scenes.jsonl"
-    rows = [row_of("PickXtimes", episode=1) | {"note": "a\u2028b"}, row_of("StopCube"), row_of("PickXtimes")]
-    path.write_text("\n".join(json.dumps(row, ensure_ascii=False) for row in rows) + "\n", encoding="utf-8")
+    rows = [
+        row_of("PickXtimes", episode=1) | {"note": "a\u2028b"},
+        row_of("StopCube"),
+        row_of("PickXtimes"),
+    ]
+    path.write_text(
+        "\n".join(json.dumps(row, ensure_ascii=False) for row in rows) + "\n", encoding="utf-8"
+    )
     specs = metadata.episodes("PickXtimes", str(path))
     assert [spec.seed for spec in specs] == [rows[0]["seed"], rows[2]["seed"]]
     assert metadata.episodes("MoveCube", str(path)) == []
@@ -156,7 +182,11 @@ BAD = [
     ("PickXtimes", put("objects.target_color", "purple"), "objects.target_color"),
     ("PickXtimes", put("layout.cubes", {"mauve_0": [0, 0, 0]}), "layout.cubes.mauve_0"),
     ("PickXtimes", put("layout.goal_xy", [float("nan"), 0]), "layout.goal_xy"),
-    ("SwingXtimes", put("layout.distractors", {"pink_0": [0.1, 0.1, 0]}), "layout.distractors.pink_0"),
+    (
+        "SwingXtimes",
+        put("layout.distractors", {"pink_0": [0.1, 0.1, 0]}),
+        "layout.distractors.pink_0",
+    ),
     ("StopCube", put("actions.stop_time", 99), "actions.stop_time"),
     ("BinFill", put("layout.slots.1", [0.024, 0.066, 0.6]), "layout.slots"),
     ("BinFill", put("objects.slot_assignment.0", "pink_0"), "objects.slot_assignment"),
@@ -178,8 +208,12 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("task", "change", "field"), BAD, ids=[f"{task}-{field}" for task, _, field in BAD])
-def test_a_bad_row_is_refused_with_the_name_of_its_field(task: str, change: Callable[[Row], None], field: str) -> None:
+@pytest.mark.parametrize(
+    ("task", "change", "field"), BAD, ids=[f"{task}-{field}" for task, _, field in BAD]
+)
+def test_a_bad_row_is_refused_with_the_name_of_its_field(
+    task: str, change: Callable[[Row], None], field: str
+) -> None:
     row = row_of(task)
     change(row)
     with pytest.raises(UserError, match=f"spec.{field}"):
@@ -207,7 +241,9 @@ def test_objects_that_overlap_are_refused_with_both_names() -> None:
         ("", "has no scenes"),
     ],
 )
-def test_a_bad_line_is_refused_when_the_file_is_read(tmp_path: Path, line: str, message: str) -> None:
+def test_a_bad_line_is_refused_when_the_file_is_read(
+    tmp_path: Path, line: str, message: str
+) -> None:
     path = tmp_path / "scenes.jsonl"
     path.write_text(line + "\n")
     with pytest.raises(UserError, match=message):

@@ -1,7 +1,9 @@
-"""Scenes are the same to the last bit whatever kernels the libraries choose: one digest of 90 scenes.
+"""Scenes are the same to the last bit whatever kernels the libraries choose: one digest of 90
+scenes.
 
-Each variable below makes a library compute as it does on another CPU. Libraries read it when they load, so each setting
-has a process of its own. `qemu-x86_64` (package `qemu-user`) emulates a whole CPU of another maker.
+Each variable below makes a library compute as it does on another CPU. Libraries read it when they
+load, so each setting has a process of its own. `qemu-x86_64` (package `qemu-user`) emulates a whole
+CPU of another maker.
 """
 
 import os
@@ -30,9 +32,13 @@ SETTINGS = [
 
 
 def digest_in_process(*command: str, every: int = 1, **settings: str) -> str:
-    environment = os.environ | settings | {"PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"}
+    environment = (
+        os.environ | settings | {"PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"}
+    )
     words = [*command, sys.executable, "-W", "ignore", "-m", "helpers.scene_digest", str(every)]
-    finished = subprocess.run(words, env=environment, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    finished = subprocess.run(
+        words, env=environment, cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
     assert finished.returncode == 0, finished.stderr[-2000:]
     return finished.stdout.split()[-1]
 
@@ -42,7 +48,9 @@ def test_scenes_here_have_the_recorded_bits() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: "-".join(*setting.items()).split()[0])
+@pytest.mark.parametrize(
+    "setting", SETTINGS, ids=lambda setting: "-".join(*setting.items()).split()[0]
+)
 def test_scenes_have_the_same_bits_with_the_kernels_of_another_cpu(setting: dict[str, str]) -> None:
     assert digest_in_process(**setting) == ALL
 
@@ -52,8 +60,17 @@ def test_scenes_have_the_same_bits_with_the_kernels_of_another_cpu(setting: dict
 def test_scenes_have_the_same_bits_on_an_emulated_cpu_of_each_maker(model: str) -> None:
     emulator = shutil.which("qemu-x86_64")
     if emulator is None:
-        pytest.skip("needs qemu-x86_64 of version 10: apt-get install -t bookworm-backports qemu-user")
-    version = subprocess.run([emulator, "--version"], capture_output=True, text=True, check=True).stdout
+        pytest.skip(
+            "needs qemu-x86_64 of version 10: apt-get install -t bookworm-backports qemu-user"
+        )
+    version = subprocess.run(
+        [emulator, "--version"], capture_output=True, text=True, check=True
+    ).stdout
     if int(version.split("version ")[1].split(".")[0]) < 10:
-        pytest.skip(f"qemu-x86_64 is too old, earlier ones crash here: {version.splitlines()[0]}; expected version 10")
-    assert digest_in_process(emulator, "-cpu", model, every=12, OMP_NUM_THREADS="1") == EVERY_TWELFTH
+        pytest.skip(
+            f"qemu-x86_64 is too old, earlier ones crash here: {version.splitlines()[0]}; expected"
+            " version 10"
+        )
+    assert (
+        digest_in_process(emulator, "-cpu", model, every=12, OMP_NUM_THREADS="1") == EVERY_TWELFTH
+    )

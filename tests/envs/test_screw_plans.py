@@ -1,6 +1,7 @@
 """Screw plans equal those of ManiSkill's planner, recorded from `mplib` 0.1.1.
 
-`MME_VLA_PLANS` names another folder with a `screw_plans.json.gz`; by default `../shared/plans` is used where it exists.
+`MME_VLA_PLANS` names another folder with a `screw_plans.json.gz`; by default `../shared/plans` is
+used where it exists.
 """
 
 import gzip
@@ -22,7 +23,12 @@ from mme_vla.envs.robot.planning import CONTROL_STEP, goal_in_base, plan_screw
 
 FILE = "screw_plans.json.gz"
 KEPT = Path(__file__).resolve().parents[1] / "data" / FILE
-OTHERS = Path(os.environ.get("MME_VLA_PLANS") or Path(__file__).resolve().parents[3] / "shared" / "plans") / FILE
+OTHERS = (
+    Path(
+        os.environ.get("MME_VLA_PLANS") or Path(__file__).resolve().parents[3] / "shared" / "plans"
+    )
+    / FILE
+)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,6 @@
-"""PickXtimes, SwingXtimes and PickHighlight: what counts as done, what is highlighted, and what fails."""
+"""PickXtimes, SwingXtimes and PickHighlight: what counts as done, what is highlighted, and what
+fails.
+"""
 
 import pytest
 
@@ -10,9 +12,17 @@ from mme_vla.envs.tasks.pick_xtimes import PickXtimes
 from mme_vla.envs.tasks.swing_xtimes import SwingXtimes
 
 LOW = 0.11
-SCENES = {"pick": (PickXtimes, 1600, "medium"), "swing": (SwingXtimes, 3601, "medium")}  # two and one repetitions
-PICK, SWING = (pytest.mark.parametrize("env", [scene], indirect=True, ids=[name]) for name, scene in SCENES.items())
-HIGHLIGHT = pytest.mark.parametrize("env", [(PickHighlight, 12600, "medium")], indirect=True, ids=["highlight"])
+SCENES = {
+    "pick": (PickXtimes, 1600, "medium"),
+    "swing": (SwingXtimes, 3601, "medium"),
+}  # two and one repetitions
+PICK, SWING = (
+    pytest.mark.parametrize("env", [scene], indirect=True, ids=[name])
+    for name, scene in SCENES.items()
+)
+HIGHLIGHT = pytest.mark.parametrize(
+    "env", [(PickHighlight, 12600, "medium")], indirect=True, ids=["highlight"]
+)
 
 
 def swing_all(env: SwingXtimes, hand: Hand) -> None:
@@ -63,7 +73,7 @@ def test_the_button_before_its_time_fails_and_stays_failed(env, hand, done):
     assert wait(env) == (False, True)
 
 
-# PickXtimes ---------------------------------------------------------------------------------------------------------
+# PickXtimes ---------------------------------------------------------------------------------------
 
 
 @PICK
@@ -71,7 +81,9 @@ def test_as_many_picks_and_places_as_requested_then_the_button_are_success(env, 
     assert env.repetitions == 2
     for i in range(2):
         assert hand.carry(env.cube) == (False, False) and env.progress.index == 2 * i + 1
-        assert hand.release(env.target.position) == (False, False) and env.progress.index == 2 * i + 2
+        assert (
+            hand.release(env.target.position) == (False, False) and env.progress.index == 2 * i + 2
+        )
     assert push_down(env, env.button) == (True, False)
     assert wait(env) == (True, False)
 
@@ -102,7 +114,7 @@ def test_once_more_than_requested_fails(env, hand):
     assert hand.carry(env.cube) == (False, True)
 
 
-# SwingXtimes --------------------------------------------------------------------------------------------------------
+# SwingXtimes --------------------------------------------------------------------------------------
 
 
 @SWING
@@ -121,7 +133,9 @@ def test_too_high_or_beside_the_target_is_no_swing(env, hand):
     hand.carry(env.cube, over=env.right, z=0.15)
     assert env.progress.index == 1 and env.swings[0].count == 0
     hand.carry(env.cube, over=env.left, z=LOW)
-    assert env.progress.index == 1 and env.swings[1].count == 1  # counted, but not the one that is due
+    assert (
+        env.progress.index == 1 and env.swings[1].count == 1
+    )  # counted, but not the one that is due
     hand.carry(env.cube, over=env.right, z=LOW)
     assert env.progress.index == 2
 
@@ -148,7 +162,9 @@ def test_one_swing_too_many_fails_and_stays_failed(env, hand):
 def test_a_target_is_highlighted_while_the_cube_is_over_it_and_20_steps_longer(env, hand):
     right, left = env._marks
     hand.carry(env.cube, over=env.right, z=LOW)
-    assert right.position == pytest.approx(env.right.position - [0, 0, 0.01]) and left.position[2] < -5
+    assert (
+        right.position == pytest.approx(env.right.position - [0, 0, 0.01]) and left.position[2] < -5
+    )
     hand.carry(env.cube, over=env.button)
     wait(env, 19)
     assert right.position == pytest.approx(env.right.position - [0, 0, 0.01])
@@ -156,7 +172,7 @@ def test_a_target_is_highlighted_while_the_cube_is_over_it_and_20_steps_longer(e
     assert right.position[2] < -5
 
 
-# PickHighlight ------------------------------------------------------------------------------------------------------
+# PickHighlight ------------------------------------------------------------------------------------
 
 
 @HIGHLIGHT

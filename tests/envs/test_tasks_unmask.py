@@ -1,4 +1,6 @@
-"""The four Unmask tasks: covering, swaps, buttons, success and failure, and official episodes replayed."""
+"""The four Unmask tasks: covering, swaps, buttons, success and failure, and official episodes
+replayed.
+"""
 
 import json
 from pathlib import Path
@@ -38,7 +40,10 @@ def hiding(env) -> list[Thing]:
 
 
 def buttons(env) -> list[Thing]:
-    return {ButtonUnmask: lambda: [env.button], ButtonUnmaskSwap: lambda: [env.right, env.left]}.get(type(env), list)()
+    return {
+        ButtonUnmask: lambda: [env.button],
+        ButtonUnmaskSwap: lambda: [env.right, env.left],
+    }.get(type(env), list)()
 
 
 def go_to_picks(env) -> int:
@@ -50,7 +55,7 @@ def go_to_picks(env) -> int:
     return env.progress.index
 
 
-# Covering and swaps -------------------------------------------------------------------------------------------------
+# Covering and swaps -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", STILL)
@@ -103,14 +108,18 @@ def test_cubes_are_away_while_containers_move_and_lie_under_the_same_ones_then(s
     wait(swap, swap.swapped_after - 65)
     assert min(cube.position[0] for cube in swap.cubes) > 9
     wait(swap, 10)
-    assert under(swap.cubes, swap.over_cubes) and [cube.colour for cube in swap.cubes] == swap.colours
+    assert (
+        under(swap.cubes, swap.over_cubes) and [cube.colour for cube in swap.cubes] == swap.colours
+    )
     after = [container.position for container in swap.containers]
     # Each stands where one stood before.
-    nearest = [min(range(len(before)), key=lambda i: distance_xy(before[i], place)) for place in after]
+    nearest = [
+        min(range(len(before)), key=lambda i: distance_xy(before[i], place)) for place in after
+    ]
     assert sorted(nearest) == list(range(len(before)))
 
 
-# Buttons, success and failure ---------------------------------------------------------------------------------------
+# Buttons, success and failure ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("reverse", [False, True])
@@ -188,12 +197,15 @@ def test_a_container_is_not_put_down_while_it_is_grasped(env, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("folder", "episode", "difficulty"), [("robomme_h5", 4, "easy"), ("robomme_h5_full", 6, "medium")]
+    ("folder", "episode", "difficulty"),
+    [("robomme_h5", 4, "easy"), ("robomme_h5_full", 6, "medium")],
 )
 def test_the_recorded_actions_have_the_recorded_effect(shared: Path, folder, episode, difficulty):
     folder = shared / folder
     env = make(VideoUnmask, 6000 + 100 * episode, difficulty, recovery="xy")
-    assert [goal.decode() for goal in setup(folder, "VideoUnmask", episode, "task_goal")] == env.goals()
+    assert [
+        goal.decode() for goal in setup(folder, "VideoUnmask", episode, "task_goal")
+    ] == env.goals()
     assert json.loads(setup(folder, "VideoUnmask", episode, "available_multi_choices")) == [
         {"label": option.label, "action": option.action, "need_parameter": option.needs_point}
         for option in env.choices()

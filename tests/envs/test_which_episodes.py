@@ -22,7 +22,9 @@ COMMANDS = pytest.mark.parametrize("command", ["evaluate", "play", "record", "sh
         ("all", list(range(50))),
     ],
 )
-def test_episodes_are_named_by_their_count_number_or_range(episodes: object, numbers: list[int]) -> None:
+def test_episodes_are_named_by_their_count_number_or_range(
+    episodes: object, numbers: list[int]
+) -> None:
     assert choose_numbers(episodes, 50) == numbers
 
 
@@ -31,7 +33,11 @@ def test_the_same_words_choose_the_same_episodes_in_every_command(command: str) 
     more = ["output=x", "split=test"] if command == "record" else []
     cfg = compose(command, ["tasks=[StopCube,BinFill]", "episodes=[0-2,7]", *more])
     choose = rollout_plan.choose_episodes if command == "evaluate" else choose_episodes
-    specs = record.plan(cfg) if command == "record" else choose(named_tasks(cfg), cfg.episodes, cfg.split)
+    specs = (
+        record.plan(cfg)
+        if command == "record"
+        else choose(named_tasks(cfg), cfg.episodes, cfg.split)
+    )
     expected = [(task, number) for task in ("StopCube", "BinFill") for number in (0, 1, 2, 7)]
     assert [(spec.task, spec.episode) for spec in specs] == expected
 
@@ -50,7 +56,9 @@ def test_commands_that_need_tasks_ask_for_them() -> None:
     assert named_tasks(compose("evaluate", [])) == "all"
 
 
-@pytest.mark.parametrize("episodes", [0, 51, True, 2.5, "1-", "a", [1, 1], ["3-1"], [], [None], "0-999999999"])
+@pytest.mark.parametrize(
+    "episodes", [0, 51, True, 2.5, "1-", "a", [1, 1], ["3-1"], [], [None], "0-999999999"]
+)
 def test_what_names_no_episodes_is_refused_at_once(episodes: object) -> None:
     with pytest.raises(UserError, match="episode"):
         choose_numbers(episodes, 50)

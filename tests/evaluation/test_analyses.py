@@ -32,7 +32,9 @@ def fixed_noise() -> Tensor:
 
 
 @pytest.mark.parametrize("model", ["framesamp_context", "tokendrop_expert", "pi05"])
-def test_attention_mass_is_that_of_the_networks_logits(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attention_mass_is_that_of_the_networks_logits(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     policy = small_policy(model)
     batch = random_batch(policy, 2)
     masks: list[tuple[Tensor, ...]] = []
@@ -48,11 +50,18 @@ def test_attention_mass_is_that_of_the_networks_logits(model: str, monkeypatch: 
     mass = watch.result()
     assert mass.layers.sum(1) == pytest.approx(torch.ones(3))
     depth, actions = len(policy.backbone.transformer.layers), 20
-    first = [(q, k, m) for q, k, m in masks if q.shape[1] == actions and k.shape[1] > actions][::depth]  # layer 0
+    first = [(q, k, m) for q, k, m in masks if q.shape[1] == actions and k.shape[1] > actions][
+        ::depth
+    ]  # layer 0
     assert len(first) == 2
     expected = []
     for q, k, m in first:
-        logits = q.transpose(1, 2) @ k.expand(-1, -1, q.shape[2], -1).permute(0, 2, 3, 1) / q.shape[-1] ** 0.5 + m
+        logits = (
+            q.transpose(1, 2)
+            @ k.expand(-1, -1, q.shape[2], -1).permute(0, 2, 3, 1)
+            / q.shape[-1] ** 0.5
+            + m
+        )
         probabilities = logits.softmax(-1).mean((0, 1, 2))
         expected.append(probabilities[-actions:].sum())  # the actions' own share
     assert float(mass.layers[0, mass.parts.index("action")]) == pytest.approx(
@@ -86,7 +95,9 @@ def test_watching_changes_no_action_and_leaves_no_hook() -> None:
 def test_modulation_statistics_are_those_of_what_was_predicted() -> None:
     policy = small_policy("tokendrop_modul")
     with torch.no_grad():
-        for layer in policy.integration.layers:  # a constant answer: scale 2 and −1 in turns, bias 0.5
+        for (
+            layer
+        ) in policy.integration.layers:  # a constant answer: scale 2 and −1 in turns, bias 0.5
             layer.modulation.weight.zero_()
             half = len(layer.modulation.bias) // 2
             layer.modulation.bias[:half] = torch.tensor([2.0, -1.0]).repeat(half // 2)
@@ -110,7 +121,9 @@ def test_wrong_policies_are_named() -> None:
 
 def test_a_replay_shows_every_frame_once() -> None:
     policy, source = quick_policy("framesamp_modul"), MadeUpSource(lengths=(60,), video=20)
-    observed = [(step, running.n_observed_frames) for step, running in replay(policy, source, 0, stride=16)]
+    observed = [
+        (step, running.n_observed_frames) for step, running in replay(policy, source, 0, stride=16)
+    ]
     assert observed == [(20, 21), (36, 37), (52, 53)]
     assert [step for step, _ in replay(policy, source, 0, stride=16, most=2)] == [20, 52]
     with pytest.raises(UserError, match="has episodes 0 … 0"):
@@ -124,12 +137,16 @@ def test_ttt_learns_from_each_frame_and_rmt_reports_its_change(sample: EpisodeSo
     assert (after < before).mean() > 0.9
     assert before[-1] < before[0]
     assert recurrence_plot([curves], "ttt").startswith("<svg")
-    assert set(recurrence_curves(quick_policy("rmt_expert", 8), MadeUpSource(), 1).curves) == {"slot_change"}
+    assert set(recurrence_curves(quick_policy("rmt_expert", 8), MadeUpSource(), 1).curves) == {
+        "slot_change"
+    }
     with pytest.raises(UserError, match="no recurrent memory"):
         recurrence_curves(small_policy("pi05"), sample, 1)
 
 
-def test_the_attention_command_works_on_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_attention_command_works_on_a_checkpoint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     small_policy("framesamp_expert").save_pretrained(tmp_path / "policy")
     out = tmp_path / "out.json"
     options = ["--episodes", "1", "--most", "1", "--output", str(out)]
@@ -144,8 +161,21 @@ def test_shipped_costs_are_what_the_code_costs() -> None:
 
 
 def test_a_smaller_memory_costs_less_and_a_stream_less_than_a_window(tmp_path: Path) -> None:
-    assert count_model("framesamp_expert", 64, "tiny").chunk < count_model("framesamp_expert", 512, "tiny").chunk
-    main(["cost", "--backbone", "tiny", "--models", "ttt_modul", "--output", str(tmp_path / "cost.csv")])
+    assert (
+        count_model("framesamp_expert", 64, "tiny").chunk
+        < count_model("framesamp_expert", 512, "tiny").chunk
+    )
+    main(
+        [
+            "cost",
+            "--backbone",
+            "tiny",
+            "--models",
+            "ttt_modul",
+            "--output",
+            str(tmp_path / "cost.csv"),
+        ]
+    )
     (row,) = csv.DictReader((tmp_path / "cost.csv").open())
     assert 0 < int(row["streamed"]) < int(row["memory"])
 
@@ -154,7 +184,9 @@ def test_a_smaller_memory_costs_less_and_a_stream_less_than_a_window(tmp_path: P
     ("arguments", "message"),
     [(["attention"], "Name one policy"), (["cost", "--models", "framesamp"], "Did you mean")],
 )  # fmt: skip
-def test_mistakes_end_with_a_sentence(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_end_with_a_sentence(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2
@@ -163,14 +195,24 @@ def test_mistakes_end_with_a_sentence(arguments: list[str], message: str, capsys
 
 @pytest.mark.parametrize(
     ("arguments", "logged"),
-    [(["attention", "--model", "framesamp_context", "--most", "1"], "attention/memory"),
-     (["modulation", "--model", "framesamp_modul", "--most", "1"], "modulation/scale_mean"),
-     (["recurrence", "--model", "rmt_modul", "--stride", "200", "--output", "{}/r.svg"], "recurrence/slot_change"),
-     (["selection", "--memory", "framesamp", "--every", "60", "--output", "{}/s.mp4"], "remembered")],
+    [
+        (["attention", "--model", "framesamp_context", "--most", "1"], "attention/memory"),
+        (["modulation", "--model", "framesamp_modul", "--most", "1"], "modulation/scale_mean"),
+        (
+            ["recurrence", "--model", "rmt_modul", "--stride", "200", "--output", "{}/r.svg"],
+            "recurrence/slot_change",
+        ),
+        (
+            ["selection", "--memory", "framesamp", "--every", "60", "--output", "{}/s.mp4"],
+            "remembered",
+        ),
+    ],
     ids=["attention", "modulation", "recurrence", "selection"],
-)  # fmt: skip
+)
 @pytest.mark.filterwarnings("ignore:load_recording:DeprecationWarning")
-def test_rerun_gets_images_words_and_numbers(arguments: list[str], logged: str, tmp_path: Path) -> None:
+def test_rerun_gets_images_words_and_numbers(
+    arguments: list[str], logged: str, tmp_path: Path
+) -> None:
     rerun = pytest.importorskip("rerun", reason="needs the extra viz")
     path = tmp_path / "log.rrd"
     episode = [] if arguments[0] == "selection" else ["--episodes", "0"]
@@ -193,5 +235,9 @@ def test_laps_of_a_watch_add_up_to_the_total() -> None:
         with pytest.raises(UserError, match="has seen nothing"):
             attention.lap()
     assert not torch.equal(laps[0][0], laps[1][0])
-    assert torch.stack([mass for mass, _ in laps]).mean(0) == pytest.approx(attention.result().layers)
-    assert np.mean([scale for _, scale in laps]) == pytest.approx(modulation.result().overall["scale"][0])
+    assert torch.stack([mass for mass, _ in laps]).mean(0) == pytest.approx(
+        attention.result().layers
+    )
+    assert np.mean([scale for _, scale in laps]) == pytest.approx(
+        modulation.result().overall["scale"][0]
+    )

@@ -1,4 +1,6 @@
-"""Episodes that processes share: each taken once, the longest first, and again after a process was killed."""
+"""Episodes that processes share: each taken once, the longest first, and again after a process was
+killed.
+"""
 
 import errno
 import subprocess
@@ -38,7 +40,9 @@ sys.stdin.read()
 """
 
 
-def record(episode: int, seconds: float = 1.0, outcome: str = "success", task: str = "BinFill") -> EpisodeRecord:
+def record(
+    episode: int, seconds: float = 1.0, outcome: str = "success", task: str = "BinFill"
+) -> EpisodeRecord:
     times = Seconds(sim=0.75 * seconds, policy=0.25 * seconds, total=2 * seconds)
     return EpisodeRecord("tiny", 1, 7, task, episode, 1, "easy", outcome, 5, times)
 
@@ -51,14 +55,22 @@ def test_each_episode_is_taken_once(tmp_path: Path) -> None:
     names = [f"episodes-{i}of2.jsonl" for i in range(2)]
     with RecordLog(tmp_path / names[0]), RecordLog(tmp_path / names[1]):
         first, second = (Claims(tmp_path, name) for name in names)
-        assert [taken(claims.take(JOBS)) for claims in (first, second, second, first)] == [0, 1, 2, 3]
+        assert [taken(claims.take(JOBS)) for claims in (first, second, second, first)] == [
+            0,
+            1,
+            2,
+            3,
+        ]
         assert first.take(JOBS) is None and second.take(JOBS) is None
 
 
 @pytest.mark.slow
 def test_unfinished_episodes_of_a_killed_process_are_taken_again(tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", TAKE_TWO, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", TAKE_TWO, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert process.stdout.readline() == "taken\n"
     other = "episodes-1of2.jsonl"
@@ -103,28 +115,41 @@ def test_without_locks_the_process_number_decides(
 
     monkeypatch.setattr(store.fcntl, "flock", no_locks)
     (tmp_path / "episodes-0of2.jsonl").touch()
-    write_json(tmp_path / "claims" / "BinFill-0.0.json", vars(store.Claim("episodes-0of2.jsonl", process=process)))
+    write_json(
+        tmp_path / "claims" / "BinFill-0.0.json",
+        vars(store.Claim("episodes-0of2.jsonl", process=process)),
+    )
     assert (Claims(tmp_path, "episodes-1of2.jsonl").take(JOBS[:1]) is None) == holds
 
 
 @pytest.mark.parametrize(
     "content",
     [
-        "", "{", "[]", "{}", '{"records": 7, "host": "a", "process": 1}', "\x00",
+        "",
+        "{",
+        "[]",
+        "{}",
+        '{"records": 7, "host": "a", "process": 1}',
+        "\x00",
         '{"records": "../episodes.jsonl", "host": "a", "process": 1}',
         '{"records": "/etc/passwd", "host": "a", "process": 1}',
-        '{"records": null, "host": "a", "process": 0}', '{"records": null, "host": "a", "process": true}',
+        '{"records": null, "host": "a", "process": 0}',
+        '{"records": null, "host": "a", "process": true}',
         '{"records": null, "host": "a", "process": 1, "more": 1}',
     ],
-)  # fmt: skip
-def test_a_damaged_claim_is_named(content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+)
+def test_a_damaged_claim_is_named(
+    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(store, "_await_content", lambda path: None)
     joined = Claims(tmp_path, "episodes-0of2.jsonl")
     path = tmp_path / "claims" / "BinFill-0.0.json"
     path.parent.mkdir()
     path.write_text(content)
     for read in (lambda: Claims(tmp_path, "episodes-1of2.jsonl"), lambda: joined.take(JOBS)):
-        with pytest.raises(UserError, match=r"claims/BinFill-0\.0\.json is damaged.*Remove the folder"):
+        with pytest.raises(
+            UserError, match=r"claims/BinFill-0\.0\.json is damaged.*Remove the folder"
+        ):
             read()
 
 
@@ -146,8 +171,10 @@ def test_the_forecast_follows_whoever_is_slower() -> None:
     assert many.seconds == pytest.approx(3600)  # the policy's quarter of each, one by one
     shared = durations.forecast(JOBS * 10, workers=4, processes=2)
     assert shared.seconds == pytest.approx(5 * 3600)
-    assert str(shared) == (
-        "forecast: about 5.0 h for 40 episodes, 8 at a time, if they take as long as the 1 before them did"
+    assert (
+        str(shared)
+        == "forecast: about 5.0 h for 40 episodes, 8 at a time, if they take as long as the 1"
+        " before them did"
     )
     assert Durations([]).forecast(JOBS, workers=1) is None
 

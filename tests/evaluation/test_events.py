@@ -1,4 +1,6 @@
-"""Events in a rollout: what the environment does, what the policy observes, and what is recorded of them."""
+"""Events in a rollout: what the environment does, what the policy observes, and what is recorded of
+them.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +31,12 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Interval, aggregate, wilson
 from mme_vla.evaluation.results.curves import distinct_parts
-from mme_vla.evaluation.results.events import event_curves, event_table, idle_events, matched_methods
+from mme_vla.evaluation.results.events import (
+    event_curves,
+    event_table,
+    idle_events,
+    matched_methods,
+)
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import evaluate_events
 from mme_vla.evaluation.rollout.events import Event, EventCourse, event_arms, read_events
@@ -53,7 +60,9 @@ def memoryless() -> MMEPolicy:
 
 
 class Observed:
-    """What the policy knew at each decision: frames observed, the memory's selection, the current image."""
+    """What the policy knew at each decision: frames observed, the memory's selection, the current
+    image.
+    """
 
     def __init__(self, policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
         self.frames: list[int] = []
@@ -64,7 +73,9 @@ class Observed:
         def watched(episodes: Any, *args: Any) -> Any:
             for episode in episodes:
                 self.frames.append(episode.n_observed_frames)
-                self.selections.append(episode.gather_selection() if episode.history is not None else None)
+                self.selections.append(
+                    episode.gather_selection() if episode.history is not None else None
+                )
                 self.images.append(episode.images.clone())
             return act(episodes, *args)
 
@@ -77,8 +88,18 @@ def facts(record: EpisodeRecord) -> tuple[Any, ...]:
 
 def test_events_are_read_from_one_word() -> None:
     first, second = read_events("pause:100@subtask:2+gap:32@step:64")
-    assert (first.event.hold, first.event.observed, first.unit, first.number) == (100, 100, "subtask", 2)
-    assert (second.event.hold, second.event.observed, second.unit, second.number) == (33, 1, "step", 64)
+    assert (first.event.hold, first.event.observed, first.unit, first.number) == (
+        100,
+        100,
+        "subtask",
+        2,
+    )
+    assert (second.event.hold, second.event.observed, second.unit, second.number) == (
+        33,
+        1,
+        "step",
+        64,
+    )
     (start,) = read_events("pause:5")
     assert start.reached(0, 0) and not first.reached(99, 1) and first.reached(0, 3)
     assert read_events(None) == () and event_arms(["pause:1", "pause:2"]) == ["pause:1", "pause:2"]
@@ -87,17 +108,25 @@ def test_events_are_read_from_one_word() -> None:
     assert arms == [["pause:100@subtask:2"], ["pause:50", "speed:0.5", "restart@step:64+gap:3"]]
 
 
-@pytest.mark.parametrize(("arm", "words"), [
-    ("pause:-5", "event=pause:-5: pause.steps=-5 must be a whole number, 0 or more"),
-    ("pause:1.5", "event=pause:1.5: pause.steps=1.5"), ("gap:-1", "event=gap:-1: gap.frames=-1"),
-    ("paus:5", "event=paus:5: name='paus'. Did you mean 'pause'"),
-    ("pause:5@subtsk:2", "event=pause:5@subtsk:2: place='subtsk'.*subtask"),
-    ("pause:5@subtask:pick", "event=pause:5@subtask:pick: write pause:100"),
-    ("pause:5@subtask:0", "subtask:0 must be 1 or more"), ("pause:5@step:-1", "step:-1 must be 0 or more"),
-    ("speed:2@step:4", "takes no place"), ("restart:4", "takes no number"),
-    ("speed:0", "event=speed:0: speed.factor=0"), ("5", "event=5: write pause:100"),
-    (["pause:5", "pause:5"], "each once"), (7, "event=7"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arm", "words"),
+    [
+        ("pause:-5", "event=pause:-5: pause.steps=-5 must be a whole number, 0 or more"),
+        ("pause:1.5", "event=pause:1.5: pause.steps=1.5"),
+        ("gap:-1", "event=gap:-1: gap.frames=-1"),
+        ("paus:5", "event=paus:5: name='paus'. Did you mean 'pause'"),
+        ("pause:5@subtsk:2", "event=pause:5@subtsk:2: place='subtsk'.*subtask"),
+        ("pause:5@subtask:pick", "event=pause:5@subtask:pick: write pause:100"),
+        ("pause:5@subtask:0", "subtask:0 must be 1 or more"),
+        ("pause:5@step:-1", "step:-1 must be 0 or more"),
+        ("speed:2@step:4", "takes no place"),
+        ("restart:4", "takes no number"),
+        ("speed:0", "event=speed:0: speed.factor=0"),
+        ("5", "event=5: write pause:100"),
+        (["pause:5", "pause:5"], "each once"),
+        (7, "event=7"),
+    ],
+)
 def test_what_is_no_event_is_refused_with_its_key(arm: Any, words: str) -> None:
     with pytest.raises(UserError, match=words) as caught:
         event_arms(arm)
@@ -107,7 +136,12 @@ def test_what_is_no_event_is_refused_with_its_key(arm: Any, words: str) -> None:
 def test_events_of_no_length_equal_the_baseline_run_to_the_last_bit(policy: MMEPolicy) -> None:
     jobs = JOBS[2:4]
     made = [
-        {r.key: facts(r) for r in roll(policy, jobs, InlineEnvs(2, base=make_moving_env), max_batch=1, event=event)}
+        {
+            r.key: facts(r)
+            for r in roll(
+                policy, jobs, InlineEnvs(2, base=make_moving_env), max_batch=1, event=event
+            )
+        }
         for event in (None, "pause:0@step:16+gap:0@subtask:3", "speed:1")
     ]
     assert len(made[0]) == 2 and all(other == made[0] for other in made)
@@ -126,32 +160,45 @@ def test_a_pause_holds_the_robot_and_memory_receives_its_frames(
     assert record.extra["events"] == [{"event": "pause:10@step:16", "step": 16}]
     frames = np.stack(env.frames)
     for count, selection in zip(observed.frames[:3], observed.selections, strict=False):
-        offline = policy.require_memory().gather_selection(cached_history(policy, frames, exec_start=START), count - 1)
+        offline = policy.require_memory().gather_selection(
+            cached_history(policy, frames, exec_start=START), count - 1
+        )
         assert torch.equal(selection.positions, offline.positions)
         assert torch.allclose(selection.features, offline.features, atol=1e-5)
 
 
-def test_frames_of_a_gap_are_not_observed(policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_of_a_gap_are_not_observed(
+    policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     observed, envs = Observed(policy, monkeypatch), InlineEnvs()
     roll(policy, [UNMASK], envs, event="gap:10@step:16")
     env = envs.made[UNMASK]
     assert env.hold_steps == 11 and observed.frames == [START + 1, START + 18, START + 34]
     frames = np.delete(np.stack(env.frames), np.arange(START + 17, START + 27), axis=0)
-    for count, selection, images in zip(observed.frames, observed.selections, observed.images, strict=True):
+    for count, selection, images in zip(
+        observed.frames, observed.selections, observed.images, strict=True
+    ):
         front = frames[count - 1]
         assert torch.equal(images, policy.require_processor().images([front, front[::-1]]))
-        offline = policy.require_memory().gather_selection(cached_history(policy, frames, exec_start=START), count - 1)
+        offline = policy.require_memory().gather_selection(
+            cached_history(policy, frames, exec_start=START), count - 1
+        )
         assert torch.allclose(selection.features, offline.features, atol=1e-5)
 
 
 def test_images_on_demand_are_all_that_a_policy_reads_under_events() -> None:
     policy = quick_policy("tokendrop_expert", 8, policy={"history_dtype": "float32"})
     event = "pause:5@step:16+gap:4@step:16+speed:2"
-    few, every = (roll(policy, [UNMASK], InlineEnvs(), event=event, draw=draw)[0] for draw in ("needed", "all"))
+    few, every = (
+        roll(policy, [UNMASK], InlineEnvs(), event=event, draw=draw)[0]
+        for draw in ("needed", "all")
+    )
     assert facts(few) == facts(every) and few.steps == 51
 
 
-def test_a_video_can_be_faster_or_slower(policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_video_can_be_faster_or_slower(
+    policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for event, length in (("speed:2", 10), ("speed:0.5", 42)):
         observed = Observed(policy, monkeypatch)
         (record,) = roll(policy, [UNMASK], InlineEnvs(), event=event)
@@ -180,7 +227,9 @@ def test_a_restart_begins_the_frame_index_anew_and_keeps_what_is_remembered(
     assert not torch.equal(observed.selections[1].positions, baseline.selections[1].positions)
 
 
-def test_a_policy_whose_frames_have_no_numbers_cannot_restart(memoryless: MMEPolicy, tmp_path: Path) -> None:
+def test_a_policy_whose_frames_have_no_numbers_cannot_restart(
+    memoryless: MMEPolicy, tmp_path: Path
+) -> None:
     with pytest.raises(UserError, match="no memory that numbers frames"):
         evaluate_events(memoryless, JOBS, tmp_path, FACTS, RolloutSettings(), ["restart@step:4"])
 
@@ -189,15 +238,26 @@ def test_events_act_by_sub_task_and_episode_by_episode(memoryless: MMEPolicy) ->
     envs = InlineEnvs(6)
     made = roll(memoryless, JOBS, envs, event="pause:7@subtask:20+pause:3@subtask:20")
     assert {env.hold_steps for env in envs.made.values()} == {10}
-    assert [entry["step"] for r in made for entry in r.extra["events"]] == [32] * 12  # the first decision in it
-    alone = roll(memoryless, JOBS, InlineEnvs(1), event="pause:7@subtask:20+pause:3@subtask:20", max_batch=1)
-    assert {(r.key, r.outcome, r.steps) for r in alone} == {(r.key, r.outcome, r.steps) for r in made}
+    assert [entry["step"] for r in made for entry in r.extra["events"]] == [
+        32
+    ] * 12  # the first decision in it
+    alone = roll(
+        memoryless, JOBS, InlineEnvs(1), event="pause:7@subtask:20+pause:3@subtask:20", max_batch=1
+    )
+    assert {(r.key, r.outcome, r.steps) for r in alone} == {
+        (r.key, r.outcome, r.steps) for r in made
+    }
     (never,) = roll(memoryless, [UNMASK], InlineEnvs(), event="pause:7@subtask:99")
-    assert never.extra["events"] == [{"event": "pause:7@subtask:99", "step": None}] and never.steps == 41
+    assert (
+        never.extra["events"] == [{"event": "pause:7@subtask:99", "step": None}]
+        and never.steps == 41
+    )
 
 
 def test_a_place_that_the_environment_does_not_tell_is_refused() -> None:
-    with pytest.raises(UserError, match="event=pause:1@subtask:1: this environment tells no sub-tasks"):
+    with pytest.raises(
+        UserError, match="event=pause:1@subtask:1: this environment tells no sub-tasks"
+    ):
         EventCourse(read_events("pause:1@subtask:1")).next(Any, step=0, subtask=0)  # type: ignore[arg-type]
 
 
@@ -210,7 +270,10 @@ def test_a_custom_event_is_registered_by_name(policy: MMEPolicy) -> None:
             episode.goal = "do something else"
 
     assert EVENTS["rename"] is Rename
-    few, every = (roll(policy, [UNMASK], InlineEnvs(), event="rename@step:10", draw=d)[0] for d in ("needed", "all"))
+    few, every = (
+        roll(policy, [UNMASK], InlineEnvs(), event="rename@step:10", draw=d)[0]
+        for d in ("needed", "all")
+    )
     assert few.extra["goal"] == "do something else" and few.extra["events"][0]["step"] == 16
     assert facts(few) == facts(every) and few.steps == 49
 
@@ -227,7 +290,10 @@ class Rail(gymnasium.Env[Any, Any]):
         return self._frame(), 0.0, False, False, {}
 
     def _frame(self) -> dict[str, np.ndarray]:
-        return {"front": np.full((8, 8, 3), self.time, np.uint8), "state": np.array([self.place], np.float32)}
+        return {
+            "front": np.full((8, 8, 3), self.time, np.uint8),
+            "state": np.array([self.place], np.float32),
+        }
 
 
 class Rails(Environment):
@@ -249,7 +315,9 @@ def test_a_custom_environment_names_the_action_that_keeps_its_robot() -> None:
     observation, _, _, truncated, _ = env.step(Hold(5))
     assert [state.item() for state in observation["state_list"]] == [1.0] * 5 and not truncated
     assert [image[0, 0, 0] for image in observation["front_rgb_list"]] == [2, 3, 4, 5, 6]
-    assert [env.step(np.ones(1))[3] for _ in range(2)] == [False, True], "three actions and five steps of the pause"
+    assert [env.step(np.ones(1))[3] for _ in range(2)] == [False, True], (
+        "three actions and five steps of the pause"
+    )
     assert env.oracle() is None, "this environment has no script"
     Braked().check_hold()
     with pytest.raises(UserError, match="Rails cannot pause: implement hold"):
@@ -264,23 +332,37 @@ def test_every_event_run_has_its_matched_arm(
     use_inline_envs(monkeypatch)
     settings = RolloutSettings(max_steps=24, flow_steps=2, workers=2, max_batch=1)
     jobs, how = JOBS[2:4], {"base": make_slow_env, "show_progress": False}
-    done = evaluate_events(memoryless, jobs, tmp_path, FACTS, settings, ["pause:9@subtask:30", "pause:9"], **how)
+    done = evaluate_events(
+        memoryless, jobs, tmp_path, FACTS, settings, ["pause:9@subtask:30", "pause:9"], **how
+    )
     assert [r.event for r in done.records] == ["pause:9@subtask:30"] * 2 + ["pause:9"] * 2
     baseline = {r.key: facts(r) for r in done.matched}
-    assert all(facts(r) == baseline[r.key] for r in done.records[:2]), "its sub-task never began: the same run"
-    assert all(r.steps != baseline[r.key][1] or facts(r) != baseline[r.key] for r in done.records[2:])
+    assert all(facts(r) == baseline[r.key] for r in done.records[:2]), (
+        "its sub-task never began: the same run"
+    )
+    assert all(
+        r.steps != baseline[r.key][1] or facts(r) != baseline[r.key] for r in done.records[2:]
+    )
     again = evaluate_events(memoryless, jobs, tmp_path, FACTS, settings, ["pause:9"], **how)
-    assert again.workload.chunks == 0 and [facts(r) for r in again.records] == [facts(r) for r in done.records[2:]]
+    assert again.workload.chunks == 0 and [facts(r) for r in again.records] == [
+        facts(r) for r in done.records[2:]
+    ]
     protocol = Protocol(("VideoUnmask", "PickXtimes"), episodes=3)
     methods = aggregate([*done.records, *done.matched], protocol).methods
-    assert [method.label for method in methods] == ["tiny · pause:9@subtask:30", "tiny · pause:9", "tiny"]
+    assert [method.label for method in methods] == [
+        "tiny · pause:9@subtask:30",
+        "tiny · pause:9",
+        "tiny",
+    ]
 
 
 def under(event: str | None, won: list[int], log: Any = ()) -> list[EpisodeRecord]:
     return [replace(r, event=event, extra={"events": list(log)}) for r in records("test", won)]
 
 
-def test_results_pair_events_with_their_matched_arms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_pair_events_with_their_matched_arms(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     never = [{"event": "pause:50@subtask:9", "step": None}]
     made = [
         *under(None, [1, 1, 1, 0]), *under("pause:50", [1, 0, 0, 1]), *under("pause:100", [0, 0]),
@@ -288,11 +370,21 @@ def test_results_pair_events_with_their_matched_arms(tmp_path: Path, capsys: pyt
     ]  # fmt: skip
     rows = {row[1]: row[3:] for row in event_table(made).rows}
     assert rows["pause:50"] == ["1", "4", "75.0", "50.0", "1", "2", "1", "1.000", "0"]
-    assert idle_events(made) == ["event=pause:50@subtask:9 did not act in 4 episodes: its place never came."]
-    assert rows["pause:50@subtask:9"][-1] == "4" and rows["speed:2"][:4] == ["1", "2", "100.0", "50.0"]
+    assert idle_events(made) == [
+        "event=pause:50@subtask:9 did not act in 4 episodes: its place never came."
+    ]
+    assert rows["pause:50@subtask:9"][-1] == "4" and rows["speed:2"][:4] == [
+        "1",
+        "2",
+        "100.0",
+        "50.0",
+    ]
     curves = {dial: [(p.turned, p.won, p.episodes) for p in points] for (_, _, dial), points in
               event_curves(made).items()}  # fmt: skip
-    assert curves["pause"] == [(0, 2, 2), (50, 1, 2), (100, 0, 2)] and curves["speed"] == [(1, 2, 2), (2, 1, 2)]
+    assert curves["pause"] == [(0, 2, 2), (50, 1, 2), (100, 0, 2)] and curves["speed"] == [
+        (1, 2, 2),
+        (2, 1, 2),
+    ]
     pairs = matched_methods(aggregate(made, Protocol(("PickXtimes",), episodes=2)))
     assert {(first.event, second.event) for first, second in pairs} == {
         (event, None) for event in ("pause:50", "pause:100", "speed:2", "pause:50@subtask:9")
@@ -300,7 +392,10 @@ def test_results_pair_events_with_their_matched_arms(tmp_path: Path, capsys: pyt
     save_records(tmp_path, made)
     page = tmp_path / "page.html"
     results([str(tmp_path), "--events", "--html", str(page)])
-    assert "Events beside their matched arms" in capsys.readouterr().out and "PickXtimes, pause" in page.read_text()
+    assert (
+        "Events beside their matched arms" in capsys.readouterr().out
+        and "PickXtimes, pause" in page.read_text()
+    )
     with pytest.raises(UserError, match="None of these records is of an event"):
         event_table(records("test", [1]))
 
@@ -309,28 +404,51 @@ def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
     won = {None: ([1, 1, 1, 1], [1, 1, 0, 0]), "pause:64": ([0, 0, 0, 1], [1, 0, 1, 0])}
     made = [
         replace(record, training=TrainingIdentity(seed, "recipe", "data", f"w{seed}"))
-        for event, outcomes in won.items() for seed, part in enumerate(outcomes) for record in under(event, part)
-    ]  # fmt: skip
+        for event, outcomes in won.items()
+        for seed, part in enumerate(outcomes)
+        for record in under(event, part)
+    ]
     (row,) = event_table(made).rows
-    assert row[2:] == ["PickXtimes", "2", "8", "75.0 ± 35.4", "37.5 ± 17.7", "2", "4", "1", "0.500", "0"]
+    assert row[2:] == [
+        "PickXtimes",
+        "2",
+        "8",
+        "75.0 ± 35.4",
+        "37.5 ± 17.7",
+        "2",
+        "4",
+        "1",
+        "0.500",
+        "0",
+    ]
     assert row[0] == "m, recipe recipe, checkpoint 1, seed 7, test"
     (points,) = event_curves(made).values()
     assert [(p.turned, p.won, p.episodes) for p in points] == [(0, 6, 8), (64, 3, 8)]
-    assert distinct_parts(["m, recipe a, seed 7", "m, recipe b, seed 7"]) == ["recipe a", "recipe b"]
+    assert distinct_parts(["m, recipe a, seed 7", "m, recipe b, seed 7"]) == [
+        "recipe a",
+        "recipe b",
+    ]
     assert distinct_parts(["m, recipe a, seed 7"]) == ["m"]
-    assert points[0].interval == Interval(*(100 * bound for bound in wilson(0.75, 4, 0.95))), "of four scenes"
+    assert points[0].interval == Interval(*(100 * bound for bound in wilson(0.75, 4, 0.95))), (
+        "of four scenes"
+    )
 
 
 def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An episode of the benchmark, by its own script, without images, cut after the motion that follows the pause."""
+    """An episode of the benchmark, by its own script, without images, cut after the motion that
+    follows the pause.
+    """
     pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
     from mme_vla.envs.interface import RoboMMEEnv
     from mme_vla.evaluation.rollouts import rollouts
 
     built = build_policy(
-        "framesamp_modul", backbone="nano_choice", embodiment="robomme_choice_front", memory={"budget": 4, "grid": 1}
+        "framesamp_modul",
+        backbone="nano_choice",
+        embodiment="robomme_choice_front",
+        memory={"budget": 4, "grid": 1},
     )
     built.require_processor().stats = NormStats.unit(8, 10)
     holds: list[tuple[int, int, float]] = []
@@ -339,10 +457,21 @@ def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task(
     def watched(env: RoboMMEEnv, run: Any, steps: int) -> None:
         before, count = np.array(env.task.qpos), run.count
         hold(env, run, steps)
-        holds.append((env.task.progress.index, run.count - count, float(np.abs(env.task.qpos - before)[:7].max())))
+        holds.append(
+            (
+                env.task.progress.index,
+                run.count - count,
+                float(np.abs(env.task.qpos - before)[:7].max()),
+            )
+        )
 
     monkeypatch.setattr(RoboMMEEnv, "_hold", watched)
-    how: dict[str, Any] = {"oracle_share": 1.0, "render": False, "max_steps": 150, "event": "pause:30@subtask:2"}
+    how: dict[str, Any] = {
+        "oracle_share": 1.0,
+        "render": False,
+        "max_steps": 150,
+        "event": "pause:30@subtask:2",
+    }
     (paused,) = rollouts(built.eval(), "mme_vla", [Job("PickXtimes", "test", 0)], (), **how)
     ((subtask, steps, motion),) = holds
     assert paused.outcome == "timeout" and paused.steps > 150

@@ -16,7 +16,9 @@ def video(folder: Path, keep: str = "all") -> EpisodeVideo:
     return EpisodeVideo(lambda outcome, goal: folder / f"{outcome}.mp4", keep)
 
 
-def test_the_video_is_the_one_that_is_compressed_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_video_is_the_one_that_is_compressed_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     threads, add = [], VideoWriter.add
 
     def check_frame(writer: VideoWriter, image: np.ndarray) -> None:
@@ -33,7 +35,9 @@ def test_the_video_is_the_one_that_is_compressed_at_once(tmp_path: Path, monkeyp
     assert path.read_bytes() == video_bytes(video_frame(views, "a caption") for views in VIEWS)
 
 
-def test_what_goes_wrong_beside_the_simulation_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_goes_wrong_beside_the_simulation_is_raised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(writer: VideoWriter, image: np.ndarray) -> None:
         raise OSError("no space left on device")
 

@@ -1,4 +1,6 @@
-"""Rollouts render what is read, and nothing changes: actions and outcomes are those of rendering everything."""
+"""Rollouts render what is read, and nothing changes: actions and outcomes are those of rendering
+everything.
+"""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -53,16 +55,24 @@ def test_of_a_robot_that_acts_at_any_frame_few_past_frames_are_rendered(name: st
     frames: dict[str, Any] = {"state": np.zeros((41, 8))}
     images = [None if number not in stored else np.zeros(1) for number in range(41)]
     assert plan.missing({**frames, "front": images}) is None, "the video is simulated once"
-    running = SimpleNamespace(episode=SimpleNamespace(n_observed_frames=41), video_frames=40, unobserved=0)
+    running = SimpleNamespace(
+        episode=SimpleNamespace(n_observed_frames=41), video_frames=40, unobserved=0
+    )
     chunk = plan.of_chunk(running, 1)  # type: ignore[arg-type]
-    assert chunk is not None and sorted(chunk.frames["front"]) == [f for f in stored if 41 <= f < 140 + LONGEST_MOTION]  # type: ignore[type-var]
-    assert chunk.now == ("front",), "the frame that the policy acts on is rendered, whatever its number"
+    assert chunk is not None and sorted(chunk.frames["front"]) == [
+        f for f in stored if 41 <= f < 140 + LONGEST_MOTION
+    ]  # type: ignore[type-var]
+    assert chunk.now == ("front",), (
+        "the frame that the policy acts on is rendered, whatever its number"
+    )
 
 
 class Watcher(SubgoalPredictor):
     """Says the brightness of all that it has seen, and so needs every frame of the front camera."""
 
-    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> SubgoalEpisode:
+    def start_episode(
+        self, goal: str, video: np.ndarray | None = None, task: str = ""
+    ) -> SubgoalEpisode:
         episode = Watching(goal, video, task)
         episode.total = int(episode.video.astype(np.int64).sum())
         return episode
@@ -92,12 +102,17 @@ class Glancer(Watcher):
 
     sees_video = sees_passing = False
 
-    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> SubgoalEpisode:
+    def start_episode(
+        self, goal: str, video: np.ndarray | None = None, task: str = ""
+    ) -> SubgoalEpisode:
         assert video is None
         return SubgoalEpisode(goal, video, task)
 
     def predict_due(self, episodes: Any) -> list[Subgoal]:
-        return [Subgoal(f"{e.step} {int(e.frame.astype(np.int64).sum())}", queried=True) for e in episodes]
+        return [
+            Subgoal(f"{e.step} {int(e.frame.astype(np.int64).sum())}", queried=True)
+            for e in episodes
+        ]
 
 
 @pytest.mark.parametrize("background", [False, True])
@@ -108,7 +123,9 @@ def test_a_predictor_that_reads_the_present_counts_the_frames_that_passed(backgr
 
 def test_a_video_shows_everything_and_changes_nothing(tmp_path: Path) -> None:
     policy = quick_policy("rmt_modul", patch_size=8)
-    bare = roll(policy, JOBS, InlineEnvs(base=make_watched_env, max_steps=STEPS - 1), max_steps=STEPS - 1)
+    bare = roll(
+        policy, JOBS, InlineEnvs(base=make_watched_env, max_steps=STEPS - 1), max_steps=STEPS - 1
+    )
     envs = InlineEnvs(base=make_watched_env, max_steps=STEPS - 1, videos=(str(tmp_path), "all"))
     recorded = roll(policy, JOBS, envs, max_steps=STEPS - 1)
     assert outcomes(recorded) == outcomes(bare)
@@ -125,7 +142,9 @@ def test_an_environment_that_does_not_repeat_its_video_is_refused() -> None:
         def reset(self) -> Any:
             return self._lists([self._frame() for _ in range(next(lengths))]), self._info("ongoing")
 
-    envs = InlineEnvs(base=lambda task, split, episode, max_steps: Moody(task, episode, max_steps, 1e9, 0.0, ""))
+    envs = InlineEnvs(
+        base=lambda task, split, episode, max_steps: Moody(task, episode, max_steps, 1e9, 0.0, "")
+    )
     with pytest.raises(UserError, match=r"video had 4 frames, and 5 when"):
         roll(quick_policy("framesamp_modul", patch_size=8, memory={"budget": 64}), JOBS[:1], envs)
 
@@ -135,7 +154,9 @@ def test_acting_on_a_frame_that_was_not_rendered_is_refused() -> None:
     episode = policy.start_episode("pick up the cube")
     images = np.zeros((1, 64, 64, 3), np.uint8)
     rendered = {"front": np.array([0]), "wrist": np.array([0])}
-    episode.observe({"front": images, "wrist": images}, np.zeros((3, 8), np.float32), rendered=rendered)
+    episode.observe(
+        {"front": images, "wrist": images}, np.zeros((3, 8), np.float32), rendered=rendered
+    )
     assert episode.n_observed_frames == 3
     with pytest.raises(UserError, match="current frame was not rendered"):
         policy.act(episode)

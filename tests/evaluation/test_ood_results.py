@@ -1,4 +1,6 @@
-"""Results on RoboMME-OOD: by tier beside the published figures, twins, and success beyond the training range."""
+"""Results on RoboMME-OOD: by tier beside the published figures, twins, and success beyond the
+training range.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +18,9 @@ from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.scopes import Protocol
 
 
-def made(task: str, split: str, wins: Sequence[int], model: str = "m", year: int = 2026) -> list[EpisodeRecord]:
+def made(
+    task: str, split: str, wins: Sequence[int], model: str = "m", year: int = 2026
+) -> list[EpisodeRecord]:
     specs = metadata.episodes(task, split)
     outcomes = ["success" if won else "fail" for won in wins]
     return [
@@ -29,11 +33,24 @@ def made(task: str, split: str, wins: Sequence[int], model: str = "m", year: int
 
 
 def test_success_is_counted_by_tier_beside_the_published_figures() -> None:
-    records = made("PickXtimes", "ood", [1] * 17 + [0] * 33) + made("StopCube", "ood:xhard2", [1, 0])
+    records = made("PickXtimes", "ood", [1] * 17 + [0] * 33) + made(
+        "StopCube", "ood:xhard2", [1, 0]
+    )
     full, tier = ood.tier_tables(records)
-    row = dict(zip(full.columns, next(row for row in full.rows if row[0] == "PickXtimes"), strict=True))
-    assert (row["xhard1"], row["xhard2"], row["xhard4"], row["all"]) == ("17/17", "0/17", "–", "17/50")
-    assert (row["GroundSG+Oracle"], row["SimpleMemVLA"], row["PonderPounce"]) == ("96.0", "0.0", "80.0")
+    row = dict(
+        zip(full.columns, next(row for row in full.rows if row[0] == "PickXtimes"), strict=True)
+    )
+    assert (row["xhard1"], row["xhard2"], row["xhard4"], row["all"]) == (
+        "17/17",
+        "0/17",
+        "–",
+        "17/50",
+    )
+    assert (row["GroundSG+Oracle"], row["SimpleMemVLA"], row["PonderPounce"]) == (
+        "96.0",
+        "0.0",
+        "80.0",
+    )
     assert "development records" in full.title
     assert [row[:3] for row in tier.rows] == [["StopCube", "–", "1/2"], ["all", "–", "1/2"]]
 
@@ -49,7 +66,11 @@ def test_twins_tell_what_memory_and_what_control_loses() -> None:
     table = ood.twin_table(records, conflicts="first")
     assert table is not None and len(table.rows) == 1
     row = dict(zip(table.columns, table.rows[0], strict=True))
-    assert (row["episodes"], row["lost by memory"], row["lost by control"]) == ("4", "+50.0", "25.0")
+    assert (row["episodes"], row["lost by memory"], row["lost by control"]) == (
+        "4",
+        "+50.0",
+        "25.0",
+    )
     assert (row["gained : lost"], row["flips of equal runs"]) == ("2 : 0", "1 of 4")
     assert ood.twin_table(made("StopCube", "ood", [1])) is None
 
@@ -60,7 +81,9 @@ def test_success_is_set_against_the_amount_over_all_splits() -> None:
     curves = ood.extrapolation(records)
     (points,) = curves.values()
     test = [ood.amount_of("StopCube", "test", record.key) for record in records[:2]]
-    assert [ood.amount_of("StopCube", "stress:count=2", record.key) for record in records[:2]] == [n + 2 for n in test]
+    assert [ood.amount_of("StopCube", "stress:count=2", record.key) for record in records[:2]] == [
+        n + 2 for n in test
+    ]
     assert set(points) == {*test, *(n + 2 for n in test), 6} and points[6].episodes >= 2
     table = ood.extrapolation_table(curves)
     assert {row[4] for row in table.rows if int(row[3]) > 5} == {"beyond"}
@@ -70,7 +93,9 @@ def test_success_is_set_against_the_amount_over_all_splits() -> None:
 
 def test_the_papers_figures_do_not_stand_beside_other_episodes() -> None:
     for split in ("ood", "hard", "challenge", "twin:ood"):
-        results = aggregate(made("StopCube", split, [1] * 12, model="framesamp_modul"), Protocol(("StopCube",), 12))
+        results = aggregate(
+            made("StopCube", split, [1] * 12, model="framesamp_modul"), Protocol(("StopCube",), 12)
+        )
         assert results.methods[0].paper is None
         assert any("none of the benchmark's" in note for note in results.notes)
 
@@ -80,11 +105,15 @@ def test_the_command_writes_the_tables(tmp_path: Path, capsys: pytest.CaptureFix
     page, text = tmp_path / "page.html", tmp_path / "page.md"
     main([str(tmp_path), "--ood", "--html", str(page), "--markdown", str(text)])
     visible = capsys.readouterr().out
-    assert "RoboMME-OOD" in visible and "Hard test episodes" in visible and "Extrapolation" in visible
+    assert (
+        "RoboMME-OOD" in visible and "Hard test episodes" in visible and "Extrapolation" in visible
+    )
     assert "SimpleMemVLA" in text.read_text() and "<svg" in page.read_text()
 
 
-def test_records_without_a_table_of_this_kind_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_records_without_a_table_of_this_kind_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     save_records(tmp_path, made("MoveCube", "ood", [1, 0]))
     main([str(tmp_path), "--ood"])
     assert "Extrapolation" not in capsys.readouterr().out, "nothing grows in MoveCube"
@@ -96,9 +125,14 @@ def test_records_without_a_table_of_this_kind_are_refused(tmp_path: Path, capsys
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [("--ood --stress", "--stress and --ood: name one"), ("--ood --csv t.csv", "--csv: not with --ood")],
+    [
+        ("--ood --stress", "--stress and --ood: name one"),
+        ("--ood --csv t.csv", "--csv: not with --ood"),
+    ],
 )
-def test_views_exclude_each_other(words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_views_exclude_each_other(
+    words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     save_records(tmp_path, made("PatternLock", "ood", [1]))
     with pytest.raises(SystemExit):
         main([str(tmp_path), *words.split()])

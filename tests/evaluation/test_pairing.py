@@ -1,6 +1,8 @@
-"""Episodes are paired where their scenes are the same, and nowhere else: a second machine with the same seeds is none.
+"""Episodes are paired where their scenes are the same, and nowhere else: a second machine with the
+same seeds is none.
 
-The second machine is simulated: its records have the seeds of the first, and other digests in some episodes.
+The second machine is simulated: its records have the seeds of the first, and other digests in some
+episodes.
 """
 
 import json
@@ -47,16 +49,33 @@ def sides(*scenes: Sequence[str | None]) -> list[dict[EpisodeKey, list[EpisodeRe
     return [{record.key: [record] for record in run} for run in runs]
 
 
-@pytest.mark.parametrize("first, second, paired, unnamed, other, mixed", [
-    (HERE, HERE, 4, 0, 0, 0), (HERE, THERE, 2, 0, 2, 0), ([None] * 4, [None] * 4, 4, 4, 0, 0),
-    (HERE, [None] * 4, 0, 0, 0, 4), ([None, NO_VALUES, NOT_BUILT, "a"], [NO_VALUES, None, NOT_BUILT, "a"], 4, 3, 0, 0),
-    (["a", NO_VALUES, NOT_BUILT, "d"], ["a", "b", "c", "e"], 1, 0, 1, 2),
-], ids=str)  # fmt: skip
+@pytest.mark.parametrize(
+    "first, second, paired, unnamed, other, mixed",
+    [
+        (HERE, HERE, 4, 0, 0, 0),
+        (HERE, THERE, 2, 0, 2, 0),
+        ([None] * 4, [None] * 4, 4, 4, 0, 0),
+        (HERE, [None] * 4, 0, 0, 0, 4),
+        ([None, NO_VALUES, NOT_BUILT, "a"], [NO_VALUES, None, NOT_BUILT, "a"], 4, 3, 0, 0),
+        (["a", NO_VALUES, NOT_BUILT, "d"], ["a", "b", "c", "e"], 1, 0, 1, 2),
+    ],
+    ids=str,
+)
 def test_equal_digests_are_paired_or_none_on_both_sides(
-    first: list[str | None], second: list[str | None], paired: int, unnamed: int, other: int, mixed: int
+    first: list[str | None],
+    second: list[str | None],
+    paired: int,
+    unnamed: int,
+    other: int,
+    mixed: int,
 ) -> None:
     pairing = pair(sides(first, second))
-    counts = len(pairing.keys), pairing.unnamed, sum(pairing.other.values()), sum(pairing.mixed.values())
+    counts = (
+        len(pairing.keys),
+        pairing.unnamed,
+        sum(pairing.other.values()),
+        sum(pairing.mixed.values()),
+    )
     assert counts == (paired, unnamed, other, mixed)
     turned = pair(sides(second, first))
     assert (turned.keys, turned.other, turned.mixed) == (pairing.keys, pairing.other, pairing.mixed)
@@ -64,7 +83,9 @@ def test_equal_digests_are_paired_or_none_on_both_sides(
 
 def test_other_seeds_are_other_scenes_without_a_digest_too() -> None:
     first, second = sides([None], [None])
-    changed = {key: [replace(record, seed=99) for record in of_key] for key, of_key in second.items()}
+    changed = {
+        key: [replace(record, seed=99) for record in of_key] for key, of_key in second.items()
+    }
     assert pair([first, changed]).other == {"PickXtimes": 1}
 
 
@@ -77,7 +98,10 @@ def test_all_runs_of_a_side_must_be_of_one_scene() -> None:
 def test_two_methods_are_compared_on_the_scenes_that_both_machines_built(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    every = [*named(records("test", [1, 1, 1, 0], "m"), HERE), *named(records("test", [0, 0, 1, 0], "n"), THERE)]
+    every = [
+        *named(records("test", [1, 1, 1, 0], "m"), HERE),
+        *named(records("test", [0, 0, 1, 0], "n"), THERE),
+    ]
     first, second = aggregate(every, PROTOCOL).methods
     result = compare(first, second, PROTOCOL)
     assert (result.episodes, result.wins, result.losses, result.first_rate) == (2, 1, 0, 100.0)
@@ -88,14 +112,31 @@ def test_two_methods_are_compared_on_the_scenes_that_both_machines_built(
     assert "(PickXtimes 2)" in printed
 
 
-@pytest.mark.parametrize("scenes, reason", [(["b0", "b1", "b2", "b3"], "are different ones"),
-                                            ([None] * 4, "only some of the runs name their scene")])  # fmt: skip
+@pytest.mark.parametrize(
+    "scenes, reason",
+    [
+        (["b0", "b1", "b2", "b3"], "are different ones"),
+        ([None] * 4, "only some of the runs name their scene"),
+    ],
+)
 def test_nothing_in_common_is_said_and_not_compared(
     scenes: list[str | None], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    every = [*named(records("test", [1] * 4, "m"), HERE), *named(records("test", [0] * 4, "n"), scenes)]
+    every = [
+        *named(records("test", [1] * 4, "m"), HERE),
+        *named(records("test", [0] * 4, "n"), scenes),
+    ]
     save_records(tmp_path, every)
-    options = [str(tmp_path), "--tasks", "PickXtimes", "--episodes", "4", "--samples", "20", "--brief"]
+    options = [
+        str(tmp_path),
+        "--tasks",
+        "PickXtimes",
+        "--episodes",
+        "4",
+        "--samples",
+        "20",
+        "--brief",
+    ]
     main(options)
     printed = capsys.readouterr().out
     assert reason in printed and "Paired comparison" not in printed
@@ -106,13 +147,15 @@ def test_nothing_in_common_is_said_and_not_compared(
     assert common_episodes(first, second) == set()
 
 
-def test_pairs_without_digests_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pairs_without_digests_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     save_records(tmp_path, [*records("test", [1] * 4, "m"), *records("test", [0] * 4, "n")])
     main([str(tmp_path), "--tasks", "PickXtimes", "--episodes", "4", "--samples", "20", "--brief"])
     assert "4 of 4 paired episodes have no digest of their scene" in capsys.readouterr().out
 
 
-# What records are made of -----------------------------------------------------------------------------------------
+# What records are made of -------------------------------------------------------------------------
 
 
 class NamedEnv(ScriptedEnv):
@@ -147,15 +190,19 @@ def test_records_from_before_there_were_digests_are_read() -> None:
     assert EpisodeRecord.from_dict(values).scene is None
 
 
-# Siblings: everything else that takes the same seed for the same scene ---------------------------------------------
+# Siblings: everything else that takes the same seed for the same scene ----------------------------
 
 
 def test_events_are_matched_with_the_same_scenes() -> None:
-    with_event = [replace(record, event="pause:10") for record in named(records("test", [0] * 4), THERE)]
+    with_event = [
+        replace(record, event="pause:10") for record in named(records("test", [0] * 4), THERE)
+    ]
     every = [*named(records("test", [1] * 4), HERE), *with_event]
     table = event_table(every)
     row = dict(zip(table.columns, table.rows[0], strict=True))
-    assert (row["pairs"], row["lost"]) == ("2", "2") and "2 episodes are not paired" in table.notes[0]
+    assert (row["pairs"], row["lost"]) == ("2", "2") and "2 episodes are not paired" in table.notes[
+        0
+    ]
     (points,) = event_curves(every).values()
     assert [point.episodes for point in points] == [2, 2]
 
@@ -163,11 +210,18 @@ def test_events_are_matched_with_the_same_scenes() -> None:
 def test_twins_are_the_same_scenes() -> None:
     every = [*named(records("test", [0] * 4), HERE), *named(records("twin", [1] * 4), THERE)]
     table = twin_table(every)
-    assert table is not None and table.rows[0][1] == "2" and "2 episodes are not paired" in table.notes[0]
+    assert (
+        table is not None
+        and table.rows[0][1] == "2"
+        and "2 episodes are not paired" in table.notes[0]
+    )
 
 
 def test_arms_of_a_probe_are_of_the_same_scenes() -> None:
-    every = [*named(records("test", [1] * 4, "m"), HERE), *named(records("test", [0] * 4, "m · drop"), THERE)]
+    every = [
+        *named(records("test", [1] * 4, "m"), HERE),
+        *named(records("test", [0] * 4, "m · drop"), THERE),
+    ]
     (comparison,) = _paired(every, "test", "m")
     assert comparison.episodes == 2 and comparison.notes
 
@@ -175,13 +229,21 @@ def test_arms_of_a_probe_are_of_the_same_scenes() -> None:
 def test_a_report_card_takes_the_scenes_that_all_arms_have() -> None:
     mine, other = sides(HERE, THERE)
     same = pair([mine, other])
-    assert list(card_module._success(mine, same.keys)) == [EpisodeKey("PickXtimes", 0), EpisodeKey("PickXtimes", 2)]
+    assert list(card_module._success(mine, same.keys)) == [
+        EpisodeKey("PickXtimes", 0),
+        EpisodeKey("PickXtimes", 2),
+    ]
 
 
 def test_the_page_of_a_nano_run_compares_the_same_scenes() -> None:
-    runs = {"m": named(records("test", [1] * 4, "m"), HERE), "n": named(records("test", [0] * 4, "n"), THERE)}
+    runs = {
+        "m": named(records("test", [1] * 4, "m"), HERE),
+        "n": named(records("test", [0] * 4, "n"), THERE),
+    }
     results, (comparison,) = compared(runs, "PickXtimes", "test", "n")
-    assert comparison.episodes == 2 and any("2 episodes are not paired" in note for note in results.notes)
+    assert comparison.episodes == 2 and any(
+        "2 episodes are not paired" in note for note in results.notes
+    )
 
 
 def test_a_run_in_two_scenes_is_refused_and_no_repetition() -> None:
@@ -194,8 +256,14 @@ def test_a_run_in_two_scenes_is_refused_and_no_repetition() -> None:
 
 
 def test_runs_of_one_method_in_other_scenes_are_told() -> None:
-    every = [*named(records("test", [1] * 4), HERE), *named(records("test", [1] * 4, seed=8), THERE)]
-    assert any("not known to be of the same scenes in 2 episodes" in note for note in aggregate(every, PROTOCOL).notes)
+    every = [
+        *named(records("test", [1] * 4), HERE),
+        *named(records("test", [1] * 4, seed=8), THERE),
+    ]
+    assert any(
+        "not known to be of the same scenes in 2 episodes" in note
+        for note in aggregate(every, PROTOCOL).notes
+    )
 
 
 def test_amounts_of_another_scene_are_not_those_of_the_one_built_here() -> None:
@@ -205,11 +273,13 @@ def test_amounts_of_another_scene_are_not_those_of_the_one_built_here() -> None:
     assert amount_of("StopCube", "test", key, "0123456789abcdef") is None
 
 
-# The board --------------------------------------------------------------------------------------------------------
+# The board ----------------------------------------------------------------------------------------
 
 
 def name_scenes(folder: Path, prefix: str) -> None:
-    write_records(folder, [replace(r, scene=f"{prefix}{r.task}{r.episode}") for r in records_of(folder)])
+    write_records(
+        folder, [replace(r, scene=f"{prefix}{r.task}{r.episode}") for r in records_of(folder)]
+    )
 
 
 @pytest.fixture
@@ -220,7 +290,9 @@ def rows(tmp_path: Path) -> Path:
     return tmp_path / "rows"
 
 
-def test_a_row_that_names_its_scenes_is_compared_by_score_with_rows_that_do_not(rows: Path, tmp_path: Path) -> None:
+def test_a_row_that_names_its_scenes_is_compared_by_score_with_rows_that_do_not(
+    rows: Path, tmp_path: Path
+) -> None:
     name_scenes(write_training(tmp_path / "mine", "mine", 0, 2), "a")
     board = Board(read_rows([rows], [tmp_path / "mine"]), samples=200)
     assert [row.name for row in board.apart] == ["mine"]
@@ -230,7 +302,9 @@ def test_a_row_that_names_its_scenes_is_compared_by_score_with_rows_that_do_not(
     assert beside.difference == pytest.approx(100 / 3) and beside.better_worse == "not paired"
     assert beside.interval.low < beside.difference < beside.interval.high and 0 < beside.p < 1
     assert any(line.startswith("mine: not known to be of the same scenes") for line in notes(board))
-    assert board.separations and all(s.memories == 2 for s in board.separations), "no memory of other scenes"
+    assert board.separations and all(s.memories == 2 for s in board.separations), (
+        "no memory of other scenes"
+    )
 
 
 @pytest.mark.parametrize("prefix, paired", [("a", True), ("b", False)])

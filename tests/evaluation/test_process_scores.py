@@ -1,4 +1,6 @@
-"""Process scores: where an episode's chain of sub-tasks broke, and at what, from the environment to the tables."""
+"""Process scores: where an episode's chain of sub-tasks broke, and at what, from the environment to
+the tables.
+"""
 
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -34,12 +36,16 @@ def twice() -> Iterator[Task]:
     env.close()
 
 
-def test_who_stops_too_early_has_lost_count_and_who_takes_another_cube_has_not(twice, monkeypatch) -> None:
+def test_who_stops_too_early_has_lost_count_and_who_takes_another_cube_has_not(
+    twice, monkeypatch
+) -> None:
     twice.reset()
     hand = Hand(twice, monkeypatch)
     hand.carry(twice.cube)
     hand.release(twice.target.position)
-    assert process_score(twice.progress, "timeout") == ProcessScore(2, 5, "stuck", "", twice.progress.subtasks[2].text)
+    assert process_score(twice.progress, "timeout") == ProcessScore(
+        2, 5, "stuck", "", twice.progress.subtasks[2].text
+    )
     assert push_down(twice, twice.button) == (False, True)
     early = process_score(twice.progress, "fail")
     assert (early.done, early.of, early.broke, early.operation) == (2, 5, "wrong", "how many")
@@ -54,15 +60,23 @@ def test_every_task_says_what_its_sub_tasks_ask_of_memory(task: str) -> None:
     load_tasks(task)
     spec = metadata.episode(task)
     env: Any = make(TASKS[task], spec.seed, spec.difficulty)
-    operations = [subtask.operation for subtask in env.progress.subtasks if not subtask.video and subtask.operation]
-    assert operations and all(callable(operation) or operation in OPERATIONS for operation in operations)
+    operations = [
+        subtask.operation
+        for subtask in env.progress.subtasks
+        if not subtask.video and subtask.operation
+    ]
+    assert operations and all(
+        callable(operation) or operation in OPERATIONS for operation in operations
+    )
     assert {operation() for operation in operations if callable(operation)} <= {"", *OPERATIONS}
     env.close()
 
 
 def test_a_success_has_done_everything_and_the_mistake_is_that_of_the_failure() -> None:
     watch = SubTask("watch", lambda: True, lambda _: None, video=True)
-    choose = SubTask("choose", lambda: False, lambda _: None, failed=lambda: True, operation=lambda: "order")
+    choose = SubTask(
+        "choose", lambda: False, lambda _: None, failed=lambda: True, operation=lambda: "order"
+    )
     steps = [watch, choose]
     progress = Progress(steps, latch_failure=False)
     assert process_score(progress, "timeout").done == 0
@@ -75,10 +89,14 @@ def test_a_success_has_done_everything_and_the_mistake_is_that_of_the_failure() 
 class ReportingEnv(ScriptedEnv):
     """Also has a pointer over sub-tasks, as a simulated task has."""
 
-    task = SimpleNamespace(progress=Progress([SubTask("push", lambda: False, lambda _: None)], latch_failure=True))
+    task = SimpleNamespace(
+        progress=Progress([SubTask("push", lambda: False, lambda _: None)], latch_failure=True)
+    )
 
 
-def make_reporting_env(task: str, split: str, episode: int, max_steps: int = 40, **options: Any) -> ReportingEnv:
+def make_reporting_env(
+    task: str, split: str, episode: int, max_steps: int = 40, **options: Any
+) -> ReportingEnv:
     return ReportingEnv(task, episode, max_steps, 1e9, 0.0, "")
 
 
@@ -88,16 +106,29 @@ def test_records_tables_and_the_report_tell_it() -> None:
     assert process_of(record) == ProcessScore(0, 1, "stuck", "", "push")
     (silent,) = roll(policy, [Job("PickXtimes", "test", 0)], InlineEnvs())
     assert process_of(silent) is None
-    scores = [ProcessScore(1, 4, "wrong", "how many", "x"), ProcessScore(3, 4, "stuck", "", "y"), ProcessScore(4, 4)]
+    scores = [
+        ProcessScore(1, 4, "wrong", "how many", "x"),
+        ProcessScore(3, 4, "stuck", "", "y"),
+        ProcessScore(4, 4),
+    ]
     outcomes = ["fail", "timeout", "success"]
     rows = [
-        EpisodeRecord("m", 1, 7, "PickXtimes", i, i, "easy", outcome, 9, extra={"process": score.to_dict()})
+        EpisodeRecord(
+            "m", 1, 7, "PickXtimes", i, i, "easy", outcome, 9, extra={"process": score.to_dict()}
+        )
         for i, (outcome, score) in enumerate(zip(outcomes, scores, strict=True))
     ]
-    results = aggregate([EpisodeRecord.from_json(r.to_json()) for r in rows], Protocol(("PickXtimes",), 3), "test")
+    results = aggregate(
+        [EpisodeRecord.from_json(r.to_json()) for r in rows], Protocol(("PickXtimes",), 3), "test"
+    )
     (table,) = process_tables(results)
     row = dict(zip(table.columns, table.rows[-1], strict=True))
-    assert (row["episodes"], row["progress (%)"], row["how many"], row["stuck"]) == ("3", "66.7", "1", "1")
+    assert (row["episodes"], row["progress (%)"], row["how many"], row["stuck"]) == (
+        "3",
+        "66.7",
+        "1",
+        "1",
+    )
     assert row["where"] == "–" and row["success"] == "1"
     assert "where the chain broke" in html_report(results, [], "t")
     with pytest.raises(UserError, match="no process score"):

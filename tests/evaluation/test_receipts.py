@@ -33,27 +33,42 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(folder: Path, checkpoint: Path, episodes: range = range(3), execute: int | None = None) -> Path:
+def run(
+    folder: Path, checkpoint: Path, episodes: range = range(3), execute: int | None = None
+) -> Path:
     """Records of these episodes, every second one solved, with their receipt."""
     policy = Policy.from_pretrained(checkpoint)
     settings = RolloutSettings(execute=execute)
     facts = facts_of(policy, None, str(checkpoint), settings, None)
     claimed = claim_run(folder, run_settings(policy, facts, settings, None, str(checkpoint)))
     path = folder / "episodes.jsonl"
-    with RecordLog(path) as log, receipts.receipt(path, policy, claimed, str(checkpoint), renders=False):
+    with (
+        RecordLog(path) as log,
+        receipts.receipt(path, policy, claimed, str(checkpoint), renders=False),
+    ):
         for number in episodes:
             spec = environment("mme_vla").episode("VideoUnmask", "test", number)
             outcome = "success" if number % 2 else "fail"
             log.append(
                 EpisodeRecord(
-                    facts.model, checkpoint_label(str(checkpoint)), 42, spec.task, number, spec.seed, spec.difficulty,
-                    outcome, 9, scene=environment("mme_vla").scene_digest(spec),
+                    facts.model,
+                    checkpoint_label(str(checkpoint)),
+                    42,
+                    spec.task,
+                    number,
+                    spec.seed,
+                    spec.difficulty,
+                    outcome,
+                    9,
+                    scene=environment("mme_vla").scene_digest(spec),
                 )
-            )  # fmt: skip
+            )
     return folder / "receipt.json"
 
 
-def test_a_receipt_agrees_with_its_run(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_receipt_agrees_with_its_run(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = run(tmp_path, checkpoint)
     assert receipts.verify(path) == ([], [], [])
     content = receipts.read_receipt(path)
@@ -71,7 +86,9 @@ def test_a_receipt_agrees_with_its_run(checkpoint: Path, tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "norm_stats.json"])
-def test_a_changed_byte_of_a_checkpoint_is_named(name: str, checkpoint: Path, tmp_path: Path) -> None:
+def test_a_changed_byte_of_a_checkpoint_is_named(
+    name: str, checkpoint: Path, tmp_path: Path
+) -> None:
     path = run(tmp_path / "run", checkpoint)
     copy = shutil.copytree(checkpoint, tmp_path / "copy")
     content = bytearray((copy / name).read_bytes())
@@ -82,11 +99,16 @@ def test_a_changed_byte_of_a_checkpoint_is_named(name: str, checkpoint: Path, tm
 
 
 def test_another_simulator_is_named(
-    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     path = run(tmp_path, checkpoint)
     installed = receipts.version
-    monkeypatch.setattr(receipts, "version", lambda name: "0.0.1" if name == "sapien" else installed(name))
+    monkeypatch.setattr(
+        receipts, "version", lambda name: "0.0.1" if name == "sapien" else installed(name)
+    )
     with pytest.raises(SystemExit):
         main(["verify", str(path)])
     output = capsys.readouterr().out
@@ -113,17 +135,23 @@ def test_changed_records_scenes_and_receipts_are_named(checkpoint: Path, tmp_pat
     records.write_text("\n".join([json.dumps(changed), *lines[1:]]) + "\n")
     differences, *_ = receipts.verify(path)
     starts = [line.split(":")[0] for line in differences]
-    assert {"records.sha256", "score.VideoUnmask.success", "scenes", "scene VideoUnmask 0"} <= set(starts)
+    assert {"records.sha256", "score.VideoUnmask.success", "scenes", "scene VideoUnmask 0"} <= set(
+        starts
+    )
     other = tmp_path / "receipt-of-something-else.json"
     other.write_text(json.dumps({"settings": {}}))
-    with pytest.raises(UserError, match="is no receipt of an evaluation: it has no conditions, records"):
+    with pytest.raises(
+        UserError, match="is no receipt of an evaluation: it has no conditions, records"
+    ):
         receipts.verify(other)
     path.write_text(path.read_text().replace('"success": 1', '"success": 3'))
     with pytest.raises(UserError, match="is not what was written"):
         receipts.verify(path)
 
 
-def test_scenes_of_an_environment_that_is_not_here_are_not_compared(checkpoint: Path, tmp_path: Path) -> None:
+def test_scenes_of_an_environment_that_is_not_here_are_not_compared(
+    checkpoint: Path, tmp_path: Path
+) -> None:
     path = run(tmp_path, checkpoint)
     for name in ("receipt.json", "run.json"):
         content = json.loads((tmp_path / name).read_text())
@@ -139,15 +167,20 @@ def test_scenes_of_an_environment_that_is_not_here_are_not_compared(checkpoint: 
 
 def test_a_receipt_is_named_after_its_records_packed_or_not() -> None:
     names = {"episodes.jsonl": "receipt.json", "episodes.jsonl.xz": "receipt.json"}
-    names |= {"episodes-0of4.jsonl": "receipt-0of4.json", "episodes-0of4.jsonl.xz": "receipt-0of4.json"}
+    names |= {
+        "episodes-0of4.jsonl": "receipt-0of4.json",
+        "episodes-0of4.jsonl.xz": "receipt-0of4.json",
+    }
     assert {name: receipts.receipt_file(Path(name)).name for name in names} == names
 
 
-# Absence is no agreement ------------------------------------------------------------------------------------------
+# Absence is no agreement --------------------------------------------------------------------------
 
 
 def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    """Change a receipt or `run.json` as a forger does, who brings its checksum and fingerprint in order."""
+    """Change a receipt or `run.json` as a forger does, who brings its checksum and fingerprint in
+    order.
+    """
     content = json.loads(path.read_text())
     content.pop("crc32")
     change(content)
@@ -159,9 +192,14 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
 def rewrite_records(path: Path, **fields: Any) -> None:
     """Change every record, and bring the receipt's digests and score in order."""
     records = path.with_name("episodes.jsonl")
-    lines = [replace(EpisodeRecord.from_json(line), **fields) for line in records.read_text().splitlines()]
+    lines = [
+        replace(EpisodeRecord.from_json(line), **fields)
+        for line in records.read_text().splitlines()
+    ]
     records.write_text("".join(line.to_json() + "\n" for line in lines))
-    rewrite(path, lambda content: content.update(to_json(receipts._score(records, content["settings"]))))
+    rewrite(
+        path, lambda content: content.update(to_json(receipts._score(records, content["settings"])))
+    )
 
 
 def first(content: dict[str, Any]) -> dict[str, Any]:
@@ -173,9 +211,15 @@ ABSENCES: dict[str, tuple[Callable[[dict[str, Any]], object], set[str]]] = {
         lambda c: c.update(conditions=[]),
         {"code", "simulator", "renderer", "libraries", "checkpoint", "statistics"},
     ),
-    "no files of the checkpoint": (lambda c: first(c)["checkpoint"].update(files={}), {"checkpoint"}),
+    "no files of the checkpoint": (
+        lambda c: first(c)["checkpoint"].update(files={}),
+        {"checkpoint"},
+    ),
     "no checkpoint": (lambda c: first(c).pop("checkpoint"), {"checkpoint", "statistics"}),
-    "another folder": (lambda c: first(c)["checkpoint"].update(folder="nowhere"), {"checkpoint", "statistics"}),
+    "another folder": (
+        lambda c: first(c)["checkpoint"].update(folder="nowhere"),
+        {"checkpoint", "statistics"},
+    ),
     "no folder": (lambda c: first(c)["checkpoint"].update(folder=""), {"checkpoint", "statistics"}),
     "no statistics": (lambda c: first(c).pop("statistics"), {"statistics"}),
     "no code": (lambda c: first(c).pop("code"), {"code"}),
@@ -194,7 +238,10 @@ ABSENCES: dict[str, tuple[Callable[[dict[str, Any]], object], set[str]]] = {
 
 @pytest.mark.parametrize("change, expected", ABSENCES.values(), ids=ABSENCES)
 def test_what_a_receipt_lacks_is_not_compared(
-    change: Callable[[dict[str, Any]], object], expected: set[str], finished: Path, capsys: pytest.CaptureFixture[str]
+    change: Callable[[dict[str, Any]], object],
+    expected: set[str],
+    finished: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     rewrite(finished, lambda content: (change(content), None)[1])
     result = receipts.verify(finished, build=True)
@@ -213,14 +260,20 @@ def finished(checkpoint: Path, tmp_path: Path) -> Path:
 
 def test_a_missing_run_and_scenes_that_are_not_built_are_not_compared(finished: Path) -> None:
     result = receipts.verify(finished, build=False)
-    assert result.word == "not compared" and [line[:7] for line in result.not_compared] == ["scenes:"]
+    assert result.word == "not compared" and [line[:7] for line in result.not_compared] == [
+        "scenes:"
+    ]
     finished.with_name("run.json").unlink()
     assert [line.split(":")[0] for line in receipts.verify(finished).not_compared] == ["settings"]
 
 
-@pytest.mark.parametrize("scene, reason", [(None, "earlier versions"), ("no values", "gave no values"),
-                                           ("not built", "ended before")])  # fmt: skip
-def test_episodes_whose_scene_is_not_named_are_not_compared(scene: str | None, reason: str, finished: Path) -> None:
+@pytest.mark.parametrize(
+    "scene, reason",
+    [(None, "earlier versions"), ("no values", "gave no values"), ("not built", "ended before")],
+)
+def test_episodes_whose_scene_is_not_named_are_not_compared(
+    scene: str | None, reason: str, finished: Path
+) -> None:
     rewrite_records(finished, scene=scene)
     result = receipts.verify(finished)
     assert result.word == "not compared" and reason in result.not_compared[0]
@@ -232,11 +285,13 @@ def test_tasks_that_are_not_here_are_not_compared(finished: Path) -> None:
     assert result.word == "not compared" and "NoTaskOfThisName" in result.not_compared[0]
 
 
-# Records that contradict their settings, and other scenes ---------------------------------------------------------
+# Records that contradict their settings, and other scenes -----------------------------------------
 
 
 def test_another_scene_of_the_same_seed_is_noticed(finished: Path) -> None:
-    """Records, receipt and digests fit each other: only building the scene tells that it was another."""
+    """Records, receipt and digests fit each other: only building the scene tells that it was
+    another.
+    """
     rewrite_records(finished, scene="0123456789abcdef")
     result = receipts.verify(finished)
     assert result.word == "differs"
@@ -245,18 +300,34 @@ def test_another_scene_of_the_same_seed_is_noticed(finished: Path) -> None:
     assert any(line.startswith("scene_digests") for line in receipts.verify(finished).differences)
 
 
-@pytest.mark.parametrize("fields, name", [
-    ({"model": "another"}, "model"), ({"model_seed": 43}, "model_seed"), ({"max_steps": 9999}, "max_steps"),
-    ({"steps": 5000}, "steps"), ({"steps": -1}, "steps"), ({"checkpoint": 7}, "checkpoint"),
-    ({"event": "pause:64"}, "event"), ({"subgoal": "oracle"}, "subgoal"), ({"extra": {"env": "another"}}, "env"),
-    ({"training": TrainingIdentity(1, "r", "d", "w")}, "training"),
-], ids=str)  # fmt: skip
-def test_records_of_other_settings_are_noticed(fields: dict[str, Any], name: str, finished: Path) -> None:
+@pytest.mark.parametrize(
+    "fields, name",
+    [
+        ({"model": "another"}, "model"),
+        ({"model_seed": 43}, "model_seed"),
+        ({"max_steps": 9999}, "max_steps"),
+        ({"steps": 5000}, "steps"),
+        ({"steps": -1}, "steps"),
+        ({"checkpoint": 7}, "checkpoint"),
+        ({"event": "pause:64"}, "event"),
+        ({"subgoal": "oracle"}, "subgoal"),
+        ({"extra": {"env": "another"}}, "env"),
+        ({"training": TrainingIdentity(1, "r", "d", "w")}, "training"),
+    ],
+    ids=str,
+)
+def test_records_of_other_settings_are_noticed(
+    fields: dict[str, Any], name: str, finished: Path
+) -> None:
     rewrite_records(finished, **fields)
-    assert [line.split(":")[0] for line in receipts.verify(finished).differences] == [f"records.{name}"]
+    assert [line.split(":")[0] for line in receipts.verify(finished).differences] == [
+        f"records.{name}"
+    ]
 
 
-@pytest.mark.parametrize("key, value", [("seed", 43), ("max_steps", 1200), ("model", "another"), ("split", "val")])
+@pytest.mark.parametrize(
+    "key, value", [("seed", 43), ("max_steps", 1200), ("model", "another"), ("split", "val")]
+)
 @pytest.mark.parametrize("with_run", [True, False])
 def test_settings_that_were_changed_everywhere_but_in_the_records_are_noticed(
     key: str, value: Any, with_run: bool, finished: Path
@@ -267,7 +338,9 @@ def test_settings_that_were_changed_everywhere_but_in_the_records_are_noticed(
     if not with_run:
         beside.unlink()
     field = {"seed": "model_seed"}.get(key, key)
-    assert f"records.{field}" in [line.split(":")[0] for line in receipts.verify(finished).differences]
+    assert f"records.{field}" in [
+        line.split(":")[0] for line in receipts.verify(finished).differences
+    ]
 
 
 def test_the_time_that_events_hold_the_robot_is_added_to_the_limit(finished: Path) -> None:
@@ -276,16 +349,23 @@ def test_the_time_that_events_hold_the_robot_is_added_to_the_limit(finished: Pat
     rewrite_records(finished, event="pause:100", steps=1402)
     assert receipts.verify(finished).differences == []
     rewrite_records(finished, event="pause:100", steps=1403)
-    assert [line.split(":")[0] for line in receipts.verify(finished).differences] == ["records.steps"]
+    assert [line.split(":")[0] for line in receipts.verify(finished).differences] == [
+        "records.steps"
+    ]
 
 
-def test_a_file_beside_those_that_were_loaded_is_noticed(finished: Path, checkpoint: Path, tmp_path: Path) -> None:
+def test_a_file_beside_those_that_were_loaded_is_noticed(
+    finished: Path, checkpoint: Path, tmp_path: Path
+) -> None:
     copy = shutil.copytree(checkpoint, tmp_path / "copy")
     (copy / "notes.md").write_text("read by nobody")
     assert receipts.verify(finished, copy).word == "agrees"
     (copy / "model.safetensors.index.json").write_text("{}")
     differences = receipts.verify(finished, copy).differences
-    assert len(differences) == 1 and "model.safetensors.index.json: None in the receipt" in differences[0]
+    assert (
+        len(differences) == 1
+        and "model.safetensors.index.json: None in the receipt" in differences[0]
+    )
 
 
 @pytest.mark.parametrize("change", [
@@ -294,17 +374,27 @@ def test_a_file_beside_those_that_were_loaded_is_noticed(finished: Path, checkpo
     lambda c: c["records"].update(file="/etc/passwd"),
     lambda c: c["records"].update(file="../episodes.jsonl"),
 ])  # fmt: skip
-def test_names_that_lead_outside_are_refused(change: Callable[[dict[str, Any]], None], finished: Path) -> None:
+def test_names_that_lead_outside_are_refused(
+    change: Callable[[dict[str, Any]], None], finished: Path
+) -> None:
     rewrite(finished, change)
     with pytest.raises(UserError, match="lies outside of it"):
         receipts.verify(finished)
 
 
-@pytest.mark.parametrize("change", [
-    lambda c: c.update(conditions="abc"), lambda c: c.update(conditions=[1]), lambda c: c.update(settings=[]),
-    lambda c: c.update(records="x"), lambda c: c.update(score=5),
-])  # fmt: skip
-def test_parts_of_another_kind_are_refused(change: Callable[[dict[str, Any]], None], finished: Path) -> None:
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c.update(conditions="abc"),
+        lambda c: c.update(conditions=[1]),
+        lambda c: c.update(settings=[]),
+        lambda c: c.update(records="x"),
+        lambda c: c.update(score=5),
+    ],
+)
+def test_parts_of_another_kind_are_refused(
+    change: Callable[[dict[str, Any]], None], finished: Path
+) -> None:
     rewrite(finished, change)
     with pytest.raises(UserError, match="is no receipt of an evaluation"):
         receipts.verify(finished)
@@ -319,7 +409,7 @@ def test_records_of_several_streams_are_read_whole(checkpoint: Path, tmp_path: P
     assert receipts.verify(path) == ([], [], [])
 
 
-# The digest of the code -------------------------------------------------------------------------------------------
+# The digest of the code ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name, counts", [
@@ -328,13 +418,22 @@ def test_records_of_several_streams_are_read_whole(checkpoint: Path, tmp_path: P
 ])  # fmt: skip
 def test_the_digest_of_the_code_covers_what_can_change_a_result(name: str, counts: bool) -> None:
     root = Path(receipts.__file__).parents[1]
-    covered = {path.relative_to(root).as_posix() for part in receipts.CODE for path in (root / part).rglob("*.py")}
+    covered = {
+        path.relative_to(root).as_posix()
+        for part in receipts.CODE
+        for path in (root / part).rglob("*.py")
+    }
     assert (name in covered) is counts
     assert all(list((root / part).rglob("*.py")) for part in receipts.CODE), "a package was moved"
 
 
 def test_a_receipt_that_digests_every_file_says_what_it_cannot_tell(finished: Path) -> None:
-    rewrite(finished, lambda content: first(content).update(code={"mme-vla": "0.1.0", "files": receipts._code([""])}))
+    rewrite(
+        finished,
+        lambda content: first(content).update(
+            code={"mme-vla": "0.1.0", "files": receipts._code([""])}
+        ),
+    )
     assert receipts.verify(finished).word == "agrees"
     rewrite(finished, lambda content: first(content)["code"].update(files="0" * 64))
     result = receipts.verify(finished)

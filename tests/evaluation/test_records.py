@@ -1,4 +1,6 @@
-"""Episode records: on disk at once, safe against a kill, merged by clear rules, bound to their run's settings."""
+"""Episode records: on disk at once, safe against a kill, merged by clear rules, bound to their
+run's settings.
+"""
 
 import json
 import warnings
@@ -14,13 +16,25 @@ from mme_vla.evaluation.store import RecordLog, claim_run, find_records, read_re
 
 
 def record(**changes: Any) -> EpisodeRecord:
-    values = {"model": "pi05", "checkpoint": 100, "model_seed": 7, "task": "BinFill", "episode": 0, "seed": 540_000,
-              "difficulty": "easy", "outcome": "success", "steps": 321, "seconds": Seconds(1.5, 0.5, 2.25)}  # fmt: skip
+    values = {
+        "model": "pi05",
+        "checkpoint": 100,
+        "model_seed": 7,
+        "task": "BinFill",
+        "episode": 0,
+        "seed": 540_000,
+        "difficulty": "easy",
+        "outcome": "success",
+        "steps": 321,
+        "seconds": Seconds(1.5, 0.5, 2.25),
+    }
     return EpisodeRecord(**{**values, **changes})
 
 
 def test_a_record_survives_its_line() -> None:
-    made = record(error="IK failed\nat step 3", outcome="error", subgoal="qwenvl", extra={"video": "a/b.mp4"})
+    made = record(
+        error="IK failed\nat step 3", outcome="error", subgoal="qwenvl", extra={"video": "a/b.mp4"}
+    )
     line = made.to_json()
     assert "\n" not in line
     assert EpisodeRecord.from_json(line) == made
@@ -95,7 +109,10 @@ def test_a_result_supersedes_an_error_in_whatever_order(turned: bool) -> None:
 
 
 def test_conflicting_outcomes_are_refused_or_selected_by_time() -> None:
-    early, late = record(when="2026-01-01T00:00:00+00:00"), record(outcome="fail", when="2026-01-02T00:00:00+00:00")
+    early, late = (
+        record(when="2026-01-01T00:00:00+00:00"),
+        record(outcome="fail", when="2026-01-02T00:00:00+00:00"),
+    )
     with pytest.raises(UserError, match="evaluated twice"):
         merge([early, late])
     for order in ([early, late], [late, early]):
@@ -121,7 +138,9 @@ def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:
     first = claim_run(tmp_path, settings, notes={"device": "cpu"})
     assert claim_run(tmp_path, settings, notes={"device": "cuda"}) == first == read_run(tmp_path)
     other = {**settings, "env": {"split": "test", "max_steps": 300}, "extra": 1}
-    with pytest.raises(UserError, match=r"env.max_steps was 1300, is 300; extra was 'not set', is 1"):
+    with pytest.raises(
+        UserError, match=r"env.max_steps was 1300, is 300; extra was 'not set', is 1"
+    ):
         claim_run(tmp_path, other)
     assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
 

@@ -1,4 +1,6 @@
-"""The results command: the paper's tables come back, nothing incomplete is averaged, comparisons are paired."""
+"""The results command: the paper's tables come back, nothing incomplete is averaged, comparisons
+are paired.
+"""
 
 import csv
 import io
@@ -18,12 +20,25 @@ from mme_vla.evaluation.results.compare import compare, compare_all, holm, sign_
 from mme_vla.evaluation.results.paper import demo_records
 from mme_vla.evaluation.results.report import policy_facts, training_details
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, TASK_FACTS, Protocol, tasks_of
-from mme_vla.evaluation.results.tables import Table, leaderboard, overview, to_csv, to_latex, to_markdown
+from mme_vla.evaluation.results.tables import (
+    Table,
+    leaderboard,
+    overview,
+    to_csv,
+    to_latex,
+    to_markdown,
+)
 from mme_vla.evaluation.store import claim_run
 
 # Where the paper's suite and group tables differ from the means of its own per-task table.
-MISPRINTS = {("pi_0.5", "Short-Horizon Video Reasoning"), ("RMT+Expert", "Reference"), ("RMT+Expert", "average"),
-             ("TTT+Modul", "Permanence"), ("TTT+Modul", "average"), ("TokenDrop+Context", "Imitation")}  # fmt: skip
+MISPRINTS = {
+    ("pi_0.5", "Short-Horizon Video Reasoning"),
+    ("RMT+Expert", "Reference"),
+    ("RMT+Expert", "average"),
+    ("TTT+Modul", "Permanence"),
+    ("TTT+Modul", "average"),
+    ("TokenDrop+Context", "Imitation"),
+}
 SMALL = Protocol(("BinFill", "MoveCube"), episodes=4, samples=200)
 
 
@@ -32,7 +47,9 @@ def records(
 ) -> list[EpisodeRecord]:
     """One run: for each task the outcomes of its episodes."""
     return [
-        EpisodeRecord(model, checkpoint, seed, task, e, e, "easy", "success" if won else "fail", 10, **more)  # type: ignore[arg-type]
+        EpisodeRecord(
+            model, checkpoint, seed, task, e, e, "easy", "success" if won else "fail", 10, **more
+        )  # type: ignore[arg-type]
         for task, outcomes in wins.items()
         for e, won in enumerate(outcomes)
     ]
@@ -45,20 +62,26 @@ def as_published(method: str) -> list[EpisodeRecord]:
     for task, result in paper.per_task(method).items():
         outcomes = np.arange(450) < round(4.5 * result.mean)
         for i, run in enumerate(np.random.default_rng(0).permutation(outcomes).reshape(9, 50)):
-            made += records(known.model or "", {task: run.tolist()}, seed=(7, 42, 0)[i % 3], checkpoint=i // 3)
+            made += records(
+                known.model or "", {task: run.tolist()}, seed=(7, 42, 0)[i % 3], checkpoint=i // 3
+            )
     return made
 
 
 @pytest.fixture(scope="module")
 def demo() -> Results:
-    return aggregate(demo_records([("framesamp_modul", None), ("groundsg", "qwenvl")]), Protocol(samples=200))
+    return aggregate(
+        demo_records([("framesamp_modul", None), ("groundsg", "qwenvl")]), Protocol(samples=200)
+    )
 
 
 # The paper
 
 
 @pytest.mark.parametrize(("method", "average"), [("FrameSamp+Modul", 44.51), ("pi_0.5", 17.93)])
-def test_records_with_the_papers_rates_give_the_papers_average_suites_and_groups(method: str, average: float) -> None:
+def test_records_with_the_papers_rates_give_the_papers_average_suites_and_groups(
+    method: str, average: float
+) -> None:
     (method_result,) = aggregate(as_published(method), Protocol(samples=100)).methods
     assert method_result.average.mean == pytest.approx(average, abs=0.006)
     assert method_result.average.complete == 9
@@ -70,12 +93,22 @@ def test_records_with_the_papers_rates_give_the_papers_average_suites_and_groups
 
 
 def test_the_shipped_numbers_are_the_papers(shared: Path) -> None:
-    for name, published in {"per_task": "results_per_task", "memory_budget": "memory_budget"}.items():
-        assert paper.paper_table(name) == list(csv.DictReader((shared / "paper" / f"{published}.csv").open()))
+    for name, published in {
+        "per_task": "results_per_task",
+        "memory_budget": "memory_budget",
+    }.items():
+        assert paper.paper_table(name) == list(
+            csv.DictReader((shared / "paper" / f"{published}.csv").open())
+        )
     for row in csv.DictReader((shared / "paper" / "task_groups.csv").open()):
         task = TASK_FACTS[row["task"]]
         facts = (task.suite, "+".join(task.memory), task.group, str(task.steps))
-        assert facts == (row["suite"], row["memory_type"], row["functional_group"], row["avg_steps"])
+        assert facts == (
+            row["suite"],
+            row["memory_type"],
+            row["functional_group"],
+            row["avg_steps"],
+        )
 
 
 # Statistics
@@ -171,15 +204,23 @@ def test_wrong_records_are_refused() -> None:
     with pytest.raises(UserError, match="each once"):
         Protocol(("BinFill", "BinFill"))
     with pytest.raises(
-        UserError, match=r"RoboMME has no task 'BinFil', and no record is of it\. Did you mean 'BinFill'"
+        UserError,
+        match=r"RoboMME has no task 'BinFil', and no record is of it\. Did you mean 'BinFill'",
     ):
         aggregate(made, Protocol(("BinFill", "BinFil")))
 
 
 def test_own_tasks_form_a_group_beside_the_benchmark() -> None:
-    benchmark, custom = records("a", {"BinFill": [1, 0]}), records("a", {"TwoButtons": [1, 1], "Stay": [0, 1]})
+    benchmark, custom = (
+        records("a", {"BinFill": [1, 0]}),
+        records("a", {"TwoButtons": [1, 1], "Stay": [0, 1]}),
+    )
     (alone,) = aggregate(custom, Protocol(tasks_of(custom), 2, samples=100)).methods
-    assert (alone.average.mean, alone.figures["suite"]["Own tasks"].mean, alone.complete) == (75.0, 75.0, True)
+    assert (alone.average.mean, alone.figures["suite"]["Own tasks"].mean, alone.complete) == (
+        75.0,
+        75.0,
+        True,
+    )
     tasks = ("BinFill", "TwoButtons", "Stay")
     both = aggregate([*benchmark, *custom], Protocol(tasks, 2, samples=100))
     (method,) = both.methods
@@ -211,7 +252,10 @@ def test_a_comparison_pairs_the_episodes() -> None:
 
 def test_several_comparisons_are_corrected(demo: Results) -> None:
     pair = (demo.methods[0], demo.methods[1])
-    (alone,), (first, _) = compare_all([pair], demo.protocol), compare_all([pair, pair[::-1]], demo.protocol)
+    (alone,), (first, _) = (
+        compare_all([pair], demo.protocol),
+        compare_all([pair, pair[::-1]], demo.protocol),
+    )
     assert first.corrected == pytest.approx(min(1, 2 * alone.p))
     with pytest.raises(UserError, match="with itself"):
         compare(pair[0], pair[0], demo.protocol)
@@ -234,7 +278,9 @@ def test_the_leaderboard_has_sixteen_rows_three_seeds_and_their_average(demo: Re
 def test_csv_holds_the_figures_and_latex_escapes(demo: Results) -> None:
     rows = list(csv.DictReader(to_csv(demo).splitlines()))
     row = next(r for r in rows if (r["method"], r["kind"]) == ("framesamp_modul", "average"))
-    assert float(row["mean"]) == pytest.approx(demo.method("framesamp_modul").average.mean, abs=1e-3)
+    assert float(row["mean"]) == pytest.approx(
+        demo.method("framesamp_modul").average.mean, abs=1e-3
+    )
     assert float(row["paper_mean"]) == pytest.approx(44.51, abs=0.005)
     assert len(rows) == 2 * (16 + 4 + 6 + 1 + 3)
     latex = to_latex(overview(demo))
@@ -243,18 +289,26 @@ def test_csv_holds_the_figures_and_latex_escapes(demo: Results) -> None:
     assert r"$\pm$" in latex
 
 
-def test_the_command_reads_shards_and_saves_every_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_reads_shards_and_saves_every_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / "run"
     for shard in range(2):
         for name, wins in (("pi05", [1, 0, 0, 0]), ("ttt_modul", [1, 1, 0, 1])):
             made = records(name, {"BinFill": wins, "MoveCube": wins})
             save_records(run / f"episodes-{shard}.jsonl", made[shard::2])
-    files = {kind: tmp_path / "out" / f"results.{kind}" for kind in ("csv", "latex", "markdown", "html")}
+    files = {
+        kind: tmp_path / "out" / f"results.{kind}" for kind in ("csv", "latex", "markdown", "html")
+    }
     options = [part for kind, path in files.items() for part in (f"--{kind}", str(path))]
-    main([str(run), "--tasks", "BinFill", "MoveCube", "--episodes", "4", "--samples", "50", *options])
+    main(
+        [str(run), "--tasks", "BinFill", "MoveCube", "--episodes", "4", "--samples", "50", *options]
+    )
     printed = capsys.readouterr().out
     assert "75.00" in printed
-    assert "no significant difference between pi05 and ttt_modul" in printed  # two methods are compared unasked
+    assert (
+        "no significant difference between pi05 and ttt_modul" in printed
+    )  # two methods are compared unasked
     page = files["html"].read_text()
     assert page.count("<svg") >= 5
     assert "<script" not in page
@@ -264,13 +318,30 @@ def test_the_command_reads_shards_and_saves_every_format(tmp_path: Path, capsys:
 
 def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
     wins = {"BinFill": [1, 0], "MoveCube": [1, 1]}
-    config = {"memory": {"name": "ttt", "budget": 512}, "integration": {"name": "expert"},
-              "card": {"data": "robomme", "recipe": {"steps": 80000, "batch_size": 64, "lr": 5e-5}}}  # fmt: skip
-    claim_run(tmp_path / "a", {"model": "ttt_expert", "checkpoint": 100}, {"policy": policy_facts(config)})
+    config = {
+        "memory": {"name": "ttt", "budget": 512},
+        "integration": {"name": "expert"},
+        "card": {"data": "robomme", "recipe": {"steps": 80000, "batch_size": 64, "lr": 5e-5}},
+    }
+    claim_run(
+        tmp_path / "a", {"model": "ttt_expert", "checkpoint": 100}, {"policy": policy_facts(config)}
+    )
     for folder, name in (("a", "ttt_expert"), ("b", "pi05")):
-        save_records(tmp_path / folder, [*records(name, wins, seed=7), *records(name, wins, seed=42)])
+        save_records(
+            tmp_path / folder, [*records(name, wins, seed=7), *records(name, wins, seed=42)]
+        )
     out = tmp_path / "out.md"
-    options = ["--tasks", "BinFill", "MoveCube", "--episodes", "2", "--samples", "50", "--brief", "--markdown"]
+    options = [
+        "--tasks",
+        "BinFill",
+        "MoveCube",
+        "--episodes",
+        "2",
+        "--samples",
+        "50",
+        "--brief",
+        "--markdown",
+    ]
     main([str(tmp_path / "a"), str(tmp_path / "b"), *options, str(out)])
     _, _, details = out.read_text().partition("## Training details")
     trained, unknown = details.split("**pi05")
@@ -286,7 +357,9 @@ def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
      (["--demo", "--samples", "20", "--compare", "pi05", "pi06"], "pi06"),
      (["--demo", "--tasks", "Binfill"], "Did you mean 'BinFill'")],
 )  # fmt: skip
-def test_mistakes_end_with_a_sentence(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_end_with_a_sentence(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2
@@ -296,8 +369,21 @@ def test_mistakes_end_with_a_sentence(arguments: list[str], message: str, capsys
 def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    save_records(tmp_path, [*records("pi05", {"BinFill": [1, 0]}), *records("ttt_modul", {"MoveCube": [1, 1]})])
-    options = [str(tmp_path), "--tasks", "BinFill", "MoveCube", "--episodes", "2", "--samples", "20", "--brief"]
+    save_records(
+        tmp_path,
+        [*records("pi05", {"BinFill": [1, 0]}), *records("ttt_modul", {"MoveCube": [1, 1]})],
+    )
+    options = [
+        str(tmp_path),
+        "--tasks",
+        "BinFill",
+        "MoveCube",
+        "--episodes",
+        "2",
+        "--samples",
+        "20",
+        "--brief",
+    ]
     main(options)
     printed = capsys.readouterr().out
     assert "incomplete (2 of 4)" in printed
@@ -311,14 +397,24 @@ def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
 @pytest.mark.parametrize(
     ("config", "said"),
     [
-        ({"memory": {"name": "ttt"}, "card": {"recipe": {"lr": "1e-4", "steps": 5}}}, "peak learning rate 1e-4"),
+        (
+            {"memory": {"name": "ttt"}, "card": {"recipe": {"lr": "1e-4", "steps": 5}}},
+            "peak learning rate 1e-4",
+        ),
         ({"memory": {"budget": 64}, "card": {"recipe": {}}}, "memory without a name, 64 tokens"),
-        ({"memory": "ttt", "integration": "expert", "card": "manually"}, "memory ttt, integration expert"),
+        (
+            {"memory": "ttt", "integration": "expert", "card": "manually"},
+            "memory ttt, integration expert",
+        ),
         ({"card": {"recipe": "as released"}}, "training: as released"),
     ],
 )
-def test_a_submission_shows_settings_of_unusual_kinds_as_they_are(config: dict[str, object], said: str) -> None:
-    methods = aggregate(records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [1, 1, 1, 1]}), SMALL).methods
+def test_a_submission_shows_settings_of_unusual_kinds_as_they_are(
+    config: dict[str, object], said: str
+) -> None:
+    methods = aggregate(
+        records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [1, 1, 1, 1]}), SMALL
+    ).methods
     run = {"settings": {"model": "a", "checkpoint": 100}, "notes": {"policy": policy_facts(config)}}
     assert said in training_details(methods, [run])
 
@@ -342,7 +438,9 @@ def test_escape_sequences_of_names_do_not_reach_the_terminal(
 
 @pytest.mark.parametrize("start", ["=HYPERLINK(1)", "+1", "-1", "@SUM(1)", "\t=1", "\r=1"])
 def test_a_name_is_no_formula_of_a_spreadsheet(start: str) -> None:
-    results = aggregate(records(start, {"BinFill": [True]}), Protocol(("BinFill",), episodes=1, samples=20))
+    results = aggregate(
+        records(start, {"BinFill": [True]}), Protocol(("BinFill",), episodes=1, samples=20)
+    )
     rows = list(csv.DictReader(io.StringIO(to_csv(results), newline="")))
     assert {row["method"] for row in rows} == {f"'{start.strip()}"}
     assert {row["mean"] for row in rows} == {"100.0000"}
@@ -363,11 +461,23 @@ def test_a_name_is_no_formula_of_a_spreadsheet(start: str) -> None:
 )
 def test_a_name_is_no_link_and_no_html_of_markdown(name: str, displayed: str) -> None:
     assert (
-        to_markdown(Table(name, ["method"], [[name]])) == f"### {displayed}\n\n| method |\n| :--- |\n| {displayed} |\n"
+        to_markdown(Table(name, ["method"], [[name]]))
+        == f"### {displayed}\n\n| method |\n| :--- |\n| {displayed} |\n"
     )
 
 
 def test_a_name_with_dollar_signs_is_text_in_the_figures(tmp_path: Path) -> None:
     save_records(tmp_path, records(r"$\nonsense$", {"BinFill": [True, False]}))
-    main([str(tmp_path), "--tasks", "BinFill", "--episodes", "2", "--html", str(tmp_path / "page.html"), "--brief"])
+    main(
+        [
+            str(tmp_path),
+            "--tasks",
+            "BinFill",
+            "--episodes",
+            "2",
+            "--html",
+            str(tmp_path / "page.html"),
+            "--brief",
+        ]
+    )
     assert r"$\nonsense$" in (tmp_path / "page.html").read_text()

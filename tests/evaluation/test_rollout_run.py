@@ -7,7 +7,15 @@ from pathlib import Path
 import pytest
 
 from helpers import commands
-from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, roll, run_evaluation, use_inline_envs
+from helpers.rollout_fakes import (
+    FACTS,
+    JOBS,
+    InlineEnvs,
+    quick_policy,
+    roll,
+    run_evaluation,
+    use_inline_envs,
+)
 from helpers.scripted_env import make_mortal_env, make_moving_env
 from mme_vla import UserError
 from mme_vla.envs.vector.pool import Job
@@ -22,11 +30,17 @@ from mme_vla.policy.mme import MMEPolicy
 def outcomes(folder: Path) -> dict:
     """What must not depend on how a run came about; the last is exact to the last bit."""
     records = [record for path in find_records([folder]) for record in read_records(path)]
-    return {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records if r.outcome != "error"}
+    return {
+        r.key: (r.outcome, r.steps, r.extra["actions_sha256"])
+        for r in records
+        if r.outcome != "error"
+    }
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     use_inline_envs(monkeypatch)  # the killed run has worker processes
     checkpoint = tmp_path / "step_000003"
     quick_policy("framesamp_modul", memory={"budget": 64}).save_pretrained(checkpoint)
@@ -54,13 +68,17 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path, monke
     with pytest.warns(UserWarning, match="half-written"):
         resumed = run_evaluation(policy, folder)
     after = read_records(records)
-    assert [(r.key, r.when) for r in after[: len(before)]] == before, "what was finished was run again"
+    assert [(r.key, r.when) for r in after[: len(before)]] == before, (
+        "what was finished was run again"
+    )
     assert len(after) == len(resumed.records) == 6
     assert outcomes(folder) == outcomes(tmp_path / "whole")
     assert run_evaluation(policy, folder).workload.batches == 0, "nothing was left to do"
 
 
-def test_a_dying_worker_is_an_error_that_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dying_worker_is_an_error_that_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     policy = quick_policy("pi05")
     (tmp_path / "graves").mkdir()
     monkeypatch.setenv("GRAVES", str(tmp_path / "graves"))
@@ -78,7 +96,9 @@ def test_a_dying_worker_is_an_error_that_is_tried_again(tmp_path: Path, monkeypa
     assert outcomes(tmp_path / "b").items() <= outcomes(tmp_path / "a").items()
 
 
-def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     use_inline_envs(monkeypatch)
     run_evaluation(quick_policy("pi05"), tmp_path, jobs=JOBS[:1])
     with pytest.raises(UserError, match=r"execute was 16, is 8"):
@@ -87,7 +107,9 @@ def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(tmp_path: Path, monke
         run_evaluation(quick_policy("framesamp_modul"), tmp_path)
 
 
-def test_episodes_of_other_runs_are_not_taken_for_this_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_episodes_of_other_runs_are_not_taken_for_this_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     use_inline_envs(monkeypatch)
     policy, runs = quick_policy("pi05"), tmp_path / "runs"
     for folder in (runs / "seed7", runs):  # the second lies above the first
@@ -100,9 +122,14 @@ def test_episodes_of_other_runs_are_not_taken_for_this_ones(tmp_path: Path, monk
     assert run_evaluation(policy, runs, jobs=JOBS[:2]).workload.batches == 0
 
 
-def test_shards_side_by_side_make_the_full_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shards_side_by_side_make_the_full_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     use_inline_envs(monkeypatch)
-    policy, settings = quick_policy("pi05"), RolloutSettings(max_steps=24, flow_steps=2, max_batch=1)
+    policy, settings = (
+        quick_policy("pi05"),
+        RolloutSettings(max_steps=24, flow_steps=2, max_batch=1),
+    )
     left = [2, 2]  # how many the first process may begin; the other does the rest
     take = Claims.take
 
@@ -115,10 +142,20 @@ def test_shards_side_by_side_make_the_full_run(tmp_path: Path, monkeypatch: pyte
     for index in range(2):
         shard = Shard(index, 2)
         mine = evaluate(
-            policy, JOBS[:4], tmp_path, FACTS, settings, shard=shard, base=make_moving_env, show_progress=False
+            policy,
+            JOBS[:4],
+            tmp_path,
+            FACTS,
+            settings,
+            shard=shard,
+            base=make_moving_env,
+            show_progress=False,
         )
         assert len(mine.records) == 2
-    assert sorted(path.name for path in find_records([tmp_path])) == ["episodes-0of2.jsonl", "episodes-1of2.jsonl"]
+    assert sorted(path.name for path in find_records([tmp_path])) == [
+        "episodes-0of2.jsonl",
+        "episodes-1of2.jsonl",
+    ]
     both = outcomes(tmp_path)
     run_evaluation(policy, tmp_path / "alone", make_moving_env, jobs=JOBS[:4])
     assert both == outcomes(tmp_path / "alone")
@@ -154,17 +191,23 @@ def test_environments_that_cannot_begin_stop_the_run() -> None:
     assert [record.outcome for record in roll(quick_policy("pi05"), many, envs)] == ["error"] * 12
 
 
-def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(tmp_path: Path) -> None:
+def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(
+    tmp_path: Path,
+) -> None:
     import av
 
     options = {"base": make_moving_env, "videos": (str(tmp_path), "all")}
     records = roll(quick_policy("pi05"), [Job("VideoUnmask", "test", 0)], InlineEnvs(**options))
     (path,) = tmp_path.iterdir()
-    assert path.name == "VideoUnmask_ep0_success_pick_up_the_red_cube.mp4" == records[0].extra["video"]
+    assert (
+        path.name == "VideoUnmask_ep0_success_pick_up_the_red_cube.mp4" == records[0].extra["video"]
+    )
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert stream.average_rate == 30
-        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(stream)]
+        frames = [
+            frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(stream)
+        ]
     assert len(frames) == 22 + records[0].steps
     red = [bool((frame[3, 20] - frame[3, 20].mean())[0] > 80) for frame in frames]
     assert red == [True] * 21 + [False] * (len(frames) - 21)

@@ -1,4 +1,6 @@
-"""Rollouts as data: rows, rewards, log-probabilities and the oracle's actions, on an environment of one decision."""
+"""Rollouts as data: rows, rewards, log-probabilities and the oracle's actions, on an environment of
+one decision.
+"""
 
 import re
 import runpy
@@ -30,13 +32,18 @@ two_choices = runpy.run_path(str(EXAMPLES / "two_choices.py"))["make_two_choices
 @pytest.fixture(scope="module")
 def policy() -> MMEPolicy:
     built = build_policy(
-        "framesamp_modul", backbone="nano_choice", embodiment="robomme_choice_front", memory={"budget": 4, "grid": 1}
+        "framesamp_modul",
+        backbone="nano_choice",
+        embodiment="robomme_choice_front",
+        memory={"budget": 4, "grid": 1},
     )
     built.require_processor().stats = NormStats.unit(8, 10)
     return built.eval()
 
 
-def test_a_trajectory_holds_rows_rewards_and_the_log_probabilities_of_its_choices(policy: MMEPolicy) -> None:
+def test_a_trajectory_holds_rows_rewards_and_the_log_probabilities_of_its_choices(
+    policy: MMEPolicy,
+) -> None:
     trajectories = list(rollouts(policy, two_choices, JOBS, ALL, seed=1))
     assert [t.job for t in trajectories] == JOBS
     for number, trajectory in enumerate(trajectories):
@@ -46,13 +53,19 @@ def test_a_trajectory_holds_rows_rewards_and_the_log_probabilities_of_its_choice
         right = int(executed[0].argmax()) == number % 2
         assert trajectory.success == right and trajectory.total_reward == float(right)
         assert int(rows.actions[0, 0, :8].argmax()) == int(executed[0, :8].argmax())
-        assert rows.action_mask is not None and rows.action_mask.tolist() == [[True, False, False, False]]
+        assert rows.action_mask is not None and rows.action_mask.tolist() == [
+            [True, False, False, False]
+        ]
         assert rows.options is not None and rows.options.tolist() == [[True, True, *[False] * 6]]
-        assert torch.allclose(log_prob(policy, rows, trajectory.chunks), trajectory.log_probs, atol=1e-5)
+        assert torch.allclose(
+            log_prob(policy, rows, trajectory.chunks), trajectory.log_probs, atol=1e-5
+        )
         assert int(trajectory.oracle.actions[0, 0, :8].argmax()) == number % 2
     batch = join([t.observations for t in trajectories if t.observations is not None])
     loss, _ = policy(batch)
-    assert torch.isfinite(loss) and batch.history is not None and len(batch.history.mask) == len(JOBS)
+    assert (
+        torch.isfinite(loss) and batch.history is not None and len(batch.history.mask) == len(JOBS)
+    )
 
 
 def test_rows_are_joined_with_their_weights_and_labels(policy: MMEPolicy) -> None:
@@ -80,8 +93,16 @@ def test_an_episode_that_cannot_begin_is_a_trajectory_without_decisions(policy: 
     trajectories = {t.job: t for t in rollouts(policy, make_env, JOBS[:3], ALL)}
     assert set(trajectories) == set(JOBS[:3])
     failed = trajectories[JOBS[1]]
-    assert failed.outcome == "error" and failed.error is not None and "no place for the cube" in failed.error
-    assert failed.chunks.shape == (0, 4, 10) and failed.total_reward == 0.0 and failed.observations is None
+    assert (
+        failed.outcome == "error"
+        and failed.error is not None
+        and "no place for the cube" in failed.error
+    )
+    assert (
+        failed.chunks.shape == (0, 4, 10)
+        and failed.total_reward == 0.0
+        and failed.observations is None
+    )
     assert trajectories[JOBS[0]].error is None and len(trajectories[JOBS[0]].chunks) == 1
 
 
@@ -102,7 +123,10 @@ def test_an_error_in_a_step_ends_its_episode_alone(policy: MMEPolicy) -> None:
 
 
 def test_the_same_seed_repeats_a_rollout_and_another_does_not(policy: MMEPolicy) -> None:
-    chunks = [torch.cat([t.chunks for t in rollouts(policy, two_choices, JOBS, (), seed=seed)]) for seed in (1, 1, 2)]
+    chunks = [
+        torch.cat([t.chunks for t in rollouts(policy, two_choices, JOBS, (), seed=seed)])
+        for seed in (1, 1, 2)
+    ]
     assert torch.equal(chunks[0], chunks[1]) and not torch.equal(chunks[0], chunks[2])
 
 

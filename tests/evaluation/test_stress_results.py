@@ -1,4 +1,6 @@
-"""Success over the dials of a stress split: one curve is of the same episodes, and the test split is its zero."""
+"""Success over the dials of a stress split: one curve is of the same episodes, and the test split
+is its zero.
+"""
 
 from pathlib import Path
 

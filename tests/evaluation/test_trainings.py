@@ -22,23 +22,45 @@ PROTOCOL = Protocol(("StopCube",), 10, samples=500)
 CONFIG = {"seed": 3, "train": {"lr": 1e-3, "steps": 100, "workers": 2}, "data": {"jitter": False}}
 
 
-def records(won: int, seed: int = 0, model_seed: int = 7, recipe: str = "r", model: str = "m") -> list[EpisodeRecord]:
+def records(
+    won: int, seed: int = 0, model_seed: int = 7, recipe: str = "r", model: str = "m"
+) -> list[EpisodeRecord]:
     trained = TrainingIdentity(seed, recipe, "d", f"w{seed}")
     return [
-        EpisodeRecord(model, 100, model_seed, "StopCube", e, e, "easy", "success" if e < won else "fail", 9,
-                      training=trained)
+        EpisodeRecord(
+            model,
+            100,
+            model_seed,
+            "StopCube",
+            e,
+            e,
+            "easy",
+            "success" if e < won else "fail",
+            9,
+            training=trained,
+        )
         for e in range(10)
-    ]  # fmt: skip
+    ]
 
 
 def test_two_trainings_are_one_method_with_a_deviation_over_trainings() -> None:
-    every = [*records(8), *records(6, model_seed=8), *records(3, seed=1), *records(3, seed=1, model_seed=8)]
+    every = [
+        *records(8),
+        *records(6, model_seed=8),
+        *records(3, seed=1),
+        *records(3, seed=1, model_seed=8),
+    ]
     results = aggregate(every, PROTOCOL)
     (method,) = results.methods
     assert method.label == "m" and len(method.trainings) == 2
-    assert method.average.mean == pytest.approx(50) and method.average.std == pytest.approx(np.std([70, 30], ddof=1))
+    assert method.average.mean == pytest.approx(50) and method.average.std == pytest.approx(
+        np.std([70, 30], ddof=1)
+    )
     one = aggregate([*records(8), *records(6, model_seed=8)], PROTOCOL).methods[0].average
-    assert method.average.interval.high - method.average.interval.low > one.interval.high - one.interval.low
+    assert (
+        method.average.interval.high - method.average.interval.low
+        > one.interval.high - one.interval.low
+    )
     table, runs = overview(results), runs_table(results)
     assert table.rows[0][:3] == ["m", "2", "4"] and "over trainings" in table.title
     assert [row[1] for row in runs.rows] == ["0", "0", "1", "1"]
@@ -54,7 +76,9 @@ def test_two_recipes_are_not_averaged() -> None:
 def test_records_without_a_training_have_the_figures_they_had() -> None:
     base = [replace(record, training=None) for record in (*records(8), *records(6, model_seed=8))]
     read = merge([EpisodeRecord.from_json(record.to_json()) for record in base])
-    lines = [{key: value for key, value in vars(record).items() if key != "training"} for record in read]
+    lines = [
+        {key: value for key, value in vars(record).items() if key != "training"} for record in read
+    ]
     old = [EpisodeRecord.from_dict(line | {"seconds": {}}) for line in lines]
     figures = [aggregate(part, PROTOCOL).methods[0].average for part in (base, old)]
     assert figures[0] == figures[1] and figures[0].std == pytest.approx(np.std([80, 60], ddof=1))
@@ -67,10 +91,19 @@ def test_a_record_keeps_its_training() -> None:
 
 
 def test_the_interval_of_a_difference_covers_trainings() -> None:
-    every = [*records(9), *records(5, seed=1), *records(4, model="n"), *records(4, seed=1, model="n")]
+    every = [
+        *records(9),
+        *records(5, seed=1),
+        *records(4, model="n"),
+        *records(4, seed=1, model="n"),
+    ]
     results = aggregate(every, PROTOCOL)
     wide = compare(results.method("m"), results.method("n"), PROTOCOL)
-    assert wide.difference == pytest.approx(30) and wide.interval.high >= 50 and wide.interval.low <= 10
+    assert (
+        wide.difference == pytest.approx(30)
+        and wide.interval.high >= 50
+        and wide.interval.low <= 10
+    )
 
 
 def test_the_bootstrap_of_one_training_draws_episodes_alone() -> None:
@@ -81,19 +114,28 @@ def test_the_bootstrap_of_one_training_draws_episodes_alone() -> None:
 
 def test_the_recipe_holds_what_changes_an_update() -> None:
     base = identify(CONFIG, ["abc"])
-    assert base["seed"] == 3 and identify({**CONFIG, "seed": 4}, ["abc"])["recipe"] == base["recipe"]
+    assert (
+        base["seed"] == 3 and identify({**CONFIG, "seed": 4}, ["abc"])["recipe"] == base["recipe"]
+    )
     free = {**CONFIG, "train": {**CONFIG["train"], "workers": 8}}
     assert identify(free, ["abc"]) == base
     longer = {**CONFIG, "train": {**CONFIG["train"], "steps": 400}}
     assert identify(longer, ["abc"])["recipe"] != base["recipe"]
-    for section, key in (("policy", "stage"), ("policy", "subtask_weight"), ("data", "weights"), ("data", "texts")):
+    for section, key in (
+        ("policy", "stage"),
+        ("policy", "subtask_weight"),
+        ("data", "weights"),
+        ("data", "texts"),
+    ):
         other = {**CONFIG, section: {**CONFIG.get(section, {}), key: "x"}}
         assert identify(other, ["abc"])["recipe"] != base["recipe"], key
     assert identify(CONFIG, ["xyz"])["data"] != base["data"]
     started = {start: identify({**CONFIG, "init_from": start}, ["abc"])["recipe"] for start in
                (None, "none", "lerobot/pi05_base", "/not/here/pi05_base")}  # fmt: skip
     assert started[None] == started["none"] == base["recipe"], "random weights"
-    assert started["lerobot/pi05_base"] == started["/not/here/pi05_base"] != base["recipe"], "the end of a path"
+    assert started["lerobot/pi05_base"] == started["/not/here/pi05_base"] != base["recipe"], (
+        "the end of a path"
+    )
 
 
 def test_a_recipe_names_the_weights_that_it_starts_from(tmp_path: Path) -> None:
@@ -101,7 +143,8 @@ def test_a_recipe_names_the_weights_that_it_starts_from(tmp_path: Path) -> None:
     quick_policy("pi05").save_pretrained(checkpoint)
     (checkpoint / STATE).write_text("{}")
     recipes = {
-        identify({**CONFIG, "init_from": str(place)}, ["abc"])["recipe"] for place in (tmp_path / "run", checkpoint)
+        identify({**CONFIG, "init_from": str(place)}, ["abc"])["recipe"]
+        for place in (tmp_path / "run", checkpoint)
     }
     assert len(recipes) == 1
 
@@ -115,5 +158,10 @@ def test_records_copy_the_training_of_a_checkpoint(tmp_path: Path) -> None:
     assert facts.training is not None and facts.training.seed == 3 and facts.training.weights
     next(policy.parameters()).data += 1
     policy.save_pretrained(tmp_path / "two")
-    other = facts_of(Policy.from_pretrained(str(tmp_path / "two")), None, "two", RolloutSettings(), None).training
-    assert other == replace(facts.training, weights=other.weights if other else None) and other != facts.training
+    other = facts_of(
+        Policy.from_pretrained(str(tmp_path / "two")), None, "two", RolloutSettings(), None
+    ).training
+    assert (
+        other == replace(facts.training, weights=other.weights if other else None)
+        and other != facts.training
+    )

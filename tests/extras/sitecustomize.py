@@ -1,7 +1,8 @@
-"""Makes modules invisible to a Python that starts with this folder in PYTHONPATH, and to the ones that it starts.
+"""Makes modules invisible to a Python that starts with this folder in PYTHONPATH, and to the ones
+that it starts.
 
-The names stand in the environment variable `HIDDEN_MODULES`, parted by spaces. To importers and to `find_spec` a hidden
-module does not exist.
+The names stand in the environment variable `HIDDEN_MODULES`, parted by spaces. To importers and to
+`find_spec` a hidden module does not exist.
 """
 
 import os

@@ -1,4 +1,6 @@
-"""Small valid files of every kind that the library reads, and all of their content as the library reads it."""
+"""Small valid files of every kind that the library reads, and all of their content as the library
+reads it.
+"""
 
 import hashlib
 import json
@@ -31,7 +33,9 @@ def digest(*values: object) -> str:
     hasher = hashlib.sha256()
     for value in values:
         if isinstance(value, np.ndarray):
-            hasher.update(f"{value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+            hasher.update(
+                f"{value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes()
+            )
         else:
             hasher.update(repr(value).encode("utf-8", "surrogatepass"))
     return hasher.hexdigest()
@@ -70,7 +74,9 @@ class SyntheticSource:
         return np.ones(LENGTHS[episode], bool)
 
     def frames(self, episode: int, indices: Any, camera: str | None = None) -> np.ndarray:
-        values = np.random.default_rng(episode).integers(0, 255, (LENGTHS[episode], SIDE, SIDE, 3), np.uint8)
+        values = np.random.default_rng(episode).integers(
+            0, 255, (LENGTHS[episode], SIDE, SIDE, 3), np.uint8
+        )
         return values[np.asarray(indices)]
 
 
@@ -79,7 +85,9 @@ def _memory() -> TokenDrop:
 
 
 def _encode(frames: np.ndarray) -> Tensor:
-    return torch.from_numpy(frames.reshape(len(frames), -1)[:, :32].astype(np.float32)).view(-1, 4, 8)
+    return torch.from_numpy(frames.reshape(len(frames), -1)[:, :32].astype(np.float32)).view(
+        -1, 4, 8
+    )
 
 
 def expected_fingerprint() -> dict[str, Any]:
@@ -101,17 +109,29 @@ def write_logs(folder: Path) -> None:
             outcome = "success" if episode % 2 else "timeout"
             log.append(
                 EpisodeRecord(
-                    "pi05", 60000, 7, "PickXtimes", episode, 500 + episode, "easy", outcome, 300 + episode,
-                    seconds=Seconds(1.5, 0.25, 2.0), when="2026-01-01T00:00:00+00:00", extra={"score": 0.5},
+                    "pi05",
+                    60000,
+                    7,
+                    "PickXtimes",
+                    episode,
+                    500 + episode,
+                    "easy",
+                    outcome,
+                    300 + episode,
+                    seconds=Seconds(1.5, 0.25, 2.0),
+                    when="2026-01-01T00:00:00+00:00",
+                    extra={"score": 0.5},
                 )
-            )  # fmt: skip
+            )
 
 
 QUESTION = ("You plan.", [("user", ["What next?"])])
 
 
 def _api(folder: Path, reply: str) -> Api:
-    api = Api(Settings(cache=str(folder / "answers"), requests_per_minute=None), Usage(), client=object())
+    api = Api(
+        Settings(cache=str(folder / "answers"), requests_per_minute=None), Usage(), client=object()
+    )
     api._once = lambda connection, system, messages: Reply(reply, 12, 7)  # type: ignore[method-assign]
     return api
 
@@ -122,7 +142,9 @@ def write_answers(folder: Path) -> None:
 
 
 def read_answers(folder: Path) -> object:
-    """The kept answer; where it is damaged the question is asked again, and answered in the same words."""
+    """The kept answer; where it is damaged the question is asked again, and answered in the same
+    words.
+    """
     reply = _api(folder, "pick up the cube at <1, 2>").ask(*QUESTION)
     return reply.text, reply.input_tokens, reply.output_tokens
 
@@ -161,13 +183,18 @@ def read_rows(folder: Path) -> object:
     for i in range(len(dataset)):
         question = dataset[i]
         read += [question.system, question.user, question.target, *question.images]
-        read += [array for clip in question.videos for array in (clip.frames, clip.indices, clip.length)]
+        read += [
+            array for clip in question.videos for array in (clip.frames, clip.indices, clip.length)
+        ]
     return digest(*read)
 
 
 def write_metadata(folder: Path) -> None:
     """Official metadata of one task."""
-    records = [{"task": "PickXtimes", "episode": e, "seed": 500 + e, "difficulty": "easy"} for e in range(4)]
+    records = [
+        {"task": "PickXtimes", "episode": e, "seed": 500 + e, "difficulty": "easy"}
+        for e in range(4)
+    ]
     place = folder / "test" / "record_dataset_PickXtimes_metadata.json"
     place.parent.mkdir()
     place.write_text(json.dumps({"env_id": "PickXtimes", "record_count": 4, "records": records}))

@@ -40,10 +40,14 @@ def case(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def rule_uniform(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
-    """The float32 numbers in [−1, 1) that the cases' READMEs call u(name, shape, seed): splitmix64 of whole numbers."""
+    """The float32 numbers in [−1, 1) that the cases' READMEs call u(name, shape, seed): splitmix64
+    of whole numbers.
+    """
     count = int(np.prod(shape, dtype=np.int64))
     with np.errstate(over="ignore"):
-        z = np.arange(count, dtype=np.uint64) + (np.uint64(zlib.crc32(f"{seed}/{name}".encode())) << np.uint64(32))
+        z = np.arange(count, dtype=np.uint64) + (
+            np.uint64(zlib.crc32(f"{seed}/{name}".encode())) << np.uint64(32)
+        )
         z += np.uint64(0x9E3779B97F4A7C15)
         for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1)):
             z ^= z >> np.uint64(shift)
@@ -56,7 +60,9 @@ def rule_uniform(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
 
 
 def rule_weight(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
-    """A parameter by rule: small biases, norm weights about one, matrices of unit gain for their fan-in."""
+    """A parameter by rule: small biases, norm weights about one, matrices of unit gain for their
+    fan-in.
+    """
     uniform = rule_uniform(name, shape, seed)
     if name.endswith("bias"):
         return 0.1 * uniform
@@ -67,7 +73,9 @@ def rule_weight(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
 
 
 def relative_error(actual: Tensor, expected: Tensor) -> float:
-    """Largest difference over the largest expected number; also kept under the running test's name (docs/evidence)."""
+    """Largest difference over the largest expected number; also kept under the running test's name
+    (docs/evidence).
+    """
     assert actual.shape == expected.shape, (actual.shape, expected.shape)
     worst = (actual.detach().double() - expected.double()).abs().max().item()
     worst /= expected.abs().max().item() or 1.0

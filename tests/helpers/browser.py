@@ -1,4 +1,6 @@
-"""A headless Chromium that tests drive through its own protocol (DevTools), with nothing but `websockets`."""
+"""A headless Chromium that tests drive through its own protocol (DevTools), with nothing but
+`websockets`.
+"""
 
 import base64
 import json
@@ -14,12 +16,20 @@ import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
-    "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-sync",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-dev-shm-usage",
     "--remote-debugging-port=0",
-]  # fmt: skip
+]
 KEYS = {"Enter": ("Enter", 13, "\r"), " ": ("Space", 32, " "), "Escape": ("Escape", 27, "")} | {
-    f"Arrow{name}": (f"Arrow{name}", code, "") for name, code in (("Left", 37), ("Up", 38), ("Right", 39), ("Down", 40))
+    f"Arrow{name}": (f"Arrow{name}", code, "")
+    for name, code in (("Left", 37), ("Up", 38), ("Right", 39), ("Down", 40))
 }
 
 
@@ -34,10 +44,14 @@ class Browser:
         program = next(filter(None, map(shutil.which, NAMES)), None)
         if program is None:
             pytest.skip("no Chromium here: apt-get install chromium")
-        sync = pytest.importorskip("websockets.sync.client", reason="pip install websockets (the dev extra has it)")
+        sync = pytest.importorskip(
+            "websockets.sync.client", reason="pip install websockets (the dev extra has it)"
+        )
         window = "--window-size={},{}".format(*size)
         command = [program, *FLAGS, window, f"--user-data-dir={profile}", "about:blank"]
-        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        self._process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
         self._socket: Any = None
         self._count = 0
         self.problems: list[str] = []
@@ -50,7 +64,11 @@ class Browser:
             for domain in ("Page", "Runtime", "Log"):
                 self.call(f"{domain}.enable")
             self.call(
-                "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
+                "Emulation.setDeviceMetricsOverride",
+                width=size[0],
+                height=size[1],
+                deviceScaleFactor=1,
+                mobile=False,
             )
         except BaseException:
             self.close()
@@ -71,7 +89,10 @@ class Browser:
             message = json.loads(self._socket.recv(timeout=60))
             if message.get("method") == "Runtime.exceptionThrown":
                 self.problems.append(str(message["params"]["exceptionDetails"]))
-            if message.get("method") == "Log.entryAdded" and message["params"]["entry"]["level"] == "error":
+            if (
+                message.get("method") == "Log.entryAdded"
+                and message["params"]["entry"]["level"] == "error"
+            ):
                 self.problems.append(str(message["params"]["entry"]))
             if message.get("id") == self._count:
                 if "error" in message:
@@ -85,7 +106,9 @@ class Browser:
 
     def run(self, script: str) -> Any:
         """The value of a JavaScript expression."""
-        reply = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        reply = self.call(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
         if "exceptionDetails" in reply:
             raise RuntimeError(f"{script}: {reply['exceptionDetails']}")
         return reply["result"].get("value")
@@ -97,7 +120,8 @@ class Browser:
             if time.monotonic() > end:
                 text = self.run("document.body.innerText")
                 raise TimeoutError(
-                    f"{script} did not come true in {seconds} s; the page says:\n{text}\n{self.problems}"
+                    f"{script} did not come true in {seconds} s; the page"
+                    f" says:\n{text}\n{self.problems}"
                 )
             time.sleep(0.05)
 
@@ -107,17 +131,33 @@ class Browser:
 
     def press(self, key: str, shift: bool = False) -> None:
         """Press a key."""
-        code, number, text = KEYS[key] if key in KEYS else (f"Key{key.upper()}", ord(key.upper()), key)
-        event = {"key": key, "code": code, "windowsVirtualKeyCode": number, "modifiers": 8 if shift else 0}
-        self.call("Input.dispatchKeyEvent", type="keyDown", **event, **({"text": text} if text else {}))
+        code, number, text = (
+            KEYS[key] if key in KEYS else (f"Key{key.upper()}", ord(key.upper()), key)
+        )
+        event = {
+            "key": key,
+            "code": code,
+            "windowsVirtualKeyCode": number,
+            "modifiers": 8 if shift else 0,
+        }
+        self.call(
+            "Input.dispatchKeyEvent", type="keyDown", **event, **({"text": text} if text else {})
+        )
         self.call("Input.dispatchKeyEvent", type="keyUp", **event)
 
     def click(self, selector: str, place: tuple[float, float] = (0.5, 0.5)) -> None:
         """Click into an element. place: (row, column) as parts of its height and width."""
         find = f"document.querySelector({selector!r})"
         self.run(f"{find}.scrollIntoView({{block: 'nearest'}})")
-        x, y, width, height = self.run(f"(b => [b.x, b.y, b.width, b.height])({find}.getBoundingClientRect())")
-        at = {"x": x + place[1] * width, "y": y + place[0] * height, "button": "left", "clickCount": 1}
+        x, y, width, height = self.run(
+            f"(b => [b.x, b.y, b.width, b.height])({find}.getBoundingClientRect())"
+        )
+        at = {
+            "x": x + place[1] * width,
+            "y": y + place[0] * height,
+            "button": "left",
+            "clickCount": 1,
+        }
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, **at)
 

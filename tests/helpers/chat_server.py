@@ -1,4 +1,6 @@
-"""A local server of a model's endpoint, such as OpenAI's chat completions, with scripted responses."""
+"""A local server of a model's endpoint, such as OpenAI's chat completions, with
+scripted responses.
+"""
 
 import json
 import threading
@@ -24,7 +26,9 @@ def failure(code: int, message: str) -> Reply:
 
 
 class ChatServer:
-    """Returns `answers` in turn, or what `respond` makes of a request; keeps every request and its key."""
+    """Returns `answers` in turn, or what `respond` makes of a request; keeps every request and its
+    key.
+    """
 
     def __init__(self) -> None:
         self.answers: list[Reply] = []
@@ -44,7 +48,9 @@ def chat_server(path: str | None = "/v1/chat/completions") -> Iterator[ChatServe
             request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
             state.requests.append(request)
             state.keys.append(self.headers.get("Authorization", ""))
-            code, body = state.respond(request) if path in (None, self.path) else failure(404, self.path)
+            code, body = (
+                state.respond(request) if path in (None, self.path) else failure(404, self.path)
+            )
             data = json.dumps(body).encode()
             self.send_response(code)
             self.send_header("Content-Type", "application/json")

@@ -1,4 +1,5 @@
-"""One of two processes that wrap a model: `torchrun … ddp_gradients.py KIND FOLDER` saves this one's gradients.
+"""One of two processes that wrap a model: `torchrun … ddp_gradients.py KIND FOLDER` saves this
+one's gradients.
 
 KIND: `ddp`, or `fsdp` (`fully_shard`), each called as PyTorch's documentation does.
 """
@@ -25,7 +26,9 @@ def main(kind: str, folder: Path) -> None:
     batch = random_batch(policy, seed=rank)  # each process has samples of its own
     noise = model.training_noise(len(batch.prompt), torch.Generator().manual_seed(rank))
     wrapped(batch, noise).backward()
-    gradient = next(p.grad for name, p in model.named_parameters() if name.endswith("action_out.weight"))
+    gradient = next(
+        p.grad for name, p in model.named_parameters() if name.endswith("action_out.weight")
+    )
     gradient = gradient.full_tensor() if kind == "fsdp" else gradient
     torch.save(gradient, folder / f"{rank}.pt")
     distributed.destroy_process_group()

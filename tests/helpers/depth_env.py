@@ -1,4 +1,6 @@
-"""Depth and poses of both cameras, and a scripted environment that sees with them and moves by waypoints."""
+"""Depth and poses of both cameras, and a scripted environment that sees with them and moves by
+waypoints.
+"""
 
 from typing import Any
 
@@ -11,7 +13,9 @@ POSE = np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)
 
 
 def readings(count: int, seed: int = 0, listed: bool = False) -> dict[str, Any]:
-    """What belongs to so many frames, as arrays or, as an environment and a client send it, as lists."""
+    """What belongs to so many frames, as arrays or, as an environment and a client send it, as
+    lists.
+    """
     rng = np.random.default_rng([seed, count])
     arrays: dict[str, Any] = {}
     for camera in ("front", "wrist"):
@@ -21,7 +25,9 @@ def readings(count: int, seed: int = 0, listed: bool = False) -> dict[str, Any]:
 
 
 class DepthEnv(ScriptedEnv):
-    """Moves for `MOTION` frames a waypoint, sees with depth unless it is blind, and succeeds after three motions."""
+    """Moves for `MOTION` frames a waypoint, sees with depth unless it is blind, and succeeds after
+    three motions.
+    """
 
     def __init__(self, task: str, episode: int, blind: bool = False) -> None:
         super().__init__(task, episode, 1000, 1e9, 0.0, "")

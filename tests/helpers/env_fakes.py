@@ -39,7 +39,13 @@ class LightEnv:
         while isinstance(action, Path) and not action.exists():
             time.sleep(0.01)
         frame = np.full(FRAME, self.steps, np.uint8)
-        return {"front_rgb_list": [frame]}, 0.0, action == "end", False, {"status": "ongoing", "steps": self.steps}
+        return (
+            {"front_rgb_list": [frame]},
+            0.0,
+            action == "end",
+            False,
+            {"status": "ongoing", "steps": self.steps},
+        )
 
     def close(self) -> None:
         """Nothing to free."""

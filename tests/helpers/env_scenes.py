@@ -1,4 +1,6 @@
-"""Helpers of the tests of the simulation: a scene with any objects, and the recorded episodes as arrays."""
+"""Helpers of the tests of the simulation: a scene with any objects, and the recorded episodes as
+arrays.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -26,9 +28,13 @@ from mme_vla.envs.task import Task
 
 
 class Scene(Task):
-    """A task without a goal: whatever `fill` puts on the table, in physics alone unless told otherwise."""
+    """A task without a goal: whatever `fill` puts on the table, in physics alone unless told
+    otherwise.
+    """
 
-    def __init__(self, fill: Callable[["Scene"], None], stick: bool = False, **settings: object) -> None:
+    def __init__(
+        self, fill: Callable[["Scene"], None], stick: bool = False, **settings: object
+    ) -> None:
         self._fill = fill
         self.stick = stick  # type: ignore[misc]
         super().__init__(**{"obs_mode": "none", "render_backend": "none", **settings})
@@ -70,15 +76,24 @@ def arm_presses_on_box(env: Task) -> bool:
 def replay(env: Task, folder: Path, episode: int) -> np.ndarray:
     """Replay an official episode and compare it with its recording.
 
-    PhysX computes contacts between two boxes with the instruction `rcpps`, whose result differs between makers of CPUs.
-    Until the first such contact of the arm, joints must equal the recorded ones to the last bit. In the whole episode
-    the order of sub-tasks and the success must be the recorded ones.
+    PhysX computes contacts between two boxes with the instruction `rcpps`, whose result differs
+    between makers of CPUs. Until the first such contact of the arm, joints must equal the recorded
+    ones to the last bit. In the whole episode the order of sub-tasks and the success must be the
+    recorded ones.
 
     Returns:
-        The largest difference of a joint position at each step [steps]: radians, for the fingers metres.
+        The largest difference of a joint position at each step [steps]: radians, for the fingers
+        metres.
     """
-    keys = ("action/joint_action", "obs/joint_state", "obs/gripper_state", "info/simple_subgoal_online")
-    actions, arm, fingers, texts = (recorded(folder, type(env).__name__, episode, key) for key in keys)
+    keys = (
+        "action/joint_action",
+        "obs/joint_state",
+        "obs/gripper_state",
+        "info/simple_subgoal_online",
+    )
+    actions, arm, fingers, texts = (
+        recorded(folder, type(env).__name__, episode, key) for key in keys
+    )
     joints, subtasks, contacts, success = [], [], [], False
 
     def note_contact() -> None:

@@ -56,7 +56,9 @@ def touches(env: Task) -> bool:
 
 def go_to(env: Task, text: str) -> None:
     """Go to the first sub-task of the execution that has this text."""
-    env.progress.index = next(i for i, s in enumerate(env.progress.subtasks) if s.text == text and not s.video)
+    env.progress.index = next(
+        i for i, s in enumerate(env.progress.subtasks) if s.text == text and not s.video
+    )
 
 
 def lift(env: Task, container: Thing) -> Flags:
@@ -80,7 +82,10 @@ def released(env: Task, button: Button) -> None:
 def under(things: Sequence[Thing], containers: Sequence[Thing]) -> bool:
     """Whether each thing lies under the container of the same index."""
     pairs = zip(things, containers, strict=True)
-    return all(np.linalg.norm(a.position[:2] - b.position[:2]) < 2e-3 and a.position[2] < 0.02 for a, b in pairs)
+    return all(
+        np.linalg.norm(a.position[:2] - b.position[:2]) < 2e-3 and a.position[2] < 0.02
+        for a, b in pairs
+    )
 
 
 class Hand:
@@ -108,7 +113,9 @@ class Hand:
 
 def steps_of_demonstration(env: Task) -> int | None:
     """Demonstrate a task that was just reset; the control steps it took, None if it failed."""
-    done = demonstrate(env, Demonstrator(env, lambda action: env.step(np.asarray(action, np.float32))))
+    done = demonstrate(
+        env, Demonstrator(env, lambda action: env.step(np.asarray(action, np.float32)))
+    )
     return env.steps_done if done else None
 
 
@@ -119,7 +126,9 @@ class Tip:
         self._env, self._place = env, [0.4, 0.4, 0.07]
         monkeypatch.setattr(type(env), "tcp_pose", property(lambda _: sapien.Pose(self._place)))
 
-    def put(self, place: Thing | Sequence[float], z: float = 0.07, aside: Sequence[float] = (0, 0)) -> Flags:
+    def put(
+        self, place: Thing | Sequence[float], z: float = 0.07, aside: Sequence[float] = (0, 0)
+    ) -> Flags:
         """Be at a place, or beside it by some metres in x and y, and evaluate."""
         xy = np.asarray(place.position if isinstance(place, Thing) else place)[:2] + aside
         self._place = [*xy, z]

@@ -1,4 +1,6 @@
-"""Golden cases of the released implementation: files, and policies built to their sizes with their parameters."""
+"""Golden cases of the released implementation: files, and policies built to their sizes with their
+parameters.
+"""
 
 import json
 import os
@@ -23,22 +25,40 @@ def load(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and description of one golden file; skips the test where the folder lacks it."""
     if not (folder / f"{name}.safetensors").is_file():
         pytest.skip(f"{name} is not in {folder}")
-    return load_file(folder / f"{name}.safetensors"), json.loads((folder / f"{name}.json").read_text())
+    return load_file(folder / f"{name}.safetensors"), json.loads(
+        (folder / f"{name}.json").read_text()
+    )
 
 
 def params(tensors: dict[str, Tensor], prefix: str = "") -> dict[str, Tensor]:
     """The released parameters of a golden file, optionally under a further prefix."""
-    return {prefix + key.removeprefix("params/"): value for key, value in tensors.items() if key.startswith("params/")}
+    return {
+        prefix + key.removeprefix("params/"): value
+        for key, value in tensors.items()
+        if key.startswith("params/")
+    }
 
 
 def vision_config(sizes: dict[str, Any], resolution: int) -> VisionConfig:
-    keys = {"width": "width", "depth": "depth", "mlp_dim": "mlp_dim", "num_heads": "num_heads", "patch_size": "patch"}
-    return VisionConfig(image_size=resolution, **{target: sizes[source] for target, source in keys.items()})
+    keys = {
+        "width": "width",
+        "depth": "depth",
+        "mlp_dim": "mlp_dim",
+        "num_heads": "num_heads",
+        "patch_size": "patch",
+    }
+    return VisionConfig(
+        image_size=resolution, **{target: sizes[source] for target, source in keys.items()}
+    )
 
 
 def config(about: dict[str, Any]) -> dict[str, Any]:
     """The policy configuration of a golden model, every dimension from its description."""
-    vlm, action, history = about["vlm_expert"], about["action_expert"], about.get("history_config") or {}
+    vlm, action, history = (
+        about["vlm_expert"],
+        about["action_expert"],
+        about.get("history_config") or {},
+    )
     backbone = BackboneConfig(
         vision=vision_config(about["siglip"], about["image_resolution"]),
         vlm=ExpertConfig(vlm["width"], vlm["mlp_dim"]),
@@ -48,7 +68,10 @@ def config(about: dict[str, Any]) -> dict[str, Any]:
         action_dim=about["action_dim"],
         horizon=about["action_horizon"],
     )
-    sections: dict[str, Any] = {"backbone": {"name": "pi05", **vars(backbone)}, "policy": {"augment": False}}
+    sections: dict[str, Any] = {
+        "backbone": {"name": "pi05", **vars(backbone)},
+        "policy": {"augment": False},
+    }
     if history.get("representation_type") not in ("perceptual", "recurrent"):
         return sections
     feature = history["memory_feature"]
@@ -65,9 +88,13 @@ def config(about: dict[str, Any]) -> dict[str, Any]:
     kind = INTEGRATION[history["integration_type"]]
     sections["integration"] = {"name": kind}
     if kind == "expert":
-        sections["integration"] |= {key: about["memory_expert"][key] for key in ("width", "mlp_dim")}
+        sections["integration"] |= {
+            key: about["memory_expert"][key] for key in ("width", "mlp_dim")
+        }
     if kind == "modulator":
-        sections["integration"] |= {key: about["modulator"][key] for key in ("num_heads", "num_kv_heads", "head_dim")}
+        sections["integration"] |= {
+            key: about["modulator"][key] for key in ("num_heads", "num_kv_heads", "head_dim")
+        }
     return sections
 
 
@@ -88,7 +115,9 @@ def recurrence(about: dict[str, Any]) -> dict[str, Any]:
             "max_grad_norm": "max_grad_norm",
         },
     }[about["type"]]
-    return options | {target: about[f"{about['type']}_config"][source] for target, source in names.items()}
+    return options | {
+        target: about[f"{about['type']}_config"][source] for target, source in names.items()
+    }
 
 
 def policy(tensors: dict[str, Tensor], about: dict[str, Any]) -> MMEPolicy:
@@ -97,20 +126,29 @@ def policy(tensors: dict[str, Tensor], about: dict[str, Any]) -> MMEPolicy:
     built = MMEPolicy.from_config(sections)
     history = about.get("history_config") or {}
     if built.memory is not None:
-        # The golden features are narrower than the tower's tokens: the memory's width of a vision token is its own.
+        # The golden features are narrower than the tower's tokens: the memory's width of a vision
+        # token is its own.
         from mme_vla.registry import MEMORIES
 
         options = {k: v for k, v in sections["memory"].items() if k != "name"}
         built.memory = MEMORIES[sections["memory"]["name"]](
-            d_vision=history["memory_feature"]["img"]["input_dim"], width=built.integration.memory_width, **options
+            d_vision=history["memory_feature"]["img"]["input_dim"],
+            width=built.integration.memory_width,
+            **options,
         )
     return from_released(built, params(tensors)).eval()
 
 
 def batch(tensors: dict[str, Tensor]) -> Batch:
-    """The golden inputs as a batch (without history: golden memories come with ready-made position features)."""
+    """The golden inputs as a batch (without history: golden memories come with ready-made position
+    features).
+    """
     cameras = ("base_0_rgb", "left_wrist_0_rgb")
-    prompt = "symbolic_tokenized_prompt" if "in/symbolic_tokenized_prompt" in tensors else "tokenized_prompt"
+    prompt = (
+        "symbolic_tokenized_prompt"
+        if "in/symbolic_tokenized_prompt" in tensors
+        else "tokenized_prompt"
+    )
     return Batch(
         images=torch.stack([tensors[f"in/image/{c}"] for c in cameras], 1).permute(0, 1, 4, 2, 3),
         image_mask=torch.stack([tensors[f"in/image_mask/{c}"] for c in cameras], 1),
@@ -127,14 +165,18 @@ def memory_tokens(policy: MMEPolicy, tensors: dict[str, Tensor]) -> MemoryTokens
     memory: Any = policy.memory
     encoder = memory.encoder
     if "in/recur_mask" in tensors:
-        features, positions = (tensors[f"in/recur_{name}"].flatten(2, 3) for name in ("image_emb", "pos_emb"))
+        features, positions = (
+            tensors[f"in/recur_{name}"].flatten(2, 3) for name in ("image_emb", "pos_emb")
+        )
         return memory.run(encoder.encode(features, positions), tensors["in/recur_mask"])
     tokens = encoder.encode(tensors["in/static_image_emb"], tensors["in/static_pos_emb"])
     return MemoryTokens(tokens, tensors["in/static_mask"])
 
 
 ERRORS: dict[str, float] = {}
-"""Largest error seen per test, for the table in docs/evidence/parity.md (`MME_VLA_PARITY_TABLE=1`, see conftest.py)."""
+"""Largest error seen per test, for the table in docs/evidence/parity.md (`MME_VLA_PARITY_TABLE=1`,
+see conftest.py).
+"""
 
 
 def error(actual: Tensor, golden: Tensor) -> float:

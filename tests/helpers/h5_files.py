@@ -1,4 +1,6 @@
-"""Small HDF5 files in the layout of RoboMME's recorder, and small datasets, for tests that need no other data."""
+"""Small HDF5 files in the layout of RoboMME's recorder, and small datasets, for tests that need no
+other data.
+"""
 
 import json
 from collections.abc import Sequence
@@ -26,11 +28,15 @@ class Recorded:
 
 def pose_at(number: int) -> np.ndarray:
     """A pose of the tool and a gripper command, another for every number."""
-    return np.array([0.1 * number, 0.2, 0.3, np.pi, 0.0, 0.01 * number, 1.0 if number % 2 else -1.0])
+    return np.array(
+        [0.1 * number, 0.2, 0.3, np.pi, 0.0, 0.01 * number, 1.0 if number % 2 else -1.0]
+    )
 
 
 def tool_at(number: int) -> np.ndarray:
-    """Where the tool is: short of the pose that is commanded, and on the other side of a half turn."""
+    """Where the tool is: short of the pose that is commanded, and on the other side of
+    a half turn.
+    """
     lag = np.array([0.01, -0.02, 0.001 * number, 0.05, 0.1, -0.1])
     return (pose_at(number)[:6] - lag + [0, 0, 0, -2 * np.pi, 0, 0]).astype(np.float32)
 
@@ -43,7 +49,9 @@ OPTIONS = [
 
 
 def choice_at(number: int) -> dict[str, Any]:
-    """A choice: pick up, press, press again, nothing at all, and from the start; only picking up has a point."""
+    """A choice: pick up, press, press again, nothing at all, and from the start; only picking up
+    has a point.
+    """
     letter = ("A", "B", "B", "")[number % 4]
     return {"choice": letter, "point": [64, 128 + number] if letter == "A" else []}
 
@@ -58,11 +66,13 @@ def write_file(
     depth: bool = False,
     choices: bool = False,
 ) -> list[Recorded]:
-    """Write an HDF5 file of random episodes: a square moves over a still background, "Complete" for the last steps.
+    """Write an HDF5 file of random episodes: a square moves over a still background, "Complete" for
+    the last steps.
 
-    With `poses` they hold the tool's poses too, and a waypoint every fourth step: the first one after three.
-    With `choices` something is chosen every fourth step, as `choice_at` says, among `OPTIONS`.
-    With `depth` both cameras look down from one metre above the table at what stands 20 cm high.
+    With `poses` they hold the tool's poses too, and a waypoint every fourth step: the first one
+    after three. With `choices` something is chosen every fourth step, as `choice_at` says, among
+    `OPTIONS`. With `depth` both cameras look down from one metre above the table at what stands 20
+    cm high.
     """
     rng = np.random.default_rng(len(path.stem))
     videos, numbers = videos or [0] * len(lengths), numbers or range(len(lengths))
@@ -70,7 +80,9 @@ def write_file(
     with h5py.File(path, "w") as file:
         for length, video, number in zip(lengths, videos, numbers, strict=True):
             episode = file.create_group(f"episode_{number}")
-            episode["setup/task_goal"] = np.array([f"Do Task {number}", "Another wording"], dtype=h5py.string_dtype())
+            episode["setup/task_goal"] = np.array(
+                [f"Do Task {number}", "Another wording"], dtype=h5py.string_dtype()
+            )
             episode["setup/seed"], episode["setup/difficulty"] = 100 * number, "easy"
             background = rng.integers(0, 255, (2, size, size, 3), np.uint8)
             frames = np.repeat(background[:, None], length, axis=1)
@@ -91,10 +103,14 @@ def write_file(
                     since = t - video if t >= video else t
                     step["obs/eef_state"] = tool_at(t)
                     step["action/eef_action"] = pose_at(t)
-                    step["action/waypoint_action"] = pose_at(100 + t // 4) if since >= 3 else np.full(7, np.nan)
+                    step["action/waypoint_action"] = (
+                        pose_at(100 + t // 4) if since >= 3 else np.full(7, np.nan)
+                    )
                 done = t >= length - 2
                 for name in ("simple_subgoal", "grounded_subgoal"):
-                    text = f"Pick Up {t // 4}" + (" at <1, 2>" if name.startswith("grounded") else "")
+                    text = f"Pick Up {t // 4}" + (
+                        " at <1, 2>" if name.startswith("grounded") else ""
+                    )
                     step[f"info/{name}"] = "Complete" if done else text
                     step[f"info/{name}_online"] = "Complete" if done else text + " online"
                 step["info/is_video_demo"], step["info/is_completed"] = t < video, done
@@ -104,7 +120,9 @@ def write_file(
 
 
 def _add_choice(episode: h5py.Group, step: h5py.Group, t: int, goes_on: bool) -> None:
-    """What is under way at a step; the last switch, to the end of the task, is marked too, as in the official files."""
+    """What is under way at a step; the last switch, to the end of the task, is marked too, as in
+    the official files.
+    """
     if t == 0:
         episode["setup/available_multi_choices"] = json.dumps(OPTIONS)
     step["action/choice_action"] = json.dumps(choice_at(t // 4))
@@ -112,7 +130,9 @@ def _add_choice(episode: h5py.Group, step: h5py.Group, t: int, goes_on: bool) ->
 
 
 def _add_depth(episode: h5py.Group, step: h5py.Group, size: int) -> None:
-    """Two cameras one metre above the table that look straight down, with the view of a square half a metre wide."""
+    """Two cameras one metre above the table that look straight down, with the view of a square half
+    a metre wide.
+    """
     down = np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)
     for camera in ("front", "wrist"):
         step[f"obs/{camera}_depth"] = np.full((size, size, 1), 800, np.int16)
@@ -125,5 +145,7 @@ def _add_depth(episode: h5py.Group, step: h5py.Group, size: int) -> None:
 
 def robomme_robot(name: str, *words: str) -> Embodiment:
     """The embodiment of that name, with changes of its configuration."""
-    section: Any = OmegaConf.to_container(compose("policy", [f"embodiment={name}", *words]).embodiment, resolve=True)
+    section: Any = OmegaConf.to_container(
+        compose("policy", [f"embodiment={name}", *words]).embodiment, resolve=True
+    )
     return Embodiment.from_dict(section)

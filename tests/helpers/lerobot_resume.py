@@ -1,6 +1,8 @@
-"""`lerobot-train` as it is, but that a resumed run begins its first update with the random state of its checkpoint.
+"""`lerobot-train` as it is, but that a resumed run begins its first update with the random state of
+its checkpoint.
 
-LeRobot restores that state, then makes the iterator of its data loader, which draws one number from it.
+LeRobot restores that state, then makes the iterator of its data loader, which draws one number from
+it.
 """
 
 from typing import Any

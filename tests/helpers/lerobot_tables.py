@@ -1,4 +1,6 @@
-"""Datasets of LeRobot's version v3.0 written table by table, so that a test can make them contradict themselves."""
+"""Datasets of LeRobot's version v3.0 written table by table, so that a test can make them
+contradict themselves.
+"""
 
 import io
 import json
@@ -24,10 +26,15 @@ SHADE = 20  # frame i of the dataset is grey of SHADE · i
 
 def own_robot(**action: Any) -> Embodiment:
     """A robot of one's own with three numbers and one camera."""
-    return Embodiment.from_dict({
-        "name": "desk arm", "cameras": {"top": {}}, "conditioning_video": False, "state": {"width": 3},
-        "action": {"width": 3, "horizon": 4, "execute": 2, **action},
-    })  # fmt: skip
+    return Embodiment.from_dict(
+        {
+            "name": "desk arm",
+            "cameras": {"top": {}},
+            "conditioning_video": False,
+            "state": {"width": 3},
+            "action": {"width": 3, "horizon": 4, "execute": 2, **action},
+        }
+    )
 
 
 def picture(shade: int) -> np.ndarray:
@@ -42,7 +49,11 @@ def cell(image: np.ndarray, kind: str = "png") -> dict[str, Any]:
 
 
 def write_video(
-    path: Path, images: Sequence[np.ndarray], rate: float = FPS, pixel_format: str = "yuv420p", coder: str = "libx264"
+    path: Path,
+    images: Sequence[np.ndarray],
+    rate: float = FPS,
+    pixel_format: str = "yuv420p",
+    coder: str = "libx264",
 ) -> None:
     """A lossless video of these images at an even rate."""
     from fractions import Fraction
@@ -89,24 +100,40 @@ def write_dataset(
         rows[CAMERA] = pa.array([cell(image) for image in images])
     table(root / ROWS, rows)
     about: dict[str, Any] = {"episode_index": np.arange(len(lengths)), "length": np.array(lengths)}
-    about |= {"dataset_from_index": ends - lengths, "dataset_to_index": ends, "tasks": [[task] for task in tasks]}
+    about |= {
+        "dataset_from_index": ends - lengths,
+        "dataset_to_index": ends,
+        "tasks": [[task] for task in tasks],
+    }
     if video:
         write_video(root / VIDEO, images, fps)
-        about |= {f"videos/{CAMERA}/{key}": np.zeros(len(lengths), int) for key in ("chunk_index", "file_index")}
+        about |= {
+            f"videos/{CAMERA}/{key}": np.zeros(len(lengths), int)
+            for key in ("chunk_index", "file_index")
+        }
         about |= {f"videos/{CAMERA}/from_timestamp": (ends - lengths) / fps}
         about |= {f"videos/{CAMERA}/to_timestamp": ends / fps}
     table(root / EPISODES, about)
     index = pd.Index(list(tasks), name="task")
-    pd.DataFrame({"task_index": range(len(tasks))}, index=index).to_parquet(root / "meta" / "tasks.parquet")
+    pd.DataFrame({"task_index": range(len(tasks))}, index=index).to_parquet(
+        root / "meta" / "tasks.parquet"
+    )
     features = {name: {"dtype": "float32", "shape": [3], "names": names} for name in vectors}
     features[CAMERA] = {"dtype": "video" if video else "image", "shape": [32, 32, 3], "names": None}
-    features |= {name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
-                 for name in ("timestamp", "frame_index", "episode_index", "index", "task_index")}  # fmt: skip
+    features |= {
+        name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
+        for name in ("timestamp", "frame_index", "episode_index", "index", "task_index")
+    }
     info = {
-        "codebase_version": "v3.0", "fps": fps, "features": features, "total_episodes": len(lengths),
-        "total_frames": total, "total_tasks": len(tasks), "chunks_size": 1000,
+        "codebase_version": "v3.0",
+        "fps": fps,
+        "features": features,
+        "total_episodes": len(lengths),
+        "total_frames": total,
+        "total_tasks": len(tasks),
+        "chunks_size": 1000,
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-    }  # fmt: skip
+    }
     (root / "meta" / "info.json").write_text(json.dumps(info))
     return root
 
@@ -123,7 +150,9 @@ def change(root: Path, file: str, name: str, values: Any) -> None:
     if name in read.column_names:
         read = read.drop_columns([name])
     if values is not None:
-        read = read.append_column(name, values if isinstance(values, pa.Array) else pa.array(values))
+        read = read.append_column(
+            name, values if isinstance(values, pa.Array) else pa.array(values)
+        )
     pq.write_table(read, path)
 
 

@@ -1,6 +1,8 @@
-"""One of two processes that train together behind LeRobot's interface: `python lerobot_two_processes.py <folder>`.
+"""One of two processes that train together behind LeRobot's interface:
+`python lerobot_two_processes.py <folder>`.
 
-Opens the dataset as a first update does, and writes down how often it built a cache and what its first batch holds.
+Opens the dataset as a first update does, and writes down how often it built a cache and what its
+first batch holds.
 """
 
 import json
@@ -30,9 +32,13 @@ def main(folder: Path) -> None:
     cache_building.build_cache = counting  # type: ignore[assignment]
     policy = small_policy("tokendrop_modul", backbone={"vision": SMALL_VISION})
     config = SimpleNamespace(
-        model="tokendrop_modul", exec_starts=None, cache_root=str(folder / "caches"), cache_local=False,
-        max_build_frames=5000, seed=1,
-    )  # fmt: skip
+        model="tokendrop_modul",
+        exec_starts=None,
+        cache_root=str(folder / "caches"),
+        cache_local=False,
+        max_build_frames=5000,
+        seed=1,
+    )
     with plugin("lerobot_policy_mme_vla", "lerobot_policy_mme_vla"):
         from lerobot_policy_mme_vla.samples import Samples
 

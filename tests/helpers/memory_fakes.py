@@ -16,7 +16,9 @@ WIDTH = 6
 def encode(frames: np.ndarray, grid: int = 2) -> Tensor:
     """Mean colour of every cell, projected by a fixed random matrix: [n, grid², WIDTH] float32."""
     n, height, width, _ = frames.shape
-    cells = torch.from_numpy(frames.astype(np.float32)).view(n, grid, height // grid, grid, width // grid, 3)
+    cells = torch.from_numpy(frames.astype(np.float32)).view(
+        n, grid, height // grid, grid, width // grid, 3
+    )
     colours = cells.mean(dim=(2, 4)).reshape(n, grid**2, 3) / 255
     return colours @ torch.randn(3, WIDTH, generator=torch.Generator().manual_seed(0))
 
@@ -31,7 +33,9 @@ class MeanBrightness:
 
 
 class LastFrames(MemoryModule, ScoringMemory):
-    """Remembers the newest kept frames, the brighter of them first in line where there are scores."""
+    """Remembers the newest kept frames, the brighter of them first in line where there
+    are scores.
+    """
 
     def __init__(self, frames: int = 3, keep_every: int = 1, scored: bool = False) -> None:
         super().__init__()
@@ -42,13 +46,19 @@ class LastFrames(MemoryModule, ScoringMemory):
     def make_scorer(self) -> FrameScorer | None:
         return MeanBrightness() if self.storage.scorer else None
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         candidates = self.storage.stored_frames(step + 1)
         if self.storage.scorer:
             scores = history.scores.until(step)
             bright = scores.frames[np.argsort(-scores.values.mean(1), kind="stable")]
             candidates = np.sort(np.intersect1d(candidates, bright)[: self.frames])
-        frames = candidates[-self.frames :] if rng is None else np.sort(rng.permutation(candidates)[: self.frames])
+        frames = (
+            candidates[-self.frames :]
+            if rng is None
+            else np.sort(rng.permutation(candidates)[: self.frames])
+        )
         return np.stack([np.repeat(frames, 4), np.tile(np.arange(4), len(frames))], axis=1)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
@@ -56,7 +66,9 @@ class LastFrames(MemoryModule, ScoringMemory):
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two items (dictionaries, structs, tensors, weights of modules, …) are equal to the last bit."""
+    """Whether two items (dictionaries, structs, tensors, weights of modules, …) are equal to the
+    last bit.
+    """
     if isinstance(a, nn.Module):
         return same(a.state_dict(), b.state_dict())
     if isinstance(a, dict):

@@ -15,7 +15,11 @@ from mme_vla.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, T
 from mme_vla.testing.small import unit_stats
 from mme_vla.weights.tables import read
 
-OPTIONS = {"consolidate_type": "consolidation", "fusion_type": "fusion", "update_fused": "store_fused"}
+OPTIONS = {
+    "consolidate_type": "consolidation",
+    "fusion_type": "fusion",
+    "update_fused": "store_fused",
+}
 RENAMED = OPTIONS | {"use_timestep_pe": "time_code", "retrieval_layers": "retrieval_layers"}
 
 
@@ -23,7 +27,10 @@ def bank(
     sizes: dict[str, Any], role: str, weights: dict[str, Tensor], case: dict[str, Any] | None = None
 ) -> MemoryBank:
     """A bank of one role with its parameters; a case's options replace those of the sizes."""
-    options: dict[str, Any] = {"length": sizes["mem_length"], "retrieval_layers": sizes["retrieval_layers"]}
+    options: dict[str, Any] = {
+        "length": sizes["mem_length"],
+        "retrieval_layers": sizes["retrieval_layers"],
+    }
     options |= {RENAMED[name]: value for name, value in (case or {}).items()}
     built = MemoryBank(sizes[role], **options)
     word = {"cog": "cognition_bank", "per": "perceptual_bank"}[role]
@@ -35,7 +42,10 @@ def bank(
 
 def core(sizes: dict[str, Any], weights: dict[str, Tensor]) -> MemoryVlaCore:
     """The whole network behind the VLM, every parameter of the case in its place."""
-    tower = [TowerConfig(width=sizes[name], depth=2, mlp_dim=1, num_heads=1) for name in ("dino", "siglip")]
+    tower = [
+        TowerConfig(width=sizes[name], depth=2, mlp_dim=1, num_heads=1)
+        for name in ("dino", "siglip")
+    ]
     side = round(sizes["patches"] ** 0.5)
     config = MemoryVlaConfig(
         vision=FusedVisionConfig(side, 1, *tower),
@@ -67,7 +77,10 @@ def reached(**options: Any) -> MemoryVlaPolicy:
     assert isinstance(policy, MemoryVlaPolicy)
     policy.require_processor().stats = unit_stats(policy.embodiment)
     generator = torch.Generator().manual_seed(0)
-    for name, parameter in policy.core.named_parameters():  # what begins at zero would hide what does not arrive
+    for (
+        name,
+        parameter,
+    ) in policy.core.named_parameters():  # what begins at zero would hide what does not arrive
         if name.endswith(("head.output.weight", "in_proj_weight")):
             torch.nn.init.normal_(parameter, std=0.3, generator=generator)
     return policy

@@ -32,23 +32,49 @@ def write_training(
     budget = int(row.partition("@")[2] or 32)
     identity = {"recipe": "r", "data": "d", "weights": f"{row}{seed}"} if trained else {}
     identity |= {name: facts.pop(name) for name in identity.keys() & facts.keys()}
-    config = {"name": model, "backbone": {"name": "nano"}, "memory": {"name": model, "budget": budget}}
+    config = {
+        "name": model,
+        "backbone": {"name": "nano"},
+        "memory": {"name": model, "budget": budget},
+    }
     settings = {"model": model, "checkpoint": 100, "seed": 7, "split": SPLIT, "max_steps": 500}
     claim_run(folder, settings)
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    costs = {"parameters": 1_419_194, "update_flops": 1.2e10, "update_s": 0.13, "cpu_minutes": 7.0, "budget": budget}
-    write_json(folder / "trained.json",
-               {"row": row, "kind": kind, "trained": trained, "seed": seed, **identity, **costs, **facts})  # fmt: skip
+    costs = {
+        "parameters": 1_419_194,
+        "update_flops": 1.2e10,
+        "update_s": 0.13,
+        "cpu_minutes": 7.0,
+        "budget": budget,
+    }
+    write_json(
+        folder / "trained.json",
+        {"row": row, "kind": kind, "trained": trained, "seed": seed, **identity, **costs, **facts},
+    )
     records = []
     for task in TASKS:
         count = won if isinstance(won, int) else won.get(task, 0)
         for spec in episodes(task, SPLIT)[:SCENES]:
             outcome = "success" if spec.episode < count else "fail"
-            records.append(EpisodeRecord(
-                model, 100, 7, task, spec.episode, spec.seed, spec.difficulty, outcome, 9, split=SPLIT, max_steps=500,
-                action_space=action_space, memory_budget=budget, composition=composition_digest(config),
-                training=TrainingIdentity(seed, **identity) if trained else None,
-            ))  # fmt: skip
+            records.append(
+                EpisodeRecord(
+                    model,
+                    100,
+                    7,
+                    task,
+                    spec.episode,
+                    spec.seed,
+                    spec.difficulty,
+                    outcome,
+                    9,
+                    split=SPLIT,
+                    max_steps=500,
+                    action_space=action_space,
+                    memory_budget=budget,
+                    composition=composition_digest(config),
+                    training=TrainingIdentity(seed, **identity) if trained else None,
+                )
+            )
     write_records(folder, records)
     return folder
 
@@ -58,4 +84,7 @@ def write_records(folder: Path, records: list[EpisodeRecord]) -> None:
 
 
 def records_of(folder: Path) -> list[EpisodeRecord]:
-    return [EpisodeRecord.from_json(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    return [
+        EpisodeRecord.from_json(line)
+        for line in (folder / "episodes.jsonl").read_text().splitlines()
+    ]

@@ -25,7 +25,11 @@ def noise() -> str:
     head = FlowHead(20, 8, deviation=0.1)
     training = head.training_noise(64, generator_for(7, "noise", 3))
     sampling = head.sampling_noise(generator_for(7, "act", 3))
-    return digest(value.numpy().tobytes() for part in (training, sampling) for _, value in sorted(part.items()))
+    return digest(
+        value.numpy().tobytes()
+        for part in (training, sampling)
+        for _, value in sorted(part.items())
+    )
 
 
 def order() -> str:
@@ -41,10 +45,16 @@ def bootstraps() -> str:
 
 def tokens() -> str:
     tokenizer, state = Tokenizer.load("sample"), np.linspace(-1.2, 1.2, 500)
-    pieces = State().pieces(PromptInput("watch the video, then pick up the green cube", state=state))
+    pieces = State().pieces(
+        PromptInput("watch the video, then pick up the green cube", state=state)
+    )
     return digest(str(tokenizer.encode(text, bos)).encode() for text, bos in pieces)
 
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    print(json.dumps({"noise": noise(), "order": order(), "bootstraps": bootstraps(), "tokens": tokens()}))
+    print(
+        json.dumps(
+            {"noise": noise(), "order": order(), "bootstraps": bootstraps(), "tokens": tokens()}
+        )
+    )

@@ -1,4 +1,6 @@
-"""Golden cases of OpenVLA-OFT: the original's small models, built here to their sizes with their parameters."""
+"""Golden cases of OpenVLA-OFT: the original's small models, built here to their sizes with their
+parameters.
+"""
 
 from typing import Any
 
@@ -19,15 +21,23 @@ END = 2
 def parameters(golden: dict[str, Tensor], about: dict[str, Any]) -> dict[str, Tensor]:
     """All parameters of a case under their golden names: by rule, but for those that are stored."""
     seed = about["weight_seed"]
-    ruled = {name: rule_weight(name, tuple(shape), seed) for name, shape in about["parameters"].items()}
-    stored = {name.removeprefix("param/"): value for name, value in golden.items() if name.startswith("param/")}
+    ruled = {
+        name: rule_weight(name, tuple(shape), seed) for name, shape in about["parameters"].items()
+    }
+    stored = {
+        name.removeprefix("param/"): value
+        for name, value in golden.items()
+        if name.startswith("param/")
+    }
     for name in ruled.keys() & stored.keys():
         torch.testing.assert_close(ruled[name], stored[name], rtol=0, atol=0)
     return ruled | stored
 
 
 def golden_name(name: str) -> str:
-    """The golden name of one of a policy's parameters: peft's wrapper stands before the model's own."""
+    """The golden name of one of a policy's parameters: peft's wrapper stands before the model's
+    own.
+    """
     if name.startswith("memory.encoder."):
         return name.replace("memory.encoder.", "memory/")
     source = openvla_name(name)
@@ -43,7 +53,12 @@ def sections(about: dict[str, Any], values: dict[str, Tensor]) -> dict[str, Any]
     def tower(source: str, target: str) -> dict[str, int]:
         mlp = shapes[f"{VLA}{WRAPPER}vision_backbone.{source}.blocks.0.mlp.fc1.weight"][0]
         of = sizes[target]
-        return {"width": of["embed_dim"], "depth": of["depth"], "num_heads": of["num_heads"], "mlp_dim": mlp}
+        return {
+            "width": of["embed_dim"],
+            "depth": of["depth"],
+            "num_heads": of["num_heads"],
+            "mlp_dim": mlp,
+        }
 
     llm = sizes["llm"]
     patch = shapes[f"{VLA}{WRAPPER}vision_backbone.featurizer.patch_embed.proj.weight"][-1]
@@ -94,14 +109,18 @@ def policy(golden: dict[str, Tensor], about: dict[str, Any]) -> MMEPolicy:
 
 
 def batch(tensors: dict[str, Tensor], about: dict[str, Any]) -> Batch:
-    """The golden inputs: the words before the action ids, which the network itself replaces by slots."""
+    """The golden inputs: the words before the action ids, which the network itself replaces by
+    slots.
+    """
     ids, slots = tensors["in/input_ids"], about["sizes"]["chunk"] * about["sizes"]["action_dim"]
     words = tensors["in/attention_mask"].sum(1) - slots - 1  # `</s>` is the network's own too
     mask = torch.arange(int(words.max())) < words[:, None]
     views = about["sizes"]["cameras"]
     history = None
     if "in/memory_features" in tensors:
-        history = HistoryTokens(*(tensors[f"in/memory_{name}"] for name in ("features", "positions", "mask")))
+        history = HistoryTokens(
+            *(tensors[f"in/memory_{name}"] for name in ("features", "positions", "mask"))
+        )
     return Batch(
         images=torch.zeros(len(ids), views, 3, 1, 1),
         image_mask=torch.ones(len(ids), views, dtype=torch.bool),

@@ -20,7 +20,8 @@ VIDEO, MOTION = 8, 5  # frames
 
 
 class BlocksEnv:
-    """The blocks must be pressed in the order the video tells; waiting moves nothing, and waving is an error.
+    """The blocks must be pressed in the order the video tells; waiting moves nothing, and waving is
+    an error.
 
     Args:
         order: the blocks to press. video: whether there is one.
@@ -36,7 +37,13 @@ class BlocksEnv:
     def step(self, action: dict[str, Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.received_actions.append(action)
         if action["choice"] == "c":
-            return None, 0.0, True, False, {"status": "error", "error_message": "no path", "exception_type": "E"}
+            return (
+                None,
+                0.0,
+                True,
+                False,
+                {"status": "error", "error_message": "no path", "exception_type": "E"},
+            )
         if action["choice"] == "b":
             return self._observation(0), 0.0, False, False, self._info("ongoing")
         near = min(BLOCKS, key=lambda name: np.hypot(*np.subtract(BLOCKS[name], action["point"])))
@@ -67,5 +74,7 @@ def an_episode(number: int = 0) -> EpisodeSpec:
 
 
 def a_session(number: int = 0, **options: Any) -> ChoiceSession:
-    limits = {key: options.pop(key) for key in ("max_choices", "pictures", "clock") if key in options}
+    limits = {
+        key: options.pop(key) for key in ("max_choices", "pictures", "clock") if key in options
+    }
     return ChoiceSession(BlocksEnv(**options), an_episode(number), **limits)

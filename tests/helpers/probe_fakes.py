@@ -1,4 +1,6 @@
-"""Recorded episodes synthetic on the spot, and policies that are known to read one slot, or none."""
+"""Recorded episodes synthetic on the spot, and policies that are known to read one
+slot, or none.
+"""
 
 from typing import Any
 
@@ -21,12 +23,19 @@ SIDE = 64
 
 
 class MadeUpSource:
-    """What a probe asks of a dataset: every frame's brightness is its episode's and its number's."""
+    """What a probe asks of a dataset: every frame's brightness is its episode's and
+    its number's.
+    """
 
     subgoal_names = ("simple_subgoal",)
     name = fingerprint = "made-up"
 
-    def __init__(self, lengths: tuple[int, ...] = (60, 70, 80), video: int = 20, robot: Embodiment = ROBOMME_JOINT):
+    def __init__(
+        self,
+        lengths: tuple[int, ...] = (60, 70, 80),
+        video: int = 20,
+        robot: Embodiment = ROBOMME_JOINT,
+    ):
         self.lengths, self.exec_starts = np.array(lengths), np.full(len(lengths), video)
         self.robot, self.frames_read = robot, []
 
@@ -56,7 +65,11 @@ class MadeUpSource:
 
     def subgoals(self, episode: int, step: int) -> dict[str, str]:
         late = step >= self.exec_starts[episode] + 20
-        return {"simple_subgoal": f"pick it up for the {'second' if late else 'first'} time, number {episode}"}
+        return {
+            "simple_subgoal": (
+                f"pick it up for the {'second' if late else 'first'} time, number {episode}"
+            )
+        }
 
     def states(self, episode: int, start: int = 0, stop: int | None = None) -> np.ndarray:
         stop = int(self.lengths[episode]) if stop is None else stop
@@ -68,7 +81,11 @@ class MadeUpSource:
     def frames(self, episode: int, indices: Any, camera: str | None = None) -> np.ndarray:
         self.frames_read += [(episode, int(i)) for i in indices]
         values = (97 * episode + 3 * np.asarray(indices)) % 256
-        images = np.broadcast_to(values[:, None, None, None], (len(values), SIDE, SIDE, 3)).astype(np.uint8).copy()
+        images = (
+            np.broadcast_to(values[:, None, None, None], (len(values), SIDE, SIDE, 3))
+            .astype(np.uint8)
+            .copy()
+        )
         images[:, : 8 + 8 * episode, :8] = 255  # not of one colour, so that a normed tower sees it
         return images
 
@@ -83,11 +100,15 @@ class ReadsOneSlot(MMEPolicy):
 
     slot: int | None = 2
 
-    def sample_actions(self, batch: Any, draws: Any = None, steps: Any = None, **others: Any) -> Tensor:
+    def sample_actions(
+        self, batch: Any, draws: Any = None, steps: Any = None, **others: Any
+    ) -> Tensor:
         noise = 0.01 * draws["noise"]
         if self.slot is None or batch.history is None:
             return noise
-        read = batch.history.features[:, self.slot].float().mean(-1) * batch.history.mask[:, self.slot]
+        read = (
+            batch.history.features[:, self.slot].float().mean(-1) * batch.history.mask[:, self.slot]
+        )
         return noise + read[:, None, None]
 
 
@@ -99,13 +120,17 @@ def reader(slot: int | None, budget: int = 5) -> ReadsOneSlot:
     return policy.eval()
 
 
-def probed(policy: Any, words: list[Any], folder: Any, count: int = 1, **settings: Any) -> list[Line]:
+def probed(
+    policy: Any, words: list[Any], folder: Any, count: int = 1, **settings: Any
+) -> list[Line]:
     """A probe of the first synthetic episodes, each of which may take from the others."""
     recordings = made_up(robot=policy.embodiment)
     arms: list[Arm] = read_arms(words) if words else []
     settings_ = OfflineSettings(**{"draws": 3, "moments": 2, "flow_steps": 2, **settings})
     torch.manual_seed(0)
-    return probe_offline(policy, arms, recordings[:count], recordings, folder / "offline.jsonl", settings_)
+    return probe_offline(
+        policy, arms, recordings[:count], recordings, folder / "offline.jsonl", settings_
+    )
 
 
 JOBS = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]

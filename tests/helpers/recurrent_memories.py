@@ -16,9 +16,13 @@ GRID = 2
 D_VISION = 24
 TOLERANCE = 1e-5
 MEMORIES = {
-    "ttt": lambda **o: TTT(D_VISION, 16, **{"budget": 12, "hidden": 16, "grid": GRID, "chunk": 4, **o}),
+    "ttt": lambda **o: TTT(
+        D_VISION, 16, **{"budget": 12, "hidden": 16, "grid": GRID, "chunk": 4, **o}
+    ),
     "rmt": lambda **o: RMT(
-        D_VISION, 16, **{"budget": 12, "hidden": 16, "grid": GRID, "chunk": 4, "attention_dtype": "float32", **o}
+        D_VISION,
+        16,
+        **{"budget": 12, "hidden": 16, "grid": GRID, "chunk": 4, "attention_dtype": "float32", **o},
     ),
 }
 
@@ -54,4 +58,6 @@ def window(memory: RecurrentMemory, length: int, exec_start: int = 0) -> History
 
 
 def same_memory(a, b) -> bool:
-    return torch.equal(a.mask, b.mask) and torch.allclose(a.tokens[a.mask], b.tokens[b.mask], atol=TOLERANCE)
+    return torch.equal(a.mask, b.mask) and torch.allclose(
+        a.tokens[a.mask], b.tokens[b.mask], atol=TOLERANCE
+    )

@@ -1,6 +1,7 @@
 """Rollouts of the scripted environment, in this process and in workers.
 
-Run as a script it is an evaluation to be killed: `python rollout_fakes.py <folder> <checkpoint> <seconds a step>`.
+Run as a script it is an evaluation to be killed:
+`python rollout_fakes.py <folder> <checkpoint> <seconds a step>`.
 """
 
 import os
@@ -24,12 +25,18 @@ from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import SMALL_VISION, small_policy
 
 FACTS = RunFacts("tiny", "untrained", 42, max_steps=24)
-JOBS = [Job(task, "test", episode) for task in ("PickXtimes", "VideoUnmask") for episode in range(3)]
+JOBS = [
+    Job(task, "test", episode) for task in ("PickXtimes", "VideoUnmask") for episode in range(3)
+]
 
 
 def quick_policy(name: str, patch_size: int = 16, **overrides: Any) -> MMEPolicy:
-    """A policy with few patches, for speed; 8 is the largest patch that every memory can be built on."""
-    return small_policy(name, backbone={"vision": {**SMALL_VISION, "patch_size": patch_size}}, **overrides)
+    """A policy with few patches, for speed; 8 is the largest patch that every memory can be built
+    on.
+    """
+    return small_policy(
+        name, backbone={"vision": {**SMALL_VISION, "patch_size": patch_size}}, **overrides
+    )
 
 
 class InlineEnvs:
@@ -70,7 +77,9 @@ class InlineEnvs:
 def use_inline_envs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `evaluate` step its environments in this process."""
 
-    def inline(jobs: Any, workers: int, factory: Any, options: dict[str, Any], timeout: Any) -> InlineEnvs:
+    def inline(
+        jobs: Any, workers: int, factory: Any, options: dict[str, Any], timeout: Any
+    ) -> InlineEnvs:
         return InlineEnvs(workers, **options)
 
     monkeypatch.setattr(evaluation, "VecEnv", inline)
@@ -92,10 +101,16 @@ def roll(
 
 
 def run_evaluation(
-    policy: MMEPolicy, folder: Path, base: Any = make_slow_env, jobs: Sequence[Job] = JOBS, **settings: Any
+    policy: MMEPolicy,
+    folder: Path,
+    base: Any = make_slow_env,
+    jobs: Sequence[Job] = JOBS,
+    **settings: Any,
 ) -> Evaluation:
     """These episodes in two worker processes, or in this one after `use_inline_envs`."""
-    options = RolloutSettings(**{"max_steps": 24, "flow_steps": 2, "workers": 2, "max_batch": 1, **settings})
+    options = RolloutSettings(
+        **{"max_steps": 24, "flow_steps": 2, "workers": 2, "max_batch": 1, **settings}
+    )
     return evaluate(policy, jobs, folder, FACTS, options, base=base, show_progress=False)
 
 
@@ -108,7 +123,9 @@ def save_records(path: Path, records: Iterable[EpisodeRecord]) -> None:
 
 def records(split: str, won: list[int], model: str = "m", seed: int = 7) -> list[EpisodeRecord]:
     return [
-        EpisodeRecord(model, 1, seed, "PickXtimes", e, e, "easy", "success" if w else "fail", 9, split=split)
+        EpisodeRecord(
+            model, 1, seed, "PickXtimes", e, e, "easy", "success" if w else "fail", 9, split=split
+        )
         for e, w in enumerate(won)
     ]
 

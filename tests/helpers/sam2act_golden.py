@@ -1,4 +1,6 @@
-"""Golden cases of SAM2Act+: their files, random weights and inputs, and networks built to their sizes."""
+"""Golden cases of SAM2Act+: their files, random weights and inputs, and networks built to their
+sizes.
+"""
 
 import json
 import zlib
@@ -19,7 +21,9 @@ def load(name: str) -> dict[str, np.ndarray]:
 
 def meta() -> dict[str, Any]:
     """Sizes, names of parameters, norms of gradients."""
-    described: dict[str, Any] = json.loads((baselines_folder("sam2act_plus") / "meta.json").read_text())
+    described: dict[str, Any] = json.loads(
+        (baselines_folder("sam2act_plus") / "meta.json").read_text()
+    )
     return described
 
 

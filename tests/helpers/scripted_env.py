@@ -15,17 +15,22 @@ SIZE = 64
 
 
 class ScriptedEnv:
-    """Takes the joints where they are sent; shows time as brightness and the first joint as a square's place.
+    """Takes the joints where they are sent; shows time as brightness and the first joint as a
+    square's place.
 
-    It ends by success once the joints have travelled far enough, so the outcome depends on all actions.
+    It ends by success once the joints have travelled far enough, so the outcome depends on all
+    actions.
 
     It holds its joints when told to, and names a sub-task anew after every action.
 
     Attributes:
-        actions: all it was given. hold_steps: control steps for which it held. frames: all front images it showed.
+        actions: all it was given. hold_steps: control steps for which it held. frames: all front
+            images it showed.
     """
 
-    def __init__(self, task: str, episode: int, max_steps: int, travel: float, step_s: float, dies: str) -> None:
+    def __init__(
+        self, task: str, episode: int, max_steps: int, travel: float, step_s: float, dies: str
+    ) -> None:
         self.task_name, self.episode, self.max_steps = task, episode, max_steps
         self.travel, self.step_s, self.dies = travel, step_s, dies
         self.actions: list[np.ndarray] = []
@@ -39,11 +44,19 @@ class ScriptedEnv:
         count = VIDEO.get(self.task_name, 0) + 1
         return self._lists([self._frame() for _ in range(count)]), self._info("ongoing")
 
-    def step(self, action: np.ndarray | Hold) -> tuple[dict[str, Any] | None, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: np.ndarray | Hold
+    ) -> tuple[dict[str, Any] | None, float, bool, bool, dict[str, Any]]:
         time.sleep(self.step_s)
         if isinstance(action, Hold):
             self.hold_steps += action.steps
-            return self._lists([self._frame() for _ in range(action.steps)]), 0.0, False, False, self._info("ongoing")
+            return (
+                self._lists([self._frame() for _ in range(action.steps)]),
+                0.0,
+                False,
+                False,
+                self._info("ongoing"),
+            )
         self.actions.append(np.array(action))
         if self.dies and len(self.actions) == 20:
             self._die()
@@ -70,23 +83,39 @@ class ScriptedEnv:
         self.frames.append(front)
         self.states.append(np.concatenate([self.joints, [self.gripper]]).astype(np.float32))
         fingers = np.full(2, self.gripper, np.float32)
-        return {"front_rgb": front, "wrist_rgb": front[::-1], "joint_state": self.joints.astype(np.float32),
-                "gripper_state": fingers}  # fmt: skip
+        return {
+            "front_rgb": front,
+            "wrist_rgb": front[::-1],
+            "joint_state": self.joints.astype(np.float32),
+            "gripper_state": fingers,
+        }
 
     def _lists(self, frames: list[dict[str, Any]]) -> dict[str, Any]:
         return {f"{key}_list": [frame[key] for frame in frames] for key in frames[0]}
 
     def _info(self, status: str) -> dict[str, Any]:
         count = len(self.actions)
-        return {"status": status, "task_goal": ["pick up the red cube"],
-                "simple_subgoal_online": f"push {count} times", "grounded_subgoal_online": f"push at <{count}, 9>",
-                "elapsed_steps": object}  # fmt: skip
+        return {
+            "status": status,
+            "task_goal": ["pick up the red cube"],
+            "simple_subgoal_online": f"push {count} times",
+            "grounded_subgoal_online": f"push at <{count}, 9>",
+            "elapsed_steps": object,
+        }
 
 
 def make_scripted_env(
-    task: str, split: str, episode: int, max_steps: int = 40, travel: float = 1e9, step_s: float = 0.0, dies: str = ""
+    task: str,
+    split: str,
+    episode: int,
+    max_steps: int = 40,
+    travel: float = 1e9,
+    step_s: float = 0.0,
+    dies: str = "",
 ) -> ScriptedEnv:
-    """As `make_env`. dies: a folder; the process of PickXtimes 1 dies at its 20th step, once a folder."""
+    """As `make_env`. dies: a folder; the process of PickXtimes 1 dies at its 20th step, once a
+    folder.
+    """
     return ScriptedEnv(task, episode, max_steps, travel, step_s, dies)
 
 

@@ -24,7 +24,9 @@ def serving_policy(name: str = "tokendrop_expert", **overrides: Any) -> MMEPolic
 
 
 class Reading:
-    """Of a video without end: whether reading has begun, whether it is enough, whether it is over."""
+    """Of a video without end: whether reading has begun, whether it is enough, whether
+    it is over.
+    """
 
     def __init__(self) -> None:
         self.begun, self.enough, self.over = threading.Event(), threading.Event(), threading.Event()
@@ -40,12 +42,16 @@ class Reading:
 
 
 class Served:
-    """Runs a server until the `with` block ends. `on_loop` runs a coroutine where the server runs."""
+    """Runs a server until the `with` block ends. `on_loop` runs a coroutine where the
+    server runs.
+    """
 
     def __init__(self, policy: MMEPolicy, **settings: Any) -> None:
         self.server: PolicyServer
         self._policy = policy
-        self._settings = ServeSettings(**{"port": 0, "flow_steps": 2, "encode_chunk": 16, "max_batch": 8, **settings})
+        self._settings = ServeSettings(
+            **{"port": 0, "flow_steps": 2, "encode_chunk": 16, "max_batch": 8, **settings}
+        )
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
 
@@ -78,7 +84,9 @@ class Served:
 
     @contextmanager
     def reading(self) -> Iterator["Reading"]:
-        """Within the block the first video, once it is read, continues being read: one of any length."""
+        """Within the block the first video, once it is read, continues being read: one of any
+        length.
+        """
         state, engine = Reading(), self.server.engine
         begin = engine.run
 
@@ -109,7 +117,9 @@ def states(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, (count, 8)).astype(np.float32)
 
 
-def challenge(front: np.ndarray, wrist: np.ndarray, state: np.ndarray, first: bool, **more: Any) -> dict[str, Any]:
+def challenge(
+    front: np.ndarray, wrist: np.ndarray, state: np.ndarray, first: bool, **more: Any
+) -> dict[str, Any]:
     """A request of the challenge's schema, with the keys a server has no use for."""
     return {
         "task_goal": [GOAL, "another wording"],
@@ -123,7 +133,9 @@ def challenge(front: np.ndarray, wrist: np.ndarray, state: np.ndarray, first: bo
     }
 
 
-def observation(front: np.ndarray, wrist: np.ndarray, state: np.ndarray, **more: Any) -> dict[str, Any]:
+def observation(
+    front: np.ndarray, wrist: np.ndarray, state: np.ndarray, **more: Any
+) -> dict[str, Any]:
     return {
         "observation/image": front,
         "observation/wrist_image": wrist,
@@ -133,15 +145,25 @@ def observation(front: np.ndarray, wrist: np.ndarray, state: np.ndarray, **more:
     }
 
 
-def course(seed: int = 0, video: int = 9, rounds: int = 2) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """(front, wrist, state) of an episode's messages: video and current frame, then 16 frames a round."""
+def course(
+    seed: int = 0, video: int = 9, rounds: int = 2
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """(front, wrist, state) of an episode's messages: video and current frame, then 16 frames a
+    round.
+    """
     total = video + 1 + 16 * rounds
-    front, wrist, state = moving_frames(total, seed=seed), moving_frames(total, seed=seed + 100), states(total, seed)
+    front, wrist, state = (
+        moving_frames(total, seed=seed),
+        moving_frames(total, seed=seed + 100),
+        states(total, seed),
+    )
     bounds = [0, video + 1, *(video + 1 + 16 * (i + 1) for i in range(rounds))]
     return [(front[a:b], wrist[a:b], state[a:b]) for a, b in pairwise(bounds)]
 
 
-def acted_directly(policy: MMEPolicy, parts: list, steps: int = 2, seed: int = 42, **subgoal: str) -> list[np.ndarray]:
+def acted_directly(
+    policy: MMEPolicy, parts: list, steps: int = 2, seed: int = 42, **subgoal: str
+) -> list[np.ndarray]:
     """The chunks of the same episode without a server."""
     episode, chunks = policy.start_episode(GOAL, seed=seed), []
     for index, (front, wrist, state) in enumerate(parts):
@@ -152,9 +174,13 @@ def acted_directly(policy: MMEPolicy, parts: list, steps: int = 2, seed: int = 4
     return chunks
 
 
-def ask(served: Served, method: str, path: str, body: bytes | None = None, **headers: str) -> tuple[int, str, bytes]:
+def ask(
+    served: Served, method: str, path: str, body: bytes | None = None, **headers: str
+) -> tuple[int, str, bytes]:
     connection = http.client.HTTPConnection(*served.address, timeout=60)
-    connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
+    connection.request(
+        method, path, body, {name.replace("_", "-"): value for name, value in headers.items()}
+    )
     response = connection.getresponse()
     result = response.status, response.headers["Content-Type"], response.read()
     connection.close()

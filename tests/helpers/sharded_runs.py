@@ -1,6 +1,8 @@
-"""What the processes of test_sharded_training.py do: `python sharded_runs.py <folder>` runs all, one after the other.
+"""What the processes of test_sharded_training.py do: `python sharded_runs.py <folder>` runs all,
+one after the other.
 
-They are forks of one that has imported and composed what they need, which takes longer than what they do.
+They are forks of one that has imported and composed what they need, which takes longer than what
+they do.
 """
 
 import copy
@@ -37,11 +39,17 @@ from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import shard_files
 
 RUNS = [(2, "train,stop,policies,die"), (1, "go_on"), (3, "resume"), (1, "whole")]
-"""How many processes do what one after the other; starting them takes longer than what they do, so few do much."""
+"""How many processes do what one after the other; starting them takes longer than what they do, so
+few do much.
+"""
 MODELS = (
-    "tokendrop_expert", "diffusion_policy", "openvla_oft_tokendrop_context", "memoryvla", "sam2act_plus",
+    "tokendrop_expert",
+    "diffusion_policy",
+    "openvla_oft_tokendrop_context",
+    "memoryvla",
+    "sam2act_plus",
     "simplememvla",
-)  # fmt: skip
+)
 SHARDED = {"parallel": {"strategy": "fsdp"}}
 BATCH = 6  # of two and of three processes
 
@@ -56,7 +64,9 @@ def trainer(folder: Path, steps: int, resumed: bool = False, **changes: Any) -> 
     validation = Validation(Samples(built, 5), collate, 5, 2, seed=1)
     settings = TrainSettings.from_dict(recipe, seed=1)
     config = {"train": recipe, "seed": 1}
-    return Trainer(built, Samples(built), collate, validation, settings, run, config, Accelerator(cpu=True))
+    return Trainer(
+        built, Samples(built), collate, validation, settings, run, config, Accelerator(cpu=True)
+    )
 
 
 def finish_run(job: Trainer, line: ProgressLine | None = None) -> bool:
@@ -173,20 +183,33 @@ def whole(folder: Path) -> dict[str, Any]:
 
 
 def resume(folder: Path) -> dict[str, Any]:
-    job = trainer(folder / "run", 8, resumed=True, accumulate=2, **SHARDED)  # gradients travel with the last piece
+    job = trainer(
+        folder / "run", 8, resumed=True, accumulate=2, **SHARDED
+    )  # gradients travel with the last piece
     assert finish_run(job)
     return validation_losses(job)
 
 
 DONE: dict[str, Callable[[Path], Any]] = {
-    "train": train, "stop": stop, "die": die, "policies": policies, "go_on": go_on, "resume": resume, "whole": whole,
-}  # fmt: skip
+    "train": train,
+    "stop": stop,
+    "die": die,
+    "policies": policies,
+    "go_on": go_on,
+    "resume": resume,
+    "whole": whole,
+}
 
 
 def rank(number: int, processes: int, port: int, what: str, folder: Path) -> None:
     """One of the processes, as torchrun starts them, without its half a minute of patience."""
     if processes > 1:
-        shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": processes, "RANK": number}
+        shared = {
+            "MASTER_ADDR": "127.0.0.1",
+            "MASTER_PORT": port,
+            "WORLD_SIZE": processes,
+            "RANK": number,
+        }
         shared |= {"LOCAL_WORLD_SIZE": processes, "LOCAL_RANK": number}
         os.environ.update({key: str(value) for key, value in shared.items()})
         Accelerator(cpu=True)  # joins the others
@@ -221,7 +244,10 @@ def main(folder: Path) -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        started = [fork.Process(target=rank, args=(number, count, port, what, folder)) for number in range(count)]
+        started = [
+            fork.Process(target=rank, args=(number, count, port, what, folder))
+            for number in range(count)
+        ]
         for process in started:
             process.start()
         for process in started:

@@ -1,4 +1,6 @@
-"""Golden cases of SimpleMemVLA: arrays, sizes, and its small policy built here with its parameters."""
+"""Golden cases of SimpleMemVLA: arrays, sizes, and its small policy built here with
+its parameters.
+"""
 
 import json
 from functools import cache
@@ -32,15 +34,23 @@ def read(name: str) -> dict[str, Any]:
 
 
 def robot_section(config: dict[str, Any]) -> dict[str, Any]:
-    """A robot with the sizes of a case; its chunks are executed as far as the prefix of the next prompt allows."""
-    window = Window(config["history_video_sec"], config["history_video_fps"], config["native_video_fps"])
+    """A robot with the sizes of a case; its chunks are executed as far as the prefix of the next
+    prompt allows.
+    """
+    window = Window(
+        config["history_video_sec"], config["history_video_fps"], config["native_video_fps"]
+    )
     action = {"width": config["action_dim"], "horizon": config["action_horizon"], "relative": []}
     return {
         "name": "golden",
         "cameras": {key.rpartition(".")[2]: {} for key in config["image_keys"]},
         "memory_camera": config["history_image_keys"][0].rpartition(".")[2],
         "state": {"width": config["state_dim"]},
-        "action": {**action, "execute": min(2 * window.stride, config["action_horizon"]), "frames": 1},
+        "action": {
+            **action,
+            "execute": min(2 * window.stride, config["action_horizon"]),
+            "frames": 1,
+        },
         "fps": config["native_video_fps"],
         "conditioning_video": True,
     }
@@ -51,7 +61,11 @@ def sections(**processor: Any) -> dict[str, Any]:
     config, pixels = meta["config"], meta["processor"]
     bounds = [pixels["min_pixels"], pixels["max_pixels"]]
     backbone = backbone_section(config)
-    settings = {"name": "simplememvla", **processor_section(config), "tokenizer": str(folder() / "tokenizer.json")}
+    settings = {
+        "name": "simplememvla",
+        **processor_section(config),
+        "tokenizer": str(folder() / "tokenizer.json"),
+    }
     return {
         "name": "simplememvla",
         "policy": {"name": "simplememvla"},

@@ -18,7 +18,9 @@ class ApiError(Exception):
 def response(text, *, finish="STOP", blocked=None):
     return SimpleNamespace(
         text=text,
-        usage_metadata=SimpleNamespace(prompt_token_count=1000, candidates_token_count=20, thoughts_token_count=80),
+        usage_metadata=SimpleNamespace(
+            prompt_token_count=1000, candidates_token_count=20, thoughts_token_count=80
+        ),
         candidates=[SimpleNamespace(finish_reason=SimpleNamespace(name=finish))],
         prompt_feedback=SimpleNamespace(block_reason=blocked),
     )
@@ -29,7 +31,9 @@ def says(subgoal):
 
 
 class Client:
-    """Has google-genai's interface; returns these outcomes in turn (exceptions are raised, functions called)."""
+    """Has google-genai's interface; returns these outcomes in turn (exceptions are raised,
+    functions called).
+    """
 
     def __init__(self, *outcomes):
         self.outcomes, self.requests = list(outcomes), []
@@ -62,7 +66,9 @@ def started(predictor, task="StopCube", video=0):
 
 
 def play(predictor, episode, chunks):
-    """Predict, then execute 16 actions; returns the subgoals and the steps at which the model was asked."""
+    """Predict, then execute 16 actions; returns the subgoals and the steps at which the model was
+    asked.
+    """
     texts, queries = [], []
     for _ in range(chunks):
         subgoal = predictor.predict([episode])[0]

@@ -17,12 +17,17 @@ from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.types import Batch, HistoryTokens
 
-SMALL = {"depth": 1, "vision": {"depth": 1, "image_size": 16, "patch_size": 1, "width": 16, "mlp_dim": 16}}
+SMALL = {
+    "depth": 1,
+    "vision": {"depth": 1, "image_size": 16, "patch_size": 1, "width": 16, "mlp_dim": 16},
+}
 RECIPE: dict[str, Any] = {
     "steps": 6, "batch_size": 4, "lr": 1e-2, "ema": 0.5, "workers": 0, "device": "cpu",
     "log_every": 1, "save_every": 2, "val_every": 3,
 }  # fmt: skip
-STATS = QuantileStats(*(torch.full((8,), value).double().numpy() for value in (0.0, 1.0, -1.0, 1.0)))
+STATS = QuantileStats(
+    *(torch.full((8,), value).double().numpy() for value in (0.0, 1.0, -1.0, 1.0))
+)
 
 
 class Samples:
@@ -41,7 +46,9 @@ class Samples:
         history = None
         if memory is not None:
             mask = torch.arange(memory.capacity) < 20
-            features = torch.randn(memory.capacity, config.vlm.width, generator=draw) * mask[:, None]
+            features = (
+                torch.randn(memory.capacity, config.vlm.width, generator=draw) * mask[:, None]
+            )
             history = HistoryTokens(features, torch.ones(memory.capacity, 3) * mask[:, None], mask)
         return Batch(
             images=torch.randint(0, 256, (2, 3, size, size), generator=draw, dtype=torch.uint8),
@@ -57,7 +64,9 @@ def collate(items: Sequence[Batch]) -> Batch:
     def stack(parts: Sequence[Any]) -> Any:
         if parts[0] is None or isinstance(parts[0], torch.Tensor):
             return None if parts[0] is None else torch.stack(list(parts))
-        return type(parts[0])(**{key: stack([vars(part)[key] for part in parts]) for key in vars(parts[0])})
+        return type(parts[0])(
+            **{key: stack([vars(part)[key] for part in parts]) for key in vars(parts[0])}
+        )
 
     return stack(items)
 
@@ -70,7 +79,9 @@ def policy(name: str = "pi05", **overrides: Any) -> MMEPolicy:
     return built
 
 
-def trainer(folder: Path, built: MMEPolicy | None = None, run: Run | None = None, **changes: Any) -> Trainer:
+def trainer(
+    folder: Path, built: MMEPolicy | None = None, run: Run | None = None, **changes: Any
+) -> Trainer:
     built = built or policy()
     recipe = {**RECIPE, **changes}
     actions = recipe.pop("actions", 0.0)
@@ -78,7 +89,9 @@ def trainer(folder: Path, built: MMEPolicy | None = None, run: Run | None = None
     run, config = run or Run(folder), {"train": recipe, "seed": 1}
     validation = Validation(Samples(built, 5), collate, 3, 2, seed=1)
     samples = Samples(built, actions=actions)
-    return Trainer(built, samples, collate, validation, settings, run, config, Accelerator(cpu=True))
+    return Trainer(
+        built, samples, collate, validation, settings, run, config, Accelerator(cpu=True)
+    )
 
 
 def loggers(folder: Path, first_step: int = 0) -> Loggers:

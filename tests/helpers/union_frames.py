@@ -13,7 +13,9 @@ JOBS = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
 
 
 class WatchedEnv(ScriptedEnv):
-    """Draws only what it is asked for, as the simulated environments do; counts its images by camera."""
+    """Draws only what it is asked for, as the simulated environments do; counts its images by
+    camera.
+    """
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -24,7 +26,11 @@ class WatchedEnv(ScriptedEnv):
         first = len(self.frames) - len(frames)
         for number, frame in enumerate(frames, first):
             newest = number == len(self.frames) - 1
-            cameras = ("front", "wrist") if self.render_request is None else self.render_request.cameras(number, newest)
+            cameras = (
+                ("front", "wrist")
+                if self.render_request is None
+                else self.render_request.cameras(number, newest)
+            )
             for camera in self.rendered:
                 self.rendered[camera] += camera in cameras
                 frame[f"{camera}_rgb"] = frame[f"{camera}_rgb"] if camera in cameras else None
@@ -37,17 +43,26 @@ def make_watched_env(task: str, split: str, episode: int, max_steps: int) -> Wat
 
 def outcomes(records: list[EpisodeRecord]) -> list[tuple[Any, ...]]:
     assert all(record.error is None for record in records)
-    return [(r.key, r.outcome, r.steps, r.extra["actions_sha256"], r.extra.get("subgoals")) for r in records]
+    return [
+        (r.key, r.outcome, r.steps, r.extra["actions_sha256"], r.extra.get("subgoals"))
+        for r in records
+    ]
 
 
-def both_ways(policy: Any, subgoals: Any = None, base: Any = make_watched_env) -> list[dict[str, int]]:
-    """Run with all images rendered and with those needed; check that both agree; return what each rendered."""
+def both_ways(
+    policy: Any, subgoals: Any = None, base: Any = make_watched_env
+) -> list[dict[str, int]]:
+    """Run with all images rendered and with those needed; check that both agree; return what each
+    rendered.
+    """
     counts = []
     results = []
     for draw in ("all", "needed"):
         envs = InlineEnvs(base=base, max_steps=STEPS - 1)
         records = roll(policy, JOBS, envs, subgoals, draw=draw, max_steps=STEPS - 1, max_batch=1)
-        assert [record.steps for record in records] == [STEPS, STEPS], "an episode should take several chunks"
+        assert [record.steps for record in records] == [STEPS, STEPS], (
+            "an episode should take several chunks"
+        )
         results.append(outcomes(records))
         if base is make_watched_env:
             counts += [env.rendered for env in envs.made.values()]

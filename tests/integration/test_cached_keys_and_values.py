@@ -61,7 +61,8 @@ def test_the_loss_is_that_of_the_policy_without_memory(policy: MMEPolicy) -> Non
     batch, noise = random_batch(base), base.training_noise(2, torch.Generator().manual_seed(0))
     history = policy.memory.gather_selection(started(policy, 0).required_history(), 2)
     with_memory = replace(
-        batch, history=history.__class__(*(x[None].repeat(2, *[1] * x.ndim) for x in history.tensors()))
+        batch,
+        history=history.__class__(*(x[None].repeat(2, *[1] * x.ndim) for x in history.tensors())),
     )
     assert torch.equal(policy(with_memory, noise)[0], base(batch, noise)[0])
 
@@ -74,12 +75,18 @@ def test_a_batch_with_unequal_caches_gives_each_episodes_own_chunk(policy: MMEPo
     assert [len(episode.cache) for episode in episodes] == [1, 2, 2]
 
 
-def test_the_cache_is_written_once_after_the_chunk_stands(policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_is_written_once_after_the_chunk_stands(
+    policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     episode = started(policy, 2, 1)
     expected = policy.act(started(policy, 2, 1))
     processor, state, before = policy.require_processor(), episode.noise_state, episode.cache
     with monkeypatch.context() as patch:
-        patch.setattr(processor, "absolute_actions", lambda *_: (_ for _ in ()).throw(RuntimeError("no memory")))
+        patch.setattr(
+            processor,
+            "absolute_actions",
+            lambda *_: (_ for _ in ()).throw(RuntimeError("no memory")),
+        )
         with pytest.raises(RuntimeError):
             policy.act(episode)
     assert episode.cache is before

@@ -1,4 +1,6 @@
-"""Every extension point of a backbone, for an integration of one's own: training, sampling and weights."""
+"""Every extension point of a backbone, for an integration of one's own: training, sampling and
+weights.
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -83,8 +85,15 @@ class Everything(BesideInASeparateExpert):
 
     def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
         word = self.word(self._mean(memory))[:, None]
-        return [Block("word", word, torch.ones(word.shape[:2], dtype=torch.bool, device=word.device), "vlm"),
-                *observation]  # fmt: skip
+        return [
+            Block(
+                "word",
+                word,
+                torch.ones(word.shape[:2], dtype=torch.bool, device=word.device),
+                "vlm",
+            ),
+            *observation,
+        ]
 
 
 class Weighted(FrameSamp):
@@ -121,7 +130,9 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(MEMORIES._entries, memory.__name__, memory)
 
 
-def policy_of(integration: type[Integration], memory: type = FrameSamp, seed: int = 42) -> MMEPolicy:
+def policy_of(
+    integration: type[Integration], memory: type = FrameSamp, seed: int = 42
+) -> MMEPolicy:
     cfg = compose("policy", ["model=framesamp_modul", "backbone=tiny"])
     cfg.integration = {"name": integration.__name__}
     cfg.memory = {"name": "framesamp" if memory is FrameSamp else memory.__name__, "budget": 128}
@@ -139,7 +150,9 @@ def test_an_extension_point_leads_to_the_action_in_training_and_in_every_step_of
 
 
 @pytest.mark.parametrize("integration", EXTENSION_POINTS)
-def test_a_policy_learns_and_acts_through_an_extension_point(integration: type[Integration]) -> None:
+def test_a_policy_learns_and_acts_through_an_extension_point(
+    integration: type[Integration],
+) -> None:
     policy = policy_of(integration)
     batch = random_batch(policy, valid=64)
     draws = policy.training_noise(2, torch.Generator().manual_seed(0))
@@ -188,11 +201,17 @@ def test_only_the_custom_component_is_new_when_starting_from_a_released_checkpoi
     assert all("mem_attn" in name or "mem_" in name for name in start.left)
     assert start.left
     for name, tensor in policy.state_dict().items():
-        assert torch.equal(tensor, before[name] if name in start.new else released_state[name]), name
+        assert torch.equal(tensor, before[name] if name in start.new else released_state[name]), (
+            name
+        )
 
 
-def test_loading_all_of_one_says_which_tensors_have_no_released_names(released: tuple[MMEPolicy, Path]) -> None:
-    with pytest.raises(UserError, match=r"(?s)experts\.recall\.attention_norm.*and 4 more.*start_from\(\)"):
+def test_loading_all_of_one_says_which_tensors_have_no_released_names(
+    released: tuple[MMEPolicy, Path],
+) -> None:
+    with pytest.raises(
+        UserError, match=r"(?s)experts\.recall\.attention_norm.*and 4 more.*start_from\(\)"
+    ):
         load_weights(policy_of(BesideInASeparateExpert), released[1])
 
 

@@ -1,4 +1,6 @@
-"""The model without configuration, data and simulation: the examples of README.md and docs/start/python.md."""
+"""The model without configuration, data and simulation: the examples of README.md and
+docs/start/python.md.
+"""
 
 import ast
 import subprocess
@@ -20,7 +22,8 @@ def ones(*shape):
     return torch.ones(shape, dtype=torch.bool)
 
 history = HistoryTokens(torch.randn(1, 512, 64), torch.zeros(1, 512, 3), ones(1, 512))
-images, prompt = torch.zeros(1, 2, 3, 64, 64, dtype=torch.uint8), torch.ones(1, 16, dtype=torch.int64)
+images = torch.zeros(1, 2, 3, 64, 64, dtype=torch.uint8)
+prompt = torch.ones(1, 16, dtype=torch.int64)
 batches = [Batch(images, ones(1, 2), prompt, ones(1, 16), history, torch.randn(1, 20, 32))]
 """
 REPORT = """
@@ -31,7 +34,9 @@ print(float(loss))
 
 
 def example(page: str) -> str:
-    blocks = (part.split("```")[0] for part in (REPOSITORY / page).read_text().split("```python\n")[1:])
+    blocks = (
+        part.split("```")[0] for part in (REPOSITORY / page).read_text().split("```python\n")[1:]
+    )
     (code,) = (code for code in blocks if "MMEModel(" in code)
     return code
 
@@ -53,7 +58,9 @@ def third_party(module: str) -> set[str]:
 @pytest.mark.parametrize(("page", "before"), [("README.md", BATCHES), ("docs/start/python.md", "")])
 def test_example_trains_and_imports_little(page: str, before: str) -> None:
     code = before + example(page) + REPORT
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY
+    )
     assert result.returncode == 0, result.stderr
     modules, loss = result.stdout.splitlines()
     assert float(loss) > 0

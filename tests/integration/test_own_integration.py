@@ -1,4 +1,6 @@
-"""The worked example of docs/extend/add-an-integration.md: an integration of one's own is checked, learns and acts."""
+"""The worked example of docs/extend/add-an-integration.md: an integration of one's own is checked,
+learns and acts.
+"""
 
 import numpy as np
 import pytest
@@ -15,7 +17,9 @@ EXAMPLE = REPOSITORY / "examples" / "gist"
 @pytest.fixture
 def policy(monkeypatch: pytest.MonkeyPatch) -> MMEPolicy:
     monkeypatch.syspath_prepend(EXAMPLE)
-    policy = build_policy("pi05", config_dir=EXAMPLE / "configs", memory="framesamp", integration="gist")
+    policy = build_policy(
+        "pi05", config_dir=EXAMPLE / "configs", memory="framesamp", integration="gist"
+    )
     policy.require_processor().stats = unit_stats()
     open_gates(policy)
     return policy

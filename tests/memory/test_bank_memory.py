@@ -1,4 +1,6 @@
-"""MemoryVLA's bank as a memory of other backbones: what it holds, and a policy that learns through it."""
+"""MemoryVLA's bank as a memory of other backbones: what it holds, and a policy that learns through
+it.
+"""
 
 import pytest
 import torch
@@ -26,7 +28,9 @@ def test_entries_stored_at_once_equal_those_stored_one_by_one(consolidation: str
         for i in range(9 - count, 9):
             state = bank.update(state, moments[row, i], moments[row, i], int(times[row, i]))
         torch.testing.assert_close(entries[row, there[row]], state.entries)
-        assert torch.equal(at[row, there[row]], state.times) and int(there[row].sum()) == min(count, 4)
+        assert torch.equal(at[row, there[row]], state.times) and int(there[row].sum()) == min(
+            count, 4
+        )
         query = torch.randn(1, 2, 8)
         together = bank.ask(query, entries[row : row + 1], at[row : row + 1], there[row : row + 1])
         torch.testing.assert_close(together, bank.retrieve([state], query))
@@ -42,5 +46,14 @@ def test_bank_modul_answers_by_what_it_remembers() -> None:
     assert not torch.equal(policy.sample_actions(batch, noise, 2), chunk)
     loss, _ = policy(batch)
     loss.backward()
-    learned = {name for name, p in policy.memory.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
-    assert {"reduce.weight", "output.weight", "bank.gate.weight", "bank.blocks.0.value.weight"} <= learned
+    learned = {
+        name
+        for name, p in policy.memory.named_parameters()
+        if p.grad is not None and p.grad.abs().sum() > 0
+    }
+    assert {
+        "reduce.weight",
+        "output.weight",
+        "bank.gate.weight",
+        "bank.blocks.0.value.weight",
+    } <= learned

@@ -45,7 +45,9 @@ def test_a_map_is_ascending_and_ends_at_the_current_frame(transform: HistoryTran
         rng = np.random.default_rng(seed)
         visible = map_frames([transform], 40, 10, rng, keep=[39])
         assert (np.diff(visible.real) >= 0).all() and visible.real[-1] == 39
-        assert (visible.real[: visible.exec_start] < 10).all() and visible.real[visible.exec_start] >= 10
+        assert (visible.real[: visible.exec_start] < 10).all() and visible.real[
+            visible.exec_start
+        ] >= 10
         again = map_frames([transform], 40, 10, np.random.default_rng(seed), keep=[39])
         assert np.array_equal(visible.real, again.real)
 
@@ -60,7 +62,10 @@ def test_in_a_probe_no_frame_depends_on_a_later_one(transform: HistoryTransform)
 
 def test_transforms_have_the_lengths_they_say() -> None:
     assert len(map_frames([RepeatFrame(16)], 40, 10).real) == 56
-    assert len(map_frames([Speed(2.0)], 40, 0).real) == 20 and len(map_frames([Speed(0.5)], 40, 0).real) == 80
+    assert (
+        len(map_frames([Speed(2.0)], 40, 0).real) == 20
+        and len(map_frames([Speed(0.5)], 40, 0).real) == 80
+    )
     assert len(map_frames([DropFrames(0.25)], 40, 0).real) == 30
     assert len(map_frames([Speed(2.0), RepeatFrame(16)], 40, 0).real) == 36
     assert len(map_frames([RepeatFrame(16, p=0.0)], 40, 10, np.random.default_rng(0)).real) == 40
@@ -71,7 +76,9 @@ def test_a_feed_shows_frames_as_the_map_does() -> None:
     real = map_frames(feed.transforms, 50, 5).real
     assert np.array_equal(np.repeat(np.arange(50), feed.repeats(np.arange(50), 5)), real)
     last = feed.displayed(np.arange(50), 5)
-    assert all(real[n] == frame for frame, n in enumerate(last) if n >= 0) and (last >= 0).sum() == len(set(real))
+    assert all(real[n] == frame for frame, n in enumerate(last) if n >= 0) and (
+        last >= 0
+    ).sum() == len(set(real))
     assert feed.source_frames(np.arange(20), 5).tolist() == sorted(set(real[:20].tolist()))
     assert np.array_equal(Feed().repeats(np.arange(9), 3), np.ones(9))
 
@@ -93,16 +100,25 @@ def test_noise_perturbs_by_its_share_of_the_deviation() -> None:
 
 
 def test_entries_that_are_no_transforms_are_reported() -> None:
-    assert build_transforms(["repeat_frame", {"name": "speed", "factor": 4}]) == (RepeatFrame(), Speed(4))
-    for entries, words in (("speed", "a list of names"), (["sped"], "Did you mean 'speed'"), ([{"factor": 2}], "name"),
-                           ([{"name": "speed", "factor": 99}], "factor=99")):  # fmt: skip
+    assert build_transforms(["repeat_frame", {"name": "speed", "factor": 4}]) == (
+        RepeatFrame(),
+        Speed(4),
+    )
+    for entries, words in (
+        ("speed", "a list of names"),
+        (["sped"], "Did you mean 'speed'"),
+        ([{"factor": 2}], "name"),
+        ([{"name": "speed", "factor": 99}], "factor=99"),
+    ):
         with pytest.raises(UserError, match=words):
             build_transforms(entries)
 
 
 def test_a_transform_that_returns_too_few_numbers_is_reported() -> None:
     class Short(HistoryTransform):
-        def repeats(self, length: int, exec_start: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        def repeats(
+            self, length: int, exec_start: int, rng: np.random.Generator | None = None
+        ) -> np.ndarray:
             return np.ones(2, np.int64)
 
     with pytest.raises(UserError, match="one for each of 9 frames"):
@@ -112,15 +128,23 @@ def test_a_transform_that_returns_too_few_numbers_is_reported() -> None:
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Processor, list[VisionCache]]:
     sources = open_sources(["sample"])
-    processor = Processor(image_size=28, tokenizer=Tokenizer.load("sample"), stats=compute_norm_stats(sources))
+    processor = Processor(
+        image_size=28, tokenizer=Tokenizer.load("sample"), stats=compute_norm_stats(sources)
+    )
     root = tmp_path_factory.mktemp("caches")
-    return sources, processor, [ensure_cache(sources[0], LastFrames(), encode, "abc", root=root, dtype="float32")]
+    return (
+        sources,
+        processor,
+        [ensure_cache(sources[0], LastFrames(), encode, "abc", root=root, dtype="float32")],
+    )
 
 
 def test_samples_are_transformed_by_seed_epoch_and_index(sample: Any) -> None:
     sources, processor, caches = sample
     base = TrainingDataset(sources, processor, LastFrames(), caches)
-    changed = TrainingDataset(sources, processor, LastFrames(), caches, transforms=[RepeatFrame(32, p=1.0)])
+    changed = TrainingDataset(
+        sources, processor, LastFrames(), caches, transforms=[RepeatFrame(32, p=1.0)]
+    )
     items = [changed[60], changed[60]]
     assert same(*items) and not same(items[0]["history"], base[60]["history"])
     assert int(items[0]["history"].step) > int(base[60]["history"].step)
@@ -129,7 +153,9 @@ def test_samples_are_transformed_by_seed_epoch_and_index(sample: Any) -> None:
             assert torch.equal(items[0][key], base[60][key]), key
     changed.set_epoch(1)
     assert not same(changed[60]["history"], items[0]["history"])
-    assert same(changed.observation(60), base.observation(60)), "what a policy meets when acting is not transformed"
+    assert same(changed.observation(60), base.observation(60)), (
+        "what a policy meets when acting is not transformed"
+    )
     nothing = TrainingDataset(sources, processor, LastFrames(), caches, transforms=[RepeatFrame(0)])
     assert same(nothing[60]["history"], base[60]["history"])
 
@@ -138,9 +164,15 @@ def test_past_actions_go_through_the_map(sample: Any, monkeypatch: pytest.Monkey
     sources, processor, caches = sample
     data = TrainingDataset(sources, processor, LastFrames(), caches)
     steps = (data.step(index) for index in range(20, len(data)))
-    step = next(s for s in steps if len(np.unique(sources[0].actions(s.episode, s.index - 4, s.index), axis=0)) > 1)
+    step = next(
+        s
+        for s in steps
+        if len(np.unique(sources[0].actions(s.episode, s.index - 4, s.index), axis=0)) > 1
+    )
     exec_start = int(sources[0].exec_starts[step.episode])
-    visible = map_frames([RepeatFrame(5, step.index - exec_start - 1)], step.index + 1, exec_start, keep=[step.index])
+    visible = map_frames(
+        [RepeatFrame(5, step.index - exec_start - 1)], step.index + 1, exec_start, keep=[step.index]
+    )
     monkeypatch.setattr(Processor, "prompt_spec", replace(processor.prompt_spec, past_actions=4))
     past = data.past_actions(step, visible)
     repeated = sources[0].actions(step.episode, step.index - 1, step.index)
@@ -151,7 +183,10 @@ def test_past_actions_go_through_the_map(sample: Any, monkeypatch: pytest.Monkey
 def test_the_times_of_a_group_are_transformed(sample: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     sources, processor, caches = sample
     monkeypatch.setattr(Processor, "samples", replace(processor.samples, group_size=4))
-    groups = [GroupDataset(sources, processor, LastFrames(), caches, transforms=t) for t in ((), [Speed(0.5)])]
+    groups = [
+        GroupDataset(sources, processor, LastFrames(), caches, transforms=t)
+        for t in ((), [Speed(0.5)])
+    ]
     base, slow = (group[1] for group in groups)
     assert base["place"] == slow["place"] and (slow["times"] >= base["times"]).all()
     assert slow["times"][-1] > base["times"][-1]
@@ -162,10 +197,16 @@ def test_nano_redraws_histories_each_epoch() -> None:
     policy, made = nano().eval(), demonstration()
     policy.require_processor().stats = statistics([made], policy)
     base = Decisions.of(policy, [made])
-    first, again = (Decisions.of(policy, [made], transforms=[RepeatFrame(32)], seed=1) for _ in range(2))
+    first, again = (
+        Decisions.of(policy, [made], transforms=[RepeatFrame(32)], seed=1) for _ in range(2)
+    )
     rows = [0, 1, 2]
     one = first.collate(rows).history
-    assert one is not None and same(one, again.collate(rows).history) and not same(one, base.collate(rows).history)
+    assert (
+        one is not None
+        and same(one, again.collate(rows).history)
+        and not same(one, base.collate(rows).history)
+    )
     first.set_epoch(1)
     assert not same(first.collate(rows).history, one)
     still = Decisions.of(policy, [made], transforms=[RepeatFrame(0)], seed=1)
@@ -173,15 +214,29 @@ def test_nano_redraws_histories_each_epoch() -> None:
 
 
 def test_a_probe_applies_the_same_objects(tmp_path: Path) -> None:
-    arms = [read_arm(word) for word in ("repeat_frame:8", "speed:2", "drop_frames:0.5", "noise:0.5")]
+    arms = [
+        read_arm(word) for word in ("repeat_frame:8", "speed:2", "drop_frames:0.5", "noise:0.5")
+    ]
     feeds = [arm.feed.transforms for arm in arms]
     assert feeds == [(RepeatFrame(8),), (Speed(2),), (DropFrames(0.5),), (Noise(0.5),)]
-    assert read_arm("pause:8").feed.repeats(np.arange(9), 3).tolist() == arms[0].feed.repeats(np.arange(9), 3).tolist()
+    assert (
+        read_arm("pause:8").feed.repeats(np.arange(9), 3).tolist()
+        == arms[0].feed.repeats(np.arange(9), 3).tolist()
+    )
     assert arms[1].dial() == 2 and options_of(arms[1]) == [{"intervention": "Speed", "factor": 2}]
-    lines = probed(reader(2), ["repeat_frame:8", "speed:2", "drop_frames:0.9", "noise:0.5", "pause:8"], tmp_path)
+    lines = probed(
+        reader(2),
+        ["repeat_frame:8", "speed:2", "drop_frames:0.9", "noise:0.5", "pause:8"],
+        tmp_path,
+    )
     moments = [line for line in lines if isinstance(line, MomentLine)]
-    changes = {name: sum(line.change for line in moments if line.arm == name) for name in {m.arm for m in moments}}
-    assert changes["speed:2"] > 0 and changes["drop_frames:0.9"] > 0 and changes["noise:0.5"] > 0, changes
+    changes = {
+        name: sum(line.change for line in moments if line.arm == name)
+        for name in {m.arm for m in moments}
+    }
+    assert changes["speed:2"] > 0 and changes["drop_frames:0.9"] > 0 and changes["noise:0.5"] > 0, (
+        changes
+    )
     assert changes["repeat_frame:8"] == changes["pause:8"]
 
 
@@ -191,4 +246,6 @@ def test_a_transform_of_ones_own_is_registered() -> None:
         pass
 
     assert HISTORY_TRANSFORMS["still_for_a_test"] is Still
-    assert np.array_equal(map_frames(build_transforms(["still_for_a_test"]), 5, 0).real, np.arange(5))
+    assert np.array_equal(
+        map_frames(build_transforms(["still_for_a_test"]), 5, 0).real, np.arange(5)
+    )

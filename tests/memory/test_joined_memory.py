@@ -1,4 +1,6 @@
-"""Several memories under one budget: each as if it were alone, in every place where a memory stands."""
+"""Several memories under one budget: each as if it were alone, in every place where a memory
+stands.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,10 @@ RMT = {"name": "rmt", "max_steps": 8, "max_video": 4, "budget": 16}
 FRAMES = {"name": "framesamp", "budget": 64}
 COMPOSITIONS = {
     "other grids": [FRAMES, TTT],
-    "a scorer of a coarser grid": [{"name": "tokendrop", "grid": 4, "budget": 64}, {**FRAMES, "grid": 8}],
+    "a scorer of a coarser grid": [
+        {"name": "tokendrop", "grid": 4, "budget": 64},
+        {**FRAMES, "grid": 8},
+    ],
     "two recurrent ones": [TTT, {"name": "tokendrop", "budget": 128}, RMT],
 }
 
@@ -41,7 +46,11 @@ def alone(memory: JoinedMemory, i: int, episode: Episode) -> Episode:
     member = memory.memories[i]
     recordings = Episode(member, episode.length)
     times = memory.storage.grid // member.storage.grid
-    cells = finer(np.array([[0, p] for p in range(member.storage.grid**2)]), member.storage.grid, memory.storage.grid)
+    cells = finer(
+        np.array([[0, p] for p in range(member.storage.grid**2)]),
+        member.storage.grid,
+        memory.storage.grid,
+    )
     recordings.tokens = episode.tokens[:, cells[:, 1]].unflatten(1, (-1, times**2)).mean(2)
     return recordings
 
@@ -56,7 +65,9 @@ def test_a_joined_memory_keeps_a_memorys_contract(members: list[Any]) -> None:
 def test_every_member_replies_as_when_alone(members: list[Any]) -> None:
     memory = joined(members).eval()
     episode, steps = Episode(memory, 48), (3, 20, 47)
-    tokens = memory(stack_history([memory.gather_selection(episode.cached(), step) for step in steps]))
+    tokens = memory(
+        stack_history([memory.gather_selection(episode.cached(), step) for step in steps])
+    )
     start = 0
     for i, member in enumerate(memory.memories):
         history = alone(memory, i, episode).cached()
@@ -72,12 +83,20 @@ def test_every_member_replies_as_when_alone(members: list[Any]) -> None:
 def test_budgets_are_shared_evenly_or_as_configured() -> None:
     assert [m.budget for m in joined(["framesamp", "ttt"]).memories] == [256, 256]
     assert [m.budget for m in joined(["framesamp", "ttt", "rmt"]).memories] == [160, 160, 160]
-    assert [m.budget for m in joined([{**FRAMES, "budget": 128}, "ttt"], 256).memories] == [128, 128]
-    assert [m.budget for m in joined(["framesamp", {"name": "present", "grid": 2}]).memories] == [256, 4]
+    assert [m.budget for m in joined([{**FRAMES, "budget": 128}, "ttt"], 256).memories] == [
+        128,
+        128,
+    ]
+    assert [m.budget for m in joined(["framesamp", {"name": "present", "grid": 2}]).memories] == [
+        256,
+        4,
+    ]
 
 
 def test_members_that_store_nothing_ask_nothing_of_the_storage() -> None:
-    stored = joined([{**FRAMES, "grid": 2, "every": 3, "pooling": "max"}, {"name": "actions", "budget": 16}]).storage
+    stored = joined(
+        [{**FRAMES, "grid": 2, "every": 3, "pooling": "max"}, {"name": "actions", "budget": 16}]
+    ).storage
     assert (stored.grid, stored.pooling, stored.keep_every) == (2, "max", 3)
 
 
@@ -88,7 +107,10 @@ def test_members_that_store_nothing_ask_nothing_of_the_storage() -> None:
         ([{**FRAMES, "budget": 512}, "ttt"], "ttt an even share"),
         (["framesamp"], "at least two"),
         (["framesamp", 3], "no memory to join"),
-        ([FRAMES, {**TTT, "pooling": "max"}], r"(?s)framesamp stores.*mean.*ttt.*max.*Set the same pooling"),
+        (
+            [FRAMES, {**TTT, "pooling": "max"}],
+            r"(?s)framesamp stores.*mean.*ttt.*max.*Set the same pooling",
+        ),
         (["tokendrop", {"name": "tokendrop", "stride": 4}], "the same grid and stride"),
         (["framesamp", "tttt"], "ttt"),
         ([{**FRAMES, "every": 7.5}, TTT], "every 7.5th frame"),
@@ -114,7 +136,9 @@ def test_every_member_learns_through_an_integration() -> None:
     policy = small_policy("pi05", memory=[FRAMES, TTT], integration="expert")
     batch = random_batch(policy, 1)
     assert batch.history is not None
-    batch.history = HistoryTokens(batch.history.features, batch.history.positions, torch.ones_like(batch.history.mask))
+    batch.history = HistoryTokens(
+        batch.history.features, batch.history.positions, torch.ones_like(batch.history.mask)
+    )
     before, _ = policy(batch, policy.training_noise(1, torch.Generator().manual_seed(0)))
     before.backward()
     assert isinstance(policy.memory, JoinedMemory)
@@ -128,7 +152,9 @@ def test_every_member_learns_through_an_integration() -> None:
 
 
 @torch.no_grad()
-def test_a_running_episode_acts_as_a_fresh_start_and_a_saved_policy_as_the_first(tmp_path: Path) -> None:
+def test_a_running_episode_acts_as_a_fresh_start_and_a_saved_policy_as_the_first(
+    tmp_path: Path,
+) -> None:
     policy = small_policy("framesamp_ttt_modul", memory={"members": [FRAMES, TTT]})
     policy.save_pretrained(tmp_path)
     again = MMEPolicy.from_pretrained(tmp_path)
@@ -139,7 +165,9 @@ def test_a_running_episode_acts_as_a_fresh_start_and_a_saved_policy_as_the_first
         episode = which.start_episode("press the button", seed=1)
         for piece in pieces:
             frames_ = frames[piece]
-            episode.observe({"front": frames_, "wrist": frames_}, np.zeros((len(frames_), 8), np.float32))
+            episode.observe(
+                {"front": frames_, "wrist": frames_}, np.zeros((len(frames_), 8), np.float32)
+            )
             which._memory_tokens([episode], which.observation([episode]))
         return which.act(episode)
 
@@ -149,10 +177,13 @@ def test_a_running_episode_acts_as_a_fresh_start_and_a_saved_policy_as_the_first
 
 
 def test_a_list_of_memories_is_understood_everywhere(tmp_path: Path) -> None:
-    assert compose("train", ["memory=[framesamp,ttt]", "integration=modulator"]).name == "framesamp_ttt_modul"
-    assert build_policy("pi05", memory=["tokendrop", "rmt"], integration="expert", device="meta").config["name"] == (
-        "tokendrop_rmt_expert"
+    assert (
+        compose("train", ["memory=[framesamp,ttt]", "integration=modulator"]).name
+        == "framesamp_ttt_modul"
     )
+    assert build_policy(
+        "pi05", memory=["tokendrop", "rmt"], integration="expert", device="meta"
+    ).config["name"] == ("tokendrop_rmt_expert")
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "two.yaml").write_text(
         "# @package _global_\ndefaults:\n  - /integration: context\nname: two\n"
@@ -166,6 +197,15 @@ def test_a_list_of_memories_is_understood_everywhere(tmp_path: Path) -> None:
 
 def test_inspect_draws_what_all_members_store(tmp_path: Path) -> None:
     inspect.main(
-        compose("inspect", ["dataset=sample", "memory=[framesamp,ttt]", "episode=0", "step=40", f"output={tmp_path}"])
+        compose(
+            "inspect",
+            [
+                "dataset=sample",
+                "memory=[framesamp,ttt]",
+                "episode=0",
+                "step=40",
+                f"output={tmp_path}",
+            ],
+        )
     )
     assert [path.name.rpartition("_")[2] for path in tmp_path.iterdir()] == ["joined.png"]

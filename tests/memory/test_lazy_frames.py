@@ -1,4 +1,6 @@
-"""Frames of a memory that reads few of them are encoded when they are read, once, and give what they always gave."""
+"""Frames of a memory that reads few of them are encoded when they are read, once, and give what
+they always gave.
+"""
 
 import numpy as np
 import pytest
@@ -15,7 +17,10 @@ SPEC = StorageSpec(2, keep_every=2)
 
 def numbered(frames: np.ndarray) -> torch.Tensor:
     """Tokens [n, 4, 1] that say which frame and patch they are of."""
-    return torch.from_numpy(frames[:, 0, 0, :1].astype(np.float32))[:, None] + torch.arange(4)[:, None] / 10
+    return (
+        torch.from_numpy(frames[:, 0, 0, :1].astype(np.float32))[:, None]
+        + torch.arange(4)[:, None] / 10
+    )
 
 
 def numbered_images(count: int) -> np.ndarray:
@@ -44,9 +49,12 @@ def test_a_lazy_history_holds_what_an_eager_one_does(rendered: np.ndarray | None
 
 
 @pytest.mark.parametrize(
-    "model", ["ttt_expert", "rmt_context", "bank_modul", "anchors_modul", "moment_modul", "gist_modul"]
+    "model",
+    ["ttt_expert", "rmt_context", "bank_modul", "anchors_modul", "moment_modul", "gist_modul"],
 )
-def test_a_policy_encodes_the_frames_it_reads_and_acts_as_ever(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_policy_encodes_the_frames_it_reads_and_acts_as_ever(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     policy = small_policy(model, backbone={"vision": {**SMALL_VISION, "patch_size": 8}})
     frames = moving_frames(40)
 
@@ -64,7 +72,9 @@ def test_a_policy_encodes_the_frames_it_reads_and_acts_as_ever(model: str, monke
             episode = policy.start_episode("press the button")
             for start in (0, 1, 17, 33):
                 part = frames[start : {0: 1, 1: 17, 17: 33, 33: 40}[start]]
-                episode.observe({"front": part, "wrist": part}, np.zeros((len(part), 8), np.float32))
+                episode.observe(
+                    {"front": part, "wrist": part}, np.zeros((len(part), 8), np.float32)
+                )
                 chunks.append(policy.act(episode))
         return chunks, n_frames
 

@@ -1,4 +1,6 @@
-"""Where memory tokens stand for rotary attention: by slot, as released, or by time, which a selection cannot shift."""
+"""Where memory tokens stand for rotary attention: by slot, as released, or by time, which a
+selection cannot shift.
+"""
 
 from dataclasses import replace
 
@@ -20,27 +22,39 @@ GRID, FRAMES, OLD = 4, 6, 16
 
 
 def composed(integration: str, position: str) -> MMEPolicy:
-    policy = small_policy(f"framesamp_{integration}", memory={"budget": 128}, integration={"memory_position": position})
+    policy = small_policy(
+        f"framesamp_{integration}",
+        memory={"budget": 128},
+        integration={"memory_position": position},
+    )
     with torch.no_grad():  # the modulator starts near the identity
         for parameter in policy.integration.parameters():
-            parameter.add_(0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
+            parameter.add_(
+                0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
+            )
     return policy.eval()
 
 
 def without(history: HistoryTokens, first: int, count: int) -> HistoryTokens:
-    """The same selection as if one frame had not been remembered: the later tokens move up, padding follows."""
+    """The same selection as if one frame had not been remembered: the later tokens move up, padding
+    follows.
+    """
 
     def shifted(x: Tensor) -> Tensor:
         others = torch.cat([x[:, :first], x[:, first + count :]], 1)
         return torch.cat([others, torch.zeros_like(x[:, :count])], 1)
 
     mask = shifted(history.mask)
-    return replace(history, features=shifted(history.features), positions=shifted(history.positions), mask=mask)
+    return replace(
+        history, features=shifted(history.features), positions=shifted(history.positions), mask=mask
+    )
 
 
 def remembered(policy: MMEPolicy) -> HistoryTokens:
     frames = moving_frames(FRAMES)
-    return stack_history([policy.require_memory().gather_selection(cached_history(policy, frames), FRAMES - 1)] * 2)
+    return stack_history(
+        [policy.require_memory().gather_selection(cached_history(policy, frames), FRAMES - 1)] * 2
+    )
 
 
 @pytest.mark.parametrize(("position", "shifts"), [("slot", True), ("time", False)])
@@ -57,13 +71,17 @@ def test_a_dropped_frame_shifts_the_distance_the_older_ones_stand_from_the_view_
         assert memory is not None
         observed = policy.backbone.embed(replace(views, images=views.images.float()))
         blocks = policy.integration.blocks(observed, memory)
-        positions = apply_custom_positions(token_positions(torch.cat([block.mask for block in blocks], 1)), blocks)
+        positions = apply_custom_positions(
+            token_positions(torch.cat([block.mask for block in blocks], 1)), blocks
+        )
         return float(positions[0, len(blocks[0])] - positions[0, 0])
 
     dropped = without(history, 2 * OLD, OLD)
     assert (distance(history) != distance(dropped)) == shifts
     if position == "time":
-        assert distance(history) == FRAMES  # frame 0 is five frames ago, and the view stands one place further
+        assert (
+            distance(history) == FRAMES
+        )  # frame 0 is five frames ago, and the view stands one place further
 
 
 @pytest.mark.parametrize(("position", "shifts"), [("slot", True), ("time", False)])
@@ -75,25 +93,35 @@ def test_a_frame_that_is_not_there_moves_the_remainder_of_what_the_modulator_rea
     fewer = policy.encode_memory(without(remembered(policy), OLD, OLD))
     assert memory is not None and fewer is not None
     hidden = replace(memory, mask=memory.mask.clone())
-    hidden.mask[:, OLD : 2 * OLD] = False  # still in its slots, but unseen: the same tokens are read
-    x = torch.randn(2, 5, policy.integration.memory_width, generator=torch.Generator().manual_seed(0))
+    hidden.mask[:, OLD : 2 * OLD] = (
+        False  # still in its slots, but unseen: the same tokens are read
+    )
+    x = torch.randn(
+        2, 5, policy.integration.memory_width, generator=torch.Generator().manual_seed(0)
+    )
     read = [policy.integration.hook(tokens)(0, x) for tokens in (hidden, fewer)]  # type: ignore[misc]
     assert bool((read[0] - read[1]).abs().max() > 1e-3) == shifts
 
 
 @pytest.mark.parametrize("integration", ["context", "modul", "expert"])
 def test_time_is_counted_back_from_now(integration: str) -> None:
-    """The same moments, remembered at the same distance in a later part of an episode, are read alike."""
+    """The same moments, remembered at the same distance in a later part of an episode, are read
+    alike.
+    """
     policy = composed(integration, "time")
     batch = random_batch(policy, valid=32)
     assert batch.history is not None and batch.history.step is not None
     memory = policy.encode_memory(batch.history)
     assert memory is not None and memory.ages is not None
-    later = replace(batch.history, positions=batch.history.positions.clone(), step=batch.history.step + 700)
+    later = replace(
+        batch.history, positions=batch.history.positions.clone(), step=batch.history.step + 700
+    )
     later.positions[..., 0] += 700
     assert torch.equal(later.ages, memory.ages)  # type: ignore[arg-type]
     older = replace(memory, ages=memory.ages * 3)
-    noise = torch.randn(2, policy.horizon, policy.action_dim, generator=torch.Generator().manual_seed(3))
+    noise = torch.randn(
+        2, policy.horizon, policy.action_dim, generator=torch.Generator().manual_seed(3)
+    )
     chunks = [policy.sample_actions(batch, noise, memory=tokens) for tokens in (memory, older)]
     assert (chunks[0] - chunks[1]).abs().max() > 1e-6
 
@@ -104,10 +132,15 @@ def test_by_time_an_integration_keeps_an_integrations_contract(integration: str)
 
 
 def test_an_episode_and_a_cache_place_memory_alike() -> None:
-    policy = small_policy("framesamp_modul", memory={"budget": 64}, integration={"memory_position": "time"})
+    policy = small_policy(
+        "framesamp_modul", memory={"budget": 64}, integration={"memory_position": "time"}
+    )
     episode, frames = policy.start_episode("press the button"), moving_frames(9)
     episode.observe({"front": frames, "wrist": frames}, np.zeros((9, 8), np.float32))
-    recalled = [episode.gather_selection(), policy.require_memory().gather_selection(cached_history(policy, frames), 8)]
+    recalled = [
+        episode.gather_selection(),
+        policy.require_memory().gather_selection(cached_history(policy, frames), 8),
+    ]
     assert [item.step.item() for item in recalled if item.step is not None] == [8, 8]
     ages = [stack_history([item]).ages for item in recalled]
     assert ages[0] is not None and ages[0].max() == 8 and torch.equal(ages[0], ages[1])  # type: ignore[arg-type]
@@ -117,7 +150,12 @@ def test_what_has_no_time_or_no_place_for_it_is_refused() -> None:
     with pytest.raises(UserError, match=r"memory_position=time.*'rmt'"):
         build_policy("rmt_modul", integration={"memory_position": "time"}, device="meta")
     with pytest.raises(UserError, match=r"'nano' has no place for blocks"):
-        build_policy("framesamp_context", backbone="nano", integration={"memory_position": "time"}, device="meta")
+        build_policy(
+            "framesamp_context",
+            backbone="nano",
+            integration={"memory_position": "time"},
+            device="meta",
+        )
     with pytest.raises(UserError, match="Did you mean 'time'"):
         build_policy("framesamp_modul", integration={"memory_position": "tme"}, device="meta")
 

@@ -1,4 +1,6 @@
-"""The worked example of docs/extend/add-a-memory.md: a memory outside the package builds, streams and trains."""
+"""The worked example of docs/extend/add-a-memory.md: a memory outside the package builds, streams
+and trains.
+"""
 
 import json
 import os
@@ -33,13 +35,21 @@ def policy(monkeypatch):
 
 def test_the_page_shows_the_files_that_are_tested():
     page = (REPOSITORY / "docs" / "extend" / "add-a-memory.md").read_text()
-    for file in ("last_frames.py", "configs/memory/last_frames.yaml", "configs/model/last_frames_context.yaml"):
+    for file in (
+        "last_frames.py",
+        "configs/memory/last_frames.yaml",
+        "configs/model/last_frames_context.yaml",
+    ):
         assert (EXAMPLE / file).read_text().strip() in page, file
 
 
 def test_the_pages_memory_with_a_forward_of_its_own_passes_the_check():
     page = (REPOSITORY / "docs" / "extend" / "add-a-memory.md").read_text()
-    block = next(block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "FrameMeans" in block)
+    block = next(
+        block
+        for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+        if "FrameMeans" in block
+    )
     exec(compile(block, "docs/extend/add-a-memory.md", "exec"), {})
     check_memory("frame_means", budget=6)
 
@@ -51,25 +61,51 @@ def test_it_passes_the_check_that_the_page_names(policy):
 def test_its_file_makes_it_a_choice_for_any_integration_and_beside_another(monkeypatch):
     monkeypatch.chdir(EXAMPLE)
     trees = [EXAMPLE / "configs"]
-    cfg = compose("train", ["memory=last_frames", "integration=modulator", "memory.spacing=8"], extra_dirs=trees)
-    assert (cfg.plugins, cfg.memory.spacing, cfg.integration.name) == (["last_frames"], 8, "modulator")
-    joined = {"memory": ["last_frames", "framesamp"], "integration": "expert", "plugins": ["last_frames"]}
+    cfg = compose(
+        "train",
+        ["memory=last_frames", "integration=modulator", "memory.spacing=8"],
+        extra_dirs=trees,
+    )
+    assert (cfg.plugins, cfg.memory.spacing, cfg.integration.name) == (
+        ["last_frames"],
+        8,
+        "modulator",
+    )
+    joined = {
+        "memory": ["last_frames", "framesamp"],
+        "integration": "expert",
+        "plugins": ["last_frames"],
+    }
     policy = build_policy("pi05", config_dir=trees[0], device="meta", **joined)
-    assert [type(member).__name__ for member in policy.memory.memories] == ["LastFrames", "FrameSamp"]
+    assert [type(member).__name__ for member in policy.memory.memories] == [
+        "LastFrames",
+        "FrameSamp",
+    ]
 
 
 @pytest.mark.slow
 def test_own_memory_trains_and_is_evaluated_on_nano(tmp_path):
-    pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
+    pytest.importorskip(
+        "mani_skill", reason="the simulator is not installed: the extra `sim` has it"
+    )
     try:
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
     settings = [
-        "beside=[]", "also=[]", "rendered_for=[]", "planner=false", "videos=false", "split=val", "episodes=1",
-        "max_steps=1", "demonstrations={easy: 2, medium: 0, hard: 0}", "train.steps=1", "train.batch_size=2",
+        "beside=[]",
+        "also=[]",
+        "rendered_for=[]",
+        "planner=false",
+        "videos=false",
+        "split=val",
+        "episodes=1",
+        "max_steps=1",
+        "demonstrations={easy: 2, medium: 0, hard: 0}",
+        "train.steps=1",
+        "train.batch_size=2",
         "+memories.last_frames={budget: 4, grid: 1, spacing: 32}",
-    ]  # fmt: skip
+    ]
     words = ["task=VideoUnmask", "model=last_frames_context", "--config-dir", "configs", *settings]
     command = [sys.executable, "-m", "mme_vla.nano", *words, f"output={tmp_path}"]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
@@ -101,10 +137,18 @@ def test_custom_memory_trains_through_the_same_command(tmp_path, monkeypatch):
         "backbone.vision.image_size=16",
         "backbone.vision.patch_size=1",
     ]
-    brief = ["train.steps=2", "train.val_samples=2", "train.open_loop_chunks=1", "train.workers=0", "logger=none"]
+    brief = [
+        "train.steps=2",
+        "train.val_samples=2",
+        "train.open_loop_chunks=1",
+        "train.workers=0",
+        "logger=none",
+    ]
     options = ["model=last_frames_context", *small, *brief, f"hydra.run.dir={tmp_path / 'run'}"]
     # As `python -m mme_vla.train` would, in a process that has imported the large packages already.
-    monkeypatch.setattr(sys, "argv", ["mme_vla.train", "--config-dir", str(EXAMPLE / "configs"), *options])
+    monkeypatch.setattr(
+        sys, "argv", ["mme_vla.train", "--config-dir", str(EXAMPLE / "configs"), *options]
+    )
     monkeypatch.syspath_prepend(EXAMPLE)
     monkeypatch.chdir(EXAMPLE)
     monkeypatch.delitem(sys.modules, "mme_vla.train", raising=False)

@@ -1,4 +1,6 @@
-"""What a memory's tokens say of their place, and a repeated frame, for every memory that has positions."""
+"""What a memory's tokens say of their place, and a repeated frame, for every memory that has
+positions.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -16,12 +18,21 @@ from mme_vla.testing.check_memory import D_VISION, WIDTH, Episode
 from mme_vla.types import HistoryTokens
 
 WITH_POSITIONS: dict[str, dict[str, Any]] = {
-    "framesamp": {"budget": 64}, "tokendrop": {"budget": 64, "grid": 4}, "retrieval": {"budget": 64},
-    "ttt": {"budget": 16, "grid": 4}, "rmt": {"budget": 16, "grid": 4}, "gist": {"budget": 128},
-    "learned_topk": {"budget": 32, "pool": 8, "grid": 4}, "moment": {}, "actions": {"budget": 4}, "present": {},
-    "anchors": {"budget": 48}, "events": {"budget": 64}, "pyramid": {"budget": 80},
+    "framesamp": {"budget": 64},
+    "tokendrop": {"budget": 64, "grid": 4},
+    "retrieval": {"budget": 64},
+    "ttt": {"budget": 16, "grid": 4},
+    "rmt": {"budget": 16, "grid": 4},
+    "gist": {"budget": 128},
+    "learned_topk": {"budget": 32, "pool": 8, "grid": 4},
+    "moment": {},
+    "actions": {"budget": 4},
+    "present": {},
+    "anchors": {"budget": 48},
+    "events": {"budget": 64},
+    "pyramid": {"budget": 80},
     "keyframes": {"budget": 48, "pool": 8},
-}  # fmt: skip
+}
 
 OTHERS: dict[str, dict[str, Any]] = {
     "bank": {"budget": 16, "grid": 4}, "spacetime": {"frames": 3},
@@ -38,7 +49,9 @@ def build(name: str, **options: Any) -> Memory:
 
 def shifted(history: HistoryTokens, *by: float) -> HistoryTokens:
     """The selection at other times, rows or columns."""
-    return replace(history, positions=(history.positions + torch.tensor(by)) * history.mask[..., None])
+    return replace(
+        history, positions=(history.positions + torch.tensor(by)) * history.mask[..., None]
+    )
 
 
 @torch.no_grad()
@@ -49,7 +62,10 @@ def test_tokens_say_of_their_place_what_positions_allows(name: str) -> None:
     for positions in ("time_space", "space", "none"):
         memory = build(name, positions=positions)
         base = memory(history)
-        for what, other in (("time", shifted(history, 100, 0, 0)), ("space", shifted(history, 0, 3, 2))):
+        for what, other in (
+            ("time", shifted(history, 100, 0, 0)),
+            ("space", shifted(history, 0, 3, 2)),
+        ):
             tokens = memory(other).tokens
             changes[positions, what] = not torch.equal(tokens[base.mask], base.tokens[base.mask])
         if positions == "time_space":
@@ -61,9 +77,13 @@ def test_tokens_say_of_their_place_what_positions_allows(name: str) -> None:
 
 
 def test_every_memory_whose_tokens_have_positions_has_the_key() -> None:
-    sections = {path.stem: OmegaConf.load(path) for path in (config_dir() / "memory").glob("*.yaml")}
+    sections = {
+        path.stem: OmegaConf.load(path) for path in (config_dir() / "memory").glob("*.yaml")
+    }
     assert {*sections} == {*WITH_POSITIONS, *OTHERS, "none"}
-    assert {name for name, section in sections.items() if "positions" in section} == {*WITH_POSITIONS}
+    assert {name for name, section in sections.items() if "positions" in section} == {
+        *WITH_POSITIONS
+    }
 
 
 def test_without_positions_there_is_no_position_layer_and_a_narrower_encoder() -> None:

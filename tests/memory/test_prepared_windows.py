@@ -1,4 +1,6 @@
-"""A full window moves at every decision: what its next one needs is prepared between requests, to the same bit."""
+"""A full window moves at every decision: what its next one needs is prepared between requests, to
+the same bit.
+"""
 
 from functools import partial
 
@@ -108,7 +110,13 @@ FULL = {
     "actions_modul": {"max_steps": 4, "stride": 16},
     **{
         model: {}
-        for model in ("retrieval_modul", "moment_modul", "gist_modul", "learned_topk_modul", "spacetime_modul")
+        for model in (
+            "retrieval_modul",
+            "moment_modul",
+            "gist_modul",
+            "learned_topk_modul",
+            "spacetime_modul",
+        )
     },
     **{model: {} for model in ("events_modul", "pyramid_modul", "keyframes_modul")},
 }
@@ -118,7 +126,9 @@ FULL = {
 @pytest.mark.parametrize("model", FULL)
 def test_preparing_changes_no_action(model):
     policy = quick_policy(model, 8, memory=FULL[model])
-    assert all(np.array_equal(a, b) for a, b in zip(acted(policy, True), acted(policy, False), strict=True))
+    assert all(
+        np.array_equal(a, b) for a, b in zip(acted(policy, True), acted(policy, False), strict=True)
+    )
 
 
 def test_policies_without_such_a_memory_have_nothing_to_prepare():
@@ -151,7 +161,11 @@ def test_preparing_waits_for_everybody_and_keeps_nobody():
 def test_rollouts_prepare_between_chunks(monkeypatch):
     policy = quick_policy("ttt_modul", 8, memory={"max_steps": 10})
     calls, prepare = [], policy.prepare
-    monkeypatch.setattr(policy, "prepare", lambda episode: calls.append(episode.n_observed_frames) or prepare(episode))
+    monkeypatch.setattr(
+        policy,
+        "prepare",
+        lambda episode: calls.append(episode.n_observed_frames) or prepare(episode),
+    )
 
     class Slow(InlineEnvs):
         """Returns frames when it is queried again, as a simulation does."""
@@ -170,7 +184,9 @@ def test_a_server_prepares_after_it_has_answered(monkeypatch):
     policy = quick_policy("rmt_modul", 8, memory={"max_steps": 4, "chunk": 2})
     parts, done = course(video=9, rounds=6), []
     prepare = policy.prepare
-    monkeypatch.setattr(policy, "prepare", lambda episode: done.append(left := prepare(episode)) or left)
+    monkeypatch.setattr(
+        policy, "prepare", lambda episode: done.append(left := prepare(episode)) or left
+    )
     expected = acted_directly(policy, parts)
     with Served(policy) as served, served.client() as client:
         for index, (front, wrist, state) in enumerate(parts):

@@ -1,4 +1,6 @@
-"""What recurrent memories guarantee beyond every memory: window and stream are equal, and their costs."""
+"""What recurrent memories guarantee beyond every memory: window and stream are equal, and their
+costs.
+"""
 
 from functools import partial
 
@@ -45,7 +47,10 @@ def test_frame_by_frame_equals_the_window(make):
     memory = make()
     tokens = window(memory, 150)
     state = memory.init_state(1)
-    for part in zip(*(x.split(GRID**2, 1) for x in (tokens.features, tokens.positions, tokens.mask)), strict=True):
+    for part in zip(
+        *(x.split(GRID**2, 1) for x in (tokens.features, tokens.positions, tokens.mask)),
+        strict=True,
+    ):
         state = memory.update(state, *part)
     assert same_memory(memory.read(state), memory(tokens))
 
@@ -74,7 +79,10 @@ def test_any_other_list_is_computed_anew(make):
     history, stream = RandomHistory(81), memory.start_stream()
     memory.encode([history], [stream])
     assert stream.updates == 6
-    for more, frames in ((5, 6), (16, 6)):  # off the stride; then on it, but the earliest frame has fallen out
+    for more, frames in (
+        (5, 6),
+        (16, 6),
+    ):  # off the stride; then on it, but the earliest frame has fallen out
         before, history.length = stream.updates, history.length + more
         now = memory.encode([history], [stream])
         assert stream.updates == before + frames
@@ -91,7 +99,9 @@ def test_episodes_at_different_places_share_a_call(make):
         for i, history in enumerate(histories):
             alone = memory(window(memory, len(history), history.exec_start))
             assert torch.equal(together.mask[i], alone.mask[0])
-            assert torch.allclose(together.tokens[i][alone.mask[0]], alone.tokens[alone.mask], atol=TOLERANCE)
+            assert torch.allclose(
+                together.tokens[i][alone.mask[0]], alone.tokens[alone.mask], atol=TOLERANCE
+            )
             history.length += 16
 
 
@@ -111,7 +121,13 @@ def test_acting_carries_the_state_in_the_episode(monkeypatch):
         view = {"front": frames[start:stop], "wrist": frames[start:stop]}
         episode.observe(view, np.zeros((stop - start, 8), np.float32))
         policy.act([episode])
-    assert counted == [1, 1, 1, 2, 1]  # the last replan came off the stride; the newest frame enters alone
+    assert counted == [
+        1,
+        1,
+        1,
+        2,
+        1,
+    ]  # the last replan came off the stride; the newest frame enters alone
     assert episode.stream.updates == 6
 
 
@@ -119,7 +135,9 @@ def test_acting_carries_the_state_in_the_episode(monkeypatch):
 def test_front_padding_never_matters(make):
     memory = make(max_steps=64)
     tokens = window(memory, 40)
-    assert tokens.mask.shape[1] == 4 * GRID**2, "a short episode is padded to a chunk, not to 64 frames"
+    assert tokens.mask.shape[1] == 4 * GRID**2, (
+        "a short episode is padded to a chunk, not to 64 frames"
+    )
     around = memory.capacity - tokens.mask.shape[1]
     padded = HistoryTokens(
         torch.nn.functional.pad(tokens.features, (0, 0, around, 0), value=9.0),
@@ -139,7 +157,9 @@ def test_chunks_and_recomputation_change_neither_numbers_nor_gradients(make):
         results.append((loss.detach(), torch.cat([gradient.flatten() for gradient in gradients])))
     for loss, gradient in results[1:]:
         assert torch.allclose(loss, results[0][0], rtol=1e-5)
-        assert torch.allclose(gradient, results[0][1], rtol=1e-3, atol=1e-4 * float(gradient.abs().max()))
+        assert torch.allclose(
+            gradient, results[0][1], rtol=1e-3, atol=1e-4 * float(gradient.abs().max())
+        )
 
 
 def test_gradients_flow_through_every_step(make):
@@ -163,13 +183,18 @@ TTT_METRICS = [
 ]
 
 
-@pytest.mark.parametrize(("model", "names"), [("ttt_modul", TTT_METRICS), ("rmt_modul", ["slot_change"])])
+@pytest.mark.parametrize(
+    ("model", "names"), [("ttt_modul", TTT_METRICS), ("rmt_modul", ["slot_change"])]
+)
 def test_inner_statistics_are_metrics(model, names):
     policy = small_policy(model)
     policy.memory.reporting = True
     _, metrics = policy(random_batch(policy))
     assert sorted(metrics) == sorted(["loss", *(f"memory/{name}" for name in names)])
-    assert all(value.ndim == 0 and torch.isfinite(value) and not value.requires_grad for value in metrics.values())
+    assert all(
+        value.ndim == 0 and torch.isfinite(value) and not value.requires_grad
+        for value in metrics.values()
+    )
     if "memory/step_size" in metrics:
         assert float(metrics["memory/step_size"]) == pytest.approx(0.01, rel=0.5)
         assert metrics["memory/inner_loss_after"] < metrics["memory/inner_loss_before"]
@@ -198,12 +223,16 @@ def test_statistics_are_computed_only_when_requested(make, monkeypatch):
     assert torch.equal(telling.tokens, quiet.tokens)
     if isinstance(memory, TTT):
         frames = tokens.mask.shape[1] // GRID**2
-        assert counted.calls - without == without / 2 + 2 * frames, "two more forward passes a frame"
+        assert counted.calls - without == without / 2 + 2 * frames, (
+            "two more forward passes a frame"
+        )
 
 
 def test_inner_updates_round_to_the_dtype_of_the_stored_state(make):
     memory = make().to(torch.bfloat16)
-    state = memory.layer.advance(memory.init_state(1), torch.randn(1, 3, GRID**2, 16), torch.ones(1, 3).bool())[0]
+    state = memory.layer.advance(
+        memory.init_state(1), torch.randn(1, 3, GRID**2, 16), torch.ones(1, 3).bool()
+    )[0]
     assert state[0].dtype == torch.bfloat16
     assert memory(window(memory, 40)).tokens.isfinite().all()
 
@@ -218,14 +247,20 @@ def test_frames_of_a_running_video_are_those_of_the_finished_episode():
 
 def test_past_frames_are_the_same_at_every_step_with_every():
     for exec_start in (0, 66, 400, 2000):
-        lists = [recurrent_frames(step, exec_start, 64, 40, 32, every=16) for step in range(0, 1300, 7)]
+        lists = [
+            recurrent_frames(step, exec_start, 64, 40, 32, every=16) for step in range(0, 1300, 7)
+        ]
         for step, frames in zip(range(0, 1300, 7), lists, strict=True):
             past = frames[frames < step]
             assert ((past == 0) | ((past + 1) % 16 == 0)).all() and (np.diff(frames) > 0).all()
             assert frames[-1] == step and len(frames) <= 64
     assert recurrent_frames(50, 0, every=16).tolist() == [0, 15, 31, 47, 50]
-    assert recurrent_frames(300, 0, 3, every=16).tolist() == [271, 287, 300], "the earliest are dropped first"
-    assert recurrent_frames(20, 21, every=16).tolist() == recurrent_frames(20, 700, every=16).tolist()
+    assert recurrent_frames(300, 0, 3, every=16).tolist() == [271, 287, 300], (
+        "the earliest are dropped first"
+    )
+    assert (
+        recurrent_frames(20, 21, every=16).tolist() == recurrent_frames(20, 700, every=16).tolist()
+    )
 
 
 @torch.no_grad()
@@ -237,14 +272,22 @@ def test_an_uneven_pace_continues_with_every(make, exec_start):
         history.length += more
         now, step = memory.encode([history], [stream]), len(history) - 1
         assert same_memory(now, memory(window(memory, len(history), exec_start)))
-        read |= {int(frame) for frame in memory.frames(history, step) if frame < step or (step + 1) % 16 == 0}
+        read |= {
+            int(frame)
+            for frame in memory.frames(history, step)
+            if frame < step or (step + 1) % 16 == 0
+        }
     assert stream.updates <= len(read) + 7, "each past frame enters once, each current one once"
 
 
 def test_every_needs_a_stride_that_is_a_multiple_and_no_jitter():
-    with pytest.raises(UserError, match=r"memory\.stride=24 must be a multiple of memory\.every=16, such as 32"):
+    with pytest.raises(
+        UserError, match=r"memory\.stride=24 must be a multiple of memory\.every=16, such as 32"
+    ):
         TTT(D_VISION, 16, stride=24, every=16)
-    with pytest.raises(UserError, match=r"memory\.jitter=3 .* set memory\.jitter=0 or memory\.every=1"):
+    with pytest.raises(
+        UserError, match=r"memory\.jitter=3 .* set memory\.jitter=0 or memory\.every=1"
+    ):
         TTT(D_VISION, 16, every=16, jitter=3)
 
 
@@ -266,7 +309,9 @@ def test_jitter_keeps_order_parts_and_the_current_frame():
         assert frames[-1] == step
 
 
-@pytest.mark.parametrize(("model", "constant"), [("ttt_modul", "ttt_base_lr_inv"), ("rmt_modul", "freqs_cis")])
+@pytest.mark.parametrize(
+    ("model", "constant"), [("ttt_modul", "ttt_base_lr_inv"), ("rmt_modul", "freqs_cis")]
+)
 def test_derived_constants_are_saved_and_checked(model, constant):
     policy, path = small_policy(model), f"mem_encoder/recur_layer/{constant}"
     tree = to_released(policy)

@@ -32,7 +32,14 @@ def test_released_rule_keeps_the_key_of_earlier_caches() -> None:
 
 def test_another_rule_or_option_has_another_key() -> None:
     keys = {
-        scorer.key for scorer in (ChangeScorer(8, 8), ChangeScorer(8, 4), OtherRule(8, 8), Brightness(), Brightness(3))
+        scorer.key
+        for scorer in (
+            ChangeScorer(8, 8),
+            ChangeScorer(8, 4),
+            OtherRule(8, 8),
+            Brightness(),
+            Brightness(3),
+        )
     }
     assert len(keys) == 5
     assert Brightness().key.startswith("brightness-every2-")

@@ -1,4 +1,6 @@
-"""Unrelated episodes before one's own, a dial of the stress split; and the frames an oracle keeps, in closed loop."""
+"""Unrelated episodes before one's own, a dial of the stress split; and the frames an oracle keeps,
+in closed loop.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -39,7 +41,11 @@ def test_a_split_with_sessions_shows_them_first_and_its_records_are_on_the_curve
     curves = stress_curves([*records("test", [1, 1, 0]), *records(SPLIT, [1, 0, 0])])
     ((_, task, dial),) = curves
     points = curves[next(iter(curves))]
-    assert (task, dial, [(p.turned, p.won) for p in points]) == ("PickXtimes", "sessions", [(0, 2), (2, 1)])
+    assert (task, dial, [(p.turned, p.won) for p in points]) == (
+        "PickXtimes",
+        "sessions",
+        [(0, 2), (2, 1)],
+    )
 
 
 def test_nobody_evaluates_such_a_split_without_showing_them(tmp_path: Path) -> None:
@@ -72,7 +78,9 @@ class Noting(ProbedPolicy):
 
     def snapshot(self, episode: ProbedEpisode, drawn: Any = None) -> Any:
         match = super().snapshot(episode, drawn)
-        self.noted.append((episode.n_observed_frames - 1, [entry.time for entry in match[1][0].entries]))
+        self.noted.append(
+            (episode.n_observed_frames - 1, [entry.time for entry in match[1][0].entries])
+        )
         return match
 
 
@@ -80,7 +88,13 @@ class Noting(ProbedPolicy):
 def test_in_closed_loop_an_oracle_keeps_the_frames_at_which_subtasks_began(arm: str) -> None:
     probe = Noting(quick_policy("framesamp_modul", 8).eval(), read_arm(arm)).eval()
     probe.noted = []
-    roll(probe, [Job("VideoUnmask", "test", 0)], InlineEnvs(base=make_telling_env), max_steps=47, max_batch=1)
+    roll(
+        probe,
+        [Job("VideoUnmask", "test", 0)],
+        InlineEnvs(base=make_telling_env),
+        max_steps=47,
+        max_batch=1,
+    )
     shift = 8 if "pause" in arm else 0  # from the first execution frame, 21, on
     assert len(probe.noted) == 3
     for now, times in probe.noted:
@@ -92,6 +106,11 @@ def test_where_nobody_tells_when_subtasks_begin_the_oracle_is_refused(tmp_path: 
     request = ProbePlan(["oracle"], jobs=JOBS, offline=OfflineSettings())
     with pytest.raises(UserError, match="whose beginnings are told"):
         run_probe(
-            quick_policy("framesamp_modul").eval(), request, tmp_path, FACTS, RolloutSettings(), base=make_moving_env,
+            quick_policy("framesamp_modul").eval(),
+            request,
+            tmp_path,
+            FACTS,
+            RolloutSettings(),
+            base=make_moving_env,
             show_progress=False,
-        )  # fmt: skip
+        )

@@ -1,4 +1,6 @@
-"""Spacetime: past images in the vision tower and past states as tokens, as LeRobot's π0.5 has it."""
+"""Spacetime: past images in the vision tower and past states as tokens, as LeRobot's
+π0.5 has it.
+"""
 
 import json
 from dataclasses import replace
@@ -11,7 +13,16 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from helpers.lerobot_window import ONLY, RECORDED, SETTINGS, VISION, as_batch, inputs, weights, window_policy
+from helpers.lerobot_window import (
+    ONLY,
+    RECORDED,
+    SETTINGS,
+    VISION,
+    as_batch,
+    inputs,
+    weights,
+    window_policy,
+)
 from helpers.union_frames import both_ways
 from mme_vla import UserError, build_policy
 from mme_vla.data.dataset import TrainingDataset, collate
@@ -26,13 +37,21 @@ SHORT = {"frames": 3, "stride": 5}
 
 @cache
 def small(model: str = "spacetime_context", **words: Any) -> MMEPolicy:
-    return small_policy(model, memory=SHORT, backbone={"vision": SMALL_VISION | {"depth": 2}}, **words)
+    return small_policy(
+        model, memory=SHORT, backbone={"vision": SMALL_VISION | {"depth": 2}}, **words
+    )
 
 
 def as_lerobots(only: str, folder: Path, **settings: Any) -> Path:
     """A checkpoint of LeRobot's, of the settings and weights that were recorded."""
     views, states = ONLY[only]
-    about = {"type": "pi05", "use_visual_memory": views, "use_proprioceptive_memory": states, **SETTINGS, **settings}
+    about = {
+        "type": "pi05",
+        "use_visual_memory": views,
+        "use_proprioceptive_memory": states,
+        **SETTINGS,
+        **settings,
+    }
     save_file(weights(window_policy(views, states)), folder / "model.safetensors")
     (folder / "config.json").write_text(json.dumps(about))
     return folder
@@ -43,7 +62,9 @@ def as_lerobots(only: str, folder: Path, **settings: Any) -> Path:
 
 @torch.no_grad()
 @pytest.mark.parametrize("only", ONLY)
-def test_a_checkpoint_of_lerobots_loads_completely_and_acts_as_it_does_there(only: str, tmp_path: Path) -> None:
+def test_a_checkpoint_of_lerobots_loads_completely_and_acts_as_it_does_there(
+    only: str, tmp_path: Path
+) -> None:
     policy = load_weights(window_policy(*ONLY[only]), as_lerobots(only, tmp_path)).eval()
     expected = torch.tensor(json.loads(RECORDED.read_text())[only])
     batch = as_batch(policy)
@@ -57,7 +78,10 @@ def test_a_checkpoint_of_lerobots_loads_completely_and_acts_as_it_does_there(onl
 
 def test_one_that_differs_is_reported_how_to_be_built(tmp_path: Path) -> None:
     folder = as_lerobots("both", tmp_path, memory_stride=30)
-    with pytest.raises(UserError, match=r"integration\.mutual=true memory\.frames=3 memory\.stride=30 memory\.every=2"):
+    with pytest.raises(
+        UserError,
+        match=r"integration\.mutual=true memory\.frames=3 memory\.stride=30 memory\.every=2",
+    ):
         load_weights(window_policy(True, True), folder)
     with pytest.raises(UserError, match=r"memoryless π0\.5 and this policy has a memory"):
         load_weights(
@@ -66,7 +90,9 @@ def test_one_that_differs_is_reported_how_to_be_built(tmp_path: Path) -> None:
         )
 
 
-def test_its_states_are_taken_where_tokens_are_as_wide_and_left_behind_by_name_otherwise(tmp_path: Path) -> None:
+def test_its_states_are_taken_where_tokens_are_as_wide_and_left_behind_by_name_otherwise(
+    tmp_path: Path,
+) -> None:
     folder, policy = as_lerobots("both", tmp_path), window_policy(True, True)
     start = transfer(policy, folder)
     assert not start.left and not start.new
@@ -74,7 +100,10 @@ def test_its_states_are_taken_where_tokens_are_as_wide_and_left_behind_by_name_o
     assert torch.equal(states.weight, weights(policy)["model.proprio_history_proj.weight"])
     sizes = {"num_heads": 8, "vision": VISION}
     narrow = small_policy("spacetime_expert", backbone=sizes, integration={"width": 32})
-    assert transfer(narrow, folder).left == ["proprio_history_proj.bias", "proprio_history_proj.weight"]
+    assert transfer(narrow, folder).left == [
+        "proprio_history_proj.bias",
+        "proprio_history_proj.weight",
+    ]
 
 
 # What is seen
@@ -114,7 +143,9 @@ def test_augmentation_changes_past_views_as_it_does_the_current_ones() -> None:
     current = policy.prepare_images(replace(batch, past=replace(batch.past, images=still)), draws_)
     views = current.images
     assert current.past is not None and not torch.equal(views, policy.prepare_images(batch).images)
-    assert torch.equal(current.past.images[:, 0], views) and torch.equal(current.past.images[:, 1], views)
+    assert torch.equal(current.past.images[:, 0], views) and torch.equal(
+        current.past.images[:, 1], views
+    )
 
 
 def test_an_episode_sees_what_the_dataset_shows_and_its_pieces_make_no_difference() -> None:
@@ -139,13 +170,21 @@ def test_an_episode_sees_what_the_dataset_shows_and_its_pieces_make_no_differenc
             episode = policy.start_episode(step.goal, seed=1)
             for at in range(0, len(frames), piece):
                 part = slice(at, at + piece)
-                episode.observe({name: view[part] for name, view in views.items()}, states[part], demo[part])
+                episode.observe(
+                    {name: view[part] for name, view in views.items()}, states[part], demo[part]
+                )
             observation = policy.observation([episode])
-            assert observation.past is not None and batch.past is not None and batch.history is not None
+            assert (
+                observation.past is not None
+                and batch.past is not None
+                and batch.history is not None
+            )
             assert torch.equal(observation.past.images, batch.past.images) and torch.equal(
                 observation.past.mask, batch.past.mask
             )
-            assert torch.allclose(episode.gather_selection().features, batch.history.features[0], atol=1e-6)
+            assert torch.allclose(
+                episode.gather_selection().features, batch.history.features[0], atol=1e-6
+            )
 
 
 @pytest.mark.parametrize("model", ["spacetime_context", "spacetime_modul"])
@@ -157,7 +196,10 @@ def test_a_rollout_renders_past_views_of_every_camera_and_nothing_changes(model:
 
 def test_it_joins_with_others_and_two_that_read_past_frames_are_refused() -> None:
     words: dict[str, Any] = {"backbone": {"vision": SMALL_VISION}, "integration": "expert"}
-    members: list[Any] = [{"name": "framesamp", "budget": 64, "grid": 4}, {"name": "spacetime", **SHORT}]
+    members: list[Any] = [
+        {"name": "framesamp", "budget": 64, "grid": 4},
+        {"name": "spacetime", **SHORT},
+    ]
     policy = small_policy("framesamp_ttt_modul", memory={"members": members}, **words)
     frames, states, chunks = moving_frames(30), np.zeros((30, 8), np.float32), []
     for piece in (30, 8):
@@ -185,7 +227,11 @@ def test_where_it_has_no_place_a_sentence_says_so() -> None:
     with pytest.raises(UserError, match="a memory without an integration"):
         build_policy("spacetime_context", integration="none", device="meta")
     with pytest.raises(UserError, match=r"integration\.mutual=true"):
-        build_policy("framesamp_context", integration={"mutual": True, "memory_position": "time"}, device="meta")
+        build_policy(
+            "framesamp_context",
+            integration={"mutual": True, "memory_position": "time"},
+            device="meta",
+        )
 
 
 def test_past_frames_of_one_camera_are_not_enough() -> None:

@@ -6,7 +6,14 @@ import torch
 
 from mme_vla import UserError
 from mme_vla.memory.base import stack_history
-from mme_vla.testing.small import NEURAL, SMALL_VISION, cached_history, moving_frames, online_history, small_policy
+from mme_vla.testing.small import (
+    NEURAL,
+    SMALL_VISION,
+    cached_history,
+    moving_frames,
+    online_history,
+    small_policy,
+)
 from mme_vla.types import Batch
 
 FRAMES = 90
@@ -37,7 +44,9 @@ def feed(policy, frames, goal="pick up the cube", seed=0, chunk=16, demo=30, upt
         part = slice(start, min(start + chunk, upto))
         view = {"front": frames[part], "wrist": frames[part][:, ::-1]}
         count = len(frames[part])
-        episode.observe(view, np.zeros((count, 8), np.float32), np.arange(start, start + count) < demo)
+        episode.observe(
+            view, np.zeros((count, 8), np.float32), np.arange(start, start + count) < demo
+        )
     return episode
 
 
@@ -45,7 +54,9 @@ def test_streaming_and_offline_give_the_same_actions(policy, frames):
     episode = feed(policy, frames)
     streamed = policy.act([episode])
     processor = policy.processor
-    history = stack_history([policy.memory.gather_selection(cached_history(policy, frames, exec_start=30), FRAMES - 1)])
+    history = stack_history(
+        [policy.memory.gather_selection(cached_history(policy, frames, exec_start=30), FRAMES - 1)]
+    )
     prompt, prompt_mask = processor.prompt("pick up the cube")
     batch = Batch(
         images=processor.images([frames[-1], frames[-1][::-1]])[None],
@@ -103,7 +114,10 @@ def test_bfloat16_history_is_what_the_cache_stores(frames):
     online = online_history(policy, frames, 16)
     cached = cached_history(policy, frames)
     step = FRAMES - 1
-    a, b = policy.memory.gather_selection(online, step), policy.memory.gather_selection(cached, step)
+    a, b = (
+        policy.memory.gather_selection(online, step),
+        policy.memory.gather_selection(cached, step),
+    )
     assert a.features.dtype == b.features.dtype == torch.bfloat16
     assert torch.allclose(a.features.float(), b.features.float(), rtol=1e-2, atol=1e-3)
 

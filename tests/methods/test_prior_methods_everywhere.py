@@ -1,4 +1,6 @@
-"""Every prior method trains, resumes, is evaluated, served and probed as any policy of the library, at tiny size."""
+"""Every prior method trains, resumes, is evaluated, served and probed as any policy of the library,
+at tiny size.
+"""
 
 import io
 from collections.abc import Callable
@@ -35,16 +37,28 @@ from mme_vla.probing.offline import OfflineSettings, probe_offline
 LLAMA = [*TOWERS, "backbone.vlm.depth=1", "backbone.vlm.width=32", "backbone.vlm.mlp_dim=32"]
 OFT = [*LLAMA, "backbone.vision.image_size=32", "backbone.vision.patch_size=2"]
 SHORT = {
-    "diffusion_policy": ["backbone.diffusion_steps=4", "backbone.widths=[16,32]", "backbone.picture=[40,40]"],
+    "diffusion_policy": [
+        "backbone.diffusion_steps=4",
+        "backbone.widths=[16,32]",
+        "backbone.picture=[40,40]",
+    ],
     **{f"openvla_oft{kind}": OFT for kind in ("", "_simplesg", "_tokendrop_context")},
-    "memoryvla": [*LLAMA, "backbone.vision.image_size=28", "backbone.head.depth=1", "processor.group_size=3"],
+    "memoryvla": [
+        *LLAMA,
+        "backbone.vision.image_size=28",
+        "backbone.head.depth=1",
+        "processor.group_size=3",
+    ],
     "sam2act_plus": ["train.warmup=1"],
     "simplememvla": [
-        "processor.max_words=4", "processor.seconds=4", "backbone.head.depth=1",
-        "backbone.vlm.vision_config.depth=1", "backbone.vlm.text_config.num_hidden_layers=2",
+        "processor.max_words=4",
+        "processor.seconds=4",
+        "backbone.head.depth=1",
+        "backbone.vlm.vision_config.depth=1",
+        "backbone.vlm.text_config.num_hidden_layers=2",
         "backbone.vlm.text_config.full_attention_interval=2",
     ],
-}  # fmt: skip
+}
 OTHER_ROWS = ["openvla_oft_groundsg", "openvla_oft_framesamp_context"]
 PAPER_ROWS = [*(model for model in SHORT if model != "simplememvla"), *OTHER_ROWS]
 pytestmark = pytest.mark.filterwarnings("ignore:.*loses its end")
@@ -52,22 +66,34 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*loses its end")
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], str]:
-    """What a model is trained on and probed with: the sample, or recordings with depth for those that read it."""
+    """What a model is trained on and probed with: the sample, or recordings with depth for those
+    that read it.
+    """
 
     @cache
     def with_depth() -> str:
         folder = tmp_path_factory.mktemp("keyframes")
-        write_file(folder / "record_dataset_VideoUnmask.h5", [40, 44], [12, 12], poses=True, depth=True)
-        convert(list_episodes(find_files([folder])), folder / "out", ConvertOptions(images="png", keyframes=True))
+        write_file(
+            folder / "record_dataset_VideoUnmask.h5", [40, 44], [12, 12], poses=True, depth=True
+        )
+        convert(
+            list_episodes(find_files([folder])),
+            folder / "out",
+            ConvertOptions(images="png", keyframes=True),
+        )
         return str(folder / "out")
 
     return lambda model: with_depth() if model == "sam2act_plus" else "sample"
 
 
 @pytest.fixture(scope="module")
-def trained(data: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def trained(
+    data: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Path]:
     """The run of a model after one update."""
-    pytest.importorskip("diffusers", reason="needs the prior methods' packages: uv sync --inexact --extra baselines")
+    pytest.importorskip(
+        "diffusers", reason="needs the prior methods' packages: uv sync --inexact --extra baselines"
+    )
 
     @cache
     def one_update(model: str) -> Path:
@@ -91,25 +117,47 @@ def loaded(trained: Callable[[str], Path]) -> Callable[[str], Policy]:
 
 RESUMED = {
     "memoryvla": ("memoryvla", []),
-    "decaying rates": ("diffusion_policy", ["train.schedule=cosine", "train.schedule_steps=3", "train.ema_warmup=true",
-                                            "train.warmup_from_zero=true", "train.warmup=1", "train.decay_min_dim=2"]),
+    "decaying rates": (
+        "diffusion_policy",
+        [
+            "train.schedule=cosine",
+            "train.schedule_steps=3",
+            "train.ema_warmup=true",
+            "train.warmup_from_zero=true",
+            "train.warmup=1",
+            "train.decay_min_dim=2",
+        ],
+    ),
     "adapters": ("openvla_oft", ["finetune=oft", "finetune.rank=2"]),
     "another optimizer": ("sam2act_plus", ["train.optimizer=lamb"]),
-    "a memory of frames": ("memoryvla", ["memory=framesamp", "memory.every=8", "processor.group_size=1"]),
+    "a memory of frames": (
+        "memoryvla",
+        ["memory=framesamp", "memory.every=8", "processor.group_size=1"],
+    ),
     "a recurrent memory": ("memoryvla", ["memory=ttt", "memory.grid=4"]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", RESUMED)
-def test_it_trains_by_the_command_and_resumes_to_the_bit(case: str, data: Callable[[str], str], tmp_path: Path) -> None:
-    pytest.importorskip("diffusers", reason="needs the prior methods' packages: uv sync --inexact --extra baselines")
+def test_it_trains_by_the_command_and_resumes_to_the_bit(
+    case: str, data: Callable[[str], str], tmp_path: Path
+) -> None:
+    pytest.importorskip(
+        "diffusers", reason="needs the prior methods' packages: uv sync --inexact --extra baselines"
+    )
     model, words = RESUMED[case]
     full, parts = tmp_path / "whole", tmp_path / "parts"
     straight = load_tensors(update(model, data(model), full, *words, "train.steps=2"))
     update(model, data(model), parts, *words, "train.steps=1")
-    last = update(model, data(model), tmp_path / "unused", *words, "train.steps=2", f"resume={parts}")
+    last = update(
+        model, data(model), tmp_path / "unused", *words, "train.steps=2", f"resume={parts}"
+    )
     assert last == parts / "checkpoints" / "step_000002"
-    assert losses(parts) == losses(full) and len(losses(parts)) == 2 and np.isfinite(losses(parts)).all()
+    assert (
+        losses(parts) == losses(full)
+        and len(losses(parts)) == 2
+        and np.isfinite(losses(parts)).all()
+    )
     resumed = load_tensors(last)
     assert all(torch.equal(tensor, resumed[name]) for name, tensor in straight.items())
     assert bool(Policy.from_pretrained(last).config.get("adapters")) == (case == "adapters")
@@ -120,10 +168,17 @@ def test_it_is_evaluated(model: str, loaded: Callable[[str], Policy]) -> None:
     policy = loaded(model)
     base = make_depth_env if policy.embodiment.readings else make_scripted_env
     envs = InlineEnvs(
-        base=base, robot=policy.embodiment, max_steps=20, max_actions=getattr(policy, "max_actions", None)
+        base=base,
+        robot=policy.embodiment,
+        max_steps=20,
+        max_actions=getattr(policy, "max_actions", None),
     )
     (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=20)
-    assert record.outcome in ("success", "fail", "timeout") and record.steps > 0 and record.extra["chunks"] > 0
+    assert (
+        record.outcome in ("success", "fail", "timeout")
+        and record.steps > 0
+        and record.extra["chunks"] > 0
+    )
     assert record.action_space == policy.embodiment.action.space
 
 
@@ -153,7 +208,12 @@ def test_it_is_probed_on_recordings(
     settings = OfflineSettings(draws=2, moments=2, flow_steps=2)
     torch.manual_seed(0)
     results = probe_offline(
-        policy, read_arms(["nodemo"]), recordings[:1], recordings, tmp_path / "lines.jsonl", settings
+        policy,
+        read_arms(["nodemo"]),
+        recordings[:1],
+        recordings,
+        tmp_path / "lines.jsonl",
+        settings,
     )
     moments = [line for line in results if isinstance(line, MomentLine)]
     assert len(moments) == 2 and {line.recording for line in moments} == {recordings[0].name}
@@ -171,11 +231,19 @@ def test_sam2act_is_reported_which_depth_a_request_lacks(loaded: Callable[[str],
     request = challenge(frames, frames, states, first=True, **lists)
     wrong = {
         "lacks wrist_depth_list": {k: v for k, v in request.items() if k != "wrist_depth_list"},
-        "front_depth_list must have one entry for each of 2 frames": request | {"front_depth_list": []},
-        r"front_depth_list must hold arrays \[64, 64\]": request | {"front_depth_list": [np.zeros((8, 8))] * 2},
-        "front_depth_list must be millimetres": request | {"front_depth_list": [-d for d in lists["front_depth_list"]]},
-        r"wrist_camera_extrinsic_list must hold arrays \[3, 4\]": request | {"wrist_camera_extrinsic_list": ["x", "y"]},
-        "add_buffer has no place for them": {"add_buffer": True, "images": frames[:, None], "state": states},
+        "front_depth_list must have one entry for each of 2 frames": request
+        | {"front_depth_list": []},
+        r"front_depth_list must hold arrays \[64, 64\]": request
+        | {"front_depth_list": [np.zeros((8, 8))] * 2},
+        "front_depth_list must be millimetres": request
+        | {"front_depth_list": [-d for d in lists["front_depth_list"]]},
+        r"wrist_camera_extrinsic_list must hold arrays \[3, 4\]": request
+        | {"wrist_camera_extrinsic_list": ["x", "y"]},
+        "add_buffer has no place for them": {
+            "add_buffer": True,
+            "images": frames[:, None],
+            "state": states,
+        },
     }
     with Served(policy) as served:
         for reason, message in wrong.items():
@@ -183,12 +251,20 @@ def test_sam2act_is_reported_which_depth_a_request_lacks(loaded: Callable[[str],
                 client.infer(message)
 
 
-def test_sam2act_takes_depth_of_the_current_frame_in_the_other_schema(loaded: Callable[[str], Policy]) -> None:
+def test_sam2act_takes_depth_of_the_current_frame_in_the_other_schema(
+    loaded: Callable[[str], Policy],
+) -> None:
     policy, image = loaded("sam2act_plus"), np.full((SIZE, SIZE, 3), 9, np.uint8)
     beside = readings(1)
     episode = policy.start_episode("pick up the cube", seed=42)
-    episode.observe({"front": image[None], "wrist": image[None], **beside}, np.full((1, 8), 0.04, np.float32))
-    message = {"observation/image": image, "observation/wrist_image": image, "prompt": "pick up the cube"}
+    episode.observe(
+        {"front": image[None], "wrist": image[None], **beside}, np.full((1, 8), 0.04, np.float32)
+    )
+    message = {
+        "observation/image": image,
+        "observation/wrist_image": image,
+        "prompt": "pick up the cube",
+    }
     message |= {"observation/state": np.full(8, 0.04, np.float32)}
     message |= {f"observation/{name}": values[0] for name, values in beside.items()}
     with Served(policy) as served, served.client() as client:
@@ -199,13 +275,17 @@ def test_sam2act_takes_depth_of_the_current_frame_in_the_other_schema(loaded: Ca
 
 
 @pytest.mark.parametrize("model", SHORT)
-def test_inspect_names_its_parts(model: str, trained: Callable[[str], Path], loaded: Callable[[str], Policy]) -> None:
+def test_inspect_names_its_parts(
+    model: str, trained: Callable[[str], Path], loaded: Callable[[str], Policy]
+) -> None:
     policy = loaded(model)
     parts = {policy.finetune_spec.component_of(name) for name, _ in policy.named_parameters()}
     console = Console(record=True, width=200, file=io.StringIO())
     show_checkpoint(trained(model), console)
     output = console.export_text()
-    assert "action" in parts and all(word in output for word in ("parameters", "normalisation", model, *parts))
+    assert "action" in parts and all(
+        word in output for word in ("parameters", "normalisation", model, *parts)
+    )
 
 
 @pytest.mark.parametrize("model", PAPER_ROWS)
@@ -219,8 +299,13 @@ def test_it_stands_beside_its_paper_row(model: str) -> None:
 
 @pytest.mark.parametrize(
     ("recipe", "name"),
-    [("diffusion_policy", "diffusion_policy"), ("openvla_oft", "openvla_oft"), ("memoryvla", "memoryvla"),
-     ("sam2act_first", "sam2act_plus"), ("sam2act_memory", "sam2act_plus")],
-)  # fmt: skip
+    [
+        ("diffusion_policy", "diffusion_policy"),
+        ("openvla_oft", "openvla_oft"),
+        ("memoryvla", "memoryvla"),
+        ("sam2act_first", "sam2act_plus"),
+        ("sam2act_memory", "sam2act_plus"),
+    ],
+)
 def test_a_recipe_at_full_size_has_the_name_that_the_papers_row_has(recipe: str, name: str) -> None:
     assert compose("train", [f"experiment={recipe}"]).name == name

@@ -1,4 +1,6 @@
-"""The demonstration in examples/: with a memory a policy learns what only the video showed, without one it cannot."""
+"""The demonstration in examples/: with a memory a policy learns what only the video showed, without
+one it cannot.
+"""
 
 from functools import partial
 
@@ -10,7 +12,9 @@ from mme_vla.testing.small import BEYOND
 pytestmark = pytest.mark.slow
 
 GUESSING = 0.75
-LEARNING = [model for model in BEYOND if not model.startswith("anchors")]  # no square in the first frame and the last
+LEARNING = [
+    model for model in BEYOND if not model.startswith("anchors")
+]  # no square in the first frame and the last
 TOWER = {"depth": 1, "image_size": 16, "patch_size": 4, "width": 16, "mlp_dim": 16, "num_heads": 1}
 
 
@@ -19,7 +23,9 @@ def learn(monkeypatch):
     monkeypatch.syspath_prepend(REPOSITORY / "examples")
     import memory_matters
 
-    monkeypatch.setitem(memory_matters.OF_KIND, "learned_topk", {"pool": memory_matters.LENGTH, "hidden": 32})
+    monkeypatch.setitem(
+        memory_matters.OF_KIND, "learned_topk", {"pool": memory_matters.LENGTH, "hidden": 32}
+    )
     short = {"episodes": 32, "lr": 3e-3, "every": 25, "enough": 0.4 * GUESSING}
     return partial(memory_matters.learn, steps=300, backbone={"depth": 1, "vision": TOWER}, **short)
 

@@ -1,4 +1,6 @@
-"""Demonstrations carried out motion by motion show what a policy meets; and noise that hides last digits."""
+"""Demonstrations carried out motion by motion show what a policy meets; and noise that hides last
+digits.
+"""
 
 import numpy as np
 import pytest
@@ -17,8 +19,12 @@ def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand(rende
     assert made is not None
     env = make_env("SwingXtimes", action_space="waypoint", render=False, **SCENE)  # type: ignore[arg-type]
     observation, _ = env.reset()
-    for number, (frame, target) in enumerate(zip(made.motions.decisions, made.motions.targets, strict=True)):
-        now = benchmark_state(observation["joint_state_list"][-1], observation["gripper_state_list"][-1])
+    for number, (frame, target) in enumerate(
+        zip(made.motions.decisions, made.motions.targets, strict=True)
+    ):
+        now = benchmark_state(
+            observation["joint_state_list"][-1], observation["gripper_state_list"][-1]
+        )
         assert np.allclose(made.states[frame], now, atol=1e-3), number
         observation, _, ended, _, info = env.step(target)
     env.close()

@@ -1,4 +1,6 @@
-"""Policies that execute several motions of a chunk are asked at every so many decisions, and learn those alone."""
+"""Policies that execute several motions of a chunk are asked at every so many decisions, and learn
+those alone.
+"""
 
 from types import SimpleNamespace
 
@@ -20,9 +22,13 @@ DECISIONS = np.array([20, 40, 60, 80, 100])
 
 def policy(execute: int) -> MMEPolicy:
     return build_policy(
-        "framesamp_modul", backbone="nano", embodiment="robomme_waypoint_front_route", policy={"augment": False},
-        memory={"budget": 32, "grid": 1, "every": 8}, **{"embodiment.action.execute": execute},
-    )  # fmt: skip
+        "framesamp_modul",
+        backbone="nano",
+        embodiment="robomme_waypoint_front_route",
+        policy={"augment": False},
+        memory={"budget": 32, "grid": 1, "every": 8},
+        **{"embodiment.action.execute": execute},
+    )
 
 
 def demonstration(frames: range | list[int]) -> Demonstration:
@@ -30,11 +36,15 @@ def demonstration(frames: range | list[int]) -> Demonstration:
     images = {frame: rng.integers(0, 256, (256, 256, 3), dtype=np.uint8) for frame in frames}
     motions = Motions(DECISIONS, rng.uniform(-0.2, 0.2, (5, 7)).astype(np.float32))
     states = rng.uniform(-1, 1, (120, 8)).astype(np.float32)
-    return Demonstration("RouteStick", 3, "easy", "follow the same path", 120, 20, states, motions, {"front": images})
+    return Demonstration(
+        "RouteStick", 3, "easy", "follow the same path", 120, 20, states, motions, {"front": images}
+    )
 
 
 @pytest.mark.parametrize(("execute", "queries"), [(1, [0, 1, 2, 3, 4]), (2, [0, 2, 4]), (14, [0])])
-def test_what_is_executed_without_asking_again_is_no_decision_to_learn(execute: int, queries: list[int]) -> None:
+def test_what_is_executed_without_asking_again_is_no_decision_to_learn(
+    execute: int, queries: list[int]
+) -> None:
     routed, made = policy(execute), demonstration(range(120))
     routed.require_processor().stats = statistics([made], routed)
     samples = Decisions.of(routed, [made])
@@ -57,10 +67,16 @@ def test_few_decisions_are_blurred_as_they_are_learned_and_measured_as_they_are(
     routed, made = policy(1), demonstration(range(120))
     routed.require_processor().stats = statistics([made], routed)
     sharp, blurred = (Decisions.of(routed, [made], token_noise=size) for size in (0.0, 0.5))
-    now, same, other = blurred.collate([0, 1, 2]), blurred.collate([0, 1, 2]), blurred.collate([2, 1, 0])
+    now, same, other = (
+        blurred.collate([0, 1, 2]),
+        blurred.collate([0, 1, 2]),
+        blurred.collate([2, 1, 0]),
+    )
     batch = sharp.collate([0, 1, 2])
     assert now.view_tokens is not None and batch.view_tokens is not None and now.history is not None
-    assert same.view_tokens is not None and other.view_tokens is not None and batch.history is not None
+    assert (
+        same.view_tokens is not None and other.view_tokens is not None and batch.history is not None
+    )
     assert torch.equal(now.view_tokens, same.view_tokens)
     assert not torch.equal(now.view_tokens[1], other.view_tokens[1])
     std = sharp.batch.view_tokens.float().flatten(0, -2).std(0)  # type: ignore[union-attr]
@@ -78,7 +94,9 @@ def step(number: int, video: int) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize(("every", "rendered"), [(1, {3, 4, 6, 8}), (2, {3, 6}), (14, {3})])
-def test_only_decisions_that_a_policy_is_requested_are_rendered(every: int, rendered: set[int]) -> None:
+def test_only_decisions_that_a_policy_is_requested_are_rendered(
+    every: int, rendered: set[int]
+) -> None:
     steps = [step(number, 3) for number in range(11)]
     selection = FrameChoice(AT_DECISIONS, None, every).render_request(steps)  # type: ignore[arg-type]
     assert set(selection.frames["front"]) == rendered

@@ -9,13 +9,17 @@ from mme_vla.nano.demonstrations import record
 
 
 def test_marks_and_traces_are_rendered_as_the_episode_showed_them() -> None:
-    """Marks come and go, and belong to no thing of the task: an image rendered afterwards has them where they were."""
+    """Marks come and go, and belong to no thing of the task: an image rendered afterwards has them
+    where they were.
+    """
     from mme_vla.envs.make import make_env
     from mme_vla.envs.observations import RenderRequest
     from mme_vla.envs.recording.frames import FrameChoice
 
     remembered = {"name": "framesamp", "budget": 16, "grid": 1, "every": 7}
-    made = record("PatternLock", 3_000_001, "easy", [FrameChoice("decisions", remembered)], ["front"])
+    made = record(
+        "PatternLock", 3_000_001, "easy", [FrameChoice("decisions", remembered)], ["front"]
+    )
     assert made is not None
     env = make_env("PatternLock", seed=3_000_001, difficulty="easy", action_space="waypoint")
     images = made.images["front"]

@@ -1,4 +1,6 @@
-"""A sweep over memories, budgets and trainings is one run: demonstrations and tokens once, one table."""
+"""A sweep over memories, budgets and trainings is one run: demonstrations and tokens once, one
+table.
+"""
 
 import shutil
 import time
@@ -28,7 +30,13 @@ FRAMES = tuple(range(0, 160))
 
 def test_models_and_budgets_are_lists_of_one_run() -> None:
     words = with_settings(["--multirun", "model=a,b,c", "budget=4,16", "trainings=2"])
-    assert words == ["nano=nano16", "with_memory=[a,b,c]", "budget=[4,16]", "trainings=2", "also=[]"]
+    assert words == [
+        "nano=nano16",
+        "with_memory=[a,b,c]",
+        "budget=[4,16]",
+        "trainings=2",
+        "also=[]",
+    ]
     swept = with_settings(["-m", "task=VideoUnmask", "model=a", "seed=0,1"])
     assert swept[1:] == ["-m", "task=VideoUnmask", "with_memory=a", "seed=0,1", "also=[]"]
     assert "--multirun" in with_settings(["--multirun", "model=a,b", "seed=0,1"])
@@ -53,10 +61,22 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
         folder.mkdir(parents=True, exist_ok=True)
         policy = MMEPolicy.from_pretrained(str(checkpoint))
         return [
-            EpisodeRecord(str(policy.config["name"]), 2, 7, "VideoUnmask", n, n, "easy", "success" if n else "fail", 9,
-                          split="further", training=identity_of(policy.config),
-                          memory_budget=policy.require_memory().budget) for n in range(2)
-        ]  # fmt: skip
+            EpisodeRecord(
+                str(policy.config["name"]),
+                2,
+                7,
+                "VideoUnmask",
+                n,
+                n,
+                "easy",
+                "success" if n else "fail",
+                9,
+                split="further",
+                training=identity_of(policy.config),
+                memory_budget=policy.require_memory().budget,
+            )
+            for n in range(2)
+        ]
 
     monkeypatch.setattr(evaluating, "run_episodes", episodes)
     words = with_settings(["task=VideoUnmask", "nano=null", "model=framesamp_modul", "budget=2,4"])
@@ -65,23 +85,48 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     words += [f"output={tmp_path / 'run'}"]
     page = runs.run(resolved(compose("nano", words))).read_text()
     assert len(recorded) == 1 and len(made) == 2, "each frame is encoded once"
-    assert all(f"| framesamp_modul-every_8-grid_1 | {budget} | 50 ± 0 % (2/4) |" in page for budget in (2, 4))
+    assert all(
+        f"| framesamp_modul-every_8-grid_1 | {budget} | 50 ± 0 % (2/4) |" in page
+        for budget in (2, 4)
+    )
     trained = sorted((tmp_path / "run").glob("training/*/*/trained.json"))
     assert len(trained) == 4
-    seeds = [identity_of(MMEPolicy.from_pretrained(str(tmp_path / "run" / "training" / "framesamp_modul@2" / n)).config)
-             for n in "01"]  # fmt: skip
+    seeds = [
+        identity_of(
+            MMEPolicy.from_pretrained(
+                str(tmp_path / "run" / "training" / "framesamp_modul@2" / n)
+            ).config
+        )
+        for n in "01"
+    ]
     assert [one and one.seed for one in seeds] == [0, 1] and seeds[0] != seeds[1]
-    about = read_json(tmp_path / "run" / "further" / "framesamp_modul@2" / "1" / "trained.json", "a row")
-    assert (about["row"], about["seed"], about["budget"], about["decisions"]) == ("framesamp_modul@2", 1, 2, 3)
-    assert about["demonstrations"] == {"VideoUnmask": 2} and about["parameters"] > 1e6 and about["update_flops"] > 1e6
+    about = read_json(
+        tmp_path / "run" / "further" / "framesamp_modul@2" / "1" / "trained.json", "a row"
+    )
+    assert (about["row"], about["seed"], about["budget"], about["decisions"]) == (
+        "framesamp_modul@2",
+        1,
+        2,
+        3,
+    )
+    assert (
+        about["demonstrations"] == {"VideoUnmask": 2}
+        and about["parameters"] > 1e6
+        and about["update_flops"] > 1e6
+    )
     runs.run(resolved(compose("nano", words)))
     assert len(made) == 2, "a finished run is not made again"
-    for changed, message in (("train.steps=3", "steps was 2, and is 3"), ("learning.noise=0.5", "learning.noise was")):
+    for changed, message in (
+        ("train.steps=3", "steps was 2, and is 3"),
+        ("learning.noise=0.5", "learning.noise was"),
+    ):
         with pytest.raises(UserError, match=message):
             runs.run(resolved(compose("nano", [*words, changed])))
     killed = tmp_path / "run" / "training" / "framesamp_modul@2" / "0"
     (killed / "trained.json").unlink()
-    shutil.rmtree(killed / "checkpoints")  # as before the first one: there are only lines of progress
+    shutil.rmtree(
+        killed / "checkpoints"
+    )  # as before the first one: there are only lines of progress
     runs.run(resolved(compose("nano", words)))
     assert read_json(killed / "trained.json", "a training's end")["steps"] == 2
 
@@ -91,7 +136,10 @@ def test_minutes_of_a_stage_add_up_over_runs(tmp_path: Path) -> None:
     for stage in ("training", "evaluation", "training"):
         with minutes.of(stage):
             time.sleep(0.02)
-    assert minutes.spent["training"] >= 2 * 0.02 / 60 and set(minutes.spent) == {"training", "evaluation"}
+    assert minutes.spent["training"] >= 2 * 0.02 / 60 and set(minutes.spent) == {
+        "training",
+        "evaluation",
+    }
 
 
 def test_the_digest_of_demonstrations_is_of_their_scenes_and_choices(tmp_path: Path) -> None:
@@ -102,7 +150,9 @@ def test_the_digest_of_demonstrations_is_of_their_scenes_and_choices(tmp_path: P
         "another processor": replace(made, states=np.nextafter(made.states, np.float32(9))),
         "carried out": replace(made, carried_out=True),
         "another goal": replace(made, goal=f"{made.goal} twice"),
-        "one decision fewer": replace(made, motions=Motions(made.motions.decisions[1:], made.motions.targets[1:])),
+        "one decision fewer": replace(
+            made, motions=Motions(made.motions.decisions[1:], made.motions.targets[1:])
+        ),
     }
     for name, variant in variants.items():
         variant.save(tmp_path / f"{name}.npz")
@@ -120,9 +170,13 @@ def test_no_demonstration_is_learned_from_and_measured(
     files, reads = [tmp_path / f"{number}.npz" for number in range(count)], []
     monkeypatch.setattr(fitting, "statistics", lambda *_: None)
     monkeypatch.setattr(fitting.Demonstration, "load", lambda file, images: file)
-    monkeypatch.setattr(fitting.Decisions, "of", lambda policy, made, *_, **__: reads.append([f for f, _ in made]))
+    monkeypatch.setattr(
+        fitting.Decisions, "of", lambda policy, made, *_, **__: reads.append([f for f, _ in made])
+    )
     store = SimpleNamespace(read=lambda file: file)
-    learning = dict.fromkeys(("elsewhere", "reflect", "sides", "often", "noise", "blur", "balanced"))
+    learning = dict.fromkeys(
+        ("elsewhere", "reflect", "sides", "often", "noise", "blur", "balanced")
+    )
     job = SimpleNamespace(learning=learning, files=files, store=store, config={"seed": 0})
     fitting.prepared(SimpleNamespace(require_processor=SimpleNamespace), job)
     learned, measured = reads

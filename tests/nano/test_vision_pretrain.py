@@ -1,4 +1,6 @@
-"""The command that trains the small tower: its labels, its training, what it measures, and the scenes it takes."""
+"""The command that trains the small tower: its labels, its training, what it measures, and the
+scenes it takes.
+"""
 
 import logging
 from pathlib import Path
@@ -53,9 +55,15 @@ class LabelTower(nn.Module):
 
     def __init__(self, scenes: Scenes, shifted: float = 0.0, only: int | None = None) -> None:
         super().__init__()
-        selected = torch.ones(len(scenes.classes), dtype=torch.bool) if only is None else scenes.classes == only
+        selected = (
+            torch.ones(len(scenes.classes), dtype=torch.bool)
+            if only is None
+            else scenes.classes == only
+        )
         places = scenes.places[selected] + torch.tensor([shifted, 0.0])
-        self.presence, self.offsets = label_cells(scenes.owners[selected], scenes.classes[selected], places, (2, 32))
+        self.presence, self.offsets = label_cells(
+            scenes.owners[selected], scenes.classes[selected], places, (2, 32)
+        )
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
         return (self.presence - 0.5) * 20, self.offsets
@@ -63,7 +71,9 @@ class LabelTower(nn.Module):
 
 def test_an_object_is_labelled_in_the_four_cells_around_it_and_detected() -> None:
     places = torch.tensor([[0.41, 0.23], [0.47, 0.23], [0.9, 0.01]])
-    presence, offsets = label_cells(torch.tensor([0, 0, 1]), torch.tensor([RED, RED, BUTTON]), places, (2, 32))
+    presence, offsets = label_cells(
+        torch.tensor([0, 0, 1]), torch.tensor([RED, RED, BUTTON]), places, (2, 32)
+    )
     assert presence[0, RED].sum() == 8 and presence[1, BUTTON].sum() == 2 and presence.sum() == 10
     assert offsets.abs().max() <= 1
     detected = sorted(find_objects(presence[0, RED], offsets[0, RED]))
@@ -106,9 +116,9 @@ def test_the_evaluation_counts_places_detections_errors_and_wrong_reports(tmp_pa
     distant = evaluate_tower(LabelTower(made, shifted=0.2), made)["red cube"]  # type: ignore[arg-type]
     assert (len(distant.errors), distant.reports) == (0, 2)
     blind = evaluate_tower(LabelTower(made, only=BUTTON), made)  # type: ignore[arg-type]
-    assert "| red cube | 2 | 0 % |  | 0 % |" in report(blind) and "| button | 1 | 100 % | 0.0 cm | 0 % |" in report(
+    assert "| red cube | 2 | 0 % |  | 0 % |" in report(
         blind
-    )
+    ) and "| button | 1 | 100 % | 0.0 cm | 0 % |" in report(blind)
 
 
 def test_one_report_between_two_objects_finds_one() -> None:
@@ -116,8 +126,13 @@ def test_one_report_between_two_objects_finds_one() -> None:
     assert match(np.array([[0.5, 1.0], [0.2, 4.0]])) == [0.2, 1.0]
 
 
-def test_an_interrupted_training_ends_in_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file, settings = save_scene(tmp_path / "a.npz"), PretrainSettings(steps=4, batch_size=2, save_every=2)
+def test_an_interrupted_training_ends_in_the_same_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, settings = (
+        save_scene(tmp_path / "a.npz"),
+        PretrainSettings(steps=4, batch_size=2, save_every=2),
+    )
     full = pretrain(fresh_tower(TINY, 0), [file], [file], tmp_path / "full", settings).read_bytes()
     batch_loss = pretraining._batch_loss
 
@@ -130,7 +145,10 @@ def test_an_interrupted_training_ends_in_the_same_weights(tmp_path: Path, monkey
     with pytest.raises(KeyboardInterrupt):
         pretrain(fresh_tower(TINY, 0), [file], [file], tmp_path / "parts", settings)
     monkeypatch.undo()
-    assert pretrain(fresh_tower(TINY, 0), [file], [file], tmp_path / "parts", settings).read_bytes() == full
+    assert (
+        pretrain(fresh_tower(TINY, 0), [file], [file], tmp_path / "parts", settings).read_bytes()
+        == full
+    )
 
 
 def test_the_loss_leads_to_the_labels(tmp_path: Path) -> None:
@@ -147,7 +165,9 @@ def test_the_loss_leads_to_the_labels(tmp_path: Path) -> None:
     assert len(results["red cube"].errors) == 2 and len(results["button"].errors) == 1
 
 
-def record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, buildable: set[int], *words: str) -> Any:
+def record(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, buildable: set[int], *words: str
+) -> Any:
     def take(folder: Path, task: str, seed: int, level: str, arrangements: int, size: int) -> Path:
         if seed - 9_000_000 not in buildable:
             raise SceneError(f"{task}, seed {seed}: target 3 finds no place.")
@@ -155,13 +175,23 @@ def record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, buildable: set[int],
 
     monkeypatch.setattr(scenes, "record_scene", take)
 
-    def names(tower: object, files: list[Path], held_out: list[Path], *_: object) -> list[list[str]]:
+    def names(
+        tower: object, files: list[Path], held_out: list[Path], *_: object
+    ) -> list[list[str]]:
         return [[file.name for file in group] for group in (files, held_out)]
 
     monkeypatch.setattr(pretraining, "pretrain", names)
     return run(
         compose(
-            "vision_pretrain", ["tasks=[StopCube]", "scenes=4", "held_out=1", "workers=1", f"output={tmp_path}", *words]
+            "vision_pretrain",
+            [
+                "tasks=[StopCube]",
+                "scenes=4",
+                "held_out=1",
+                "workers=1",
+                f"output={tmp_path}",
+                *words,
+            ],
         )
     )
 
@@ -171,12 +201,18 @@ def test_the_last_scenes_of_a_task_are_held_out_and_only_demonstrated(
 ) -> None:
     with caplog.at_level(logging.INFO, "mme_vla.nano"):
         learned, held_out = record(monkeypatch, tmp_path, {0, 2, 3}, "arrangements=5")
-    assert learned == ["StopCube-9000000-5.npz", "StopCube-9000002-5.npz"] and held_out == ["StopCube-9000003-0.npz"]
+    assert learned == ["StopCube-9000000-5.npz", "StopCube-9000002-5.npz"] and held_out == [
+        "StopCube-9000003-0.npz"
+    ]
     assert "left out: StopCube, seed 9000001" in caplog.text
 
 
-def test_without_any_scene_it_says_what_to_change(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="None of the 4 scenes can be built: change first_seed=9000000"):
+def test_without_any_scene_it_says_what_to_change(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with pytest.raises(
+        UserError, match="None of the 4 scenes can be built: change first_seed=9000000"
+    ):
         record(monkeypatch, tmp_path, set())
     with pytest.raises(UserError, match="held_out=4: must be less than scenes=4"):
         record(monkeypatch, tmp_path, {0}, "held_out=4")

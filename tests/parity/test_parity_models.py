@@ -1,4 +1,5 @@
-"""Whole policies equal the released implementation: velocity, loss and sampled actions at tiny size.
+"""Whole policies equal the released implementation: velocity, loss and sampled actions at tiny
+size.
 
 They run on the GPU where there is one.
 """
@@ -33,11 +34,15 @@ def loaded(parity: Path, name: str):
 
 
 def exact(policy, tensors):
-    """Turn RMT's cast to bfloat16 off and return the golden outputs without it; other models' as they are."""
+    """Turn RMT's cast to bfloat16 off and return the golden outputs without it; other models' as
+    they are.
+    """
     if not isinstance(policy.memory, RMT):
         return tensors
     policy.memory.layer.attention_dtype = torch.float32
-    return tensors | {key.removesuffix("_f32attn"): value for key, value in tensors.items() if "_f32attn" in key}
+    return tensors | {
+        key.removesuffix("_f32attn"): value for key, value in tensors.items() if "_f32attn" in key
+    }
 
 
 @torch.no_grad()
@@ -75,13 +80,17 @@ def test_rmt_rounds_where_the_released_model_does(integration, parity):
     assert golden.error(memory.tokens, tensors["out/mem_tokens"]) <= ROUNDED_TOLERANCE
     velocity = policy.velocity(batch, tensors["out/x_t"], tensors["in/time"], memory)
     assert golden.error(velocity, tensors["out/v_t"]) <= ROUNDED_TOLERANCE
-    sampled = policy.sample_actions(batch, tensors["in/sample_noise"], about["num_denoise_steps"], memory=memory)
+    sampled = policy.sample_actions(
+        batch, tensors["in/sample_noise"], about["num_denoise_steps"], memory=memory
+    )
     assert golden.error(sampled, tensors["out/sampled_actions"]) <= ROUNDED_TOLERANCE
 
 
 @torch.no_grad()
 def test_bfloat16_stays_near_the_released_model(case):
-    """Under autocast, as in training, and with rounded weights, as in evaluation; relative to the largest entry."""
+    """Under autocast, as in training, and with rounded weights, as in evaluation; relative to the
+    largest entry.
+    """
     policy, tensors, about = case
     policy.compute_dtype = torch.bfloat16
     for dtype in (torch.float32, torch.bfloat16):
@@ -91,8 +100,13 @@ def test_bfloat16_stays_near_the_released_model(case):
             velocity = policy.velocity(batch, tensors["out/x_t"], tensors["in/time"], memory)
             noise = tensors["in/sample_noise"]
             sampled = policy.sample_actions(batch, noise, about["num_denoise_steps"], memory=memory)
-        for actual, expected in ((velocity, tensors["out/v_t"]), (sampled, tensors["out/sampled_actions"])):
-            assert golden.error(actual, expected) <= ROUNDED_TOLERANCE * float(expected.abs().max()), dtype
+        for actual, expected in (
+            (velocity, tensors["out/v_t"]),
+            (sampled, tensors["out/sampled_actions"]),
+        ):
+            assert golden.error(actual, expected) <= ROUNDED_TOLERANCE * float(
+                expected.abs().max()
+            ), dtype
 
 
 def test_gradients_equal_the_released_model(case):
@@ -101,13 +115,19 @@ def test_gradients_equal_the_released_model(case):
     for parameter in policy.parameters():
         parameter.requires_grad_(True)
     loss, _ = policy(
-        golden.batch(tensors), tensors["in/noise"], tensors["in/time"], golden.memory_tokens(policy, tensors)
+        golden.batch(tensors),
+        tensors["in/noise"],
+        tensors["in/time"],
+        golden.memory_tokens(policy, tensors),
     )
     loss.backward()
     from mme_vla.weights.released import released_table, released_unread
     from mme_vla.weights.tables import write
 
-    gradients = {name: p.grad if p.grad is not None else torch.zeros_like(p) for name, p in policy.named_parameters()}
+    gradients = {
+        name: p.grad if p.grad is not None else torch.zeros_like(p)
+        for name, p in policy.named_parameters()
+    }
     released = write(released_table(policy), released_unread(policy), gradients)
     for path, norm in about["grad_l2_of_mean_loss"].items():
         assert abs(float(released[path].norm()) - norm) <= 1e-4 + 1e-3 * norm, path

@@ -25,7 +25,9 @@ def unit(parity):
 
 
 def test_recurrent_frames(parity):
-    for entry in json.loads((parity / "unit_sampling_indices.json").read_text())["recurrent_sampling"]:
+    for entry in json.loads((parity / "unit_sampling_indices.json").read_text())[
+        "recurrent_sampling"
+    ]:
         limits = (entry["max_steps"], entry["max_video"], entry["horizon"])
         frames = recurrent_frames(entry["step"], entry["exec_start"], *limits)
         assert isinstance(frames, np.ndarray)
@@ -65,7 +67,9 @@ def test_ttt_step_sizes_and_clipping(ttt):
     x, valid = tensors["in/x"], tensors["in/mask"]
     _, numbers = layer.advance(layer.initial(len(x)), x, valid, statistics=True)
     assert error(numbers["step_size"][valid], tensors["stats/eta_mean"].mean(1)[valid]) <= TOLERANCE
-    assert float(numbers["clipped_rates"].mean()) == pytest.approx(about["fraction_eta_above_max_lr"], abs=1e-6)
+    assert float(numbers["clipped_rates"].mean()) == pytest.approx(
+        about["fraction_eta_above_max_lr"], abs=1e-6
+    )
     golden = torch.stack([tensors["stats/grad_w_norm"], tensors["stats/grad_b_norm"]])
     clipped = (golden > about["max_grad_norm"]).float().mean((0, 2))
     assert error(numbers["clipped_gradients"][valid], clipped[valid]) <= TOLERANCE
@@ -74,7 +78,9 @@ def test_ttt_step_sizes_and_clipping(ttt):
 
 def rmt(tensors, about, **options) -> torch.Tensor:
     """The golden layer's slots after the last frame."""
-    layer = RMTLayer(about["hidden"], about["rmt_heads"], about["rmt_kv"], about["budget"], **options)
+    layer = RMTLayer(
+        about["hidden"], about["rmt_heads"], about["rmt_kv"], about["budget"], **options
+    )
     layer.load_state_dict(read(layer_names(layer, ""), params(tensors, "/")))
     x = tensors["in/x"]
     return layer.read(layer.advance(layer.initial(len(x)), x, tensors["in/mask"])[0])[0]
@@ -83,7 +89,10 @@ def rmt(tensors, about, **options) -> torch.Tensor:
 @torch.no_grad()
 def test_rmt_slots(unit):
     tensors, about = unit("unit_rmt")
-    assert error(rmt(tensors, about, attention_dtype="float32"), tensors["out/memory_f32attn"]) <= TOLERANCE
+    assert (
+        error(rmt(tensors, about, attention_dtype="float32"), tensors["out/memory_f32attn"])
+        <= TOLERANCE
+    )
 
 
 @torch.no_grad()
@@ -101,6 +110,8 @@ def test_rmt_slots_with_cosines_only(unit):
 
 def test_rotary_table_is_the_released_constant(unit):
     tensors, about = unit("unit_rmt")
-    table = rotary_table(2 * (about["tokens"] + about["budget"]), about["hidden"] // about["rmt_heads"])
+    table = rotary_table(
+        2 * (about["tokens"] + about["budget"]), about["hidden"] // about["rmt_heads"]
+    )
     assert error(table.real, tensors["out/freqs_cos"]) <= TOLERANCE
     assert error(table.imag, tensors["out/freqs_sin"]) <= TOLERANCE

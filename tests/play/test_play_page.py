@@ -25,8 +25,12 @@ from mme_vla.play.desk import Desk
 from mme_vla.play.run import Identity, PlayRun
 from mme_vla.play.web import is_local, listen, make_server
 
-pytest.importorskip("starlette", reason="the page needs the extra play: uv sync --inexact --extra play")
-pytest.importorskip("uvicorn", reason="the page needs the extra play: uv sync --inexact --extra play")
+pytest.importorskip(
+    "starlette", reason="the page needs the extra play: uv sync --inexact --extra play"
+)
+pytest.importorskip(
+    "uvicorn", reason="the page needs the extra play: uv sync --inexact --extra play"
+)
 
 
 class Served:
@@ -60,7 +64,10 @@ class Served:
 @contextmanager
 def served(folder, make=lambda which: a_session(which.episode), episodes=2, **options):
     identity = Identity("human", "anna", 0, 1300, {"player": "human"})
-    with PlayRun(folder, [an_episode(n) for n in range(episodes)], identity, make) as run, listen("127.0.0.1", 0) as at:
+    with (
+        PlayRun(folder, [an_episode(n) for n in range(episodes)], identity, make) as run,
+        listen("127.0.0.1", 0) as at,
+    ):
         desk = Desk(run, "anna")
         desk.address = f"http://127.0.0.1:{at.getsockname()[1]}"
         server = make_server(desk, **options)
@@ -73,7 +80,7 @@ def served(folder, make=lambda which: a_session(which.episode), episodes=2, **op
             thread.join(30)
 
 
-# Over HTTP --------------------------------------------------------------------------------------------------------
+# Over HTTP ----------------------------------------------------------------------------------------
 
 
 def test_an_episode_is_played_over_http_and_recorded(tmp_path, caplog):
@@ -81,23 +88,38 @@ def test_an_episode_is_played_over_http_and_recorded(tmp_path, caplog):
     with served(tmp_path, episodes=1) as page:
         state = page.until("choosing")
         page.desk._thread.submit(lambda: None).result()
-        assert caplog.messages[-1] == f"VideoUnmask, episode 0: ready at http://127.0.0.1:{page.port}"
+        assert (
+            caplog.messages[-1] == f"VideoUnmask, episode 0: ready at http://127.0.0.1:{page.port}"
+        )
         assert [o["label"] for o in state["options"]] == ["a", "b", "c"]
         for name in ("blue", "red"):
             state = page.until("choosing")
-            choice = {"session": state["session"], "decision": len(state["decisions"]), "choice": "a"}
+            choice = {
+                "session": state["session"],
+                "decision": len(state["decisions"]),
+                "choice": "a",
+            }
             response, _ = page.ask("POST", "/choose", {**choice, "point": BLOCKS[name]})
             assert response.status == 200
             page.desk._thread.submit(lambda: None).result()
         state = page.until("ended")
         assert (state["status"], state["played"], state["successes"]) == ("success", 1, 1)
-        assert [(r["start"], r["count"]) for r in state["reveals"]] == [(0, 9), (9, MOTION), (14, MOTION)]
+        assert [(r["start"], r["count"]) for r in state["reveals"]] == [
+            (0, 9),
+            (9, MOTION),
+            (14, MOTION),
+        ]
         page.ask("POST", "/next", {})
         state = page.until("finished")
-        assert state["summary"] == [{"task": "VideoUnmask", "successes": 1, "episodes": 1, "human": 90.0}]
+        assert state["summary"] == [
+            {"task": "VideoUnmask", "successes": 1, "episodes": 1, "human": 90.0}
+        ]
     (record,) = read_records(tmp_path / "episodes.jsonl")
     assert (record.model, record.checkpoint, record.outcome) == ("human", "anna", "success")
-    assert [d["point"] for d in record.extra["decisions"]] == [list(BLOCKS["blue"]), list(BLOCKS["red"])]
+    assert [d["point"] for d in record.extra["decisions"]] == [
+        list(BLOCKS["blue"]),
+        list(BLOCKS["red"]),
+    ]
 
 
 def test_frames_come_as_jpegs_behind_a_table(tmp_path):
@@ -130,7 +152,9 @@ def test_a_choice_that_cannot_be_made_is_answered_and_changes_nothing(tmp_path):
             response, content = page.ask("POST", "/choose", body)
             assert response.status == status, content
             assert reason in json.loads(content)["error"]
-        response, _ = page.ask("POST", "/choose", json.dumps(request), **{"Content-Type": "text/plain"})
+        response, _ = page.ask(
+            "POST", "/choose", json.dumps(request), **{"Content-Type": "text/plain"}
+        )
         assert response.status == 400
         assert page.state()["decisions"] == []
 
@@ -154,15 +178,12 @@ def test_only_this_machine_is_answered_and_the_page_loads_nothing_foreign(tmp_pa
 @pytest.mark.slow
 def test_ctrl_c_frees_the_simulator_and_goes_on_behind_the_page(tmp_path):
     script = (
-        "import logging; from pathlib import Path; from helpers.play_fakes import a_session, an_episode\n"
-        "from mme_vla.play.desk import Desk; from mme_vla.play.run import Identity, PlayRun\n"
-        "from mme_vla.play.web import serve\n"
-        "logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
-        "session = a_session()\n"
-        "who = Identity('human', 'anna', 0, 1300, {})\n"
-        f"run = PlayRun(Path({str(tmp_path)!r}), [an_episode()], who, lambda _: session)\n"
-        "serve(Desk(run, 'anna'), '127.0.0.1', 0)\n"
-        "print('freed', session.env.closed)"
+        "import logging; from pathlib import Path; from helpers.play_fakes import a_session,"
+        " an_episode\nfrom mme_vla.play.desk import Desk; from mme_vla.play.run import Identity,"
+        " PlayRun\nfrom mme_vla.play.web import serve\nlogging.basicConfig(level=logging.INFO,"
+        " format='%(message)s')\nsession = a_session()\nwho = Identity('human', 'anna', 0, 1300,"
+        f" {{}})\nrun = PlayRun(Path({str(tmp_path)!r}), [an_episode()], who, lambda _:"
+        " session)\nserve(Desk(run, 'anna'), '127.0.0.1', 0)\nprint('freed', session.env.closed)"
     )
     here = Path(__file__).parents[1]
     paths = os.pathsep.join([str(here), str(here.parent), *sys.path])
@@ -214,10 +235,13 @@ def test_an_episode_that_cannot_be_saved_is_not_lost(tmp_path, monkeypatch):
                 page.ask("POST", "/choose", {"choice": "a", "point": [10, 20], **decision})
         assert "No space left" in page.until("broken")["error"] and page.state()["played"] == 0
         page.ask("POST", "/next", {})
-        assert page.until("ended")["played"] == 1 and len(read_records(tmp_path / "episodes.jsonl")) == 1
+        assert (
+            page.until("ended")["played"] == 1
+            and len(read_records(tmp_path / "episodes.jsonl")) == 1
+        )
 
 
-# In a browser -----------------------------------------------------------------------------------------------------
+# In a browser -------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -227,7 +251,9 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
         browser.wait("document.querySelectorAll('.option:not(:disabled)').length === 3")
         assert browser.text("#goal") == "press the blocks in the order of the video"
         assert browser.text("#do").startswith("Do it")
-        browser.wait("document.querySelector('#badge').innerText === 'Present'")  # the video has played to its end
+        browser.wait(
+            "document.querySelector('#badge').innerText === 'Present'"
+        )  # the video has played to its end
 
         # Scrub back into the video, and see that a point is only taken in the present image.
         browser.press("ArrowLeft", shift=True)
@@ -237,7 +263,9 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
         assert browser.run("document.querySelector('#do').disabled")
         row, column = BLOCKS["blue"]
         browser.click("#image", ((row + 0.5) / 256, (column + 0.5) / 256))
-        browser.wait(f"document.querySelector('#hint').innerText === 'Point: row {row}, column {column}.'")
+        browser.wait(
+            f"document.querySelector('#hint').innerText === 'Point: row {row}, column {column}.'"
+        )
         browser.click("#do")
         browser.wait("document.querySelectorAll('#history li').length === 1")
         assert browser.text("#history").endswith(f"press the block at row {row}, column {column}")
@@ -261,7 +289,9 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
         browser.wait("document.querySelector('#outcome').classList.contains('error')")
         assert "no path" in browser.text("#outcome-text")
         browser.click("#next")
-        browser.wait("document.querySelector('#outcome-title').innerText.startsWith('All episodes')")
+        browser.wait(
+            "document.querySelector('#outcome-title').innerText.startsWith('All episodes')"
+        )
         assert browser.problems == []
     first, second = read_records(tmp_path / "run" / "episodes.jsonl")
     assert [d["point"] for d in first.extra["decisions"]] == [[180, 190], [67, 68]]
@@ -293,7 +323,10 @@ def test_headers_and_bodies_that_never_end_are_not_waited_for(tmp_path, monkeypa
     monkeypatch.setattr(web, "ARRIVAL_S", 0.5)
     with served(tmp_path) as page:
         at = ("127.0.0.1", page.port)
-        head = b"POST /next HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
+        head = (
+            b"POST /next HTTP/1.1\r\nHost: localhost\r\nContent-Type:"
+            b" application/json\r\nContent-Length: 9\r\n\r\n"
+        )
         with socket.create_connection(at) as silent, socket.create_connection(at) as half:
             half.sendall(b"GET /state HTTP/1.1\r\nHost:")
             assert ended(silent) == ended(half) == b""
@@ -310,7 +343,9 @@ def test_headers_and_bodies_that_never_end_are_not_waited_for(tmp_path, monkeypa
 @pytest.mark.parametrize("method", ["POST /choose", "GET /state"])
 def test_a_body_that_is_not_read_ends_the_connection(tmp_path, method):
     with served(tmp_path) as page, socket.create_connection(("127.0.0.1", page.port)) as endless:
-        endless.sendall(method.encode() + b" HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
-                        b"Content-Length: 1000000000\r\n\r\n" + bytes(5000))  # fmt: skip
+        endless.sendall(
+            method.encode() + b" HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+            b"Content-Length: 1000000000\r\n\r\n" + bytes(5000)
+        )
         reply = ended(endless)
     assert b"connection: close" in reply.lower().partition(b"\r\n\r\n")[0]

@@ -1,4 +1,6 @@
-"""An episode as a sequence of choices, and the runs made of them, against a stand-in environment."""
+"""An episode as a sequence of choices, and the runs made of them, against a stand-in
+environment.
+"""
 
 import json
 from dataclasses import replace
@@ -25,10 +27,18 @@ def test_the_video_comes_first_then_the_frames_of_each_motion():
     session = a_session()
     first = session.start()
     assert (first.title, len(first.frames), first.start) == ("Conditioning video", VIDEO + 1, 0)
-    assert [(o.label, o.needs_point) for o in session.options] == [("a", True), ("b", False), ("c", False)]
+    assert [(o.label, o.needs_point) for o in session.options] == [
+        ("a", True),
+        ("b", False),
+        ("c", False),
+    ]
     assert session.goal == "press the blocks in the order of the video"
     second = session.choose(press("blue"))
-    assert (second.title, len(second.frames), second.start) == ("press the block", MOTION, VIDEO + 1)
+    assert (second.title, len(second.frames), second.start) == (
+        "press the block",
+        MOTION,
+        VIDEO + 1,
+    )
     assert session.frame is second.frames[-1]
     assert session.n_displayed_frames == VIDEO + 1 + MOTION
     assert session.steps == MOTION
@@ -114,8 +124,17 @@ def test_the_record_holds_every_decision_and_survives_its_line():
     session.choose({"choice": "b"})
     session.choose(press("red"))
     record = EpisodeRecord.from_json(session.record("human", "anna", extra_key=1).to_json())
-    assert (record.model, record.checkpoint, record.action_space) == ("human", "anna", "multi_choice")
-    assert (record.outcome, record.steps, record.seed, record.difficulty) == ("success", 2 * MOTION, 560000, "easy")
+    assert (record.model, record.checkpoint, record.action_space) == (
+        "human",
+        "anna",
+        "multi_choice",
+    )
+    assert (record.outcome, record.steps, record.seed, record.difficulty) == (
+        "success",
+        2 * MOTION,
+        560000,
+        "easy",
+    )
     first, second, third = record.extra["decisions"]
     assert first["choice"] == "a"
     assert first["point"] == list(BLOCKS["blue"])
@@ -123,7 +142,10 @@ def test_the_record_holds_every_decision_and_survives_its_line():
     assert first["note"] == {"answers": ["first"]}
     assert (second["point"], second["frames"][0] == second["frames"][1]) == (None, True)
     assert (first["status"], third["status"]) == ("ongoing", "success")
-    assert (record.seconds.sim, record.seconds.policy) == (4, 3)  # a tick each: reset, three steps; three thoughts
+    assert (record.seconds.sim, record.seconds.policy) == (
+        4,
+        3,
+    )  # a tick each: reset, three steps; three thoughts
     assert record.extra["extra_key"] == 1
 
 
@@ -141,12 +163,14 @@ def test_random_choices_depend_on_seed_and_episode_alone():
     assert len({choices(*which) for which in ((0, 1), (0, 2), (1, 1))}) == 3
 
 
-# Runs -------------------------------------------------------------------------------------------------------------
+# Runs ---------------------------------------------------------------------------------------------
 
 
 def a_run(folder, numbers=range(2), **settings):
     identity = Identity("random", 0, 0, 1300, {"player": "random", **settings})
-    return PlayRun(folder, [an_episode(n) for n in numbers], identity, lambda which: a_session(which.episode))
+    return PlayRun(
+        folder, [an_episode(n) for n in numbers], identity, lambda which: a_session(which.episode)
+    )
 
 
 def test_a_run_goes_on_where_it_stopped(tmp_path):
@@ -185,7 +209,9 @@ def test_an_error_is_played_again_only_when_requested(tmp_path):
     with a_run(tmp_path, [0]) as run:
         assert run.todo == []
         identity = run.identity
-    with PlayRun(tmp_path, [an_episode()], identity, lambda _: a_session(), retry_errors=True) as run:
+    with PlayRun(
+        tmp_path, [an_episode()], identity, lambda _: a_session(), retry_errors=True
+    ) as run:
         assert run.todo == [an_episode()]
 
 
@@ -220,7 +246,12 @@ def breaking_run(folder, places):
             raise RuntimeError("no scene for this seed")
         return ChoiceSession(Collapsing(place), which)
 
-    return PlayRun(folder, [an_episode(n) for n in range(len(places))], Identity("random", 0, 0, 1300, {}), make)
+    return PlayRun(
+        folder,
+        [an_episode(n) for n in range(len(places))],
+        Identity("random", 0, 0, 1300, {}),
+        make,
+    )
 
 
 def test_an_episode_that_breaks_is_recorded_as_an_error_and_the_others_are_played(tmp_path):
@@ -233,7 +264,11 @@ def test_an_episode_that_breaks_is_recorded_as_an_error_and_the_others_are_playe
         (n, place in ("make", "reset", "step")) for n, place in enumerate(places)
     ]
     assert records[0].error == "RuntimeError: no scene for this seed"
-    assert records[3].error == records[3].extra["ended_by"] == "RuntimeError: the scene fell apart in step"
+    assert (
+        records[3].error
+        == records[3].extra["ended_by"]
+        == "RuntimeError: the scene fell apart in step"
+    )
     assert (records[0].seed, records[0].extra["decisions"]) == (560000, [])
     assert "no scene for this seed" in line(records[0])
     with breaking_run(tmp_path, places) as run:  # the same command again does not stumble over them

@@ -1,4 +1,6 @@
-"""Files that somebody adds to a checkpoint: what is read is what was checked, or is refused by name."""
+"""Files that somebody adds to a checkpoint: what is read is what was checked, or is refused by
+name.
+"""
 
 import json
 import shutil
@@ -71,7 +73,9 @@ def halved(folder: Path) -> None:
     """Add other weights and an index that names them."""
     tensors = {name: tensor * 0.5 for name, tensor in load_file(folder / WEIGHTS).items()}
     save_file(tensors, folder / "evil.safetensors")
-    (folder / INDEX).write_text(json.dumps({"weight_map": dict.fromkeys(tensors, "evil.safetensors")}))
+    (folder / INDEX).write_text(
+        json.dumps({"weight_map": dict.fromkeys(tensors, "evil.safetensors")})
+    )
 
 
 def unlist(folder: Path, name: str) -> None:
@@ -88,7 +92,9 @@ def refusal(read: Read, folder: Path) -> str:
 
 @pytest.mark.parametrize("listed", ["listed", "not listed", "no sums"])
 @pytest.mark.parametrize("reader", READERS)
-def test_weights_and_an_index_of_others_are_refused_by_every_reader(reader: str, listed: str, checkpoint: Path) -> None:
+def test_weights_and_an_index_of_others_are_refused_by_every_reader(
+    reader: str, listed: str, checkpoint: Path
+) -> None:
     halved(checkpoint)
     if listed == "listed":
         write_sums(checkpoint, [INDEX, "evil.safetensors"], keep=True)
@@ -117,12 +123,24 @@ def test_a_shard_that_is_not_listed_is_refused_though_its_index_is(tmp_path: Pat
 @pytest.mark.parametrize(
     ("name", "reader"),
     [
-        *((name, "policy") for name in
-            ("config.json", "processor.json", "norm_stats.json", "tokenizer.model", WEIGHTS)),
-        *((name, "resume") for name in ("raw.safetensors", "optimizer.safetensors", "training_state.json")),
-        ("config.json", "conversion"), (WEIGHTS, "init_from"),
+        *(
+            (name, "policy")
+            for name in (
+                "config.json",
+                "processor.json",
+                "norm_stats.json",
+                "tokenizer.model",
+                WEIGHTS,
+            )
+        ),
+        *(
+            (name, "resume")
+            for name in ("raw.safetensors", "optimizer.safetensors", "training_state.json")
+        ),
+        ("config.json", "conversion"),
+        (WEIGHTS, "init_from"),
     ],
-)  # fmt: skip
+)
 def test_every_file_that_is_read_must_be_listed(name: str, reader: str, checkpoint: Path) -> None:
     READERS[reader](checkpoint)
     unlist(checkpoint, name)
@@ -142,7 +160,9 @@ def test_the_line_that_the_message_names_lets_a_file_in(tmp_path: Path) -> None:
     (tmp_path / "stats.json").write_bytes(b"abc")
     assert "sha256sum" in refusal(lambda folder: checked_file(folder, "stats.json"), tmp_path)
     with (tmp_path / SUMS).open("a") as file:  # as `sha256sum ./stats.json` writes it
-        file.write("ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad  ./stats.json\n")
+        file.write(
+            "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad  ./stats.json\n"
+        )
     assert checked_file(tmp_path, "stats.json") == tmp_path / "stats.json"
     assert check_sums(tmp_path)
 
@@ -158,18 +178,26 @@ def test_the_weights_that_are_read_are_listed_relative_to_the_folder(tmp_path: P
 @pytest.mark.parametrize(
     ("name", "read"),
     [
-        ("model.pth", lambda folder: Source("diffusion_policy", folder, (folder / "model.pth",)).tensors()),
+        (
+            "model.pth",
+            lambda folder: Source("diffusion_policy", folder, (folder / "model.pth",)).tensors(),
+        ),
         ("stats.json", read_diffusion_stats),
         ("dataset_statistics.json", read_dataset_statistics),
         ("action_head--5_checkpoint.pt", lambda folder: with_heads({}, folder)),
         ("lora_adapter/adapter_config.json", lambda folder: merged({}, folder)),
-        ("params/array/.zarray", lambda folder: Source("released", folder, params=folder / "params").tensors()),
+        (
+            "params/array/.zarray",
+            lambda folder: Source("released", folder, params=folder / "params").tensors(),
+        ),
         ("step.zip", lambda folder: load_weights(tiny(), folder / "step.zip")),
         ("norm_stats.json", read_stats),
         ("policy_preprocessor.json", read_stats),
     ],
-)  # fmt: skip
-def test_formats_of_others_are_held_to_the_sums_as_well(name: str, read: Read, tmp_path: Path) -> None:
+)
+def test_formats_of_others_are_held_to_the_sums_as_well(
+    name: str, read: Read, tmp_path: Path
+) -> None:
     (tmp_path / "listed").write_text("was there")
     write_sums(tmp_path)
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -184,7 +212,9 @@ def test_formats_of_others_are_held_to_the_sums_as_well(name: str, read: Read, t
     assert f"does not list {name}" in refusal(read, tmp_path)
 
 
-@pytest.mark.parametrize("name", ["config.json", WEIGHTS, "merges.txt", "chat_template.jinja", "adapter_model.bin"])
+@pytest.mark.parametrize(
+    "name", ["config.json", WEIGHTS, "merges.txt", "chat_template.jinja", "adapter_model.bin"]
+)
 def test_folders_of_subgoal_models_are_held_to_their_sums(name: str, tmp_path: Path) -> None:
     (tmp_path / "tokenizer.json").write_text("{}")
     write_sums(tmp_path)
@@ -194,11 +224,15 @@ def test_folders_of_subgoal_models_are_held_to_their_sums(name: str, tmp_path: P
     assert f"does not list {name}" in refusal(check_transformers_folder, tmp_path)
 
 
-def test_a_subgoal_model_with_two_sets_of_weights_is_refused_before_it_is_loaded(tmp_path: Path) -> None:
+def test_a_subgoal_model_with_two_sets_of_weights_is_refused_before_it_is_loaded(
+    tmp_path: Path,
+) -> None:
     pytest.importorskip("transformers", reason="subgoal models need the extra `vlm`")
     from mme_vla.subgoal.models.qwen3vl import load_model
 
     (tmp_path / WEIGHTS).write_text("{}")
     (tmp_path / INDEX).write_text('{"weight_map": {"a": "other.safetensors"}}')
-    assert f"both {WEIGHTS} and {INDEX}" in refusal(lambda folder: load_model(str(folder)), tmp_path)
+    assert f"both {WEIGHTS} and {INDEX}" in refusal(
+        lambda folder: load_model(str(folder)), tmp_path
+    )
     check_transformers_folder("owner/name")  # on the hub

@@ -1,4 +1,6 @@
-"""The order of work: short frames, one batch, long videos; episodes that are ready share a batch."""
+"""The order of work: short frames, one batch, long videos; episodes that are ready
+share a batch.
+"""
 
 from dataclasses import dataclass
 
@@ -31,7 +33,9 @@ def test_short_frames_come_first_then_one_batch_then_a_piece_of_a_long_video(mon
     now = iter(range(1000))
     monkeypatch.setattr(scheduler.time, "perf_counter", lambda: 0.0 if next(now) % 3 < 2 else 1.0)
     schedule: Scheduler = Scheduler(max_batch=2)
-    schedule.reading.extend([Frames("v", 3), Frames("a", 1), Frames("w", 3), Frames("b", 1), Frames("c", 1)])
+    schedule.reading.extend(
+        [Frames("v", 3), Frames("a", 1), Frames("w", 3), Frames("b", 1), Frames("c", 1)]
+    )
     assert steps(schedule) == ["read a", "read b", "read c", "act ab", "read v"]
     assert steps(schedule) == ["act c", "read w"]
     assert steps(schedule) == ["read v"], "videos take turns"

@@ -20,7 +20,9 @@ def policy() -> MMEPolicy:
     return small_policy("pi05")
 
 
-@pytest.mark.parametrize("name", ["no", "null", "2026-11-21", "my: model", "- x", "framesamp_modul", "1e3"])
+@pytest.mark.parametrize(
+    "name", ["no", "null", "2026-11-21", "my: model", "- x", "framesamp_modul", "1e3"]
+)
 def test_every_name_stays_a_name(policy: MMEPolicy, name: str) -> None:
     data = ModelCard(model_card(policy, {**policy.config, "name": name})).data
     assert data.tags[-1] == name and isinstance(data.tags[-1], str)
@@ -38,7 +40,9 @@ def test_licence_origin_data_and_results_are_reported(policy: MMEPolicy) -> None
     card = ModelCard(model_card(policy, {**policy.config, "card": known}))
     assert (card.data.license, card.data.base_model) == ("apache-2.0", "lerobot/pi05_base")
     assert card.data.datasets == ["lerobot/robomme"]
-    assert [(r.metric_type, r.metric_value) for r in card.data.eval_results] == [("success_rate", 0.25)]
+    assert [(r.metric_type, r.metric_value) for r in card.data.eval_results] == [
+        ("success_rate", 0.25)
+    ]
     assert "| note | one seed |" in card.text
 
 
@@ -51,7 +55,9 @@ def test_licence_origin_data_and_results_are_reported(policy: MMEPolicy) -> None
         ("sam2act_plus", {"backbone": "sam2act_tiny"}),
     ],
 )
-def test_the_example_of_a_card_runs_to_an_action(model: str, settings: dict, tmp_path: Path) -> None:
+def test_the_example_of_a_card_runs_to_an_action(
+    model: str, settings: dict, tmp_path: Path
+) -> None:
     """Of robots that choose among options and that read depth as well."""
     saved = build_policy(model, **{"backbone": "tiny", **settings})
     saved.require_processor().stats = unit_stats(saved.embodiment)
@@ -64,7 +70,9 @@ def test_the_example_of_a_card_runs_to_an_action(model: str, settings: dict, tmp
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_the_example_of_a_shipped_card_runs_to_an_action(name: str) -> None:
-    (block,) = re.findall(r"```python\n(.*?)```", (find_run(Path(name)) / "README.md").read_text(), re.DOTALL)
+    (block,) = re.findall(
+        r"```python\n(.*?)```", (find_run(Path(name)) / "README.md").read_text(), re.DOTALL
+    )
     space: dict = {}
     exec(block, space)
     assert np.isfinite(space.get("chunk", space.get("choice"))).all()

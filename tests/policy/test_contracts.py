@@ -1,4 +1,6 @@
-"""What the library asks of a user's parts it asks of its own: every registered one passes its check."""
+"""What the library asks of a user's parts it asks of its own: every registered one passes its
+check.
+"""
 
 from typing import Any
 
@@ -19,16 +21,23 @@ from mme_vla.testing.small import tiny_sections
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 SIZES: dict[str, dict[str, Any]] = {
-    "framesamp": {"budget": 256}, "tokendrop": {"budget": 256},
-    "ttt": {"budget": 16, "max_steps": 8, "max_video": 4}, "rmt": {"budget": 16, "max_steps": 8, "max_video": 4},
-    "retrieval": {"budget": 64, "every": 2, "longest": 3}, "moment": {"budget": 16, "moments": 2, "grid": 2},
+    "framesamp": {"budget": 256},
+    "tokendrop": {"budget": 256},
+    "ttt": {"budget": 16, "max_steps": 8, "max_video": 4},
+    "rmt": {"budget": 16, "max_steps": 8, "max_video": 4},
+    "retrieval": {"budget": 64, "every": 2, "longest": 3},
+    "moment": {"budget": 16, "moments": 2, "grid": 2},
     "gist": {"budget": 48, "anchors": 1, "recent": 1, "gists": 4, "stride": 8},
-    "actions": {"budget": 4, "max_steps": 12, "max_video": 6}, "present": {"grid": 4},
+    "actions": {"budget": 4, "max_steps": 12, "max_video": 6},
+    "present": {"grid": 4},
     "learned_topk": {"budget": 32, "pool": 6},
-    "spacetime": {"stride": 4}, "bank": {"budget": 16, "grid": 4, "moments": 4, "video": 2, "hidden": 32, "length": 3},
-    "anchors": {"spacing": 3}, "events": {"budget": 64, "stride": 4}, "pyramid": {"budget": 96, "strides": [1, 4]},
+    "spacetime": {"stride": 4},
+    "bank": {"budget": 16, "grid": 4, "moments": 4, "video": 2, "hidden": 32, "length": 3},
+    "anchors": {"spacing": 3},
+    "events": {"budget": 64, "stride": 4},
+    "pyramid": {"budget": 96, "strides": [1, 4]},
     "keyframes": {"budget": 64, "every": 4, "pool": 8},
-}  # fmt: skip
+}
 
 
 def test_every_memory_that_ships_is_queried() -> None:
@@ -37,7 +46,9 @@ def test_every_memory_that_ships_is_queried() -> None:
 
 
 @pytest.mark.parametrize("name", SIZES)
-def test_every_memory_of_the_library_keeps_a_memorys_contract(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_memory_of_the_library_keeps_a_memorys_contract(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     check_memory(name, **SIZES[name])
     assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == [name] * 4
 
@@ -51,11 +62,15 @@ def test_every_integration_of_the_library_keeps_an_integrations_contract(
 
 
 def test_the_backbone_of_the_library_keeps_a_backbones_contract() -> None:
-    check_backbone("pi05", **{k: v for k, v in tiny_sections("pi05")["backbone"].items() if k != "name"})
+    check_backbone(
+        "pi05", **{k: v for k, v in tiny_sections("pi05")["backbone"].items() if k != "name"}
+    )
 
 
 def test_a_task_of_the_library_keeps_a_tasks_contract() -> None:
-    pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
+    pytest.importorskip(
+        "mani_skill", reason="the simulator is not installed: the extra `sim` has it"
+    )
     check_task("StopCube", difficulty="easy")
 
 
@@ -63,14 +78,20 @@ def test_a_task_of_the_library_keeps_a_tasks_contract() -> None:
 
 
 class _LooksAhead(FrameSamp):
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         return super().select(history, len(history) - 1, rng)
 
 
 class _Dices(FrameSamp):
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         frames = super().select(history, step, rng)
-        return frames[np.sort(np.random.default_rng().permutation(len(frames))[: max(len(frames) // 2, 1)])]
+        return frames[
+            np.sort(np.random.default_rng().permutation(len(frames))[: max(len(frames) // 2, 1)])
+        ]
 
 
 class _ReadsPadding(FrameSamp):
@@ -87,7 +108,12 @@ class _Forgets(FrameSamp):
 
 @pytest.mark.parametrize(
     ("broken", "words"),
-    [(_LooksAhead, "later"), (_Dices, "same choice"), (_ReadsPadding, "padding"), (_Forgets, "does not read")],
+    [
+        (_LooksAhead, "later"),
+        (_Dices, "same choice"),
+        (_ReadsPadding, "padding"),
+        (_Forgets, "does not read"),
+    ],
 )
 def test_a_broken_memory_is_reported_which_prefix_it_breaks(
     broken: type, words: str, monkeypatch: pytest.MonkeyPatch
@@ -119,4 +145,6 @@ class _Random(Pi05Backbone):
 def test_a_backbone_whose_loss_does_not_repeat_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(BACKBONES._entries, "broken", _Random)
     with pytest.raises(AssertionError, match="same noise must give the same loss"):
-        check_backbone("broken", **{k: v for k, v in tiny_sections("pi05")["backbone"].items() if k != "name"})
+        check_backbone(
+            "broken", **{k: v for k, v in tiny_sections("pi05")["backbone"].items() if k != "name"}
+        )

@@ -1,4 +1,6 @@
-"""Checkpoints whose files were damaged on the way: found before anything is computed, and said in one paragraph."""
+"""Checkpoints whose files were damaged on the way: found before anything is computed, and said in
+one paragraph.
+"""
 
 import json
 import shutil
@@ -69,17 +71,32 @@ def test_every_file_that_is_read_has_a_sum(checkpoint: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "read"),
     [
-        *((name, MMEPolicy.from_pretrained) for name in (
-            "model.safetensors", "config.json", "processor.json", "norm_stats.json", "tokenizer.model",
-        )),
-        *((name, resume) for name in (
-            "model.safetensors", "raw.safetensors", "optimizer.safetensors", "training_state.json",
-        )),
+        *(
+            (name, MMEPolicy.from_pretrained)
+            for name in (
+                "model.safetensors",
+                "config.json",
+                "processor.json",
+                "norm_stats.json",
+                "tokenizer.model",
+            )
+        ),
+        *(
+            (name, resume)
+            for name in (
+                "model.safetensors",
+                "raw.safetensors",
+                "optimizer.safetensors",
+                "training_state.json",
+            )
+        ),
         ("model.safetensors", lambda folder: load_weights(tiny(), folder)),
         ("model.safetensors", lambda folder: start_from(tiny(), folder)),
     ],
-)  # fmt: skip
-def test_one_flipped_bit_in_any_file_is_detected(name: str, read: Callable[[Path], Any], checkpoint: Path) -> None:
+)
+def test_one_flipped_bit_in_any_file_is_detected(
+    name: str, read: Callable[[Path], Any], checkpoint: Path
+) -> None:
     read(checkpoint)
     data = bytearray((checkpoint / name).read_bytes())
     data[-20] ^= 1
@@ -111,7 +128,9 @@ def test_a_checkpoint_from_before_there_were_sums_loads_without_a_word(
     assert list(recwarn) == []
 
 
-@pytest.mark.parametrize("content", [DEEP, "[]"], ids=["deep", "list"])  # others: tests/utils/test_files.py
+@pytest.mark.parametrize(
+    "content", [DEEP, "[]"], ids=["deep", "list"]
+)  # others: tests/utils/test_files.py
 @pytest.mark.parametrize(
     ("name", "read"),
     [
@@ -131,16 +150,27 @@ def test_damaged_json_is_one_short_paragraph(
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
-        ("processor.json", {"prompt": []}), ("processor.json", {"views": [1]}), ("processor.json", {"horizon": 10**9}),
-        ("processor.json", {"tokenizer": None}), ("processor.json", {"stats": 3}), ("processor.json", {"x" * 9999: 1}),
-        ("processor.json", {"image_size": 3}), ("config.json", {"backbone": 3}), ("config.json", {"memory": [1]}),
-        ("config.json", {"policy": []}), ("config.json", {"adapters": {"rank": 0}}), ("config.json", {"plugins": [1]}),
-        ("config.json", {"plugins": 7}), ("config.json", {"integration": {"name": []}}),
+        ("processor.json", {"prompt": []}),
+        ("processor.json", {"views": [1]}),
+        ("processor.json", {"horizon": 10**9}),
+        ("processor.json", {"tokenizer": None}),
+        ("processor.json", {"stats": 3}),
+        ("processor.json", {"x" * 9999: 1}),
+        ("processor.json", {"image_size": 3}),
+        ("config.json", {"backbone": 3}),
+        ("config.json", {"memory": [1]}),
+        ("config.json", {"policy": []}),
+        ("config.json", {"adapters": {"rank": 0}}),
+        ("config.json", {"plugins": [1]}),
+        ("config.json", {"plugins": 7}),
+        ("config.json", {"integration": {"name": []}}),
         ("norm_stats.json", {"norm_stats": {"state": {"mean": [10**400]}, "actions": {}}}),
         ("norm_stats.json", {"norm_stats": {str(i): 0 for i in range(9999)}}),
     ],
-)  # fmt: skip
-def test_values_of_the_wrong_kind_are_one_short_paragraph(name: str, changes: dict[str, Any], checkpoint: Path) -> None:
+)
+def test_values_of_the_wrong_kind_are_one_short_paragraph(
+    name: str, changes: dict[str, Any], checkpoint: Path
+) -> None:
     (checkpoint / SUMS).unlink()
     content = json.loads((checkpoint / name).read_text())
     (checkpoint / name).write_text(json.dumps({**content, **changes}))
@@ -149,9 +179,13 @@ def test_values_of_the_wrong_kind_are_one_short_paragraph(name: str, changes: di
 
 def test_thousands_of_names_are_one_short_paragraph(checkpoint: Path) -> None:
     (checkpoint / SUMS).unlink()
-    save_file({f"{'x' * 200}{i}": torch.zeros(1) for i in range(2000)}, checkpoint / "model.safetensors")
+    save_file(
+        {f"{'x' * 200}{i}": torch.zeros(1) for i in range(2000)}, checkpoint / "model.safetensors"
+    )
     assert "2,000 unexpected" in refusal(MMEPolicy.from_pretrained, checkpoint)
-    save_file({f"{'x' * 200}{i}": torch.zeros(1) for i in range(2000)}, checkpoint / "raw.safetensors")
+    save_file(
+        {f"{'x' * 200}{i}": torch.zeros(1) for i in range(2000)}, checkpoint / "raw.safetensors"
+    )
     refusal(resume, checkpoint)
 
 
@@ -165,7 +199,9 @@ def test_moments_that_are_no_numbers_are_refused(checkpoint: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["memroy", "extra", "Backbone"])
-def test_an_unknown_section_of_a_configuration_is_refused_with_the_known_ones(key: str, checkpoint: Path) -> None:
+def test_an_unknown_section_of_a_configuration_is_refused_with_the_known_ones(
+    key: str, checkpoint: Path
+) -> None:
     config = json.loads((checkpoint / "config.json").read_text())
     (checkpoint / "config.json").write_text(json.dumps({**config, key: {}}))
     (checkpoint / SUMS).unlink()

@@ -53,9 +53,10 @@ def test_full_learns_all_but_the_vision_tower(variant: str) -> None:
 def test_expert_only_learns_the_action_side_and_the_memory(variant: str) -> None:
     policy = small_policy(variant, backbone=FEW_TOKENS)
     counts = apply_finetuning(policy, "expert_only")
-    assert {policy.finetune_spec.component_of(name) for name in learning(policy)} == {"action", "memory"} - (
-        {"memory"} if variant == "pi05" else set()
-    )
+    assert {policy.finetune_spec.component_of(name) for name in learning(policy)} == {
+        "action",
+        "memory",
+    } - ({"memory"} if variant == "pi05" else set())
     assert counts["vlm"] == counts["vision"] == 0
     loss, _ = policy.train()(random_batch(policy))
     loss.backward()
@@ -69,7 +70,9 @@ def test_adapters_follow_from_their_seed_alone() -> None:
         policy = small_policy("pi05", backbone=FEW_TOKENS)
         torch.manual_seed(before)
         apply_finetuning(policy, "lora", seed=seed)
-        return torch.cat([p.flatten() for name, p in policy.named_parameters() if ".lora_A." in name])
+        return torch.cat(
+            [p.flatten() for name, p in policy.named_parameters() if ".lora_A." in name]
+        )
 
     assert torch.equal(adapters(1, seed=7), adapters(2, seed=7))
     assert not torch.equal(adapters(1, seed=7), adapters(1, seed=8))
@@ -159,7 +162,9 @@ def test_freezing_random_weights_is_warned_of(mode: str) -> None:
         warn_of_frozen_random_weights(mode)
 
 
-def test_training_everything_from_random_weights_is_not_warned_of(recwarn: pytest.WarningsRecorder) -> None:
+def test_training_everything_from_random_weights_is_not_warned_of(
+    recwarn: pytest.WarningsRecorder,
+) -> None:
     warn_of_frozen_random_weights("full")
     assert not recwarn.list
 

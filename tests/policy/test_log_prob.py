@@ -21,7 +21,8 @@ def test_the_log_probability_of_a_path_is_the_density_of_the_joint_normal() -> N
     noise = torch.randn(5, 2, 3, generator=generator, dtype=torch.float64)
     increments = torch.randn(5, steps, 2, 3, generator=generator, dtype=torch.float64)
     path = head.sample_path(linear, noise, increments, deviation)
-    # x_{i+1} = (1 − slope/k)·x_i + σ·ε_i: one joint normal distribution of the k + 1 states of each number.
+    # x_{i+1} = (1 − slope/k)·x_i + σ·ε_i: one joint normal distribution of the k + 1 states of each
+    # number.
     gain = 1 - slope / steps
     mixing = torch.zeros(steps + 1, steps + 1, dtype=torch.float64)
     for i in range(steps + 1):
@@ -42,7 +43,9 @@ def test_a_path_is_sampled_and_its_log_probability_has_a_gradient(backbone: str)
     assert torch.allclose(log_prob, path.log_prob, rtol=1e-5)
     log_prob.sum().backward()
     learning = [
-        n for n, p in policy.named_parameters() if n.startswith(("backbone.", "memory.")) and p.grad is not None
+        n
+        for n, p in policy.named_parameters()
+        if n.startswith(("backbone.", "memory.")) and p.grad is not None
     ]
     assert any(n.startswith("backbone.action_out") for n in learning)
     assert any(n.startswith("memory.") for n in learning)
@@ -73,9 +76,13 @@ def test_a_head_with_deviation_samples_the_path_of_its_noise() -> None:
         return 0.7 * x
 
     path = head.sample_path(linear, noise["noise"], noise["increments"], 0.3)
-    assert torch.equal(head.sample(linear, noise["noise"], steps, increments=noise["increments"]), path[:, -1])
+    assert torch.equal(
+        head.sample(linear, noise["noise"], steps, increments=noise["increments"]), path[:, -1]
+    )
     base = head.sample(linear, noise["noise"], steps)
-    assert torch.equal(head.sample_path(linear, noise["noise"], noise["increments"], 0.0)[:, -1], base)
+    assert torch.equal(
+        head.sample_path(linear, noise["noise"], noise["increments"], 0.0)[:, -1], base
+    )
     assert set(FlowHead(horizon=2, action_dim=3).sampling_noise(generator)) == {"noise"}
     with pytest.raises(UserError, match="flow_steps=5"):
         head.sample(linear, noise["noise"], 5, increments=noise["increments"])

@@ -27,14 +27,22 @@ def policy(monkeypatch: pytest.MonkeyPatch) -> MMEPolicy:
 
 def prepared(policy: MMEPolicy, folder: Path, **options: object) -> SplitData:
     data = {
-        "name": "sample", "sources": ["sample"], "val_fraction": 0.0, "val_episodes": [], "action_offset": 0,
-        "mask_padding": False, "jitter": False, "cache": {"root": str(folder), "batch_size": 32},
+        "name": "sample",
+        "sources": ["sample"],
+        "val_fraction": 0.0,
+        "val_episodes": [],
+        "action_offset": 0,
+        "mask_padding": False,
+        "jitter": False,
+        "cache": {"root": str(folder), "batch_size": 32},
         **options,
-    }  # fmt: skip
+    }
     return prepare_data(policy, data, 0, say=lambda line: None)
 
 
-def test_a_sample_reads_the_line_before_and_learns_its_own(policy: MMEPolicy, tmp_path: Path) -> None:
+def test_a_sample_reads_the_line_before_and_learns_its_own(
+    policy: MMEPolicy, tmp_path: Path
+) -> None:
     dataset = prepared(policy, tmp_path, texts={"scratchpad": COLUMN}).train
     processor, tokenizer = policy.require_processor(), policy.require_processor().tokenizer
     source, episode, frame = dataset[60]["place"]
@@ -58,7 +66,9 @@ def test_a_sample_reads_the_line_before_and_learns_its_own(policy: MMEPolicy, tm
 def test_a_format_with_notes_needs_their_columns(policy: MMEPolicy, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"reads the notes scratchpad: name their columns"):
         prepared(policy, tmp_path)
-    with pytest.raises(UserError, match=r"the column 'frame_index' of sample holds int64, no texts"):
+    with pytest.raises(
+        UserError, match=r"the column 'frame_index' of sample holds int64, no texts"
+    ):
         prepared(policy, tmp_path, texts={"scratchpad": "frame_index"})
 
 

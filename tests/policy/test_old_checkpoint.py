@@ -1,4 +1,6 @@
-"""A checkpoint written before the folders were rearranged loads, continues training and acts as it did then."""
+"""A checkpoint written before the folders were rearranged loads, continues training and acts as it
+did then.
+"""
 
 import json
 import shutil
@@ -29,16 +31,39 @@ def test_its_training_goes_on_with_the_losses_it_had(tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(FOLDER / "run", run)
     then = OmegaConf.load(run / "config.yaml")
-    sizes = [f"backbone.{key}={value}" for key, value in flat(then.backbone) if key not in ("name", "horizon")]
-    recipe = [f"train.{key}={value}" for key, value in flat(then.train) if key in ("batch_size", "val_samples")]
+    sizes = [
+        f"backbone.{key}={value}"
+        for key, value in flat(then.backbone)
+        if key not in ("name", "horizon")
+    ]
+    recipe = [
+        f"train.{key}={value}"
+        for key, value in flat(then.train)
+        if key in ("batch_size", "val_samples")
+    ]
     words = [
-        "model=framesamp_modul", "memory.budget=32", "memory.grid=2", "logger=none", "train.steps=4", *sizes, *recipe,
-        "train.log_every=1", "train.save_every=4", "train.open_loop_chunks=0", "train.workers=0", "train.device=cpu",
-        f"data.cache.root={tmp_path / 'cache'}", f"resume={run}",
-    ]  # fmt: skip
+        "model=framesamp_modul",
+        "memory.budget=32",
+        "memory.grid=2",
+        "logger=none",
+        "train.steps=4",
+        *sizes,
+        *recipe,
+        "train.log_every=1",
+        "train.save_every=4",
+        "train.open_loop_chunks=0",
+        "train.workers=0",
+        "train.device=cpu",
+        f"data.cache.root={tmp_path / 'cache'}",
+        f"resume={run}",
+    ]
     main(compose("train", words))
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    losses = {str(line["step"]): line["train/loss"] for line in lines if "train/loss" in line and line["step"] > 2}
+    losses = {
+        str(line["step"]): line["train/loss"]
+        for line in lines
+        if "train/loss" in line and line["step"] > 2
+    }
     assert losses == pytest.approx(EXPECTED["losses"], rel=1e-5)
     assert [line["val/loss"] for line in lines if "val/loss" in line] == pytest.approx(
         [EXPECTED["validation"]], rel=1e-5
@@ -47,4 +72,8 @@ def test_its_training_goes_on_with_the_losses_it_had(tmp_path: Path) -> None:
 
 def flat(section, prefix: str = ""):
     for key, value in section.items():
-        yield from flat(value, f"{prefix}{key}.") if OmegaConf.is_dict(value) else [(f"{prefix}{key}", value)]
+        yield from (
+            flat(value, f"{prefix}{key}.")
+            if OmegaConf.is_dict(value)
+            else [(f"{prefix}{key}", value)]
+        )

@@ -13,9 +13,16 @@ FEW_TOKENS = {"vision": {**SMALL_VISION, "patch_size": 8}}
 """8×8 tokens a view; nothing here depends on their number."""
 MEMORY = {"budget": 128}
 NEURAL = [
-    "framesamp_context", "tokendrop_modul", "framesamp_expert", "rmt_context", "ttt_modul", "ttt_expert",
-]  # fmt: skip
-"""Every memory, and every integration with a memory that selects tokens and with a recurrent one."""
+    "framesamp_context",
+    "tokendrop_modul",
+    "framesamp_expert",
+    "rmt_context",
+    "ttt_modul",
+    "ttt_expert",
+]
+"""Every memory, and every integration with a memory that selects tokens and with a
+recurrent one.
+"""
 
 
 @pytest.fixture(params=["pi05", *NEURAL])
@@ -44,7 +51,9 @@ def test_cached_prefix_equals_the_joint_pass(policy):
     prefix, injection = prefill(policy, batch)
     action = policy.backbone.action_block(noise)
     layout = policy.backbone.transformer.layout([action], policy.integration.visibility, prefix)
-    cached = policy.backbone.denoise(noise, policy.backbone.time_condition(time_), layout, prefix, injection)
+    cached = policy.backbone.denoise(
+        noise, policy.backbone.time_condition(time_), layout, prefix, injection
+    )
     assert (cached - policy.velocity(batch, noise, time_)).abs().max() < TOLERANCE
 
 
@@ -93,7 +102,9 @@ def test_batch_equals_each_alone(policy):
     together = velocity(policy, batch)
     for i in range(3):
         alone = batch._map(lambda x, i=i: x[i : i + 1])
-        noise = torch.randn(batch.actions.shape, generator=torch.Generator().manual_seed(1))[i : i + 1]
+        noise = torch.randn(batch.actions.shape, generator=torch.Generator().manual_seed(1))[
+            i : i + 1
+        ]
         with torch.no_grad():
             one = policy.velocity(alone, noise, torch.full((1,), 0.6))
         assert (one - together[i : i + 1]).abs().max() < TOLERANCE
@@ -140,7 +151,9 @@ def test_modulator_encodes_memory_once_per_chunk():
 def test_exact_identity_modulator_is_the_memoryless_policy_to_the_bit():
     memoryless, modulated = (
         small_policy("pi05", backbone=FEW_TOKENS),
-        small_policy("framesamp_modul", backbone=FEW_TOKENS, integration={"exact_identity": "true"}),
+        small_policy(
+            "framesamp_modul", backbone=FEW_TOKENS, integration={"exact_identity": "true"}
+        ),
     )
     shared = memoryless.state_dict()
     assert not modulated.load_state_dict(shared, strict=False).unexpected_keys
@@ -182,7 +195,9 @@ def prefix_keys(policy, batch):
 def test_prompt_sees_memory_only_if_requested(integration):
     for sees in (True, False):
         setting = {"prompt_sees_memory": str(sees).lower()}
-        policy = small_policy(f"framesamp_{integration}", backbone=FEW_TOKENS, memory=MEMORY, integration=setting)
+        policy = small_policy(
+            f"framesamp_{integration}", backbone=FEW_TOKENS, memory=MEMORY, integration=setting
+        )
         row = policy.integration.visibility["prompt"]
         assert ("memory" in row) is sees
         batch = random_batch(policy)
@@ -244,7 +259,9 @@ def test_foreign_checkpoints_are_refused(tmp_path):
     policy.save_pretrained(tmp_path / "first")
     other = small_policy("tokendrop_expert", backbone=FEW_TOKENS)
     other.save_pretrained(tmp_path / "other")
-    (tmp_path / "other" / "config.json").write_text((tmp_path / "first" / "config.json").read_text())
+    (tmp_path / "other" / "config.json").write_text(
+        (tmp_path / "first" / "config.json").read_text()
+    )
     (tmp_path / "other" / SUMS).unlink()
     with pytest.raises(UserError, match=r"(?s)missing.*unexpected"):
         MMEPolicy.from_pretrained(tmp_path / "other")
@@ -253,7 +270,9 @@ def test_foreign_checkpoints_are_refused(tmp_path):
 def test_a_masked_loss_does_not_depend_on_what_is_computed_together():
     policy = small_policy("pi05", backbone=FEW_TOKENS)
     batch = random_batch(policy, batch=4)
-    batch.action_mask = torch.arange(batch.actions.shape[1]).expand(4, -1) < torch.tensor([[1], [20], [7], [20]])
+    batch.action_mask = torch.arange(batch.actions.shape[1]).expand(4, -1) < torch.tensor(
+        [[1], [20], [7], [20]]
+    )
     noise, time_ = torch.randn(batch.actions.shape), torch.full((4,), 0.5)
     with torch.no_grad():
         together, _ = policy(batch, noise, time_)
@@ -272,24 +291,38 @@ def test_a_masked_loss_does_not_depend_on_what_is_computed_together():
 @pytest.mark.parametrize(
     ("memory", "options", "message"),
     [
-        ("framesamp", {"budget": 500}, "memory.budget=500.*512|496"), ("framesamp", {"pooling": "median"}, "'median'"),
-        ("framesamp", {"grid": 5, "budget": 500}, "grid=5"), ("framesamp", {"position_dim": 0}, "position_dim=0"),
-        ("framesamp", {"position_hidden": 0}, "position_hidden=0.*or null"), ("tokendrop", {"grid": 0}, "grid=0"),
-        ("tokendrop", {"stride": 0}, "memory.stride=0"), ("tokendrop", {"budget": 63}, "memory.budget=63"),
-        ("tokendrop", {"budget": 4096}, "memory.budget=4096"), ("ttt", {"budget": 4097}, "memory.budget=4097"),
-        ("ttt", {"heads": 3}, "multiple of memory.heads=3"), ("ttt", {"max_rate": 0}, "above 0"),
-        ("ttt", {"jitter": 8}, "memory.jitter=8"), ("ttt", {"chunk": 0}, "memory.chunk=0"),
-        ("rmt", {"budget": 0}, "memory.budget=0"), ("rmt", {"rotation": "sine"}, "cosine_only"),
-        ("rmt", {"attention_dtype": "int8"}, "bfloat16"), ("rmt", {"heads": 3}, "even multiple of heads"),
-        ("retrieval", {"cut": 2.0}, "memory.cut"), ("retrieval", {"longest": 0}, "memory.longest"),
-        ("moment", {"budget": 10}, "multiple of memory.moments"), ("moment", {"heads": 7}, "memory.heads=7"),
-        ("gist", {"budget": 96}, "choose at least 104"), ("gist", {"recent": 0}, "memory.recent=0"),
-        ("learned_topk", {"pool": 2}, "memory.pool=2"), ("learned_topk", {"temperature": 0.0}, "memory.temperature"),
-        ("actions", {"layers": 0}, "memory.layers"), ("actions", {"max_steps": 0}, "memory.max_steps"),
+        ("framesamp", {"budget": 500}, "memory.budget=500.*512|496"),
+        ("framesamp", {"pooling": "median"}, "'median'"),
+        ("framesamp", {"grid": 5, "budget": 500}, "grid=5"),
+        ("framesamp", {"position_dim": 0}, "position_dim=0"),
+        ("framesamp", {"position_hidden": 0}, "position_hidden=0.*or null"),
+        ("tokendrop", {"grid": 0}, "grid=0"),
+        ("tokendrop", {"stride": 0}, "memory.stride=0"),
+        ("tokendrop", {"budget": 63}, "memory.budget=63"),
+        ("tokendrop", {"budget": 4096}, "memory.budget=4096"),
+        ("ttt", {"budget": 4097}, "memory.budget=4097"),
+        ("ttt", {"heads": 3}, "multiple of memory.heads=3"),
+        ("ttt", {"max_rate": 0}, "above 0"),
+        ("ttt", {"jitter": 8}, "memory.jitter=8"),
+        ("ttt", {"chunk": 0}, "memory.chunk=0"),
+        ("rmt", {"budget": 0}, "memory.budget=0"),
+        ("rmt", {"rotation": "sine"}, "cosine_only"),
+        ("rmt", {"attention_dtype": "int8"}, "bfloat16"),
+        ("rmt", {"heads": 3}, "even multiple of heads"),
+        ("retrieval", {"cut": 2.0}, "memory.cut"),
+        ("retrieval", {"longest": 0}, "memory.longest"),
+        ("moment", {"budget": 10}, "multiple of memory.moments"),
+        ("moment", {"heads": 7}, "memory.heads=7"),
+        ("gist", {"budget": 96}, "choose at least 104"),
+        ("gist", {"recent": 0}, "memory.recent=0"),
+        ("learned_topk", {"pool": 2}, "memory.pool=2"),
+        ("learned_topk", {"temperature": 0.0}, "memory.temperature"),
+        ("actions", {"layers": 0}, "memory.layers"),
+        ("actions", {"max_steps": 0}, "memory.max_steps"),
         ("bank", {"budget": 16}, "budget=16 does not hold the 8×8 tokens"),
         ("bank", {"moments": 4}, "moments=4 must be .* more than memory.video=16"),
     ],
-)  # fmt: skip
+)
 def test_options_of_a_memory_that_cannot_be_are_refused(memory, options, message):
     with pytest.raises(UserError, match=message):
         build_policy(f"{memory}_modul", memory=options, device="meta")

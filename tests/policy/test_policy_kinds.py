@@ -1,4 +1,6 @@
-"""Policies of any kind: names in a configuration, recipes beyond the released one, statistics with extremes."""
+"""Policies of any kind: names in a configuration, recipes beyond the released one, statistics with
+extremes.
+"""
 
 from typing import Any
 
@@ -41,12 +43,19 @@ def test_a_subclass_takes_the_options_of_its_parents() -> None:
     assert isinstance(custom, KeepingPolicy) and (custom.augment, custom.keep) == (False, 1)
     with pytest.raises(UserError, match=r"policy has no key 'augmnt'\. Did you mean 'augment'"):
         policy_options(KeepingPolicy, {"policy": {"augmnt": False}})
-    assert policy_options(KeepingPolicy, {"policy": {"keep": 3, "augment": False}}) == {"keep": 3, "augment": False}
+    assert policy_options(KeepingPolicy, {"policy": {"keep": 3, "augment": False}}) == {
+        "keep": 3,
+        "augment": False,
+    }
 
 
 def test_a_kind_comes_back_as_what_it_was(tmp_path: Any) -> None:
     build_policy("pi05", policy={"name": "quiet"}).save_pretrained(tmp_path)
-    assert type(Policy.from_pretrained(tmp_path)) is type(MMEPolicy.from_pretrained(tmp_path)) is QuietPolicy
+    assert (
+        type(Policy.from_pretrained(tmp_path))
+        is type(MMEPolicy.from_pretrained(tmp_path))
+        is QuietPolicy
+    )
 
 
 def test_the_default_kind_changes_no_digest_and_another_does() -> None:
@@ -73,7 +82,15 @@ def test_recipes_that_cannot_be(values: dict[str, Any], says: str) -> None:
 def test_runs_of_before_resume_though_they_know_none_of_the_new_keys() -> None:
     now: Any = OmegaConf.to_container(compose("train", ["model=pi05"]), resolve=True)
     config = {key: now[key] for key in ("train", "policy", "backbone", "embodiment")}
-    new = ("warmup_from_zero", "schedule", "schedule_steps", "milestones", "gamma", "decay_min_dim", "ema_warmup")
+    new = (
+        "warmup_from_zero",
+        "schedule",
+        "schedule_steps",
+        "milestones",
+        "gamma",
+        "decay_min_dim",
+        "ema_warmup",
+    )
     then = {
         **config,
         "train": {key: value for key, value in config["train"].items() if key not in new},
@@ -82,4 +99,6 @@ def test_runs_of_before_resume_though_they_know_none_of_the_new_keys() -> None:
     assert set(new) <= set(config["train"])
     assert differing_keys(_completed(then), _completed(config)) == {}
     changed = {**config, "train": {**config["train"], "schedule": "cosine"}}
-    assert differing_keys(_completed(then), _completed(changed)) == {"train.schedule": ("constant", "cosine")}
+    assert differing_keys(_completed(then), _completed(changed)) == {
+        "train.schedule": ("constant", "cosine")
+    }

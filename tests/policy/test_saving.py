@@ -21,7 +21,9 @@ def policy() -> MMEPolicy:
     return small_policy("framesamp_modul")
 
 
-def test_bfloat16_files_are_half_as_large_and_load_in_either_dtype(policy: MMEPolicy, tmp_path: Path) -> None:
+def test_bfloat16_files_are_half_as_large_and_load_in_either_dtype(
+    policy: MMEPolicy, tmp_path: Path
+) -> None:
     policy.save_pretrained(tmp_path / "full")
     policy.save_pretrained(tmp_path / "half", dtype="bfloat16")
     full, half = (tmp_path / name / "model.safetensors" for name in ("full", "half"))
@@ -62,7 +64,10 @@ def test_the_card_says_what_is_known_and_what_is_not(tmp_path: Path) -> None:
     again = MMEPolicy.from_pretrained(tmp_path / "known")
     again.save_pretrained(tmp_path / "again")
     card = (tmp_path / "again" / "README.md").read_text()
-    assert all(words in card for words in ("RoboMME, 16 tasks", "| steps | 80000 |", "| mean success | 44.5 % |"))
+    assert all(
+        words in card
+        for words in ("RoboMME, 16 tasks", "| steps | 80000 |", "| mean success | 44.5 % |")
+    )
 
 
 class StandInHub:
@@ -82,16 +87,22 @@ class StandInHub:
     def create_branch(self, repo_id: str, *, branch: str, exist_ok: bool) -> None:
         self.calls.append(("branch", branch))
 
-    def upload_folder(self, *, repo_id: str, folder_path: Path, commit_message: str, revision: str | None) -> None:
+    def upload_folder(
+        self, *, repo_id: str, folder_path: Path, commit_message: str, revision: str | None
+    ) -> None:
         self.calls.append(("upload", repo_id, commit_message, revision))
         Path(folder_path).rename(self.folder / "repository")
         Path(folder_path).mkdir()
 
 
-def test_push_and_load_by_name(policy: MMEPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_push_and_load_by_name(
+    policy: MMEPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     hub = StandInHub(tmp_path)
     monkeypatch.setattr(huggingface_hub, "HfApi", hub)
-    address = policy.push_to_hub("group/modul", private=True, token="secret", revision="v1", message="first")
+    address = policy.push_to_hub(
+        "group/modul", private=True, token="secret", revision="v1", message="first"
+    )
     assert address == "https://hub/group/modul"
     assert hub.calls == [
         ("login", "secret"), ("create", "group/modul", True, True), ("branch", "v1"),
@@ -106,18 +117,25 @@ def test_push_and_load_by_name(policy: MMEPolicy, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot)
     loaded = MMEPolicy.from_pretrained("group/modul", revision="v1", token="secret")
     assert calls == {"repo_id": "group/modul", "revision": "v1", "token": "secret"}
-    assert all(torch.equal(tensor, loaded.state_dict()[name]) for name, tensor in policy.state_dict().items())
+    assert all(
+        torch.equal(tensor, loaded.state_dict()[name])
+        for name, tensor in policy.state_dict().items()
+    )
     load_weights(small_policy("framesamp_modul"), "group/modul")
     with pytest.raises(UserError, match="owner/name"):
         policy.push_to_hub("no-owner")
 
 
-def test_without_network_the_sentence_names_the_repository(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_network_the_sentence_names_the_repository(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     def offline(repo_id: str, **options: Any) -> str:
         raise LocalEntryNotFoundError("no connection")
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", offline)
-    with pytest.raises(UserError, match=r"group/modul is not a path.*revision 'v2'.*no connection.*hf auth login"):
+    with pytest.raises(
+        UserError, match=r"group/modul is not a path.*revision 'v2'.*no connection.*hf auth login"
+    ):
         MMEPolicy.from_pretrained("group/modul", revision="v2")
     with pytest.raises(UserError, match="names a state of a hub repository"):
         MMEPolicy.from_pretrained(tmp_path, revision="v2")

@@ -40,7 +40,9 @@ def test_point_noise_has_the_released_range_and_deviation(parity):
 
 
 def test_point_noise_applies_where_the_released_one_does(parity):
-    cases = json.loads((parity / "pipeline_text.json").read_text())["grounding_augmentation_applies"]
+    cases = json.loads((parity / "pipeline_text.json").read_text())[
+        "grounding_augmentation_applies"
+    ]
     rng = np.random.default_rng(1)
     for case in cases:
         changed = any(perturb_point(case["in"], 8, rng) != case["in"] for _ in range(50))
@@ -58,7 +60,9 @@ def test_half_of_the_texts_are_the_online_ones():
 def test_training_prompts_hold_goal_and_subgoal(model, source):
     policy = build_policy(model)
     policy.processor.stats = small_policy("pi05").processor.stats
-    data = TrainingDataset([source], policy.processor, subgoal=SubgoalText.from_config(policy.config["subgoal_text"]))
+    data = TrainingDataset(
+        [source], policy.processor, subgoal=SubgoalText.from_config(policy.config["subgoal_text"])
+    )
     item = data[5]
     pattern = rf"Task: {re.escape(item['goal'])}; Current Subgoal: .+; Action:"
     assert re.search(pattern, re.sub(r"\s+", " ", words(policy, item)))
@@ -82,7 +86,9 @@ def test_the_subgoal_of_an_episode_changes_its_actions():
     chunks = []
     for subgoal in ("pick up the red cube", "press the button"):
         episode.subgoal = subgoal
-        assert subgoal in policy.processor.tokenizer.decode(episode.prompt[0][episode.prompt[1]].tolist())
+        assert subgoal in policy.processor.tokenizer.decode(
+            episode.prompt[0][episode.prompt[1]].tolist()
+        )
         again = policy.start_episode("sort the cubes", seed=1)
         again.observe({"front": frames, "wrist": frames}, np.zeros((1, 8)))
         again.subgoal = subgoal
@@ -95,12 +101,20 @@ def test_past_actions_of_training_are_the_ones_right_before_the_chunk(source):
     policy.processor.stats = small_policy("pi05").processor.stats
     data = TrainingDataset([source], policy.processor)
     start = int(source.exec_starts[0])
-    assert data.past_actions(data.step(0)).shape == (0, 8), "the video's actions are not the robot's own"
+    assert data.past_actions(data.step(0)).shape == (0, 8), (
+        "the video's actions are not the robot's own"
+    )
     assert np.array_equal(data.past_actions(data.step(3)), source.actions(0, start, start + 3))
-    assert np.array_equal(data.past_actions(data.step(40)), source.actions(0, start + 24, start + 40))
+    assert np.array_equal(
+        data.past_actions(data.step(40)), source.actions(0, start + 24, start + 40)
+    )
     later = TrainingDataset([source], policy.processor, action_offset=1)
-    assert later.past_actions(later.step(0)).shape == (0, 8), "no action comes before the first frame of the execution"
-    assert np.array_equal(later.past_actions(later.step(3)), source.actions(0, start + 1, start + 4))
+    assert later.past_actions(later.step(0)).shape == (0, 8), (
+        "no action comes before the first frame of the execution"
+    )
+    assert np.array_equal(
+        later.past_actions(later.step(3)), source.actions(0, start + 1, start + 4)
+    )
     assert int(data[40]["prompt_mask"].sum()) < 640, "all 128 numbers fit"
     assert len(re.findall(r"\d+", words(policy, data[40]).split("Past actions:")[1])) == 128
 
@@ -130,7 +144,9 @@ def test_an_episode_knows_its_executed_actions_by_the_frames_that_follow():
 
 def test_hybrid_reads_subgoal_and_memory_and_both_change_its_actions(source):
     policy, frames = small_policy("hybrid"), moving_frames(40)
-    data = TrainingDataset([source], policy.processor, subgoal=SubgoalText.from_config(policy.config["subgoal_text"]))
+    data = TrainingDataset(
+        [source], policy.processor, subgoal=SubgoalText.from_config(policy.config["subgoal_text"])
+    )
     assert re.search(r"Current Subgoal: .+ at <\d+", re.sub(r"\s+", " ", words(policy, data[5])))
 
     def act(past, subgoal):
@@ -142,7 +158,8 @@ def test_hybrid_reads_subgoal_and_memory_and_both_change_its_actions(source):
     baseline = act(frames, "press the button at <1, 2>")
     assert not np.allclose(baseline, act(frames, "put it down"))
     assert not np.allclose(
-        baseline, act(np.concatenate([frames[:39][::-1], frames[39:]]), "press the button at <1, 2>")
+        baseline,
+        act(np.concatenate([frames[:39][::-1], frames[39:]]), "press the button at <1, 2>"),
     )
 
 
@@ -167,4 +184,8 @@ def test_hybrid_is_saved_and_loaded_with_its_limits(tmp_path):
 
     small_policy("hybrid").save_pretrained(tmp_path)
     loaded = MMEPolicy.from_pretrained(tmp_path)
-    assert (loaded.processor.subgoal_length, loaded.memory.budget, loaded.config["token_budget"]) == (64, 448, 512)
+    assert (
+        loaded.processor.subgoal_length,
+        loaded.memory.budget,
+        loaded.config["token_budget"],
+    ) == (64, 448, 512)

@@ -20,11 +20,23 @@ from mme_vla.probing.offline import compare_chunks
 from mme_vla.probing.probed import ProbedPolicy
 from mme_vla.probing.report import Findings
 
-NEURAL_ARMS = ["drop:all", "shuffle", "swap", "delay:16", "recent:8", "oracle", "pause:8", "distract:1", "nodemo"]
+NEURAL_ARMS = [
+    "drop:all",
+    "shuffle",
+    "swap",
+    "delay:16",
+    "recent:8",
+    "oracle",
+    "pause:8",
+    "distract:1",
+    "nodemo",
+]
 
 
 @pytest.mark.parametrize("slot", [0, 2, 4])
-def test_the_slot_that_a_policy_reads_is_detected_at_its_distance(slot: int, tmp_path: Path) -> None:
+def test_the_slot_that_a_policy_reads_is_detected_at_its_distance(
+    slot: int, tmp_path: Path
+) -> None:
     findings = Findings.of(probed(reader(slot), [], tmp_path))
     assert len(findings.entries) == 2 * 5
     for entry in findings.entries:
@@ -39,7 +51,13 @@ def test_the_slot_that_a_policy_reads_is_detected_at_its_distance(slot: int, tmp
 
 
 def test_only_interventions_that_touch_the_slot_have_an_effect(tmp_path: Path) -> None:
-    words = [{"name": "drop", "which": "newest"}, {"name": "drop", "which": "oldest"}, "swap", "shuffle", "delay:64"]
+    words = [
+        {"name": "drop", "which": "newest"},
+        {"name": "drop", "which": "oldest"},
+        "swap",
+        "shuffle",
+        "delay:64",
+    ]
     arms = Findings.of(probed(reader(4), words, tmp_path)).arms()
     assert arms["drop(which=oldest)"].change == 0 and arms["delay:64"].change == 0
     for name in ("drop(which=newest)", "swap", "shuffle"):
@@ -61,13 +79,17 @@ def test_a_memoryless_policy_shows_no_effect(tmp_path: Path) -> None:
     assert all(arm.spread > 0 and arm.distance == 0 for arm in deaf.arms().values())
     assert all(entry.change == 0 for entry in deaf.entries) and len(deaf.entries) == 10
     memoryless = quick_policy("pi05").eval()
-    arm = Findings.of(probed(memoryless, ["pause:8", "distract:1", "nodemo"], tmp_path / "memoryless"))
+    arm = Findings.of(
+        probed(memoryless, ["pause:8", "distract:1", "nodemo"], tmp_path / "memoryless")
+    )
     assert [effect.change for effect in arm.arms().values()] == [0, 0, 0] and not arm.entries
 
 
 def test_interventions_on_entries_are_refused_where_there_are_none() -> None:
     policy = quick_policy("pi05")
-    with pytest.raises(UserError, match="with=shuffle needs something remembered that the probe can reach"):
+    with pytest.raises(
+        UserError, match="with=shuffle needs something remembered that the probe can reach"
+    ):
         choose_arms(["shuffle"], policy, channel_of(policy), 3, boundaries=True)
     arms, notes = choose_arms(None, policy, channel_of(policy), 3, boundaries=True)
     assert [arm.name for arm in arms] == ["nodemo", "pause", "distract:1", "distract:3"]
@@ -106,7 +128,9 @@ def test_arms_compose_in_their_order(tmp_path: Path) -> None:
     assert any(max(line.touched) > line.step - 20 for line in moments if line.arm == "drop:all")
 
 
-@pytest.mark.parametrize("name", ["framesamp_context", "tokendrop_modul", "ttt_expert", "rmt_modul"])
+@pytest.mark.parametrize(
+    "name", ["framesamp_context", "tokendrop_modul", "ttt_expert", "rmt_modul"]
+)
 def test_through_the_probe_an_unprobed_policy_answers_as_it_does(name: str) -> None:
     policy = quick_policy(name, 8).eval()
     probe, recording = ProbedPolicy(policy).eval(), made_up()[0]
@@ -116,8 +140,12 @@ def test_through_the_probe_an_unprobed_policy_answers_as_it_does(name: str) -> N
     snapshot, stores = probe.snapshot(mine)
     draws = [policy.sampling_noise(torch.Generator().manual_seed(7))]
     actual = probe.ask(mine, snapshot, [stores], draws, 2)[0, 0]
-    expected = policy.sample_actions(policy.observation([its]), {k: v[None] for k, v in draws[0].items()}, 2,
-                                  memory=policy._memory_tokens([its], policy.observation([its])))  # fmt: skip
+    expected = policy.sample_actions(
+        policy.observation([its]),
+        {k: v[None] for k, v in draws[0].items()},
+        2,
+        memory=policy._memory_tokens([its], policy.observation([its])),
+    )
     action = policy.embodiment.action
     assert torch.allclose(actual, expected[0, : action.execute, : action.width], atol=1e-5)
     chunks = [probe.act(mine, 2), policy.act(its, 2)]
@@ -128,7 +156,9 @@ def test_what_is_done_is_not_done_again_and_a_torn_line_is_done_anew(tmp_path: P
     lines = probed(reader(2), ["shuffle"], tmp_path, count=2)
     path = tmp_path / "offline.jsonl"
     content = path.read_bytes()
-    assert probed(reader(2), ["shuffle"], tmp_path, count=2) == lines and path.read_bytes() == content
+    assert (
+        probed(reader(2), ["shuffle"], tmp_path, count=2) == lines and path.read_bytes() == content
+    )
     for cut in (100, 1):  # within the last line, and its end alone
         path.write_bytes(content[:-cut])
         with pytest.warns(UserWarning, match="half-written") if cut > 1 else nullcontext():
@@ -149,7 +179,13 @@ def test_a_damaged_line_of_a_probe_is_named(tmp_path: Path) -> None:
     del row["crc32"]
     path.write_text(json.dumps(row) + "\n" + "".join(others))  # as earlier versions wrote it
     assert len(read(path)[0]) == len(others)
-    for changed in ({"change": {"a": 1}}, {"step": "x"}, {"step": True}, {"kind": "other"}, {"more": 1}):
+    for changed in (
+        {"change": {"a": 1}},
+        {"step": "x"},
+        {"step": True},
+        {"kind": "other"},
+        {"more": 1},
+    ):
         path.write_text(json.dumps(row | changed) + "\n" + "".join(others))
         with pytest.raises(UserError, match="line 1"):
             read(path)
@@ -163,5 +199,11 @@ def test_a_change_is_measured_against_the_noise_of_the_same_policy() -> None:
     before = torch.randn(6, 4, 2, generator=torch.Generator().manual_seed(0))
     same, changed = compare_chunks(before, before.clone()), compare_chunks(before, before + 0.5)
     assert (same.change, same.distance) == (0, 0) and same.spread > 0
-    assert changed.change == pytest.approx(0.5) and changed.spread == same.spread and changed.distance > 0
-    assert compare_chunks(before, before[[1, 2, 3, 4, 5, 0]]).distance == pytest.approx(0, abs=1e-12)
+    assert (
+        changed.change == pytest.approx(0.5)
+        and changed.spread == same.spread
+        and changed.distance > 0
+    )
+    assert compare_chunks(before, before[[1, 2, 3, 4, 5, 0]]).distance == pytest.approx(
+        0, abs=1e-12
+    )

@@ -25,8 +25,17 @@ JOINED: list[dict[str, Any]] = [{"name": "framesamp", "budget": 64}, {"name": "t
 
 def diffusion_with_memory() -> Any:
     pytest.importorskip("diffusers")
-    tower = {"image_size": 32, "patch_size": 2, "width": 16, "depth": 1, "mlp_dim": 16, "num_heads": 2}
-    policy = build_policy("diffusion_policy", backbone={"memory_tower": tower}, memory="tokendrop", integration="film")
+    tower = {
+        "image_size": 32,
+        "patch_size": 2,
+        "width": 16,
+        "depth": 1,
+        "mlp_dim": 16,
+        "num_heads": 2,
+    }
+    policy = build_policy(
+        "diffusion_policy", backbone={"memory_tower": tower}, memory="tokendrop", integration="film"
+    )
     policy.require_processor().stats = unit_stats(policy.embodiment)
     return policy.eval()
 
@@ -35,7 +44,10 @@ def memoryvla() -> Any:
     policy = build_policy("memoryvla", backbone={"vision": {"image_size": 28}})
     policy.require_processor().stats = unit_stats(policy.embodiment)
     generator = torch.Generator().manual_seed(0)
-    for name, parameter in policy.core.named_parameters():  # what begins at zero would hide what does not arrive
+    for (
+        name,
+        parameter,
+    ) in policy.core.named_parameters():  # what begins at zero would hide what does not arrive
         if name.endswith(("head.output.weight", "in_proj_weight")):
             torch.nn.init.normal_(parameter, std=0.3, generator=generator)
     return policy.eval()
@@ -85,12 +97,20 @@ def chunks(policy: Any, word: str | None, step: int = 36) -> tuple[ProbedPolicy,
 def test_every_memory_answers_otherwise_when_its_entries_are_others(kind: str) -> None:
     policy = KINDS[kind]()
     baseline = chunks(policy, None)[1]
-    words = ["drop:all", "shuffle", "swap", "delay:40"] + (["recent:4"] if channel_of(policy).chooses else [])
+    words = ["drop:all", "shuffle", "swap", "delay:40"] + (
+        ["recent:4"] if channel_of(policy).chooses else []
+    )
     for word in words:
         changed = chunks(policy, word)[1]
-        if not (kind == "by change" and word == "shuffle"):  # where all that changed is of one frame, nothing moves
-            assert any(np.abs(a - b).max() > 1e-6 for a, b in zip(baseline, changed, strict=True)), word
-    assert all(np.array_equal(*pair) for pair in zip(baseline, chunks(policy, None)[1], strict=True))
+        if not (
+            kind == "by change" and word == "shuffle"
+        ):  # where all that changed is of one frame, nothing moves
+            assert any(
+                np.abs(a - b).max() > 1e-6 for a, b in zip(baseline, changed, strict=True)
+            ), word
+    assert all(
+        np.array_equal(*pair) for pair in zip(baseline, chunks(policy, None)[1], strict=True)
+    )
 
 
 @pytest.mark.parametrize("kind", ["perceptual", "recurrent", "film", "bank"])
@@ -109,7 +129,9 @@ def test_probe_frames_equal_manually_composed_ones(kind: str) -> None:
         assert np.array_equal(chunks(policy, name)[1][0], expected), name
 
 
-def test_a_policy_by_choices_reads_the_recorded_options_and_each_motion_once(tmp_path: Path) -> None:
+def test_a_policy_by_choices_reads_the_recorded_options_and_each_motion_once(
+    tmp_path: Path,
+) -> None:
     policy, goals = by_choices(), set()
     prompt = policy.processor.prompt
     policy.processor.prompt = lambda goal, **others: (goals.add(goal), prompt(goal, **others))[1]
@@ -162,10 +184,14 @@ def test_keyframes_are_probed_and_the_bank_goes_on_as_it_was() -> None:
     store = snapshot.stores[0]
     assert [store.age(slot) for slot in store.occupied] == [3, 2, 1]
     twin = channel.counterfactual(episode, snapshot, [store.without([1])])
-    assert [float(m[0, 0, 0]) for m in twin.remembered.maps] == [0, 2] and len(episode.remembered) == 3
+    assert [float(m[0, 0, 0]) for m in twin.remembered.maps] == [0, 2] and len(
+        episode.remembered
+    ) == 3
     twin.decided(BankState((*twin.remembered.maps, torch.full((3, 4, 2), 9.0))))
     channel.commit(episode, twin)
-    assert [float(m[0, 0, 0]) for m in episode.awaiting.maps][-4:] == [0, 1, 2, 9][-policy.backbone.sizes.remembered :]
+    assert [float(m[0, 0, 0]) for m in episode.awaiting.maps][-4:] == [0, 1, 2, 9][
+        -policy.backbone.sizes.remembered :
+    ]
     with pytest.raises(UserError, match="entries that have a time"):
         choose_arms(["delay"], policy, channel, 3, boundaries=True)
 
@@ -173,7 +199,11 @@ def test_keyframes_are_probed_and_the_bank_goes_on_as_it_was() -> None:
 @pytest.mark.parametrize(
     ("word", "message", "expected"),
     [
-        ("subgoal_count", "pick it up for the first time at <1, 2>", "pick it up for the second time at <1, 2>"),
+        (
+            "subgoal_count",
+            "pick it up for the first time at <1, 2>",
+            "pick it up for the second time at <1, 2>",
+        ),
         ("subgoal_count:-1", "press 3 times, then one", "press 2 times, then ten"),
         ("subgoal_delay:1", "the third thing", "the second thing"),
     ],
@@ -189,11 +219,17 @@ def test_subgoals_can_be_wrong_by_one_or_late(word: str, message: str, expected:
 def test_a_subgoal_of_another_episode_reaches_the_prompt() -> None:
     policy = quick_policy("simplesg").eval()
     recordings = made_up()
-    probe = ProbedPolicy(policy, read_arm("subgoal_swap"), donors=DonorEpisodes(policy, channel_of(policy), recordings))
+    probe = ProbedPolicy(
+        policy,
+        read_arm("subgoal_swap"),
+        donors=DonorEpisodes(policy, channel_of(policy), recordings),
+    )
     episode = probe.start_episode(recordings[0].goal, 1)
     episode.recording = recordings[0]
     recordings[0].show(episode, 0, 21)
     episode.subgoal = recordings[0].subgoal(20)
     probe.eval().act(episode, 2)
     assert episode.subgoal.endswith("number 0")
-    assert episode.inner.subgoal[-1] in "12" and episode.inner.subgoal.startswith("pick it up for the first time")
+    assert episode.inner.subgoal[-1] in "12" and episode.inner.subgoal.startswith(
+        "pick it up for the first time"
+    )

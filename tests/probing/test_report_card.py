@@ -57,13 +57,17 @@ def image(choice: int) -> np.ndarray:
 
 
 class ChoiceEnv(ScriptedEnv):
-    """Two choices, the sign of the first joint. Length and image of the video both tell the right one."""
+    """Two choices, the sign of the first joint. Length and image of the video both tell the right
+    one.
+    """
 
     def reset(self) -> tuple[dict[str, Any], dict[str, Any]]:
         count = VIDEO[self.episode % 2] + 1
         return self._lists([self._frame() for _ in range(count)]), self._info("ongoing")
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, Any] | None, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, Any] | None, float, bool, bool, dict[str, Any]]:
         observation, reward, _, late, _ = super().step(action)
         right = len(self.actions) == self.max_steps and (self.joints[0] > 0) == (self.episode % 2)
         status = "success" if right else "timeout" if late else "ongoing"
@@ -97,22 +101,33 @@ class Reader(MMEPolicy):
 
     def predict_chunk(self, batch: Any, episodes: Any, draws: Any, steps: Any = None) -> Tensor:
         histories = [episode.required_history() for episode in episodes]
-        tokens = [self.require_memory().gather_selection(history, len(history) - 1) for history in histories]
-        return self.sample_actions(replace(batch, history=stack_history(tokens, self.device)), draws, steps)
+        tokens = [
+            self.require_memory().gather_selection(history, len(history) - 1)
+            for history in histories
+        ]
+        return self.sample_actions(
+            replace(batch, history=stack_history(tokens, self.device)), draws, steps
+        )
 
-    def sample_actions(self, batch: Any, draws: Any = None, steps: Any = None, **others: Any) -> Tensor:
+    def sample_actions(
+        self, batch: Any, draws: Any = None, steps: Any = None, **others: Any
+    ) -> Tensor:
         times = batch.history.positions[..., 0]
         if self.reads == TIME:
             choice = (times.amax(1) > sum(VIDEO) / 2).long()
         else:
             oldest = batch.history.features[:, :1].float()
-            choice = torch.cdist(oldest, self.prototypes[None].expand(len(oldest), -1, -1))[:, 0].argmin(1)
+            choice = torch.cdist(oldest, self.prototypes[None].expand(len(oldest), -1, -1))[
+                :, 0
+            ].argmin(1)
         return 0.01 * draws["noise"] + (choice - 0.5)[:, None, None]
 
 
 def reader(reads: str) -> Reader:
     base = quick_policy("framesamp_modul", memory={"budget": 4, "grid": 1})
-    policy = Reader(base.backbone, base.memory, base.integration, base.processor, base.config).eval()
+    policy = Reader(
+        base.backbone, base.memory, base.integration, base.processor, base.config
+    ).eval()
     policy.reads = reads
     contents = []
     for choice in range(2):
@@ -128,8 +143,12 @@ def reader(reads: str) -> Reader:
 def outcomes(policy: MMEPolicy, word: str | None, seed: int = 42) -> dict[EpisodeKey, float]:
     donors = recordings()
     if word is not None:
-        policy = ProbedPolicy(policy, read_arm(word), donors, DonorEpisodes(policy, channel_of(policy), donors)).eval()
-    return outcomes_of(roll(policy, JOBS, InlineEnvs(base=make_choice_env, max_steps=16), seed=seed))
+        policy = ProbedPolicy(
+            policy, read_arm(word), donors, DonorEpisodes(policy, channel_of(policy), donors)
+        ).eval()
+    return outcomes_of(
+        roll(policy, JOBS, InlineEnvs(base=make_choice_env, max_steps=16), seed=seed)
+    )
 
 
 @pytest.mark.parametrize(("reads", "score"), [(TIME, 1.0), (CONTENT, 0.0)])
@@ -141,13 +160,20 @@ def test_a_policy_that_reads_time_scores_one_and_one_that_reads_content_zero(
     card = grade(outcomes(policy, None), arms, outcomes(policy, None, seed=43))
     assert (card.matched, card.noise, card.scenes) == (1.0, 0.0, 8)
     other = CONTENT if reads == TIME else TIME
-    assert card.arms[reads].loss == 0.5 and card.arms[reads].lost == 4 and card.arms[reads].beyond_noise
+    assert (
+        card.arms[reads].loss == 0.5
+        and card.arms[reads].lost == 4
+        and card.arms[reads].beyond_noise
+    )
     assert card.arms[other].loss == 0 and not card.arms[other].beyond_noise
     clock = card.memory_or_clock
     assert (clock.score, clock.low, clock.high) == (score, score, score)
     write_card(card, tmp_path)
     assert json.loads((tmp_path / "card.json").read_text())["memory_or_clock"]["score"] == score
-    assert f"{score:.2f}" in card_text(card) and "memory-or-clock" in (tmp_path / "card.html").read_text()
+    assert (
+        f"{score:.2f}" in card_text(card)
+        and "memory-or-clock" in (tmp_path / "card.html").read_text()
+    )
 
 
 def scenes(values: list[int]) -> dict[EpisodeKey, float]:
@@ -158,8 +184,13 @@ def test_the_score_is_undefined_where_both_losses_lie_within_noise() -> None:
     matched, again = scenes([1] * 6 + [0] * 6), scenes([1] * 3 + [0] * 6 + [1] * 3)
     card = grade(matched, {TIME: scenes([1] * 2 + [0] * 10), CONTENT: matched}, again)
     assert card.noise == 0.5 and not card.arms[TIME].beyond_noise
-    assert card.memory_or_clock.score is None and card.memory_or_clock.undefined == "neither loss is beyond noise"
-    quiet = grade(matched, {TIME: scenes([1] * 2 + [0] * 10), CONTENT: scenes([1] * 4 + [0] * 8)}, matched)
+    assert (
+        card.memory_or_clock.score is None
+        and card.memory_or_clock.undefined == "neither loss is beyond noise"
+    )
+    quiet = grade(
+        matched, {TIME: scenes([1] * 2 + [0] * 10), CONTENT: scenes([1] * 4 + [0] * 8)}, matched
+    )
     score = quiet.memory_or_clock
     assert score.score == pytest.approx(4 / 6) and score.low is not None and score.high is not None
     assert score.low < 4 / 6 < score.high <= 1
@@ -174,9 +205,15 @@ def test_each_suite_has_a_score_of_its_own() -> None:
     matched = outcomes(8, 8)
     arms = {TIME: outcomes(0, 8), CONTENT: outcomes(8, 0)}
     scores = clock_scores(matched, arms, matched, {})
-    assert {suite: score.score for suite, score in scores.items()} == {"Counting": 1.0, "Permanence": 0.0}
+    assert {suite: score.score for suite, score in scores.items()} == {
+        "Counting": 1.0,
+        "Permanence": 0.0,
+    }
     card = replace(grade(matched, arms, matched), suites=scores)
-    assert card.memory_or_clock.score == 0.5 and "memory-or-clock score, Counting | 1.00" in card_text(card)
+    assert (
+        card.memory_or_clock.score == 0.5
+        and "memory-or-clock score, Counting | 1.00" in card_text(card)
+    )
     counting = {key: value for key, value in matched.items() if key.task == "PickXtimes"}
     assert clock_scores(counting, {TIME: counting}, counting, {}) == {}, "all are of one"
     user = {EpisodeKey(task, i): 1.0 for task in ("mine", "yours") for i in range(8)}
@@ -193,7 +230,9 @@ def test_a_committed_card_follows_from_its_records(folder: Path) -> None:
         return outcomes_of(read_folders(find_records([folder / part])))
 
     matched, again = outcomes("online/unprobed"), outcomes("again")
-    arms = {label: outcomes(f"online/{slug(read_arm(ARMS[label]).name)}") for label in figures["arms"]}
+    arms = {
+        label: outcomes(f"online/{slug(read_arm(ARMS[label]).name)}") for label in figures["arms"]
+    }
     card = grade(matched, arms, again)
     assert card.scenes == figures["scenes"]
     for label, loss in card.arms.items():
@@ -208,28 +247,46 @@ def test_a_committed_card_follows_from_its_records(folder: Path) -> None:
 def test_recovery_counts_decisions_until_nothing_changes_any_more() -> None:
     def moments(name: str, changes: list[float], spread: float = 0.1) -> list[MomentLine]:
         return [
-            MomentLine(name, "VideoUnmask", 16 * i, 0, "", "distract:1", 1.0, 4, [], change, spread, 0.0)
+            MomentLine(
+                name, "VideoUnmask", 16 * i, 0, "", "distract:1", 1.0, 4, [], change, spread, 0.0
+            )
             for i, change in enumerate(changes)
         ]
 
-    lines = moments("a", [0.0, 0.5, 0.1, 0.0]) + moments("b", [0.1, 0.0, 0.0, 0.0]) + moments("c", [0.5, 0, 0, 0.5])
+    lines = (
+        moments("a", [0.0, 0.5, 0.1, 0.0])
+        + moments("b", [0.1, 0.0, 0.0, 0.0])
+        + moments("c", [0.5, 0, 0, 0.5])
+    )
     assert recovery(lines) == Recovery(2.0, 2, 3, 4.0)
     assert recovery(moments("c", [0.0, 0.5])) == Recovery(None, 0, 1, 2.0)
-    assert recovery(moments("d", [0.5, 1e-4, 0.0], spread=0.0)) == Recovery(1.0, 1, 1, 3.0), "a policy without noise"
+    assert recovery(moments("d", [0.5, 1e-4, 0.0], spread=0.0)) == Recovery(1.0, 1, 1, 3.0), (
+        "a policy without noise"
+    )
     assert recovery([]) is None
 
 
-def test_a_card_without_another_scene_to_show_has_no_recovery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_card_without_another_scene_to_show_has_no_recovery(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plans: list[ProbePlan] = []
     donors = recordings()
-    monkeypatch.setattr(card_module, "lacking", lambda arm, *_, **__: "a camera" if arm.name == "distract:1" else None)
+    monkeypatch.setattr(
+        card_module,
+        "lacking",
+        lambda arm, *_, **__: "a camera" if arm.name == "distract:1" else None,
+    )
     monkeypatch.setattr(card_module, "run_probe", lambda policy, plan, *_, **__: plans.append(plan))
     monkeypatch.setattr(card_module, "evaluate", lambda *_, **__: None)
-    ended = {EpisodeKey(record.task, record.episode): [record] for record in records("test", [1, 1])}
+    ended = {
+        EpisodeKey(record.task, record.episode): [record] for record in records("test", [1, 1])
+    }
     monkeypatch.setattr(card_module, "_scenes", lambda *_: ended)
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
     card = run_card(reader(TIME), plan, tmp_path, FACTS, RolloutSettings(), base=make_choice_env)
-    assert card.recovery is None and card.notes == ["wrong scene first (distract:1) was left out: it needs a camera."]
+    assert card.recovery is None and card.notes == [
+        "wrong scene first (distract:1) was left out: it needs a camera."
+    ]
     assert all("distract:1" not in plan.arms for plan in plans)
 
 

@@ -8,7 +8,12 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.processing.images import augment_views, augmentation_draws, crop_and_rotate, jitter_colours
+from mme_vla.processing.images import (
+    augment_views,
+    augmentation_draws,
+    crop_and_rotate,
+    jitter_colours,
+)
 
 VIEWS = ("all", "colour")
 
@@ -18,7 +23,9 @@ def random_images(batch: int = 4, size: int = 40) -> Tensor:
 
 
 def augmented(images: Tensor, seed: int = 7) -> Tensor:
-    return augment_views(images, VIEWS, augmentation_draws(len(images), torch.Generator().manual_seed(seed)))
+    return augment_views(
+        images, VIEWS, augmentation_draws(len(images), torch.Generator().manual_seed(seed))
+    )
 
 
 def test_same_generator_gives_same_images_and_another_seed_others() -> None:
@@ -67,14 +74,20 @@ def test_rotation_is_about_the_centre() -> None:
     assert abs(math.degrees(math.atan2(row - 50, column - 50))) == pytest.approx(5, abs=1)
 
 
-def one_colour(rgb: tuple[float, float, float], brightness: float, contrast: float, hue: float) -> tuple[float, ...]:
+def one_colour(
+    rgb: tuple[float, float, float], brightness: float, contrast: float, hue: float
+) -> tuple[float, ...]:
     pixel = torch.tensor(rgb).reshape(1, 1, 3, 1, 1)
     result = jitter_colours(pixel, *(torch.tensor([x]) for x in (brightness, contrast, hue)))
     return tuple(result.flatten().tolist())
 
 
-@pytest.mark.parametrize("rgb", [(0.8, 0.2, 0.4), (0.1, 0.7, 0.3), (0.3, 0.3, 0.9), (0.5, 0.5, 0.5), (0.0, 0.0, 0.0)])
-@pytest.mark.parametrize(("brightness", "contrast", "hue"), [(0.0, 0.0, 0.0), (-0.2, 0.3, 0.08), (0.25, -0.35, -0.1)])
+@pytest.mark.parametrize(
+    "rgb", [(0.8, 0.2, 0.4), (0.1, 0.7, 0.3), (0.3, 0.3, 0.9), (0.5, 0.5, 0.5), (0.0, 0.0, 0.0)]
+)
+@pytest.mark.parametrize(
+    ("brightness", "contrast", "hue"), [(0.0, 0.0, 0.0), (-0.2, 0.3, 0.08), (0.25, -0.35, -0.1)]
+)
 def test_colour_jitter_works_on_the_hsv_value_and_hue(
     rgb: tuple[float, float, float], brightness: float, contrast: float, hue: float
 ) -> None:

@@ -1,4 +1,6 @@
-"""Goals are spelled alike in training and acting for a robot of one's own; the benchmark's stay as they are given."""
+"""Goals are spelled alike in training and acting for a robot of one's own; the benchmark's stay as
+they are given.
+"""
 
 import json
 from pathlib import Path
@@ -75,7 +77,9 @@ def test_an_episode_without_a_goal_is_refused_when_its_prompt_is_made() -> None:
     policy = small_policy("pi05")
     episode = policy.start_episode("")  # environments give it later
     image = np.zeros((1, 32, 32, 3), np.uint8)
-    episode.observe(dict.fromkeys(policy.embodiment.camera_names, image), np.zeros((1, 8), np.float32))
+    episode.observe(
+        dict.fromkeys(policy.embodiment.camera_names, image), np.zeros((1, 8), np.float32)
+    )
     with pytest.raises(UserError, match=r"The goal is ''"):
         _ = episode.prompt
     episode.goal = "press the button"
@@ -95,7 +99,8 @@ def test_simplememvla_spells_alike() -> None:
 
     robot = own_robot(horizon=20)
     goal_text, lower = (
-        SimpleMemVlaProcessor(PromptSettings(tokenizer="bytes", goal_case=case), robot, 32) for case in (None, "lower")
+        SimpleMemVlaProcessor(PromptSettings(tokenizer="bytes", goal_case=case), robot, 32)
+        for case in (None, "lower")
     )
     assert GOAL in goal_text.prompt(GOAL)
     assert GOAL.lower() in lower.prompt(GOAL) and GOAL not in lower.prompt(GOAL)

@@ -11,7 +11,12 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8, to_unit_range
+from mme_vla.processing.images import (
+    as_uint8_frames,
+    resize_with_pad,
+    resize_with_pad_uint8,
+    to_unit_range,
+)
 
 
 def cases(tensors: dict[str, Tensor], output: str) -> list[tuple[Tensor, Tensor]]:
@@ -23,12 +28,18 @@ def cases(tensors: dict[str, Tensor], output: str) -> list[tuple[Tensor, Tensor]
 
 
 def test_pillow_path_gives_the_golden_bytes(parity: Path) -> None:
-    for source, golden in cases(load_file(parity / "unit_resize_with_pad.safetensors"), "out_pil_uint8"):
-        assert (resize_with_pad_uint8(source.numpy(), tuple(golden.shape[:2])) == golden.numpy()).all()
+    for source, golden in cases(
+        load_file(parity / "unit_resize_with_pad.safetensors"), "out_pil_uint8"
+    ):
+        assert (
+            resize_with_pad_uint8(source.numpy(), tuple(golden.shape[:2])) == golden.numpy()
+        ).all()
 
 
 def test_float_path_gives_the_golden_values(parity: Path) -> None:
-    for source, golden in cases(load_file(parity / "unit_resize_with_pad.safetensors"), "out_float"):
+    for source, golden in cases(
+        load_file(parity / "unit_resize_with_pad.safetensors"), "out_float"
+    ):
         resized = resize_with_pad(source[None], tuple(golden.shape[:2]))[0].permute(1, 2, 0)
         assert (resized - golden).abs().max() <= 1e-5
 

@@ -1,4 +1,6 @@
-"""Statistics against the extremes of what they normalise, and quantiles that one value far away does not move."""
+"""Statistics against the extremes of what they normalise, and quantiles that one value far away
+does not move.
+"""
 
 import shutil
 from pathlib import Path
@@ -16,7 +18,13 @@ from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.data.statistics import check_ranges, compute_norm_stats
 from mme_vla.errors import UserError
 from mme_vla.policy.training_identity import identify
-from mme_vla.processing.normalise import ExactStats, NormStats, QuantileStats, RunningStats, normalize
+from mme_vla.processing.normalise import (
+    ExactStats,
+    NormStats,
+    QuantileStats,
+    RunningStats,
+    normalize,
+)
 
 FRAMES = 600
 
@@ -26,7 +34,15 @@ def source_of(root: Path, numbers: np.ndarray, states: np.ndarray | None = None)
     time = np.arange(FRAMES) / 10
     actions = np.stack([np.sin(time), numbers, np.cos(time)], axis=1)
     states = actions if states is None else states
-    write_dataset(root, (FRAMES,), ("move",), states=states, actions=actions, video=True, names=["x", "grip", "z"])
+    write_dataset(
+        root,
+        (FRAMES,),
+        ("move",),
+        states=states,
+        actions=actions,
+        video=True,
+        names=["x", "grip", "z"],
+    )
     return EpisodeSource(root, robot=own_robot())
 
 
@@ -37,11 +53,17 @@ def seldom(at: int, value: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("exact", [False, True])
-@pytest.mark.parametrize("at", [300, FRAMES - 1])  # also where the shuffled batches may leave it out
-def test_a_number_that_seldom_moves_is_named_refused_or_widened(tmp_path: Path, exact: bool, at: int, caplog) -> None:
+@pytest.mark.parametrize(
+    "at", [300, FRAMES - 1]
+)  # also where the shuffled batches may leave it out
+def test_a_number_that_seldom_moves_is_named_refused_or_widened(
+    tmp_path: Path, exact: bool, at: int, caplog
+) -> None:
     source = source_of(tmp_path, seldom(at), states=np.zeros((FRAMES, 3)))
     options: dict[str, Any] = {"horizon": 1, "robot": own_robot(), "exact": exact}
-    with pytest.raises(UserError, match=r"grip of the action has q01 .* and q99 .*, but values from 0 to 1.*widen"):
+    with pytest.raises(
+        UserError, match=r"grip of the action has q01 .* and q99 .*, but values from 0 to 1.*widen"
+    ):
         compute_norm_stats([source], narrow="refuse", **options)
     widened = compute_norm_stats([source], narrow="widen", **options).actions
     assert widened.q01[1] == 0 and widened.q99[1] == pytest.approx(1, abs=1e-3)
@@ -64,7 +86,9 @@ def test_a_number_that_seldom_moves_is_named_refused_or_widened(tmp_path: Path, 
     ],
 )
 def test_ordinary_numbers_are_accepted(tmp_path: Path, numbers: np.ndarray, caplog) -> None:
-    compute_norm_stats([source_of(tmp_path, numbers)], horizon=4, robot=own_robot(), narrow="refuse")
+    compute_norm_stats(
+        [source_of(tmp_path, numbers)], horizon=4, robot=own_robot(), narrow="refuse"
+    )
     assert not caplog.text
 
 
@@ -77,11 +101,15 @@ def test_a_state_is_compared_as_well(tmp_path: Path) -> None:
 
 
 def test_statistics_of_other_data_are_compared_with_these(tmp_path: Path) -> None:
-    """A hundred times too small: radians where the data are in degrees, or millimetres for metres."""
+    """A hundred times too small: radians where the data are in degrees, or millimetres
+    for metres.
+    """
     source = source_of(tmp_path, 300 * np.sin(np.arange(FRAMES)), states=np.zeros((FRAMES, 3)))
     side = QuantileStats(*(np.full(3, value) for value in (0.0, 1.0, -1.0, 1.0)))
     stats = NormStats(side, side)
-    with pytest.raises(UserError, match=r"grip of the action has q01 -1 and q99 1, but values from -29\d\.\d+ to"):
+    with pytest.raises(
+        UserError, match=r"grip of the action has q01 -1 and q99 1, but values from -29\d\.\d+ to"
+    ):
         check_ranges(stats, [source], horizon=1, robot=own_robot())
     widened = check_ranges(stats, [source], horizon=1, robot=own_robot(), narrow="widen")
     assert widened.actions.q01[1] < -299 and widened.actions.q01[0] == -1
@@ -126,7 +154,9 @@ def test_the_recipe_of_a_training_names_widening_and_stays_what_it_was_without()
 @pytest.mark.parametrize("outlier", [1e3, 1e4, 1e5, 1e6, -1e6, 1e30])
 @pytest.mark.parametrize("at", [7, 395])  # in the first batch, and in the last
 @pytest.mark.parametrize("middle", [0.0, 1000.0])
-def test_one_value_far_away_does_not_move_the_running_quantiles(outlier: float, at: int, middle: float) -> None:
+def test_one_value_far_away_does_not_move_the_running_quantiles(
+    outlier: float, at: int, middle: float
+) -> None:
     rows = np.random.default_rng(0).normal(size=(400, 2)) + middle
     rows[at, 0] = outlier
     running, exact = RunningStats(), ExactStats()
@@ -134,7 +164,10 @@ def test_one_value_far_away_does_not_move_the_running_quantiles(outlier: float, 
         running.update(rows[begin : begin + 100])
         exact.update(rows[begin : begin + 100])
     measured, expected = running.result(), exact.result()
-    assert np.abs(measured.q01 - expected.q01).max() < 0.12 and np.abs(measured.q99 - expected.q99).max() < 0.12
+    assert (
+        np.abs(measured.q01 - expected.q01).max() < 0.12
+        and np.abs(measured.q99 - expected.q99).max() < 0.12
+    )
 
 
 def test_quantiles_of_ordinary_values_are_the_released_ones() -> None:

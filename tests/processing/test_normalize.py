@@ -11,12 +11,20 @@ from torch import Tensor
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError
 from mme_vla.processing.base import pad_width
-from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats, normalize, unnormalize
+from mme_vla.processing.normalise import (
+    NormStats,
+    QuantileStats,
+    RunningStats,
+    normalize,
+    unnormalize,
+)
 
 
 def golden_stats(tensors: dict[str, Tensor]) -> NormStats:
     def read(name: str) -> dict[str, list[float]]:
-        return {key: tensors[f"stats/{name}/{key}"].tolist() for key in ("mean", "std", "q01", "q99")}
+        return {
+            key: tensors[f"stats/{name}/{key}"].tolist() for key in ("mean", "std", "q01", "q99")
+        }
 
     return NormStats.from_dict({"norm_stats": {name: read(name) for name in ("state", "actions")}})
 
@@ -24,7 +32,9 @@ def golden_stats(tensors: dict[str, Tensor]) -> NormStats:
 def made_up_stats(dims: int = 8) -> QuantileStats:
     rng = np.random.default_rng(3)
     low = rng.normal(size=dims)
-    return QuantileStats(mean=low + 0.5, std=np.ones(dims), q01=low, q99=low + rng.uniform(0.1, 2, dims))
+    return QuantileStats(
+        mean=low + 0.5, std=np.ones(dims), q01=low, q99=low + rng.uniform(0.1, 2, dims)
+    )
 
 
 def test_action_chain_gives_the_golden_values_both_ways(parity: Path) -> None:
@@ -38,7 +48,9 @@ def test_action_chain_gives_the_golden_values_both_ways(parity: Path) -> None:
     width = tensors["out/actions_padded"].shape[-1]
     padded = pad_width(normalised, width)
     assert (padded - tensors["out/actions_padded"]).abs().max() <= 1e-5
-    back = ROBOMME_JOINT.action.to_absolute(unnormalize(padded, stats.actions)[..., : len(stats.actions)], state)
+    back = ROBOMME_JOINT.action.to_absolute(
+        unnormalize(padded, stats.actions)[..., : len(stats.actions)], state
+    )
     assert (back - tensors["out/actions_absolute_first8"]).abs().max() <= 1e-5
 
 
@@ -78,7 +90,11 @@ def test_a_dimension_that_never_moves_has_itself_as_quantiles() -> None:
     running.update(np.array([[1.0, 0.0], [1.0, 2.0]]))
     running.update(np.array([[1.0, -3.0], [1.0, 5.0]]))
     result = running.result()
-    assert result.q01[0] == pytest.approx(1) and result.q99[0] == pytest.approx(1) and result.std[0] == 0
+    assert (
+        result.q01[0] == pytest.approx(1)
+        and result.q99[0] == pytest.approx(1)
+        and result.std[0] == 0
+    )
 
 
 def test_running_statistics_refuse_bad_rows() -> None:
@@ -120,9 +136,27 @@ def test_statistics_survive_their_file(tmp_path: Path) -> None:
         ("[]", "an object"),
         ('{"state": {}}', "must look like"),
         ('{"norm_stats": {"state": {}, "actions": {}}}', "lack 'mean'"),
-        ('{"norm_stats": {"state": {"mean": [0], "std": [1], "q01": [0, 1], "q99": [1]}, "actions": {}}}', "lengths"),
-        ('{"norm_stats": {"state": {"mean": [0], "std": [1], "q01": [2], "q99": [1]}, "actions": {}}}', "below q01"),
-        ('{"norm_stats": {"state": {"mean": ["x"], "std": [1], "q01": [2], "q99": [1]}, "actions": {}}}', "finite"),
+        (
+            (
+                '{"norm_stats": {"state": {"mean": [0], "std": [1], "q01": [0, 1], "q99": [1]},'
+                ' "actions": {}}}'
+            ),
+            "lengths",
+        ),
+        (
+            (
+                '{"norm_stats": {"state": {"mean": [0], "std": [1], "q01": [2], "q99": [1]},'
+                ' "actions": {}}}'
+            ),
+            "below q01",
+        ),
+        (
+            (
+                '{"norm_stats": {"state": {"mean": ["x"], "std": [1], "q01": [2], "q99": [1]},'
+                ' "actions": {}}}'
+            ),
+            "finite",
+        ),
     ],
 )
 def test_damaged_statistics_are_refused(tmp_path: Path, text: str, message: str) -> None:

@@ -22,7 +22,12 @@ def stats(dims: int = 8) -> NormStats:
 
 
 def processor(**changes) -> Processor:
-    settings = {"image_size": 28, "tokenizer": Tokenizer.load("sample"), "prompt_length": 32, "horizon": 5}
+    settings = {
+        "image_size": 28,
+        "tokenizer": Tokenizer.load("sample"),
+        "prompt_length": 32,
+        "horizon": 5,
+    }
     return Processor(**{**settings, "stats": stats(), **changes})
 
 
@@ -67,14 +72,19 @@ def test_prompt_state_is_normalised_before_it_is_saved() -> None:
 
 def test_prompt_takes_what_its_format_needs_and_ignores_the_remainder() -> None:
     unprompted, subgoal = processor(stats=None), processor(prompt="subgoal", stats=None)
-    assert torch.equal(unprompted.prompt("press it", "put it down", np.zeros(8))[0], unprompted.prompt("press it")[0])
+    assert torch.equal(
+        unprompted.prompt("press it", "put it down", np.zeros(8))[0],
+        unprompted.prompt("press it")[0],
+    )
     ids, mask = subgoal.prompt("press it", "put it down")
     assert "Current Subgoal: put it down" in subgoal.tokenizer.decode(ids[mask].tolist())
 
 
 @pytest.mark.parametrize("with_stats", [True, False])
 def test_processor_comes_out_of_its_folder_unchanged(tmp_path: Path, with_stats: bool) -> None:
-    saved = processor(prompt="subgoal", embodiment=ROBOMME_JOINT, stats=stats() if with_stats else None)
+    saved = processor(
+        prompt="subgoal", embodiment=ROBOMME_JOINT, stats=stats() if with_stats else None
+    )
     saved.save(tmp_path)
     loaded = Processor.load(tmp_path)
     assert loaded.to_config() == saved.to_config()
@@ -86,9 +96,18 @@ def test_processor_comes_out_of_its_folder_unchanged(tmp_path: Path, with_stats:
 def test_config_names_a_tokenizer_and_statistics_by_path(tmp_path: Path) -> None:
     stats().save(tmp_path / "mine.json")
     built = Processor.from_config(
-        {"image_size": 56, "tokenizer": "sample", "stats": str(tmp_path / "mine.json"), "horizon": 10}
+        {
+            "image_size": 56,
+            "tokenizer": "sample",
+            "stats": str(tmp_path / "mine.json"),
+            "horizon": 10,
+        }
     )
-    assert built.stats is not None and built.embodiment.action.horizon == 10 and built.prompt_length == 64
+    assert (
+        built.stats is not None
+        and built.embodiment.action.horizon == 10
+        and built.prompt_length == 64
+    )
 
 
 @pytest.mark.parametrize(

@@ -39,14 +39,18 @@ def test_pieces_are_the_golden_ones(parity: Path) -> None:
     assert cases
     for case in cases:
         state = None if case["state"] is None else np.array(case["state"])
-        pieces = PROMPTS[format_for(case)]().pieces(PromptInput(case["prompt"], case["subgoal"], state))
+        pieces = PROMPTS[format_for(case)]().pieces(
+            PromptInput(case["prompt"], case["subgoal"], state)
+        )
         assert [list(piece) for piece in pieces] == case["encoded_pieces"]
 
 
 def test_prompt_is_padded_on_the_right_with_zeros(tokenizer: Tokenizer) -> None:
     ids, mask = encode_prompt(PROMPTS["plain"](), tokenizer, PromptInput("press the button"), 16)
     length = int(mask.sum())
-    assert ids.shape == mask.shape == (16,) and ids.dtype == torch.int64 and mask.dtype == torch.bool
+    assert (
+        ids.shape == mask.shape == (16,) and ids.dtype == torch.int64 and mask.dtype == torch.bool
+    )
     assert mask[:length].all() and not mask[length:].any() and not ids[length:].any()
 
 

@@ -19,11 +19,15 @@ def data(tmp_path_factory) -> tuple[EpisodeSource, list[Recorded]]:
     return EpisodeSource(folder / "out"), recorded
 
 
-def expected(recorded: list[Recorded], starts: list[int], offset: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def expected(
+    recorded: list[Recorded], starts: list[int], offset: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     states, deltas = [], []
     for episode, start in zip(recorded, starts, strict=True):
         for t in range(start, len(episode.state)):
-            chunk = episode.actions[np.minimum(np.arange(t + offset, t + offset + 20), len(episode.state) - 1)].copy()
+            chunk = episode.actions[
+                np.minimum(np.arange(t + offset, t + offset + 20), len(episode.state) - 1)
+            ].copy()
             chunk[:, :7] -= episode.state[t, :7]
             states.append(episode.state[t])
             deltas.append(chunk)
@@ -34,11 +38,17 @@ def expected(recorded: list[Recorded], starts: list[int], offset: int = 0) -> tu
 def test_statistics_are_those_of_execution_states_and_delta_chunks(data, offset: int) -> None:
     source, recorded = data
     stats = compute_norm_stats([source], action_offset=offset)
-    for actual, rows in zip((stats.state, stats.actions), expected(recorded, [12, 0], offset), strict=True):
-        assert np.allclose(actual.mean, rows.mean(0), atol=1e-5) and np.allclose(actual.std, rows.std(0), atol=1e-5)
+    for actual, rows in zip(
+        (stats.state, stats.actions), expected(recorded, [12, 0], offset), strict=True
+    ):
+        assert np.allclose(actual.mean, rows.mean(0), atol=1e-5) and np.allclose(
+            actual.std, rows.std(0), atol=1e-5
+        )
         bin_width = np.ptp(rows, axis=0) / 5000
         quantiles = np.quantile(rows, [0.01, 0.99], axis=0, method="inverted_cdf")
-        assert (np.abs(np.stack([actual.q01, actual.q99]) - quantiles) <= 2 * bin_width + 1e-6).all()
+        assert (
+            np.abs(np.stack([actual.q01, actual.q99]) - quantiles) <= 2 * bin_width + 1e-6
+        ).all()
 
 
 def test_only_the_selected_episodes_count(data) -> None:
@@ -53,7 +63,9 @@ def test_an_incomplete_last_batch_is_left_out_as_released(data, monkeypatch) -> 
     from mme_vla.data import statistics as module
 
     update = module.RunningStats.update
-    monkeypatch.setattr(module.RunningStats, "update", lambda self, x: (counts.append(len(x)), update(self, x)))
+    monkeypatch.setattr(
+        module.RunningStats, "update", lambda self, x: (counts.append(len(x)), update(self, x))
+    )
     monkeypatch.setattr(module, "BATCH", 16)
     compute_norm_stats([source])
     assert counts == [16] * 6  # 58 steps: three batches of states and of chunks

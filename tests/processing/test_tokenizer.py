@@ -1,4 +1,6 @@
-"""The shipped tokenizer knows RoboMME's language; others load by path or from the hub, or fail clearly."""
+"""The shipped tokenizer knows RoboMME's language; others load by path or from the hub, or fail
+clearly.
+"""
 
 from pathlib import Path
 
@@ -18,7 +20,12 @@ def tokenizer() -> Tokenizer:
 
 def test_special_ids_are_those_of_paligemma(tokenizer: Tokenizer) -> None:
     processor = tokenizer._processor
-    assert [processor.pad_id(), processor.eos_id(), processor.bos_id(), processor.unk_id()] == [0, 1, 2, 3]
+    assert [processor.pad_id(), processor.eos_id(), processor.bos_id(), processor.unk_id()] == [
+        0,
+        1,
+        2,
+        3,
+    ]
     assert tokenizer.encode("press") == [2, *tokenizer.encode("press", bos=False)]
 
 
@@ -44,10 +51,14 @@ def test_training_on_the_shipped_corpus_gives_the_shipped_model(tokenizer: Token
     assert pieces[0] == pieces[1]
 
 
-def test_a_model_loads_by_path_with_the_same_fingerprint(tokenizer: Tokenizer, tmp_path: Path) -> None:
+def test_a_model_loads_by_path_with_the_same_fingerprint(
+    tokenizer: Tokenizer, tmp_path: Path
+) -> None:
     tokenizer.save(tmp_path / "own.model")
     loaded = Tokenizer.load(tmp_path / "own.model")
-    assert loaded.fingerprint == tokenizer.fingerprint and loaded.spec == str(tmp_path / "own.model")
+    assert loaded.fingerprint == tokenizer.fingerprint and loaded.spec == str(
+        tmp_path / "own.model"
+    )
 
 
 def test_a_missing_file_is_named_with_the_alternatives() -> None:

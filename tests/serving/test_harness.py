@@ -1,4 +1,6 @@
-"""The model server of vla-evaluation-harness, driven by the harness's own runner: the numbers are the policy's."""
+"""The model server of vla-evaluation-harness, driven by the harness's own runner: the numbers are
+the policy's.
+"""
 
 import asyncio
 import sys
@@ -8,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-vla_eval = pytest.importorskip("vla_eval", reason="the harness is not installed: uv sync --inexact --extra harness")
+vla_eval = pytest.importorskip(
+    "vla_eval", reason="the harness is not installed: uv sync --inexact --extra harness"
+)
 from vla_eval.api import serve_background  # noqa: E402
 from vla_eval.benchmarks.base import StepBenchmark, StepResult  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
@@ -34,7 +38,9 @@ class Scripted(StepBenchmark):
         super().__init__()
         self.number, self.fails_at = number, fails_at
         self.rng = np.random.default_rng(number)
-        self.video = [self.rng.integers(0, 255, (64, 64, 3), np.uint8) for _ in range(VIDEO * number)]
+        self.video = [
+            self.rng.integers(0, 255, (64, 64, 3), np.uint8) for _ in range(VIDEO * number)
+        ]
         self.first = True
         self.state = np.zeros(8, np.float32)
         self.taken: list[np.ndarray] = []
@@ -56,7 +62,10 @@ class Scripted(StepBenchmark):
 
     def make_obs(self, raw_obs: Any, task: Any) -> dict[str, Any]:
         if self.fails_at == len(self.taken):
-            return {"images": {}, "task_description": ""}  # what it sends where inverse kinematics failed
+            return {
+                "images": {},
+                "task_description": "",
+            }  # what it sends where inverse kinematics failed
         video, self.first = (self.video if self.first else []), False
         return raw_obs | ({"video_history": video} if video else {})
 
@@ -76,7 +85,9 @@ class Scripted(StepBenchmark):
         return {"agentview": IMAGE_RGB, "wrist": IMAGE_RGB, "state": RAW, "language": LANGUAGE}
 
 
-def through_the_harness(policy: MMEPolicy, benchmarks: list[Scripted], **options: Any) -> MMEVLAModelServer:
+def through_the_harness(
+    policy: MMEPolicy, benchmarks: list[Scripted], **options: Any
+) -> MMEVLAModelServer:
     """Run all of them at once, each on a connection of its own, and return the server."""
     server = MMEVLAModelServer(policy, **options)
 
@@ -103,11 +114,17 @@ def in_process(policy: MMEPolicy, numbers: list[int]) -> np.ndarray:
     while len(worlds[0].taken) < STEPS:
         for episode, frames in zip(episodes, observed, strict=True):
             views = {"front": "agentview", "wrist": "wrist"}
-            images = {camera: np.stack([f["images"][name] for f in frames]) for camera, name in views.items()}
+            images = {
+                camera: np.stack([f["images"][name] for f in frames])
+                for camera, name in views.items()
+            }
             episode.observe(images, np.stack([frame["states"] for frame in frames]))
         chunks = policy.act(episodes)[:, :16]
         left = STEPS - len(worlds[0].taken)
-        observed = [[w.step({"actions": a}).obs for a in c[:left]] for w, c in zip(worlds, chunks, strict=True)]
+        observed = [
+            [w.step({"actions": a}).obs for a in c[:left]]
+            for w, c in zip(worlds, chunks, strict=True)
+        ]
     return np.stack([world.taken for world in worlds])
 
 
@@ -123,7 +140,9 @@ def test_an_episode_has_the_type_of_its_policy(policy: MMEPolicy) -> None:
     assert server.sessions == {}
 
 
-def test_sessions_act_in_one_batch_and_stay_apart(policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sessions_act_in_one_batch_and_stay_apart(
+    policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sizes: list[int] = []
     act = policy.act
 
@@ -149,10 +168,22 @@ def test_an_observation_without_images_ends_its_episode_alone(policy: MMEPolicy)
 
 def test_it_asks_for_what_the_policy_reads() -> None:
     server = MMEVLAModelServer(small_policy("groundsg"), execute=8)
-    expected = {"send_state": True, "send_video_history": True, "send_wrist_image": True, "action_space": "joint_angle",
-              "send_subgoal": True, "subgoal_mode": "grounded"}  # fmt: skip
+    expected = {
+        "send_state": True,
+        "send_video_history": True,
+        "send_wrist_image": True,
+        "action_space": "joint_angle",
+        "send_subgoal": True,
+        "subgoal_mode": "grounded",
+    }
     assert server.get_observation_params() == expected
-    assert set(server.get_observation_spec()) == {"agentview", "wrist", "state", "language", "subgoal"}
+    assert set(server.get_observation_spec()) == {
+        "agentview",
+        "wrist",
+        "state",
+        "language",
+        "subgoal",
+    }
     assert server.chunk_size == 8
 
 
@@ -182,12 +213,16 @@ def test_the_server_listens_on_this_machine_alone_by_default(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     addresses = []
-    monkeypatch.setattr(harness_serve, "serve", lambda server, host, port: addresses.append((host, port)))
+    monkeypatch.setattr(
+        harness_serve, "serve", lambda server, host, port: addresses.append((host, port))
+    )
     monkeypatch.setattr(harness, "serve", harness_serve.serve, raising=False)
     policy.save_pretrained(tmp_path / "checkpoint")
     (tmp_path / "server.yaml").write_text("host: 0.0.0.0\nport: 4\n")
     words = tuple(word.replace("FILE", str(tmp_path / "server.yaml")) for word in words)
-    monkeypatch.setattr(sys, "argv", ["vla_eval", *words, f"--args.checkpoint={tmp_path / 'checkpoint'}"])
+    monkeypatch.setattr(
+        sys, "argv", ["vla_eval", *words, f"--args.checkpoint={tmp_path / 'checkpoint'}"]
+    )
     main()
     assert addresses == [address]
     assert ("every client that reaches this port" in caplog.text) == warned

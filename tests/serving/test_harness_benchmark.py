@@ -1,4 +1,6 @@
-"""The harness's own RoboMME benchmark, unmodified, over this library's environments: actions are the policy's own."""
+"""The harness's own RoboMME benchmark, unmodified, over this library's environments: actions are
+the policy's own.
+"""
 
 import asyncio
 from typing import Any
@@ -8,8 +10,12 @@ import pytest
 
 from helpers.plugins import plugin
 
-vla_eval = pytest.importorskip("vla_eval", reason="the harness is not installed: uv sync --inexact --extra harness")
-pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
+vla_eval = pytest.importorskip(
+    "vla_eval", reason="the harness is not installed: uv sync --inexact --extra harness"
+)
+pytest.importorskip(
+    "mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim"
+)
 from vla_eval.api import serve_background  # noqa: E402
 from vla_eval.benchmarks.robomme.benchmark import RoboMMEBenchmark  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
@@ -52,7 +58,10 @@ def in_process(policy: MMEPolicy) -> np.ndarray:
         episode = policy.start_episode(info["task_goal"][0], seed=42)
         frames = [observed]
         while len(taken) < STEPS:
-            images = {name: np.stack([f[f"{name}_rgb_list"][-1] for f in frames]) for name in ("front", "wrist")}
+            images = {
+                name: np.stack([f[f"{name}_rgb_list"][-1] for f in frames])
+                for name in ("front", "wrist")
+            }
             arms = [[*f["joint_state_list"][-1], f["gripper_state_list"][-1][0]] for f in frames]
             episode.observe(images, np.array(arms, np.float32))
             chunk = policy.act(episode)[:16][: STEPS - len(taken)]
@@ -63,8 +72,12 @@ def in_process(policy: MMEPolicy) -> np.ndarray:
     return np.stack(taken)
 
 
-def test_its_benchmark_runs_on_our_environments_and_takes_the_policys_actions(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(RoboMMEBenchmark, "_render_env", {})  # the renderer is this library's affair
+def test_its_benchmark_runs_on_our_environments_and_takes_the_policys_actions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        RoboMMEBenchmark, "_render_env", {}
+    )  # the renderer is this library's affair
     policy = small_policy("tokendrop_expert")
     benchmark = Noted(tasks=[TASK], max_steps=STEPS)
     benchmark.taken = []

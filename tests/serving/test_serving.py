@@ -1,4 +1,6 @@
-"""A served policy returns what the policy itself would, to many clients at once, whatever some of them do."""
+"""A served policy returns what the policy itself would, to many clients at once, whatever some of
+them do.
+"""
 
 import gc
 import socket
@@ -41,7 +43,10 @@ def served(policy):
 
 def by_challenge(client: Client, parts: list, **more) -> list[np.ndarray]:
     assert client.reset()["reset_finished"] is True
-    return [client.infer(challenge(*part, first=i == 0, **more))["actions"] for i, part in enumerate(parts)]
+    return [
+        client.infer(challenge(*part, first=i == 0, **more))["actions"]
+        for i, part in enumerate(parts)
+    ]
 
 
 def by_buffer(client: Client, parts: list, **more) -> list[np.ndarray]:
@@ -116,7 +121,9 @@ def test_reset_forgets_and_a_repeated_first_request_does_not_add_up(served):
     with served.client() as client:
         first = by_challenge(client, parts)
         again = by_challenge(client, parts)
-        repeated = [client.infer(challenge(*part, first=i == 0))["actions"] for i, part in enumerate(parts)]
+        repeated = [
+            client.infer(challenge(*part, first=i == 0))["actions"] for i, part in enumerate(parts)
+        ]
     for chunks in (again, repeated):
         np.testing.assert_allclose(chunks, first, rtol=0, atol=0)
 
@@ -143,7 +150,9 @@ def test_an_episodes_memory_is_freed_when_its_client_goes(policy):
                 wait_until(lambda: served.server.stats.connections == 0)
         finally:
             del policy.start_episode
-        assert len(born) == 6, "two connections of three episodes: at connect, reset and first request"
+        assert len(born) == 6, (
+            "two connections of three episodes: at connect, reset and first request"
+        )
         wait_until(lambda: gc.collect() >= 0 and all(episode() is None for episode in born))
 
 
@@ -151,7 +160,9 @@ def test_a_client_that_goes_while_its_video_is_encoded_stops_the_work(policy):
     with Served(policy, encode_chunk=1) as served, served.reading() as video:
         client = served.client()
         front = np.zeros((40, 64, 64, 3), np.uint8)
-        client._socket.send(pack({"add_buffer": True, "images": front[:, None], "state": np.zeros((40, 8), "f4")}))
+        client._socket.send(
+            pack({"add_buffer": True, "images": front[:, None], "state": np.zeros((40, 8), "f4")})
+        )
         assert video.begun.wait(30)
         client._socket.socket.shutdown(socket.SHUT_RDWR)
         wait_until(lambda: served.server.stats.connections == 0)
@@ -168,7 +179,16 @@ def test_a_client_that_goes_while_its_video_is_encoded_stops_the_work(policy):
         (pack({"front_rgb_lost": 1}), "front_rgb_list"),
         (pack({"action_space": "waypoint"}), "joint_angle"),
         (pack({**observation(*(np.zeros((64, 64, 3), "f4"),) * 2, states(1)[0])}), "uint8"),
-        (pack({"add_buffer": True, "images": np.zeros((51, 1, 64, 64, 3), "u1"), "state": states(51)}), "51 frames"),
+        (
+            pack(
+                {
+                    "add_buffer": True,
+                    "images": np.zeros((51, 1, 64, 64, 3), "u1"),
+                    "state": states(51),
+                }
+            ),
+            "51 frames",
+        ),
         (pack(observation(*(np.zeros((64, 64, 3), "u1"),) * 2, states(1)[0])), "add_buffer"),
         (pack(challenge(*course()[0], first=False)), "is_first_step"),
     ],
@@ -185,7 +205,9 @@ def test_a_bad_message_is_answered_with_the_reason_and_1011(policy, message, sai
             assert closed.value.rcvd.code == 1011
         with served.client() as client:
             by_challenge(client, course()[:1])  # and others are served as before
-        assert served.server.stats.counts["refused"] == 1 and served.server.stats.counts["failed"] == 0
+        assert (
+            served.server.stats.counts["refused"] == 1 and served.server.stats.counts["failed"] == 0
+        )
 
 
 def test_an_episode_cannot_outgrow_the_limit(policy):
@@ -236,7 +258,9 @@ def test_a_full_server_says_so_and_has_capacity_again_later(policy):
     with Served(policy, encode_chunk=1, limits=Limits(connections=1)) as served, served.reading():
         busy = served.client()
         front = np.zeros((40, 64, 64, 3), np.uint8)
-        busy._socket.send(pack({"add_buffer": True, "images": front[:, None], "state": np.zeros((40, 8), "f4")}))
+        busy._socket.send(
+            pack({"add_buffer": True, "images": front[:, None], "state": np.zeros((40, 8), "f4")})
+        )
         wait_until(lambda: served.busy == 1)
         with pytest.raises(UserError, match="full"):
             served.client()
@@ -248,12 +272,15 @@ def test_a_full_server_says_so_and_has_capacity_again_later(policy):
 def test_a_client_that_takes_no_answers_is_cut_off_and_delays_nobody(policy):
     with Served(policy, limits=Limits(send_s=2)) as served:
         for listening in served.server._uvicorn.servers[0].sockets:
-            listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)  # so that little has to go unread
+            listening.setsockopt(
+                socket.SOL_SOCKET, socket.SO_SNDBUF, 4096
+            )  # so that little has to go unread
         slow = socket.create_connection(served.address)
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         slow.sendall(
-            b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+            b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection:"
+            b" Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key:"
+            b" dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
         )
         assert slow.recv(12) == b"HTTP/1.1 101"
         reset = pack({"reset": True})
@@ -282,9 +309,11 @@ def test_a_client_that_takes_no_answers_is_cut_off_and_delays_nobody(policy):
 
 def test_a_long_video_does_not_keep_others_waiting(policy):
     with (
-        Served(policy, encode_chunk=1) as served, served.client() as watcher, served.client() as other,
+        Served(policy, encode_chunk=1) as served,
+        served.client() as watcher,
+        served.client() as other,
         ThreadPoolExecutor(1) as pool,
-    ):  # fmt: skip
+    ):
         front = np.zeros((40, 64, 64, 3), np.uint8)
         video = challenge(front, front, np.zeros((40, 8), np.float32), first=True)
         with served.reading() as reading:
@@ -300,10 +329,14 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
     with served, ThreadPoolExecutor(2) as pool:
         busy, idle = served.client(), served.client()
         busy.reset()
-        wait_until(lambda: served.busy == 0)  # the answer to the reset comes before the server rests
+        wait_until(
+            lambda: served.busy == 0
+        )  # the answer to the reset comes before the server rests
         front = np.zeros((40, 64, 64, 3), np.uint8)
         with served.reading():
-            pending = pool.submit(busy.infer, challenge(front, front, np.zeros((40, 8), np.float32), first=True))
+            pending = pool.submit(
+                busy.infer, challenge(front, front, np.zeros((40, 8), np.float32), first=True)
+            )
             wait_until(lambda: served.busy == 1)
             stopped = pool.submit(served.on_loop, served.server.stop())
             wait_until(lambda: served.server.connections.stopping)
@@ -317,11 +350,14 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
 
 
 def test_settings_and_policies_that_cannot_work_are_refused(policy):
-    for bad, message in (({"port": 70000}, "port=70000 must be a whole number from 0 to 65535"),
-                         ({"action_space": "joints"}, "action_space='joints'. Known: ee_delta"),
-                         ({"api_key": " x"}, "without blanks"),
-                         ({"execute": 0}, "a whole number, 1 or more or null"), ({"max_batch": 1.5}, "a whole number"),
-                         ({"limits": {"send_s": -1}}, "limits.send_s=-1 must be a number above 0")):  # fmt: skip
+    for bad, message in (
+        ({"port": 70000}, "port=70000 must be a whole number from 0 to 65535"),
+        ({"action_space": "joints"}, "action_space='joints'. Known: ee_delta"),
+        ({"api_key": " x"}, "without blanks"),
+        ({"execute": 0}, "a whole number, 1 or more or null"),
+        ({"max_batch": 1.5}, "a whole number"),
+        ({"limits": {"send_s": -1}}, "limits.send_s=-1 must be a number above 0"),
+    ):
         with pytest.raises(UserError, match=message):
             ServeSettings.from_dict(bad)
     unknowing = serving_policy()

@@ -45,7 +45,9 @@ def test_every_dtype_that_is_sent_comes_back(dtype):
         assert np.array_equal(back, sent) and np.shape(back) == np.shape(sent)
 
 
-@pytest.mark.parametrize("value", [np.array([1j]), np.array([object()]), np.zeros(2, "i4,f4"), object(), {"x": {1}}])
+@pytest.mark.parametrize(
+    "value", [np.array([1j]), np.array([object()]), np.zeros(2, "i4,f4"), object(), {"x": {1}}]
+)
 def test_records_objects_and_complex_numbers_are_not_sent(value):
     with pytest.raises(UserError, match="cannot be encoded"):
         pack(value)
@@ -53,10 +55,23 @@ def test_records_objects_and_complex_numbers_are_not_sent(value):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"shape": [3, 2]}, {"shape": [-2, -2]}, {"shape": "ab"}, {"shape": [2.0, 2]}, {"data": b""}, {"data": "text"},
-     {"shape": [0, 2**62], "data": b""}, {"shape": [2**40, 2**40]}, {"shape": [1] * 40}, {"shape": [True, 4]},
-     *({"dtype": dtype} for dtype in ("|O", "<c8", "|V4", "i4,f4", "nonsense", 7, None, "f" * 99))],
-)  # fmt: skip
+    [
+        {"shape": [3, 2]},
+        {"shape": [-2, -2]},
+        {"shape": "ab"},
+        {"shape": [2.0, 2]},
+        {"data": b""},
+        {"data": "text"},
+        {"shape": [0, 2**62], "data": b""},
+        {"shape": [2**40, 2**40]},
+        {"shape": [1] * 40},
+        {"shape": [True, 4]},
+        *(
+            {"dtype": dtype}
+            for dtype in ("|O", "<c8", "|V4", "i4,f4", "nonsense", 7, None, "f" * 99)
+        ),
+    ],
+)
 def test_an_array_that_is_not_what_it_says_is_refused(changes):
     with pytest.raises(UserError, match=r"array|shape|bytes|dtype"):
         unpack(raw_array(**changes))
@@ -64,9 +79,20 @@ def test_an_array_that_is_not_what_it_says_is_refused(changes):
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"\xc1", b"hello world", ARRAY_BYTES[:-3], ARRAY_BYTES + b"\0", b"\x91" * 5000, b"\xdd\xff\xff\xff\xff",
-     b"\xa2\xff\xff", msgpack.packb(msgpack.Timestamp(1)), b"\x81\xc0\xc0", b"\x81\x90\x01"],
-)  # fmt: skip
+    [
+        b"",
+        b"\xc1",
+        b"hello world",
+        ARRAY_BYTES[:-3],
+        ARRAY_BYTES + b"\0",
+        b"\x91" * 5000,
+        b"\xdd\xff\xff\xff\xff",
+        b"\xa2\xff\xff",
+        msgpack.packb(msgpack.Timestamp(1)),
+        b"\x81\xc0\xc0",
+        b"\x81\x90\x01",
+    ],
+)
 def test_bytes_that_are_no_message_are_refused(data):
     with pytest.raises(UserError):
         unpack(data)
@@ -76,7 +102,11 @@ def test_random_bytes_never_raise_anything_else():
     rng = np.random.default_rng(0)
     refused = 0
     for _ in range(3000):
-        data = bytearray(ARRAY_BYTES) if rng.random() < 0.5 else bytearray(rng.bytes(rng.integers(1, 60)))
+        data = (
+            bytearray(ARRAY_BYTES)
+            if rng.random() < 0.5
+            else bytearray(rng.bytes(rng.integers(1, 60)))
+        )
         for _ in range(3):
             data[rng.integers(len(data))] = rng.integers(256)
         try:
@@ -88,7 +118,10 @@ def test_random_bytes_never_raise_anything_else():
 
 def test_requests_are_recognised_by_their_keys():
     assert isinstance(parse({"reset": True}, 10), Reset)
-    added = parse({"add_buffer": True, "images": IMAGE[None, None], "state": states(1), "exec_start_idx": 3}, 10)
+    added = parse(
+        {"add_buffer": True, "images": IMAGE[None, None], "state": states(1), "exec_start_idx": 3},
+        10,
+    )
     assert isinstance(added, AddBuffer) and added.exec_start == 3 and len(added.frames) == 1
     native = parse(observation(IMAGE, IMAGE, states(1)[0], grounded_subgoal="pick at <3, 4>"), 10)
     assert (
@@ -97,7 +130,11 @@ def test_requests_are_recognised_by_their_keys():
         and native.subgoals == {"grounded_subgoal": "pick at <3, 4>"}
     )
     challenge_request = parse(challenge([IMAGE] * 2, [IMAGE] * 2, states(2), True), 10)
-    assert isinstance(challenge_request, Infer) and challenge_request.first and challenge_request.goal == GOAL
+    assert (
+        isinstance(challenge_request, Infer)
+        and challenge_request.first
+        and challenge_request.goal == GOAL
+    )
     assert np.array_equal(challenge_request.state, states(2)[-1])
 
 
@@ -131,7 +168,9 @@ def test_a_wrong_value_is_named(change, named):
         parse({**right, **change}, 10)
 
 
-@pytest.mark.parametrize("key", ["front_rgb_list", "wrist_rgb_list", "joint_state_list", "is_first_step"])
+@pytest.mark.parametrize(
+    "key", ["front_rgb_list", "wrist_rgb_list", "joint_state_list", "is_first_step"]
+)
 def test_a_missing_key_is_named(key):
     message = challenge([IMAGE], [IMAGE], states(1), True)
     del message[key]
@@ -150,7 +189,9 @@ def test_what_is_no_request_is_refused(message):
 
 
 def test_a_false_flag_alone_is_told_what_to_send():
-    with pytest.raises(UserError, match=r"reset=false: no request\. Send reset=true, or an observation"):
+    with pytest.raises(
+        UserError, match=r"reset=false: no request\. Send reset=true, or an observation"
+    ):
         parse({"reset": False}, 10)
     with pytest.raises(UserError, match="Did you mean 'observation/image'"):
         parse({"reset": False, "observation_image": IMAGE}, 10)
@@ -164,11 +205,15 @@ def test_false_flags_beside_an_observation_are_as_good_as_none():
         parse({**sent, "add_buffer": "no"}, 10)
 
 
-@pytest.mark.parametrize("goal", ["\ud800", "pick \udfff up", None, 7, b"pick", [None], {"a": 1}, np.zeros(2)])
+@pytest.mark.parametrize(
+    "goal", ["\ud800", "pick \udfff up", None, 7, b"pick", [None], {"a": 1}, np.zeros(2)]
+)
 def test_a_prompt_that_is_no_text_is_refused_in_words(goal):
     for sent in (observation(IMAGE, IMAGE, states(1)[0], prompt=goal),
                  challenge([IMAGE], [IMAGE], states(1), True, task_goal=goal)):  # fmt: skip
-        with pytest.raises(UserError, match=r"(prompt|task_goal) (must be a text|holds half of a surrogate pair)"):
+        with pytest.raises(
+            UserError, match=r"(prompt|task_goal) (must be a text|holds half of a surrogate pair)"
+        ):
             parse(sent, 10)
 
 
@@ -178,11 +223,24 @@ def values(message: object) -> int:
     return 1 + (sum(map(values, message)) if isinstance(message, list) else 0)
 
 
-@pytest.mark.parametrize("message", [
-    None, 3, [], {}, [[]] * 3, {"a": {"b": [1, 2.5, "x" * 40]}}, list(range(-200, 70000, 7)), [2**40, -(2**40), 1e9],
-    ["x" * n for n in (0, 31, 32, 255, 256, 65535, 65536)], [b"x" * n for n in (0, 255, 256, 65536)],
-    {str(n): [] for n in range(70000)}, [[[[[{}]]]]], [True, False, None],
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "message",
+    [
+        None,
+        3,
+        [],
+        {},
+        [[]] * 3,
+        {"a": {"b": [1, 2.5, "x" * 40]}},
+        list(range(-200, 70000, 7)),
+        [2**40, -(2**40), 1e9],
+        ["x" * n for n in (0, 31, 32, 255, 256, 65535, 65536)],
+        [b"x" * n for n in (0, 255, 256, 65536)],
+        {str(n): [] for n in range(70000)},
+        [[[[[{}]]]]],
+        [True, False, None],
+    ],
+)
 def test_values_are_counted_as_they_are(message):
     data, count = msgpack.packb(message), values(message)
     check_size(data, count)
@@ -200,12 +258,22 @@ def test_a_message_of_nothing_but_empty_maps_is_refused_before_they_are_made():
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 2**20
-    with pytest.raises(UserError, match="more than 1000 values"):  # many small lists count as one large
+    with pytest.raises(
+        UserError, match="more than 1000 values"
+    ):  # many small lists count as one large
         check_size(b"\xdc\x00\x40" + (b"\xdc\x00\x40" + b"\x80" * 64) * 64, 1000)
 
 
 def test_a_first_message_of_the_longest_episode_passes():
     frames = 4096
-    lists = ("front_rgb_list", "wrist_rgb_list", "front_depth_list", "wrist_depth_list", "joint_state_list",
-             "gripper_state_list", "eef_state_list", "front_camera_extrinsic_list")  # fmt: skip
+    lists = (
+        "front_rgb_list",
+        "wrist_rgb_list",
+        "front_depth_list",
+        "wrist_depth_list",
+        "joint_state_list",
+        "gripper_state_list",
+        "eef_state_list",
+        "front_camera_extrinsic_list",
+    )
     assert set(unpack(pack({key: [np.zeros(3, np.uint8)] * frames for key in lists}))) == set(lists)

@@ -12,7 +12,15 @@ import numpy as np
 import pytest
 
 from helpers import commands
-from helpers.serving_fakes import Served, acted_directly, ask, challenge, course, serving_policy, wait_until
+from helpers.serving_fakes import (
+    Served,
+    acted_directly,
+    ask,
+    challenge,
+    course,
+    serving_policy,
+    wait_until,
+)
 from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
@@ -40,7 +48,9 @@ def by_http(served: Served, parts: list, **headers: str) -> list[np.ndarray]:
     assert (status, kind) == (200, "application/msgpack") and unpack(body)["reset_finished"] is True
     chunks = []
     for index, part in enumerate(parts):
-        status, _, body = ask(served, "POST", "/infer", pack(challenge(*part, first=index == 0)), **headers)
+        status, _, body = ask(
+            served, "POST", "/infer", pack(challenge(*part, first=index == 0)), **headers
+        )
         assert status == 200, body
         chunks.append(unpack(body)["actions"])
     return chunks
@@ -49,7 +59,9 @@ def by_http(served: Served, parts: list, **headers: str) -> list[np.ndarray]:
 def test_health_metadata_and_statistics(served):
     assert ask(served, "GET", "/healthz") == (200, "text/plain; charset=utf-8", b"OK\n")
     status, kind, body = ask(served, "GET", "/metadata")
-    assert (status, kind) == (200, "application/msgpack") and unpack(body)["action_space"] == "joint_angle"
+    assert (status, kind) == (200, "application/msgpack") and unpack(body)[
+        "action_space"
+    ] == "joint_angle"
     before = json.loads(ask(served, "GET", "/stats")[2])["counts"]
     by_http(served, course())
     stats = json.loads(ask(served, "GET", "/stats")[2])
@@ -93,7 +105,9 @@ def test_what_the_policy_cannot_do_is_a_500(policy):
     with Served(policy) as served:
         policy.act = lambda *_: 1 / 0
         try:
-            status, _, reply = ask(served, "POST", "/infer", pack(challenge(*course()[0], first=True)))
+            status, _, reply = ask(
+                served, "POST", "/infer", pack(challenge(*course()[0], first=True))
+            )
         finally:
             del policy.act
         assert status == 500 and b"ZeroDivisionError" in reply and b"Traceback" not in reply
@@ -103,16 +117,24 @@ def test_what_the_policy_cannot_do_is_a_500(policy):
 
 def test_a_key_is_requested_but_not_for_health_and_metadata(policy):
     with Served(policy, api_key="right") as served:
-        for path in ("/healthz", "/metadata"):  # the challenge's client requests the metadata without its key
+        for path in (
+            "/healthz",
+            "/metadata",
+        ):  # the challenge's client requests the metadata without its key
             assert ask(served, "GET", path)[0] == 200
         for header in (None, "Api-Key wrong", "Bearer right", "Api-Key rïght"):
-            assert ask(served, "GET", "/stats", **({"Authorization": header} if header else {}))[0] == 401
+            assert (
+                ask(served, "GET", "/stats", **({"Authorization": header} if header else {}))[0]
+                == 401
+            )
         assert ask(served, "GET", "/stats", Authorization="Api-Key right")[0] == 200
         assert ask(served, "POST", "/infer", b"x")[0] == 401
 
 
 def test_a_page_in_a_browser_is_refused(served):
-    assert ask(served, "POST", "/reset", pack({"reset": True}), Origin="http://example.com")[0] == 403
+    assert (
+        ask(served, "POST", "/reset", pack({"reset": True}), Origin="http://example.com")[0] == 403
+    )
 
 
 def slow_post(served: Served) -> socket.socket:
@@ -158,11 +180,17 @@ def test_silent_sessions_are_freed(policy):
 
 @pytest.mark.parametrize(
     "sent",
-    [b"\x16\x03\x01\x02\x00\x01", b"GET\r\n\r\n", b"A" * 100_000, b"POST /infer HTTP/1.1\r\nContent-Length: -4\r\n\r\n",
-     b"POST /infer HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nhello\r\n0\r\n\r\n",
-     b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n", b"GET / HTTP/1.1\r\nbroken header\r\n\r\n",
-     b"POST /infer HTTP/1.1\r\nContent-Length: 100\r\n\r\ncut"],
-)  # fmt: skip
+    [
+        b"\x16\x03\x01\x02\x00\x01",
+        b"GET\r\n\r\n",
+        b"A" * 100_000,
+        b"POST /infer HTTP/1.1\r\nContent-Length: -4\r\n\r\n",
+        b"POST /infer HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nhello\r\n0\r\n\r\n",
+        b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n",
+        b"GET / HTTP/1.1\r\nbroken header\r\n\r\n",
+        b"POST /infer HTTP/1.1\r\nContent-Length: 100\r\n\r\ncut",
+    ],
+)
 def test_garbage_on_the_wire_is_answered_and_harms_nobody(served, sent):
     with socket.create_connection(served.address, timeout=20) as raw:
         raw.sendall(sent)
@@ -200,7 +228,9 @@ def test_the_command_serves_and_stops_on_request(tmp_path):
         server.kill()
 
 
-@pytest.mark.parametrize(("words", "expected"), [([], "checkpoint="), (["checkpoint=nowhere"], "nowhere")])
+@pytest.mark.parametrize(
+    ("words", "expected"), [([], "checkpoint="), (["checkpoint=nowhere"], "nowhere")]
+)
 def test_the_command_says_what_it_needs(words, expected):
     with pytest.raises(UserError, match=expected):
         load_policy(compose("serve", words), "serve", LOGGER)
@@ -211,7 +241,9 @@ def test_the_command_loads_a_checkpoint(policy, tmp_path):
     loaded, name, _ = load_policy(compose("serve", [f"checkpoint={tmp_path}"]), "serve", LOGGER)
     assert name == "tokendrop_expert"
     parts = course(rounds=0)
-    np.testing.assert_array_equal(acted_directly(loaded, parts)[0], acted_directly(policy, parts)[0])
+    np.testing.assert_array_equal(
+        acted_directly(loaded, parts)[0], acted_directly(policy, parts)[0]
+    )
 
 
 def test_a_new_session_takes_the_place_of_the_longest_silent(served):
@@ -238,7 +270,9 @@ def test_a_request_that_waited_does_not_continue_with_an_episode_that_failed_mea
     async def meet():
         first = sessions.find(name, Reset())
         await first.lock.acquire()
-        waiting = asyncio.ensure_future(sessions.respond(name, AddBuffer([], 0, np.zeros((0, 8), np.float32)), 0.0))
+        waiting = asyncio.ensure_future(
+            sessions.respond(name, AddBuffer([], 0, np.zeros((0, 8), np.float32)), 0.0)
+        )
         await asyncio.sleep(0)
         assert first.requests == 1
         sessions.drop(name)  # as an error of the request before it does
@@ -253,9 +287,14 @@ def test_a_request_that_waited_does_not_continue_with_an_episode_that_failed_mea
 
 @pytest.mark.parametrize(
     "word",
-    ["model=pi05", "policy.compute_dtype=bfloat16", "policy.history_dtype=float32", "token_budget=64",
-     "+subgoal_text.kind=x"],
-)  # fmt: skip
+    [
+        "model=pi05",
+        "policy.compute_dtype=bfloat16",
+        "policy.history_dtype=float32",
+        "token_budget=64",
+        "+subgoal_text.kind=x",
+    ],
+)
 def test_what_a_checkpoint_defines_cannot_be_set_beside_it(word, monkeypatch):
     overrides = SimpleNamespace(overrides=SimpleNamespace(task=["checkpoint=x", word]))
     monkeypatch.setattr("hydra.core.hydra_config.HydraConfig.initialized", lambda: True)

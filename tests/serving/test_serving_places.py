@@ -1,4 +1,6 @@
-"""Who holds a place: hundreds of clients that never say goodbye, untrusted sources without the key, and the silent."""
+"""Who holds a place: hundreds of clients that never say goodbye, untrusted sources without the key,
+and the silent.
+"""
 
 import re
 import socket
@@ -11,7 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.serving_fakes import Served, acted_directly, ask, challenge, course, serving_policy, states
+from helpers.serving_fakes import (
+    Served,
+    acted_directly,
+    ask,
+    challenge,
+    course,
+    serving_policy,
+    states,
+)
 from mme_vla.errors import UserError
 from mme_vla.serving import Limits, connections, pack
 
@@ -78,7 +88,9 @@ def test_headers_that_never_end_are_not_waited_for(policy, monkeypatch):
     monkeypatch.setattr(connections, "HEAD_S", 0.5)
     with Served(policy, limits=Limits(receive_s=1)) as served:
         sockets = idle(served, 1, b"")
-        sockets += idle(served, 1, b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")  # answered, and then it dawdles
+        sockets += idle(
+            served, 1, b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
+        )  # answered, and then it dawdles
         until = time.monotonic() + 30
         while time.monotonic() < until and served.server.connections.open:
             for raw in sockets:
@@ -102,7 +114,9 @@ def test_an_unrequested_body_is_discarded(policy, monkeypatch, path):
     with Served(policy, api_key="right") as served:
         before = resident_mib()
         with socket.create_connection(served.address, timeout=10) as raw:
-            raw.sendall(f"GET {path} HTTP/1.1\r\nHost: x\r\nContent-Length: {2**30}\r\n\r\n".encode())
+            raw.sendall(
+                f"GET {path} HTTP/1.1\r\nHost: x\r\nContent-Length: {2**30}\r\n\r\n".encode()
+            )
             with pytest.raises(OSError):
                 for _ in range(400):
                     raw.sendall(piece)
@@ -112,7 +126,9 @@ def test_an_unrequested_body_is_discarded(policy, monkeypatch, path):
 
 
 def test_a_lost_http_episode_is_not_gone_on_with(policy):
-    first, later = (pack(challenge(*part, first=index == 0)) for index, part in enumerate(course()[:2]))
+    first, later = (
+        pack(challenge(*part, first=index == 0)) for index, part in enumerate(course()[:2])
+    )
     buffer = pack({"add_buffer": True, "images": IMAGE[None, None], "state": states(1)})
     with Served(policy, limits=Limits(connections=2)) as served:
         assert ask(served, "POST", "/infer", buffer, X_Session="a")[0] == 409, "it was never begun"
@@ -149,7 +165,9 @@ def test_one_broken_episode_does_not_fail_those_that_act_with_it(policy, monkeyp
             with served.client() as client:
                 together.wait()
                 try:
-                    return client.infer({**message, **({"task_goal": "break"} if number == 0 else {})})["actions"]
+                    return client.infer(
+                        {**message, **({"task_goal": "break"} if number == 0 else {})}
+                    )["actions"]
                 except UserError as error:
                     return str(error)
 

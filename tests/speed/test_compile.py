@@ -1,4 +1,6 @@
-"""What is compiled: few graphs whatever the depth, no break, no eager fall-back, and the loss that it always was."""
+"""What is compiled: few graphs whatever the depth, no break, no eager fall-back, and the loss that
+it always was.
+"""
 
 import logging
 from collections.abc import Iterator
@@ -23,7 +25,9 @@ SHORT_TOWER = {"backbone.vision.depth": 1}
 
 @pytest.fixture(autouse=True)
 def fresh_and_quiet(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Nothing compiled before or after; and no notes of every step, which pytest would keep and which cost seconds."""
+    """Nothing compiled before or after; and no notes of every step, which pytest would keep and
+    which cost seconds.
+    """
     monkeypatch.setattr(logging.getLogger("torch.__trace"), "disabled", True)
     torch.compiler.reset()
     yield
@@ -55,7 +59,9 @@ def batch_of(policy: MMEPolicy, samples: int, prompt: int, frames: int) -> Batch
     [("framesamp_modul", 4), ("ttt_expert", 2), ("rmt_context", 2)],
 )
 def test_a_run_compiles_few_graphs_at_any_depth(model: str, depth: int) -> None:
-    policy = small_policy(model, **{"backbone.depth": depth}, **SHORT_TOWER, policy={"augment": False}).train()
+    policy = small_policy(
+        model, **{"backbone.depth": depth}, **SHORT_TOWER, policy={"augment": False}
+    ).train()
     policy.backbone.vision.requires_grad_(False)
     first, second = batch_of(policy, 2, 32, 16), batch_of(policy, 2, 16, 8)
     draws = policy.training_noise(2, torch.Generator().manual_seed(0))
@@ -66,9 +72,13 @@ def test_a_run_compiles_few_graphs_at_any_depth(model: str, depth: int) -> None:
     assert float(loss.detach()) == pytest.approx(float(eager.detach()), rel=1e-5)
     after_one = counted.graphs
     policy(second)[0].backward()
-    validation = Validation([0, 1, 2], lambda items: batch_of(policy, len(items), 16, 8), 3, 2, seed=0)
+    validation = Validation(
+        [0, 1, 2], lambda items: batch_of(policy, len(items), 16, 8), 3, 2, seed=0
+    )
     validation.loss(policy)
-    assert after_one == counted.graphs <= MOST_GRAPHS, "other lengths, batches and validation need no code of their own"
+    assert after_one == counted.graphs <= MOST_GRAPHS, (
+        "other lengths, batches and validation need no code of their own"
+    )
     assert counted.graphs >= 3, "the tower, a layer, and the last layer"
 
 
@@ -77,7 +87,11 @@ def test_a_hook_of_layers_answers_as_one_of_numbers() -> None:
     x = torch.ones(2)
     for layer, expected in enumerate((2.0, 2.0)):
         bound = bind_hook(hook, layer)
-        assert bound is not None and torch.equal(bound(x), hook(layer, x)) and float(bound(x)[0]) == expected
+        assert (
+            bound is not None
+            and torch.equal(bound(x), hook(layer, x))
+            and float(bound(x)[0]) == expected
+        )
     bound_layer = bind_hook(lambda layer, x: x + layer, 3)
     assert bound_layer is not None and float(bound_layer(x)[0]) == 4
     assert bind_hook(None, 0) is None

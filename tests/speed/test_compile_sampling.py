@@ -1,4 +1,6 @@
-"""Sampling in place: the same chunks as with keys joined anew in every step; what depends on weights alone is kept."""
+"""Sampling in place: the same chunks as with keys joined anew in every step; what depends on
+weights alone is kept.
+"""
 
 import logging
 
@@ -25,16 +27,23 @@ def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> T
     memory = policy.encode_memory(policy.conditioned_history(batch))
     injection = policy.inject(policy.prepare_images(batch), memory)
     prefix = backbone.prefill(injection)
-    layout = backbone.transformer.layout([backbone.action_block(noise)], injection.visibility, prefix)
+    layout = backbone.transformer.layout(
+        [backbone.action_block(noise)], injection.visibility, prefix
+    )
     times = backbone.time_condition(flow.euler_times(steps, noise.device))
     conditions = backbone.transformer.conditioning(times)
-    return flow.euler(noise, steps, lambda x, i: backbone.denoise(x, conditions.at(i), layout, prefix, injection))
+    return flow.euler(
+        noise, steps, lambda x, i: backbone.denoise(x, conditions.at(i), layout, prefix, injection)
+    )
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_sampling_in_place_equals_joining_keys_to_the_bit(model: str) -> None:
     policy = small_policy(model).eval()
-    batch, noise = random_batch(policy, 2), torch.randn(2, 20, 32, generator=torch.Generator().manual_seed(0))
+    batch, noise = (
+        random_batch(policy, 2),
+        torch.randn(2, 20, 32, generator=torch.Generator().manual_seed(0)),
+    )
     expected = joined_anew(policy, batch, noise, 3)
     assert torch.equal(policy.sample_actions(batch, noise, steps=3), expected)
     policy.compile_sampling()
@@ -95,10 +104,15 @@ def captures(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("model", ["pi05", "framesamp_expert"])
-def test_few_sizes_are_captured_and_each_batch_gets_its_reply(model: str, captures: list[int]) -> None:
+def test_few_sizes_are_captured_and_each_batch_gets_its_reply(
+    model: str, captures: list[int]
+) -> None:
     policy = small_policy(model).eval()
     generator = torch.Generator().manual_seed(0)
-    cases = [(random_batch(policy, n, seed=n), torch.randn(n, 20, 32, generator=generator)) for n in (3, 4, 1, 3, 2)]
+    cases = [
+        (random_batch(policy, n, seed=n), torch.randn(n, 20, 32, generator=generator))
+        for n in (3, 4, 1, 3, 2)
+    ]
     expected = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
     policy.compile_sampling()
     policy._sampler = CapturedSampling(policy._sample, policy.backbone.sampling_stamp)

@@ -1,4 +1,6 @@
-"""How float32 is multiplied is said in one place, holds for recurrent memories alone, and leaves PyTorch as it was."""
+"""How float32 is multiplied is said in one place, holds for recurrent memories alone, and leaves
+PyTorch as it was.
+"""
 
 import pytest
 import torch
@@ -13,9 +15,12 @@ SWITCH = torch.backends.cuda.matmul
 def switches() -> tuple[object, ...]:
     backends = torch.backends
     return (
-        SWITCH.fp32_precision, SWITCH.allow_tf32, torch.get_float32_matmul_precision(), backends.fp32_precision,
+        SWITCH.fp32_precision,
+        SWITCH.allow_tf32,
+        torch.get_float32_matmul_precision(),
+        backends.fp32_precision,
         backends.cudnn.allow_tf32,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("before", ["highest", "high"])
@@ -54,7 +59,9 @@ def test_recurrent_layers_alone_see_it_the_recomputed_ones_too(
     loss, _ = policy(random_batch(policy, 2))
     forward = len(inside)
     loss.backward()
-    assert set(inside) == {how} and len(inside) == 2 * forward, "every chunk once more for the backward pass"
+    assert set(inside) == {how} and len(inside) == 2 * forward, (
+        "every chunk once more for the backward pass"
+    )
     assert set(precisions) == {outside} and switches() == outside
 
 

@@ -16,20 +16,28 @@ def test_images_are_changed_alike_however_an_update_is_divided() -> None:
     changes = policy.augmentation_params(4, torch.Generator().manual_seed(3))["changes"]
     together = policy.prepare_images(batch, changes).images
     pieces = [
-        policy.prepare_images(batch.rows(torch.tensor(rows)), changes[rows]).images for rows in ([0], [1, 2], [3])
+        policy.prepare_images(batch.rows(torch.tensor(rows)), changes[rows]).images
+        for rows in ([0], [1, 2], [3])
     ]
     assert torch.equal(torch.cat(pieces), together)
     assert not torch.equal(together, policy.prepare_images(batch).images)
 
 
-def test_weights_for_acting_are_rounded_where_they_may_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_for_acting_are_rounded_where_they_may_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     small_policy("pi05").save_pretrained(tmp_path)
     here = MMEPolicy.from_pretrained(tmp_path, dtype="auto")
     assert {p.dtype for p in here.parameters()} == {torch.float32}
     assert all(p.requires_grad for p in here.parameters())
     rounded = MMEPolicy.from_pretrained(tmp_path, dtype="bfloat16")
-    assert not any(p.requires_grad for p in rounded.parameters()) and rounded.compute_dtype == torch.bfloat16
-    monkeypatch.setattr(MMEPolicy, "to", lambda self, device: self)  # there need be no GPU to see what would go there
+    assert (
+        not any(p.requires_grad for p in rounded.parameters())
+        and rounded.compute_dtype == torch.bfloat16
+    )
+    monkeypatch.setattr(
+        MMEPolicy, "to", lambda self, device: self
+    )  # there need be no GPU to see what would go there
     there = MMEPolicy.from_pretrained(tmp_path, dtype="auto", device="cuda")
     assert {p.dtype for p in there.parameters()} == {torch.bfloat16}
     monkeypatch.setattr(MMEPolicy, "acts_in_bfloat16", DiffusionPolicy.acts_in_bfloat16)

@@ -1,6 +1,7 @@
 """No operation of an update or a chunk waits for the device.
 
-On the meta device operations have no numbers, so that one that needs a number, or a tensor of the CPU, is found.
+On the meta device operations have no numbers, so that one that needs a number, or a tensor of the
+CPU, is found.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,11 @@ class HostWork(TorchDispatchMode):
         self.waits: list[str] = []
 
     def __torch_dispatch__(
-        self, func: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+        self,
+        func: Any,
+        types: Sequence[type],
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
     ) -> Any:
         result = func(*args, **(kwargs or {}))
         tensors = [x for x in tree_leaves((args, kwargs, result)) if isinstance(x, torch.Tensor)]

@@ -42,7 +42,9 @@ def test_weights_are_full_until_the_chunk_is_there_and_then_fade() -> None:
 
 def test_the_pull_is_bounded_at_both_ends() -> None:
     times = torch.tensor([1.0, 0.9, 0.5, 0.1, 0.0])
-    assert strength(times).tolist() == pytest.approx([STRONGEST, STRONGEST, 2.0, STRONGEST, STRONGEST])
+    assert strength(times).tolist() == pytest.approx(
+        [STRONGEST, STRONGEST, 2.0, STRONGEST, STRONGEST]
+    )
 
 
 def test_the_pull_is_the_gradient_through_the_network() -> None:
@@ -69,7 +71,9 @@ def test_the_next_chunk_honours_what_was_committed(policy: MMEPolicy, before: np
     episode.set_action_prefix(before, delay=4)
     bound = policy.act(episode)
     apart = [np.abs(chunk[:10] - before).mean(1) for chunk in (free, bound)]
-    assert (apart[1][:4] < 0.15 * apart[0][:4]).all(), apart  # these are executed before the chunk is there
+    assert (apart[1][:4] < 0.15 * apart[0][:4]).all(), (
+        apart
+    )  # these are executed before the chunk is there
     assert apart[1][4:7].mean() < 0.6 * apart[0][4:7].mean(), apart  # these fade
     assert episode.action_prefix is None
     np.testing.assert_array_equal(policy.act(episode_of(policy)), free)
@@ -94,7 +98,9 @@ def test_a_prefix_changes_its_episode_alone(policy: MMEPolicy, before: np.ndarra
         (np.zeros((3, 8)), 4, "delay=4 must be a whole number from 0 to 3"),
     ],
 )
-def test_a_prefix_that_cannot_be_is_refused(policy: MMEPolicy, actions: np.ndarray, delay: int, message: str) -> None:
+def test_a_prefix_that_cannot_be_is_refused(
+    policy: MMEPolicy, actions: np.ndarray, delay: int, message: str
+) -> None:
     with pytest.raises(UserError, match=message):
         episode_of(policy).set_action_prefix(actions, delay)
 

@@ -33,7 +33,8 @@ def losses(folder: Path, name: str = "train/loss") -> list[float]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two processes to step 4, one to 6, three to 8; two that are stopped, and two of which one is killed.
+    """Two processes to step 4, one to 6, three to 8; two that are stopped, and two of which one is
+    killed.
 
     Beside them one that did all 8.
     """
@@ -62,7 +63,9 @@ def test_the_averages_are_what_is_validated_and_saved(folder: Path) -> None:
     assert shared == pytest.approx(alone, rel=CLOSE)
     assert abs(shared["raw"] - shared["average"]) > 1e-3
     parts = Policy.from_pretrained(resolve_checkpoint(folder / "run")).state_dict()
-    for name, tensor in Policy.from_pretrained(resolve_checkpoint(folder / "whole")).state_dict().items():
+    for name, tensor in (
+        Policy.from_pretrained(resolve_checkpoint(folder / "whole")).state_dict().items()
+    ):
         # Adam divides by what may be all but zero: a few numbers differ more than the losses.
         assert (parts[name] - tensor).abs().float().mean() < 1e-6, name
 
@@ -83,7 +86,9 @@ def test_a_stop_signal_to_one_process_saves_what_all_hold(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_a_killed_process_ends_the_others(folder: Path) -> None:
-    """Of the fixture's two the second killed itself; the first then ended with an error, which it compared."""
+    """Of the fixture's two the second killed itself; the first then ended with an error, which it
+    compared.
+    """
     assert reply(folder, "policies")
     assert not (folder / "die.json").exists()
     assert not checkpoints_in(folder / "killed" / "checkpoints")
@@ -95,7 +100,9 @@ def test_every_kind_of_policy_learns_and_answers_the_same_shared(folder: Path) -
     assert set(sharded_runs.MODELS) <= set(result)
     for name, one in result.items():
         assert one["shared"] == pytest.approx(one["alone"], rel=2e-5), name
-        assert one["shared chunk"] == pytest.approx(one["alone chunk"], rel=1e-3 if "16" in name else 2e-5), name
+        assert one["shared chunk"] == pytest.approx(
+            one["alone chunk"], rel=1e-3 if "16" in name else 2e-5
+        ), name
         assert one["again"] == one["shared"][2], name
 
 
@@ -122,7 +129,9 @@ def test_what_cannot_be_shared_is_reported_in_words() -> None:
         ParallelSettings("fsdp").shards(torch.device("cpu"))
     with pytest.raises(UserError, match="Did you mean 'fsdp'"):
         read_section(ParallelSettings, {"strategy": "fspd"}, "train.parallel")
-    with pytest.raises(UserError, match=r"train\.parallel\.replicate=0 must be a whole number, 1 or more"):
+    with pytest.raises(
+        UserError, match=r"train\.parallel\.replicate=0 must be a whole number, 1 or more"
+    ):
         read_section(ParallelSettings, {"replicate": 0}, "train.parallel")
     assert not ParallelSettings().shards(torch.device("cpu"))
 

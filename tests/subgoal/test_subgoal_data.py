@@ -1,4 +1,6 @@
-"""Training data of the subgoal predictors: row by row as released, with its defects repaired or kept as asked."""
+"""Training data of the subgoal predictors: row by row as released, with its defects repaired or
+kept as asked.
+"""
 
 import json
 import shutil
@@ -16,7 +18,14 @@ from mme_vla.errors import UserError
 from mme_vla.subgoal.clips import Clip, read_image, sample_video
 from mme_vla.subgoal.finetuning import collecting as module
 from mme_vla.subgoal.finetuning.collecting import build, open_input
-from mme_vla.subgoal.finetuning.labels import Labels, keyframes, resting_frames, selected_steps, transitions, windows
+from mme_vla.subgoal.finetuning.labels import (
+    Labels,
+    keyframes,
+    resting_frames,
+    selected_steps,
+    transitions,
+    windows,
+)
 from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
 from mme_vla.subgoal.finetuning.training import command, write_arguments
 from mme_vla.utils import SUMS
@@ -74,7 +83,9 @@ def test_sets_equal_the_released_ones_row_by_row(built, golden, name):
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_the_repaired_defects_leave_these_episodes_as_they_are_but_for_the_repeated_rows(labelled, golden, name):
+def test_the_repaired_defects_leave_these_episodes_as_they_are_but_for_the_repeated_rows(
+    labelled, golden, name
+):
     actual, expected = [], []
     for _, labels in labelled:
         actual += episode_rows(name, labels, RowOptions(noise=None)).rows
@@ -104,20 +115,34 @@ def test_every_image_and_video_a_row_names_is_there(built, labelled):
     for name in SETS:
         for row in rows_of(built, name):
             marks = row["messages"][1]["content"]
-            assert marks.count("<image>") == len(row["images"]) and marks.count("<video>") == len(row.get("videos", []))
-            assert all((built / path).is_file() for path in [*row["images"], *row.get("videos", [])])
+            assert marks.count("<image>") == len(row["images"]) and marks.count("<video>") == len(
+                row.get("videos", [])
+            )
+            assert all(
+                (built / path).is_file() for path in [*row["images"], *row.get("videos", [])]
+            )
     episode, about = labels["VideoRepick_ep0"]
     stored = read_image(built / "qwenvl/images/VideoRepick_ep0_step56.png")
     assert np.array_equal(stored, next(episode.read_images([56])))
-    assert Clip.read(built / "memer/images/VideoRepick_ep0_video.mp4").length == about.exec_start == 37
+    assert (
+        Clip.read(built / "memer/images/VideoRepick_ep0_video.mp4").length == about.exec_start == 37
+    )
 
 
 def test_a_lerobot_dataset_gives_the_same_rows(h5, golden, tmp_path):
-    refs = [ref for ref in list_episodes(find_files([h5])) if ref.task in ("VideoRepick", "PickHighlight")]
+    refs = [
+        ref
+        for ref in list_episodes(find_files([h5]))
+        if ref.task in ("VideoRepick", "PickHighlight")
+    ]
     convert(refs, tmp_path / "dataset", ConvertOptions(images="png"))
     build(open_input(tmp_path / "dataset"), tmp_path / "data", ["grounded", "memer"], RELEASED)
     for name in ("grounded", "memer"):
-        expected = [r for r in golden["vlm_datasets"][SETS[name]] if "VideoRepick" in str(r) or "PickH" in str(r)]
+        expected = [
+            r
+            for r in golden["vlm_datasets"][SETS[name]]
+            if "VideoRepick" in str(r) or "PickH" in str(r)
+        ]
         assert rows_of(tmp_path / "data", name) == expected
 
 
@@ -134,13 +159,17 @@ def test_an_interrupted_build_continues_and_ends_the_same(h5, built, tmp_path, m
     monkeypatch.setattr(module, "_build_episode", interrupted)
     with pytest.raises(KeyboardInterrupt):
         build(episodes, output, list(SETS), RELEASED)
-    monkeypatch.setattr(module, "_build_episode", lambda e, *arguments: (names.append(e.name), original(e, *arguments)))
+    monkeypatch.setattr(
+        module,
+        "_build_episode",
+        lambda e, *arguments: (names.append(e.name), original(e, *arguments)),
+    )
     build(episodes, output, list(SETS), RELEASED)
     assert Counter(names) == Counter(e.name for e in episodes), "no episode is built twice"
     files = sorted(p.relative_to(built) for p in built.rglob("*") if p.is_file())
     assert files == sorted(p.relative_to(output) for p in output.rglob("*") if p.is_file())
-    # Encoders may differ in the last bits of such tiny images, and so may the sums of their files; that the videos
-    # are there is checked above.
+    # Encoders may differ in the last bits of such tiny images, and so may the sums of their files;
+    # that the videos are there is checked above.
     same = [f for f in files if f.suffix != ".mp4" and f.name != SUMS]
     assert [f for f in same if (built / f).read_bytes() != (output / f).read_bytes()] == []
 
@@ -161,7 +190,9 @@ def test_a_dataset_that_does_not_tell_its_tasks_is_requested_them(tmp_path):
         open_input(copy)
     names = {str(e): "PickXtimes" for e in range(4)}
     (tmp_path / "tasks.json").write_text(json.dumps(names))
-    assert [episode.name for episode in open_input(copy, tmp_path / "tasks.json")][2] == "PickXtimes_ep2"
+    assert [episode.name for episode in open_input(copy, tmp_path / "tasks.json")][
+        2
+    ] == "PickXtimes_ep2"
 
 
 def test_noise_keeps_to_its_range_and_to_the_image_and_is_sampled_for_each_row():
@@ -172,7 +203,13 @@ def test_noise_keeps_to_its_range_and_to_the_image_and_is_sampled_for_each_row()
     assert len({str(row["objects"]["bbox"][0]) for row in rows}) > 4
     edge = made_up(length=2000, changes=(0,))
     edge.grounded[:] = ["at <0, 255>"] * 2000
-    clamped = np.array([p for row in episode_rows("grounded", edge, RowOptions()).rows for p in row["objects"]["bbox"]])
+    clamped = np.array(
+        [
+            p
+            for row in episode_rows("grounded", edge, RowOptions()).rows
+            for p in row["objects"]["bbox"]
+        ]
+    )
     assert clamped[:, 0].min() == 0 and clamped[:, 1].max() == 255
     assert rows == episode_rows("grounded", labels, RowOptions()).rows
     assert rows != episode_rows("grounded", labels, RowOptions(seed=1)).rows
@@ -184,14 +221,24 @@ def test_a_second_keyframe_in_one_window_is_detected_unless_the_defect_is_reques
     assert [w.positions for w in repaired] == [[1], [], [2, 6], [], [1], []]
     assert repaired[-1].past == [0, 20, 28, 50]
     released = windows(labels, keyframes(labels), one_a_window=True)
-    assert [w.positions for w in released] == [[1], [], [2], [], [], []], "28 is missed, and 50 with it"
+    assert [w.positions for w in released] == [[1], [], [2], [], [], []], (
+        "28 is missed, and 50 with it"
+    )
 
 
 def test_extra_keyframes_belong_to_their_tasks():
     bounds = (0, 30, 60)
     assert keyframes(made_up("ButtonUnmaskSwap", 90, bounds)) == [0, 10, 20, 30, 40, 50, 60]
     assert keyframes(made_up("ButtonUnmask", 90, bounds)) == [0, 30, 60]
-    assert keyframes(made_up("ButtonUnmask", 90, bounds), substring_match=True) == [0, 10, 20, 30, 40, 50, 60]
+    assert keyframes(made_up("ButtonUnmask", 90, bounds), substring_match=True) == [
+        0,
+        10,
+        20,
+        30,
+        40,
+        50,
+        60,
+    ]
     assert keyframes(made_up("PickHighlight", 90, bounds)) == [0, 15, 30, 60]
 
 
@@ -211,7 +258,16 @@ def test_a_short_segment_has_a_row_only_if_requested():
 
 
 def test_complete_is_no_subgoal():
-    labels = Labels("A", 0, "g", 0, ["a", "Complete"], ["a at <1, 2>", "complete"], np.zeros((2, 7)), np.zeros((2, 7)))
+    labels = Labels(
+        "A",
+        0,
+        "g",
+        0,
+        ["a", "Complete"],
+        ["a at <1, 2>", "complete"],
+        np.zeros((2, 7)),
+        np.zeros((2, 7)),
+    )
     assert labels.simple == ["a", "a"] and labels.grounded == ["a at <1, 2>"] * 2
 
 
@@ -227,7 +283,9 @@ def test_the_argument_file_of_ms_swift_is_the_papers_recipe(tmp_path):
     assert recipe == [16, 32, 1e-4, 0.05]
     assert options["per_device_train_batch_size"] * options["gradient_accumulation_steps"] * 4 == 64
     page = (REPOSITORY / "docs" / "train" / "subgoal-training.md").read_text().replace(" \\\n ", "")
-    assert command("grounded") in page and command("grounded").endswith("swift sft swift_grounded.json")
+    assert command("grounded") in page and command("grounded").endswith(
+        "swift sft swift_grounded.json"
+    )
 
 
 def test_settings_that_cannot_work_are_named(tmp_path):
@@ -246,7 +304,9 @@ def test_settings_that_cannot_work_are_named(tmp_path):
         ("seed=-1", "seed=-1"),
     ):
         with pytest.raises(UserError, match=message):
-            subgoal_build.main(compose("subgoal_build", ["input=sample", f"output={tmp_path / 'out'}", word]))
+            subgoal_build.main(
+                compose("subgoal_build", ["input=sample", f"output={tmp_path / 'out'}", word])
+            )
     for tasks in (tmp_path / "missing.json", tmp_path, listed):
         with pytest.raises(UserError, match="tasks="):
             open_input("sample", tasks)

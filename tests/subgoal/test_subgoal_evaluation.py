@@ -17,7 +17,13 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.report import html_report
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.subgoals import SubgoalScore, SubgoalTrace, point_distances, subgoal_tables, total_score
+from mme_vla.evaluation.rollout.subgoals import (
+    SubgoalScore,
+    SubgoalTrace,
+    point_distances,
+    subgoal_tables,
+    total_score,
+)
 from mme_vla.evaluation.store import read_records
 from mme_vla.subgoal import BackgroundPredictor, Subgoal, SubgoalPredictor, build_predictor
 from mme_vla.subgoal.text import points_of
@@ -26,7 +32,9 @@ UNMASK = Job("VideoUnmask", "test", 0)
 
 
 class Shifted(SubgoalPredictor):
-    """Says the scripted environment's grounded subgoal with its point moved, and from the third on other words."""
+    """Says the scripted environment's grounded subgoal with its point moved, and from the third on
+    other words.
+    """
 
     def predict_due(self, episodes):
         message = []
@@ -34,7 +42,13 @@ class Shifted(SubgoalPredictor):
             text = f"Push at <{episode.step + 3}, 13>." if episode.step < 32 else "pull"
             problem = "malformed" if episode.step == 16 else ""
             message.append(
-                Subgoal(text, points_of(text), queried=True, reply=f"answer {episode.step}", problem=problem)
+                Subgoal(
+                    text,
+                    points_of(text),
+                    queried=True,
+                    reply=f"answer {episode.step}",
+                    problem=problem,
+                )
             )
         return message
 
@@ -51,23 +65,41 @@ def test_every_subgoal_is_recorded_with_its_time_and_image(tmp_path: Path) -> No
     records = lines(tmp_path / "VideoUnmask_ep0.jsonl")
     assert [line["step"] for line in records] == [0, 16, 32]
     assert [line["text"] for line in records] == ["Push at <3, 13>.", "Push at <19, 13>.", "pull"]
-    assert [line["oracle"] for line in records] == ["push at <0, 9>", "push at <16, 9>", "push at <32, 9>"]
+    assert [line["oracle"] for line in records] == [
+        "push at <0, 9>",
+        "push at <16, 9>",
+        "push at <32, 9>",
+    ]
     assert [line["answer"] for line in records] == ["answer 0", "answer 16", "answer 32"]
     assert [line["asked_step"] for line in records] == [0, 16, 32]
     assert all(line["asked"] and line["latency_s"] >= 0 for line in records)
-    assert 0 < records[0]["seconds"] < records[1]["seconds"] < records[2]["seconds"] < record.seconds.total
+    assert (
+        0
+        < records[0]["seconds"]
+        < records[1]["seconds"]
+        < records[2]["seconds"]
+        < record.seconds.total
+    )
     for line in records:
         image = np.asarray(Image.open(tmp_path / line["image"]), np.int64)
         frame = envs.made[UNMASK].frames[21 + line["step"]]  # 21 frames of video come before
         assert np.abs(image - frame).mean() < 2
     assert len(list((tmp_path / "VideoUnmask_ep0").iterdir())) == 3
     assert record.extra["subgoals"] == {
-        "chunks": 3, "judged": 3, "right": 2, "points": 2, "distance": 10.0, "asked": 3, "problems": {"malformed": 1},
-    }  # fmt: skip
+        "chunks": 3,
+        "judged": 3,
+        "right": 2,
+        "points": 2,
+        "distance": 10.0,
+        "asked": 3,
+        "problems": {"malformed": 1},
+    }
 
 
 def test_the_oracle_is_always_right(tmp_path: Path) -> None:
-    records = roll(quick_policy("groundsg"), [UNMASK], InlineEnvs(), build_predictor({"name": "oracle"}))
+    records = roll(
+        quick_policy("groundsg"), [UNMASK], InlineEnvs(), build_predictor({"name": "oracle"})
+    )
     score = total_score(records)
     assert score is not None
     assert (score.accuracy, score.mean_distance, score.asked, score.judged) == (100.0, 0.0, 0, 3)
@@ -77,7 +109,12 @@ def test_the_oracle_is_always_right(tmp_path: Path) -> None:
 def test_words_are_compared_without_points_case_and_full_stop() -> None:
     assert point_distances("Pick up the cube at <3, 4>.", "pick up  the cube at <0, 0>") == [5.0]
     assert point_distances("press the button", "press the button") == []
-    for text in (None, "press the button", "pick up the cube", "pick up the cube at <3, 4> at <1, 1>"):
+    for text in (
+        None,
+        "press the button",
+        "pick up the cube",
+        "pick up the cube at <3, 4> at <1, 1>",
+    ):
         assert point_distances(text, "pick up the cube at <0, 0>") is None
 
 
@@ -92,8 +129,17 @@ def test_what_the_environment_does_not_name_is_not_judged() -> None:
 
 def test_results_tell_right_subgoals_and_distances_by_task() -> None:
     def record(task: str, right: int, problems: dict | None = None) -> EpisodeRecord:
-        extra = {"subgoals": {"chunks": 4, "judged": 4, "right": right, "points": right, "distance": 3.0 * right,
-                              "asked": 4, "problems": problems or {}}}  # fmt: skip
+        extra = {
+            "subgoals": {
+                "chunks": 4,
+                "judged": 4,
+                "right": right,
+                "points": right,
+                "distance": 3.0 * right,
+                "asked": 4,
+                "problems": problems or {},
+            }
+        }
         place = ("groundsg", 1, 7, task, 0, 1, "easy", "success", 9)
         return EpisodeRecord(*place, subgoal="qwenvl", extra=extra)
 
@@ -107,7 +153,9 @@ def test_results_tell_right_subgoals_and_distances_by_task() -> None:
     ]
     assert [row[-1] for row in table.rows] == ["0", "2 empty", "2 empty"]
     assert "subgoals beside the environment" in html_report(results, [], "t")
-    broken = EpisodeRecord("groundsg", 1, 7, "PickXtimes", 0, 1, "easy", "success", 9, extra={"subgoals": {"right": 1}})
+    broken = EpisodeRecord(
+        "groundsg", 1, 7, "PickXtimes", 0, 1, "easy", "success", 9, extra={"subgoals": {"right": 1}}
+    )
     with pytest.raises(UserError, match="not a score"):
         total_score([broken])
 
@@ -156,13 +204,17 @@ def test_in_the_background_only_the_first_subgoal_is_waited_for() -> None:
     slow.go.release()
     assert predictor.predict([episode]) == [Subgoal("go 0", queried=True)]
     episode.observe(frames(1, 16))
-    assert predictor.predict([episode]) == [Subgoal("go 0")], "the policy continues with the last one"
+    assert predictor.predict([episode]) == [Subgoal("go 0")], (
+        "the policy continues with the last one"
+    )
     episode.observe(frames(17, 16))
     assert predictor.predict([episode]) == [Subgoal("go 0")]
     slow.go.release()
     settle(predictor)
     episode.observe(frames(33, 16))
-    assert predictor.predict([episode]) == [Subgoal("go 16", queried=True)], "the answer to the question at step 16"
+    assert predictor.predict([episode]) == [Subgoal("go 16", queried=True)], (
+        "the answer to the question at step 16"
+    )
     slow.go.release()
     settle(predictor)
     assert slow.queries == [[("go", 0)], [("go", 16)], [("go", 48)]]
@@ -189,7 +241,9 @@ def test_a_question_that_came_due_while_the_thread_was_busy_is_queried_once_it_i
     predictor.predict([second])
     settle(predictor)
     assert slow.queries == [[("a", 0), ("b", 0)], [("a", 48)], [("b", 64)]]
-    assert predictor.predict([second]) == [Subgoal("b 64", queried=True)] and second.query_step == 64
+    assert (
+        predictor.predict([second]) == [Subgoal("b 64", queried=True)] and second.query_step == 64
+    )
     predictor.close()
 
 
@@ -225,12 +279,19 @@ def test_a_folder_left_by_another_process_does_not_stop_a_trace(
     assert (tmp_path / "VideoUnmask_ep0.jsonl").read_bytes() == b""
 
 
-TINY_VLM = ["subgoal=qwenvl", "subgoal.model=tiny", "subgoal.device=cpu", "subgoal.max_new_tokens=8"]
+TINY_VLM = [
+    "subgoal=qwenvl",
+    "subgoal.model=tiny",
+    "subgoal.device=cpu",
+    "subgoal.max_new_tokens=8",
+]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["subgoal=oracle"], TINY_VLM], ids=["oracle", "qwenvl"])
-def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(words: list[str], tmp_path: Path) -> None:
+def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(
+    words: list[str], tmp_path: Path
+) -> None:
     pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
     pytest.importorskip("transformers", reason="needs the extra vlm")
     from mme_vla.envs.rendering import render_backend
@@ -239,19 +300,31 @@ def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(words: list[str
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
-    tasks = ["model=groundsg", "backbone=tiny", "tasks=[PickXtimes,ButtonUnmask]", "episodes=1", "max_steps=24"]
-    done = commands.run("mme_vla.evaluate", *tasks, *words, "video=all", "workers=2", f"output={tmp_path}")
+    tasks = [
+        "model=groundsg",
+        "backbone=tiny",
+        "tasks=[PickXtimes,ButtonUnmask]",
+        "episodes=1",
+        "max_steps=24",
+    ]
+    done = commands.run(
+        "mme_vla.evaluate", *tasks, *words, "video=all", "workers=2", f"output={tmp_path}"
+    )
     assert done.returncode == 0, done.stderr
     records = read_records(tmp_path / "episodes.jsonl")
     assert sorted(record.task for record in records) == ["ButtonUnmask", "PickXtimes"]
-    assert all((record.outcome, record.steps) == ("timeout", 25) for record in records), [r.error for r in records]
+    assert all((record.outcome, record.steps) == ("timeout", 25) for record in records), [
+        r.error for r in records
+    ]
     score = total_score(records)
     assert score is not None and (score.chunks, score.judged) == (4, 4)
     assert "right subgoals" in done.stdout and "points off by" in done.stdout
     for record in records:
         name = f"{record.task}_ep0"
         entries = lines(tmp_path / "subgoals" / f"{name}.jsonl")
-        assert [line["step"] for line in entries] == [0, 16] and all(line["oracle"] for line in entries)
+        assert [line["step"] for line in entries] == [0, 16] and all(
+            line["oracle"] for line in entries
+        )
         assert Image.open(tmp_path / "subgoals" / entries[0]["image"]).size == (256, 256)
         assert (tmp_path / "videos" / record.extra["video"]).stat().st_size > 1000
     if words[0] == "subgoal=oracle":

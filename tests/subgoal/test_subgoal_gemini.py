@@ -1,4 +1,6 @@
-"""The prompted model behind an API, against a stand-in client: conversations, failures of every kind, cache, cost."""
+"""The prompted model behind an API, against a stand-in client: conversations, failures of every
+kind, cache, cost.
+"""
 
 import logging
 import sys
@@ -7,7 +9,16 @@ import time
 
 import pytest
 
-from helpers.subgoal_fakes import ApiError, Client, kinds, play, predictor_of, response, says, started
+from helpers.subgoal_fakes import (
+    ApiError,
+    Client,
+    kinds,
+    play,
+    predictor_of,
+    response,
+    says,
+    started,
+)
 from mme_vla.errors import UserError
 from mme_vla.subgoal import Gemini
 from mme_vla.subgoal.base import Usage
@@ -36,7 +47,9 @@ def test_a_conversation_shows_all_that_happened_since():
     assert subgoals[3].text == "move <256, 0> then <0, 255>"
     (first, config), (second, _) = client.requests
     assert kinds(first[0]["parts"]) == ["video/mp4", "image/png", "text"]
-    assert "stop the cube" in first[0]["parts"][2]["text"] and "<y, x>" in config["system_instruction"]
+    assert (
+        "stop the cube" in first[0]["parts"][2]["text"] and "<y, x>" in config["system_instruction"]
+    )
     assert [message["role"] for message in second] == ["user", "model", "user"]
     assert kinds(second[2]["parts"]) == ["video/mp4", "text"]
 
@@ -71,7 +84,9 @@ def test_what_goes_wrong_is_counted_and_never_ends_the_episode(outcome, problem,
     assert subgoals[-1].text == "lift" and queries == [64 if steps == 1 else 96], (
         "asked again at once if nothing was said"
     )
-    assert len(client.requests[-1][0]) == (3 if steps == 1 else 5), "a question without an answer leaves no turn"
+    assert len(client.requests[-1][0]) == (3 if steps == 1 else 5), (
+        "a question without an answer leaves no turn"
+    )
 
 
 def test_frames_that_a_failed_question_did_not_show_go_with_the_next():
@@ -80,7 +95,9 @@ def test_frames_that_a_failed_question_did_not_show_go_with_the_next():
     play(predictor, episode, 1)
     predictor.predict([episode])
     assert kinds(client.requests[1][0][0]["parts"]) == ["image/png", "text", "video/mp4", "text"]
-    assert len(client.requests[1][0]) == 1, "the question that failed is not part of the conversation"
+    assert len(client.requests[1][0]) == 1, (
+        "the question that failed is not part of the conversation"
+    )
 
 
 def test_a_passing_error_is_tried_again_with_growing_pauses():
@@ -108,13 +125,21 @@ def test_questions_keep_to_the_rate():
         slept.append(seconds)
         now[0] += seconds
 
-    api = Api(Settings(requests_per_minute=30), Usage(), Client(*[says("a")] * 3), clock=lambda: now[0], sleep=sleep)
+    api = Api(
+        Settings(requests_per_minute=30),
+        Usage(),
+        Client(*[says("a")] * 3),
+        clock=lambda: now[0],
+        sleep=sleep,
+    )
     for _ in range(3):
         api.ask("s", [("user", ["q"])])
     assert slept == [2.0, 2.0]
 
 
-@pytest.mark.parametrize("error", [ApiError(401), ApiError(404), ApiError(400, "API key not valid")])
+@pytest.mark.parametrize(
+    "error", [ApiError(401), ApiError(404), ApiError(400, "API key not valid")]
+)
 def test_a_key_that_is_not_accepted_ends_it_at_once(error):
     predictor, client = predictor_of(error)
     with pytest.raises(UserError, match="GEMINI_API_KEY"):
@@ -124,7 +149,9 @@ def test_a_key_that_is_not_accepted_ends_it_at_once(error):
 
 def test_the_key_stands_in_no_log_and_no_message(caplog, tmp_path):
     leak = f"https://host/v1?key={SECRET}"
-    predictor, _ = predictor_of(*[ApiError(500, leak)] * 2, says("a"), retries=1, cache=str(tmp_path))
+    predictor, _ = predictor_of(
+        *[ApiError(500, leak)] * 2, says("a"), retries=1, cache=str(tmp_path)
+    )
     episode = started(predictor)
     with caplog.at_level(logging.DEBUG):
         assert predictor.predict([episode])[0].problem == "failed"
@@ -132,7 +159,11 @@ def test_the_key_stands_in_no_log_and_no_message(caplog, tmp_path):
     with pytest.raises(UserError) as caught:
         predictor_of(ApiError(403, leak))[0].api.ask("s", [("user", ["q"])])
     content = "".join(path.read_text() for path in tmp_path.rglob("*.json"))
-    assert caplog.text and content and all(SECRET not in text for text in (caplog.text, str(caught.value), content))
+    assert (
+        caplog.text
+        and content
+        and all(SECRET not in text for text in (caplog.text, str(caught.value), content))
+    )
     assert "***" in caplog.text
 
 

@@ -1,4 +1,6 @@
-"""The prompted model through google-genai itself, against a local server; skipped where the extra is not installed."""
+"""The prompted model through google-genai itself, against a local server; skipped where the extra
+is not installed.
+"""
 
 import base64
 import logging
@@ -16,8 +18,16 @@ SECRET = "AIza-not-a-real-key"
 
 def reply(text: str | None, finish: str = "STOP") -> tuple[int, dict]:
     content = {"role": "model", "parts": [] if text is None else [{"text": text}]}
-    used = {"promptTokenCount": 300, "candidatesTokenCount": 20, "thoughtsTokenCount": 80, "totalTokenCount": 400}
-    return 200, {"candidates": [{"content": content, "finishReason": finish}], "usageMetadata": used}
+    used = {
+        "promptTokenCount": 300,
+        "candidatesTokenCount": 20,
+        "thoughtsTokenCount": 80,
+        "totalTokenCount": 400,
+    }
+    return 200, {
+        "candidates": [{"content": content, "finishReason": finish}],
+        "usageMetadata": used,
+    }
 
 
 def failure(code: int, message: str) -> tuple[int, dict]:
@@ -55,6 +65,10 @@ def test_a_conversation_over_http(server: ChatServer, caplog: pytest.LogCaptureF
     assert (usage.calls, usage.retries, usage.input_tokens, usage.output_tokens) == (3, 2, 900, 300)
     first = server.requests[0]["contents"][0]["parts"]
     assert base64.b64decode(first[0]["inlineData"]["data"])[4:8] == b"ftyp" and "text" in first[2]
-    assert [rotation["role"] for rotation in server.requests[-1]["contents"]] == ["user", "model", "user"]
+    assert [rotation["role"] for rotation in server.requests[-1]["contents"]] == [
+        "user",
+        "model",
+        "user",
+    ]
     assert "subgoal" in server.requests[0]["systemInstruction"]["parts"][0]["text"]
     assert SECRET not in caplog.text

@@ -17,20 +17,35 @@ def test_late_tasks_leave_out_what_came_due_before_their_step():
     for _ in range(7):
         queries += [episode.step] if predictor.predict([episode])[0].queried else []
         episode.observe(frames(20, episode.n_observed_frames))
-    assert queries == [0, 100], "the question of step 48 is left out, the one of step 96 is asked at 100"
+    assert queries == [0, 100], (
+        "the question of step 48 is left out, the one of step 96 is asked at 100"
+    )
 
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("timeout", 0), ("timeout", "soon"), ("retries", -1), ("retries", 1.5), ("backoff", -1), ("temperature", -0.1),
-     ("requests_per_minute", 0), ("input_price", -1), ("output_price", float("nan")), ("workers", 0), ("wait", -1)],
-)  # fmt: skip
+    [
+        ("timeout", 0),
+        ("timeout", "soon"),
+        ("retries", -1),
+        ("retries", 1.5),
+        ("backoff", -1),
+        ("temperature", -0.1),
+        ("requests_per_minute", 0),
+        ("input_price", -1),
+        ("output_price", float("nan")),
+        ("workers", 0),
+        ("wait", -1),
+    ],
+)
 def test_settings_that_cannot_work_are_named(key, value):
     with pytest.raises(UserError, match=f"{key}="):
         predictor_of(**{key: value})
 
 
-@pytest.mark.parametrize("damage", ["", "{", "[]", '{"text": "a"}', '{"text": "a", "input_tokens": "x"}'])
+@pytest.mark.parametrize(
+    "damage", ["", "{", "[]", '{"text": "a"}', '{"text": "a", "input_tokens": "x"}']
+)
 def test_a_damaged_reply_on_disk_is_requested_again(damage, tmp_path):
     first, _ = predictor_of(says("press"), cache=str(tmp_path))
     first.predict([started(first)])
@@ -85,7 +100,9 @@ for predictor in (gemini, BackgroundPredictor(gemini)):
     except KeyboardInterrupt:
         print("interrupted", time.monotonic() - began < 300)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY, timeout=600)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY, timeout=600
+    )
     assert done.stdout.split() == ["interrupted", "True"] * 2 and done.returncode == 0, done.stderr
 
 

@@ -1,4 +1,6 @@
-"""A model with a notebook: what its notes may be, and that they change only when a subgoal was seen complete."""
+"""A model with a notebook: what its notes may be, and that they change only when a subgoal was seen
+complete.
+"""
 
 import json
 from collections.abc import Iterator
@@ -18,7 +20,7 @@ QUICK = {"backoff": 0, "requests_per_minute": None, "retries": 0}
 COUNT = {"kind": "count", "name": "placed", "value": 0}
 
 
-# Notes --------------------------------------------------------------------------------------------------------------
+# Notes --------------------------------------------------------------------------------------------
 
 
 def test_notes_of_every_kind_are_read_and_reported_in_words() -> None:
@@ -29,8 +31,10 @@ def test_notes_of_every_kind_are_read_and_reported_in_words() -> None:
     ]
     book = Notebook().with_entries(read_notes(notes), None)
     assert book.notes == {
-        "placed": Count(0), "red cube's container": Identity("the left one"), "pattern": Route(("left", "forward"), 1),
-    }  # fmt: skip
+        "placed": Count(0),
+        "red cube's container": Identity("the left one"),
+        "pattern": Route(("left", "forward"), 1),
+    }
     assert book.in_words() == (
         "- count, placed: 0\n- identity, red cube's container: the left one\n"
         "- route, pattern: 1. left; 2. forward (1 of 2 done)"
@@ -40,13 +44,21 @@ def test_notes_of_every_kind_are_read_and_reported_in_words() -> None:
 
 @pytest.mark.parametrize(
     "given",
-    ["notes", [1], [{"kind": "count", "name": "a"}], [{"kind": "count", "name": "a", "value": -1}],
-     [{"kind": "count", "name": "a", "value": True}], [{"kind": "count", "value": 1}],
-     [{"kind": "count", "name": " ", "value": 1}],
-     [{"kind": "route", "name": "a", "steps": []}], [{"kind": "route", "name": "a", "steps": ["x", 3]}],
-     [{"kind": "identity", "name": "a", "words": "x" * 201}], [{"kind": "thought", "name": "a"}],
-     [{"kind": "identity", "name": "a", "words": "half \ud800"}]],
-)  # fmt: skip
+    [
+        "notes",
+        [1],
+        [{"kind": "count", "name": "a"}],
+        [{"kind": "count", "name": "a", "value": -1}],
+        [{"kind": "count", "name": "a", "value": True}],
+        [{"kind": "count", "value": 1}],
+        [{"kind": "count", "name": " ", "value": 1}],
+        [{"kind": "route", "name": "a", "steps": []}],
+        [{"kind": "route", "name": "a", "steps": ["x", 3]}],
+        [{"kind": "identity", "name": "a", "words": "x" * 201}],
+        [{"kind": "thought", "name": "a"}],
+        [{"kind": "identity", "name": "a", "words": "half \ud800"}],
+    ],
+)
 def test_what_is_no_note_is_refused(given: Any) -> None:
     with pytest.raises(MalformedReply):
         read_notes(given)
@@ -68,10 +80,14 @@ def test_what_is_no_note_is_refused(given: Any) -> None:
         (Identity("left"), Count(1), True, False),
     ],
 )
-def test_notes_change_only_as_their_kind_does(before: Any, after: Any, finished: bool, allowed: bool) -> None:
+def test_notes_change_only_as_their_kind_does(
+    before: Any, after: Any, finished: bool, allowed: bool
+) -> None:
     book = Notebook({"it": before})
     if allowed:
-        assert book.with_entries([("it", after)], "pick" if finished else None).notes == {"it": after}
+        assert book.with_entries([("it", after)], "pick" if finished else None).notes == {
+            "it": after
+        }
     else:
         with pytest.raises(MalformedReply):
             book.with_entries([("it", after)], "pick" if finished else None)
@@ -84,11 +100,13 @@ def test_a_route_is_no_longer_than_its_steps_and_a_notebook_has_an_end() -> None
         Notebook().with_entries([(str(i), Count(0)) for i in range(17)], None)
 
 
-# The predictor --------------------------------------------------------------------------------------------------------
+# The predictor ------------------------------------------------------------------------------------
 
 
 class Model:
-    """Sees a subgoal complete where the newest image is bright, and counts; keeps what it was asked."""
+    """Sees a subgoal complete where the newest image is bright, and counts; keeps what it was
+    asked.
+    """
 
     def __init__(self, server: ChatServer) -> None:
         self.queries: list[str] = []
@@ -104,7 +122,11 @@ class Model:
         if monitor:
             return says(json.dumps({"why": "", "done": self.done}))
         note = {**COUNT, "value": self.value}
-        return says(json.dumps({"notes": [note], "subgoal": f"pick up the red cube at <{100 + self.value}, 500>"}))
+        return says(
+            json.dumps(
+                {"notes": [note], "subgoal": f"pick up the red cube at <{100 + self.value}, 500>"}
+            )
+        )
 
 
 @pytest.fixture
@@ -122,7 +144,9 @@ def predictor_for(server: ChatServer | None, **options: Any) -> NotebookPredicto
     return built
 
 
-def test_nothing_is_noted_and_no_subgoal_returned_before_the_monitor_confirms(server: ChatServer) -> None:
+def test_nothing_is_noted_and_no_subgoal_returned_before_the_monitor_confirms(
+    server: ChatServer,
+) -> None:
     model, predictor = Model(server), predictor_for(server, kind="grounded")
     episode = predictor.start_episode("Pick it up twice", frames(20), "PickXtimes")
     episode.observe(frames(1))
@@ -138,12 +162,19 @@ def test_nothing_is_noted_and_no_subgoal_returned_before_the_monitor_confirms(se
     episode.observe(frames(16))
     assert predictor.predict([episode])[0].text == "pick up the red cube at <25, 128>"
     assert model.queries[4:] == ["monitor", "planner"]
-    assert episode.notebook.notes == {"placed": Count(1)} and episode.notebook.finished == (first.text,)
-    assert "- count, placed: 0" in model.message and f"The subgoal {first.text!r} is complete" in model.message
+    assert episode.notebook.notes == {"placed": Count(1)} and episode.notebook.finished == (
+        first.text,
+    )
+    assert (
+        "- count, placed: 0" in model.message
+        and f"The subgoal {first.text!r} is complete" in model.message
+    )
     assert predictor.usage.problems == {}
 
 
-def test_a_note_that_cannot_be_leaves_notebook_and_subgoal_and_is_requested_again(server: ChatServer) -> None:
+def test_a_note_that_cannot_be_leaves_notebook_and_subgoal_and_is_requested_again(
+    server: ChatServer,
+) -> None:
     model, predictor = Model(server), predictor_for(server)
     episode = predictor.start_episode("go", None, "PickXtimes")
     episode.observe(frames(1))
@@ -151,13 +182,18 @@ def test_a_note_that_cannot_be_leaves_notebook_and_subgoal_and_is_requested_agai
     model.done, model.value = True, 5
     episode.observe(frames(16))
     subgoal = predictor.predict([episode])[0]
-    assert (subgoal.text, subgoal.problem) == (first.text, "malformed") and episode.notebook.notes == {
-        "placed": Count(0)
-    }
+    assert (subgoal.text, subgoal.problem) == (
+        first.text,
+        "malformed",
+    ) and episode.notebook.notes == {"placed": Count(0)}
     model.value = 1
     episode.observe(frames(16))
-    assert predictor.predict([episode])[0].problem == "" and episode.notebook.notes == {"placed": Count(1)}
-    assert model.queries == ["planner", "monitor", "planner", "planner"], "the monitor had agreed already"
+    assert predictor.predict([episode])[0].problem == "" and episode.notebook.notes == {
+        "placed": Count(1)
+    }
+    assert model.queries == ["planner", "monitor", "planner", "planner"], (
+        "the monitor had agreed already"
+    )
 
 
 def test_whatever_goes_wrong_keeps_the_subgoal_and_is_counted(server: ChatServer) -> None:
@@ -189,7 +225,10 @@ def test_a_full_episode_is_replayed_from_its_cache_without_key_and_server(tmp_pa
     ) -> tuple[list[Any], NotebookPredictor, Notebook]:
         key = {} if server is not None else {"key_variable": "A_KEY_THAT_IS_NOT_SET"}
         predictor = predictor_for(server, cache=str(tmp_path), **key)
-        episodes = [predictor.start_episode("go", frames(9), "BinFill"), predictor.start_episode("run", None)]
+        episodes = [
+            predictor.start_episode("go", frames(9), "BinFill"),
+            predictor.start_episode("run", None),
+        ]
         subgoals = []
         for step in range(4):
             if model is not None:

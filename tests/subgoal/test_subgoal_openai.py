@@ -45,7 +45,9 @@ def test_a_conversation_over_http(server: ChatServer, caplog: pytest.LogCaptureF
         failure(429, "slowly"),
         subgoal("put it down"),
     ]
-    predictor = OpenAI(base_url=server.url, retries=1, interval=16, input_price=1.0, output_price=2.0, **QUICK)
+    predictor = OpenAI(
+        base_url=server.url, retries=1, interval=16, input_price=1.0, output_price=2.0, **QUICK
+    )
     episode = predictor.start_episode("press", frames(30), "StopCube")
     episode.observe(frames(1))
     subgoals = []
@@ -75,7 +77,9 @@ def test_a_video_is_sent_as_sampled_images(server: ChatServer) -> None:
     content = server.requests[0]["messages"][1]["content"]
     urls = [part["image_url"]["url"] for part in content if part["type"] == "image_url"]
     assert "A video of 31 frames; 4 of them in order:" in content[0]["text"]
-    pixels = [np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1])))) for url in urls]
+    pixels = [
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1])))) for url in urls
+    ]
     assert [int(image[0, 0, 0]) for image in pixels] == [0, 10, 20, 30, 200]
     assert server.requests[0]["temperature"] == 0.0
 
@@ -96,13 +100,17 @@ def test_answers_are_replayed_from_the_cache_without_a_key_or_a_server(
         without.setitem(sys.modules, "openai", None)
         text, predictor = first_subgoal()
     assert (text, predictor.usage.cached, predictor.usage.calls) == ("press", 1, 0)
-    with pytest.raises(UserError, match=r"key in the environment variable OPENAI_API_KEY.*lacks this answer"):
+    with pytest.raises(
+        UserError, match=r"key in the environment variable OPENAI_API_KEY.*lacks this answer"
+    ):
         first_subgoal(model="another")
     monkeypatch.setenv("OPENAI_API_KEY", SECRET)
     assert first_subgoal(base_url=server.url, model="another")[0] == "another model's"
 
 
-def test_an_endpoint_without_a_key_gets_none(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endpoint_without_a_key_gets_none(
+    server: ChatServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("OPENAI_API_KEY")
     server.answers = [subgoal("press")]
     config = {"name": "openai", "base_url": server.url, "key_variable": None, **QUICK}
@@ -133,7 +141,11 @@ def test_a_player_speaks_to_the_same_endpoints(server: ChatServer) -> None:
     options = (SimpleNamespace(label="a", action="press", needs_point=True),)
     image = np.zeros((256, 256, 3), np.uint8)
     session: Any = SimpleNamespace(
-        goal="press", options=options, decisions=[], frame=image, reveals=[SimpleNamespace(frames=[image] * 6)]
+        goal="press",
+        options=options,
+        decisions=[],
+        frame=image,
+        reveals=[SimpleNamespace(frames=[image] * 6)],
     )
     server.answers = [says("I see it."), says('{"choice": "a", "point": [500, 250]}')]
     player = OpenAIPlayer(base_url=server.url, **QUICK)
@@ -171,7 +183,9 @@ def test_an_address_that_is_refused_is_named_without_its_password(address: str) 
     assert "secret-word" not in str(caught.value)
 
 
-def test_a_key_that_is_a_word_is_left_in_answers(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_that_is_a_word_is_left_in_answers(
+    server: ChatServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", "none")
     server.answers = [subgoal("press none of them")]
     predictor = OpenAI(base_url=server.url, **QUICK)

@@ -1,4 +1,6 @@
-"""Predictors with a model of their own: what they ask, what they make of any answer, and a tiny Qwen3-VL."""
+"""Predictors with a model of their own: what they ask, what they make of any answer, and a tiny
+Qwen3-VL.
+"""
 
 import logging
 from functools import partial
@@ -80,7 +82,11 @@ def test_questions_carry_goal_history_points_image_and_video():
     assert predictor.predict([episode])[0].text == "put it down"
     first, second = (batch[0] for batch in vlm.batches)
     assert "The task goal is: sort the cubes\nThis is the initial turn" in first.user
-    assert first.videos[0].length == 40 and (first.images[0] == 0).all() and (second.images[0] == 16).all()
+    assert (
+        first.videos[0].length == 40
+        and (first.images[0] == 0).all()
+        and (second.images[0] == 16).all()
+    )
     assert "are: 1. pick at <|box_start|>(387,703)<|box_end|>\n<image>" in second.user
     assert "grounded language subgoals" in second.system
 
@@ -89,7 +95,10 @@ def test_many_episodes_are_queried_in_one_batch_and_only_those_that_are_due():
     vlm = Scripted("press the button", "pick it up", "put it down")
     predictor = QwenVL("simple", vlm=vlm)
     waiting, other = at_start(predictor, task="ButtonUnmask"), at_start(predictor)
-    assert [s.text for s in predictor.predict([waiting, other])] == ["press the button", "pick it up"]
+    assert [s.text for s in predictor.predict([waiting, other])] == [
+        "press the button",
+        "pick it up",
+    ]
     advance(waiting)
     advance(other)
     unchanged, new = predictor.predict([waiting, other])
@@ -100,10 +109,16 @@ def test_many_episodes_are_queried_in_one_batch_and_only_those_that_are_due():
         True,
     )
     assert [len(batch) for batch in vlm.batches] == [2, 1]
-    assert predictor.usage.calls == 3 and predictor.usage.input_tokens == 300 and predictor.usage.output_tokens == 21
+    assert (
+        predictor.usage.calls == 3
+        and predictor.usage.input_tokens == 300
+        and predictor.usage.output_tokens == 21
+    )
 
 
-@pytest.mark.parametrize(("reply_text", "problem"), [("", "empty"), ("pick <|box_start|>(1", "malformed")])
+@pytest.mark.parametrize(
+    ("reply_text", "problem"), [("", "empty"), ("pick <|box_start|>(1", "malformed")]
+)
 def test_an_unusable_reply_keeps_the_last_subgoal_and_is_counted(reply_text, problem, caplog):
     predictor = QwenVL("grounded", vlm=Scripted(reply_text, "press", reply_text))
     episode = at_start(predictor)
@@ -121,7 +136,10 @@ def test_an_unusable_reply_keeps_the_last_subgoal_and_is_counted(reply_text, pro
 def test_memer_shows_recent_frames_and_the_keyframes_it_chose():
     answers = (
         '{"current_subtask": "pick", "keyframe_positions": [1]}',
-        '{"current_subtask":"pick at <|box_start|>(500,500)<|box_end|>", "keyframe_positions": [4]}',
+        (
+            '{"current_subtask":"pick at <|box_start|>(500,500)<|box_end|>", "keyframe_positions":'
+            " [4]}"
+        ),
         "no idea",
         '{"current_subtask": "put", "keyframe_positions": [1, 8]}',
         '{"current_subtask": "put", "keyframe_positions": []}',
@@ -141,9 +159,17 @@ def test_memer_shows_recent_frames_and_the_keyframes_it_chose():
         [8, *range(34, 49, 2)],
         [8, 34, 48, *range(50, 65, 2)],
     ], "0 and 8 are so near that only the later of the two stays"
-    assert [s.text for s in subgoals] == ["pick", "pick at <128, 128>", "pick at <128, 128>", "put", "put"]
+    assert [s.text for s in subgoals] == [
+        "pick",
+        "pick at <128, 128>",
+        "pick at <128, 128>",
+        "put",
+        "put",
+    ]
     assert [s.problem for s in subgoals] == ["", "", "malformed", "", ""]
-    assert vlm.batches[1][0].user.count("<image>") == 9 and "setup: <video>" in vlm.batches[1][0].user
+    assert (
+        vlm.batches[1][0].user.count("<image>") == 9 and "setup: <video>" in vlm.batches[1][0].user
+    )
 
 
 def test_an_episode_without_a_frame_is_refused():
@@ -156,14 +182,19 @@ def test_an_episode_without_a_frame_is_refused():
 
 def test_a_tiny_model_reads_conversations_in_qwens_format(tiny):
     question = Question(
-        "be brief", "<video>go\n<image>at <|box_start|>(1,2)<|box_end|>", [frames(1)[0]], [Clip.of(frames(66))]
+        "be brief",
+        "<video>go\n<image>at <|box_start|>(1,2)<|box_end|>",
+        [frames(1)[0]],
+        [Clip.of(frames(66))],
     )
     batch = tiny.encode([question])
     text = tiny.processor.tokenizer.decode(batch["input_ids"][0])
     assert text.startswith("<|im_start|>system\nbe brief<|im_end|>\n<|im_start|>user\n<")
     assert text.endswith("at <|box_start|>(1,2)<|box_end|><|im_end|>\n<|im_start|>assistant\n")
     assert text.count("<|image_pad|>") == 64, "256×256 pixels, 32 a token"
-    assert text.count("<|video_pad|>") == 2 * 64 and text.count(" seconds>") == 2, "four frames, two by two"
+    assert text.count("<|video_pad|>") == 2 * 64 and text.count(" seconds>") == 2, (
+        "four frames, two by two"
+    )
     long = tiny.encode([Question("s", "<video>", videos=[Clip.of(frames(600))])])
     assert tiny.processor.tokenizer.decode(long["input_ids"][0]).count("<|video_pad|>") == 5 * 64
     large = tiny.encode([Question("s", "<image>", [frames(1, size=1024)[0]])])
@@ -171,7 +202,10 @@ def test_a_tiny_model_reads_conversations_in_qwens_format(tiny):
 
 
 def test_replies_do_not_depend_on_what_is_queried_beside(tiny):
-    questions = [Question("s", "<image>" + "pick up the red cube " * n, [frames(1, 9 * n)[0]]) for n in (1, 7, 3)]
+    questions = [
+        Question("s", "<image>" + "pick up the red cube " * n, [frames(1, 9 * n)[0]])
+        for n in (1, 7, 3)
+    ]
     together = tiny.generate(questions, 12)
     assert together == [tiny.generate([question], 12)[0] for question in questions]
     assert all(reply.output_tokens <= 12 for reply in together)
@@ -248,7 +282,9 @@ def test_what_came_due_while_a_subgoal_was_fixed_is_left_out():
     predictor = QwenVL("simple", interval=48, vlm=Scripted("press", "pick", "put"))
     assert query_steps(predictor, 16, 12, "ButtonUnmask") == [0, 96, 144]
     predictor = QwenVL("simple", interval=32, vlm=Scripted(*["press the first button"] * 3))
-    assert query_steps(predictor, 16, 9, "ButtonUnmaskSwap") == [0, 128], "112 would answer what came due at 96"
+    assert query_steps(predictor, 16, 9, "ButtonUnmaskSwap") == [0, 128], (
+        "112 would answer what came due at 96"
+    )
 
 
 def test_an_episode_that_is_joined_late_is_queried_at_once():

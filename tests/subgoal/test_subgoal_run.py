@@ -1,4 +1,6 @@
-"""A predictor in a whole run: what `run.json` keeps of it, where it runs, what is told of it at the end."""
+"""A predictor in a whole run: what `run.json` keeps of it, where it runs, what is told of it at the
+end.
+"""
 
 from pathlib import Path
 
@@ -19,13 +21,35 @@ def facts_of(predictor) -> dict:
 
 
 def test_whatever_decides_what_a_predictor_says_belongs_to_the_run() -> None:
-    base = {"name": "gemini", "client": object(), "model": "a", "wait": 75, "temperature": 0.0, "interval": 48}
+    base = {
+        "name": "gemini",
+        "client": object(),
+        "model": "a",
+        "wait": 75,
+        "temperature": 0.0,
+        "interval": 48,
+    }
     facts = facts_of(build_predictor(base))
     assert facts["model"] == "a" and "client" not in facts
-    for change in ({"model": "b"}, {"wait": 0}, {"temperature": 1.0}, {"interval": 16}, {"kind": "simple"}):
+    for change in (
+        {"model": "b"},
+        {"wait": 0},
+        {"temperature": 1.0},
+        {"interval": 16},
+        {"kind": "simple"},
+    ):
         assert facts_of(build_predictor({**base, **change})) != facts, change
-    other = {"workers": 1, "cache": "c", "key_variable": "K", "timeout": 5.0, "retries": 0, "backoff": 0.0,
-             "requests_per_minute": None, "input_price": 0.0, "output_price": 0.0}  # fmt: skip
+    other = {
+        "workers": 1,
+        "cache": "c",
+        "key_variable": "K",
+        "timeout": 5.0,
+        "retries": 0,
+        "backoff": 0.0,
+        "requests_per_minute": None,
+        "input_price": 0.0,
+        "output_price": 0.0,
+    }
     assert facts_of(build_predictor({**base, **other})) == facts
     background = BackgroundPredictor(build_predictor(base))
     assert facts_of(background) == {**facts, "mode": "background"}
@@ -34,9 +58,19 @@ def test_whatever_decides_what_a_predictor_says_belongs_to_the_run() -> None:
 
 def test_a_model_of_subgoals_is_known_by_the_end_of_its_path() -> None:
     oracle = Oracle()
-    oracle.settings = {"adapter": "/here/outputs/subgoal/a/adapter", "model": "Qwen/Qwen3", "hold": True, "device": "x"}
+    oracle.settings = {
+        "adapter": "/here/outputs/subgoal/a/adapter",
+        "model": "Qwen/Qwen3",
+        "hold": True,
+        "device": "x",
+    }
     there = Oracle()
-    there.settings = {"adapter": "outputs/subgoal/a/adapter", "model": "Qwen/Qwen3", "hold": True, "device": "cpu"}
+    there.settings = {
+        "adapter": "outputs/subgoal/a/adapter",
+        "model": "Qwen/Qwen3",
+        "hold": True,
+        "device": "cpu",
+    }
     assert facts_of(oracle) == facts_of(there)
     there.settings["adapter"] = "outputs/subgoal/b/adapter"
     assert facts_of(oracle) != facts_of(there)
@@ -53,11 +87,15 @@ def test_a_checkpoint_saved_as_text_is_the_same_number(tmp_path: Path) -> None:
 
 def test_subgoals_and_policies_must_go_together(caplog: pytest.LogCaptureFixture) -> None:
     oracle = {"name": "oracle", "kind": "grounded", "interval": 1}
-    assert choose_subgoals(quick_policy("simplesg"), oracle).kind == "simple", "the policy's own kind"
+    assert choose_subgoals(quick_policy("simplesg"), oracle).kind == "simple", (
+        "the policy's own kind"
+    )
     with pytest.raises(UserError, match="reads no subgoal"):
         choose_subgoals(quick_policy("pi05"), oracle)
     assert choose_subgoals(quick_policy("simplesg"), None) is None
-    assert [predictor_of(quick_policy(name), "oracle").kind for name in ("simplesg", "groundsg")] == [
+    assert [
+        predictor_of(quick_policy(name), "oracle").kind for name in ("simplesg", "groundsg")
+    ] == [
         "simple",
         "grounded",
     ], "a name in Python"
@@ -69,10 +107,16 @@ def test_a_predictor_on_auto_runs_on_the_policys_device(monkeypatch: pytest.Monk
 
     devices = []
     monkeypatch.setattr(
-        module, "build_predictor", lambda section: devices.append(section["device"]) or Oracle("simple")
+        module,
+        "build_predictor",
+        lambda section: devices.append(section["device"]) or Oracle("simple"),
     )
     for name in ("auto", "cpu"):
-        choose_subgoals(quick_policy("simplesg"), {"name": "qwenvl", "device": name}, device=torch.device("cuda", 3))
+        choose_subgoals(
+            quick_policy("simplesg"),
+            {"name": "qwenvl", "device": name},
+            device=torch.device("cuda", 3),
+        )
     assert devices == ["cuda:3", "cpu"]
 
 
@@ -83,4 +127,6 @@ def test_what_a_predictor_did_is_reported_in_one_line(caplog: pytest.LogCaptureF
         report_usage(Usage())
         assert caplog.text == ""
         report_usage(usage)
-    assert caplog.messages == ["subgoals: 1,200 calls, 2 retries, 34,567 tokens read, 3 malformed answers, $1.50"]
+    assert caplog.messages == [
+        "subgoals: 1,200 calls, 2 retries, 34,567 tokens read, 3 malformed answers, $1.50"
+    ]

@@ -37,12 +37,16 @@ def figures(shared):
     """The messages of the paper's three example prompts."""
     source = (shared / "paper" / "robomme_paper.tex").read_text()
     listings = re.findall(
-        r"Example Prompt for [^\n]*\n.*?\\begin\{lstlisting\}.*?\n(.*?)\\end\{lstlisting\}", source, re.S
+        r"Example Prompt for [^\n]*\n.*?\\begin\{lstlisting\}.*?\n(.*?)\\end\{lstlisting\}",
+        source,
+        re.S,
     )
     rows = []
     for text in listings[:3]:
         without_trailing_commas = re.sub(r",(\s*[\]}])", r"\1", text)
-        rows.append([message["content"] for message in json.loads(without_trailing_commas)["messages"]])
+        rows.append(
+            [message["content"] for message in json.loads(without_trailing_commas)["messages"]]
+        )
     return dict(zip(("simple", "grounded", "memer"), rows, strict=True))
 
 
@@ -67,7 +71,9 @@ def test_memer_prompts_are_the_papers(figures):
 
 def test_a_first_message_has_no_history_and_no_video_mark():
     text = subgoal_user("simple", "press the button", [], video=False)
-    assert text.startswith("The task goal is: press the button\nThis is the initial turn for prediction\n<image>")
+    assert text.startswith(
+        "The task goal is: press the button\nThis is the initial turn for prediction\n<image>"
+    )
     assert split_media(text)[1] == "<image>"
 
 
@@ -107,7 +113,9 @@ def test_prompted_answers_are_read_as_released(golden):
 
 def test_labels_give_up_their_points_as_released(golden):
     inputs = ["pick at <12, 200>", "press", "from <1, 2> at <3, 4> at <5, 6>"]
-    for text, (stripped, points) in zip(inputs, golden["training_grounded_preprocess"], strict=True):
+    for text, (stripped, points) in zip(
+        inputs, golden["training_grounded_preprocess"], strict=True
+    ):
         assert mark_points(text) == (stripped, [tuple(p) for p in points])
 
 
@@ -128,7 +136,9 @@ def test_a_damaged_reply_is_named_so(answer):
 
 def test_memer_answers():
     box = "<|box_start|>(500,250)<|box_end|>"
-    reply = f'```json\n{{"current_subtask": "pick at {box}", "keyframe_positions": [9, 3, 3, 0]}}```'
+    reply = (
+        f'```json\n{{"current_subtask": "pick at {box}", "keyframe_positions": [9, 3, 3, 0]}}```'
+    )
     parsed, positions = parse_memer(reply, 8)
     assert (parsed.text, parsed.points, positions) == ("pick at <128, 64>", ((128, 64),), [3])
     for reply in (
@@ -143,9 +153,9 @@ def test_memer_answers():
 
 
 def test_a_prompted_reply_may_carry_what_it_likes_around_it():
-    assert parse_gemini('Sure!\n{"subgoal_sequence": ["a", "b"],\n "subgoal": "press the button"}\nGood luck') == (
-        "press the button"
-    )
+    assert parse_gemini(
+        'Sure!\n{"subgoal_sequence": ["a", "b"],\n "subgoal": "press the button"}\nGood luck'
+    ) == ("press the button")
     assert parse_gemini('{"subgoal":\n "press"}') == "press"
     assert pixels_of_pairs("move to <-5, 2000>").points == ((0, 256),)
     assert says_done("The task is complete.") and not says_done("complete the row")
@@ -162,7 +172,10 @@ def test_coordinates_go_there_and_back():
 
 
 def test_holding_rules_of_the_three_tasks():
-    assert [hold_until(t, None) for t in ("ButtonUnmask", "PickHighlight", "ButtonUnmaskSwap", "BinFill")] == [
+    assert [
+        hold_until(t, None)
+        for t in ("ButtonUnmask", "PickHighlight", "ButtonUnmaskSwap", "BinFill")
+    ] == [
         90,
         90,
         0,

@@ -1,4 +1,6 @@
-"""Fine-tuning: rows become questions and labels, and the whole path from demonstrations to predictions runs."""
+"""Fine-tuning: rows become questions and labels, and the whole path from demonstrations to
+predictions runs.
+"""
 
 import json
 
@@ -42,10 +44,21 @@ def tiny():
 
 def settings(data, output, **words):
     options = {
-        "rows": data / "grounded.jsonl", "output": output, "vlm": "tiny", "steps": 14, "batch": 2, "lr": 1e-2,
-        "per_device_batch": 1, "workers": 0, "log_every": 1, "save_every": 7, "report_to": "null", "device": "cpu",
-        "gradient_checkpointing": "false", **words,
-    }  # fmt: skip
+        "rows": data / "grounded.jsonl",
+        "output": output,
+        "vlm": "tiny",
+        "steps": 14,
+        "batch": 2,
+        "lr": 1e-2,
+        "per_device_batch": 1,
+        "workers": 0,
+        "log_every": 1,
+        "save_every": 7,
+        "report_to": "null",
+        "device": "cpu",
+        "gradient_checkpointing": "false",
+        **words,
+    }
     return compose("subgoal_train", [f"{key}={value}" for key, value in options.items()])
 
 
@@ -59,7 +72,11 @@ def test_points_of_a_row_go_to_the_question_first_and_to_the_reply_then():
         "messages": [{"content": "s"}, {"content": "1. at <bbox>"}, {"content": "at <bbox>"}],
         "objects": {"ref": [], "bbox": [[128, 64], [0, 255]]},
     }
-    expected = ("s", "1. at <|box_start|>(500,250)<|box_end|>", "at <|box_start|>(0,996)<|box_end|>")
+    expected = (
+        "s",
+        "1. at <|box_start|>(500,250)<|box_end|>",
+        "at <|box_start|>(0,996)<|box_end|>",
+    )
     assert texts_of(row) == expected
 
 
@@ -93,7 +110,9 @@ def test_training_and_prediction_ask_in_the_same_words(data, tiny):
 
 def test_rows_that_are_too_long_are_left_out(data, tiny):
     tokenizer, file = tiny.processor.tokenizer, data / "memer.jsonl"
-    lengths = [len(tiny.encode([question_of(row, data)])["input_ids"][0]) for row in read_rows(file)]
+    lengths = [
+        len(tiny.encode([question_of(row, data)])["input_ids"][0]) for row in read_rows(file)
+    ]
     everything = RowDataset(file, tokenizer)
     assert len(everything) == len(lengths) and everything.left_out == 0
     limit = int(np.median(lengths))
@@ -111,7 +130,9 @@ def test_rows_are_a_hugging_face_dataset(data):
     assert [m["role"] for m in one["messages"]] == ["system", "user", "assistant"]
     assert sum(p["type"] == "image" for p in parts) == len(one["images"]) == len(rows[-1]["images"])
     assert sum(p["type"] == "video" for p in parts) == len(one["videos"]) == 1
-    assert np.array_equal(np.asarray(one["images"][0].convert("RGB")), read_image(data / rows[-1]["images"][0]))
+    assert np.array_equal(
+        np.asarray(one["images"][0].convert("RGB")), read_image(data / rows[-1]["images"][0])
+    )
 
 
 def test_damaged_rows_and_missing_images_are_named(tmp_path, data):
@@ -137,25 +158,49 @@ def test_the_full_path_learns_resumes_and_predicts(data, tmp_path):
     halved.mkdir()
     (tmp_path / "checkpoint-7").rename(halved / "checkpoint-7")
     fine_tune(settings(data, halved, resume="auto"))
-    assert losses(halved) == pytest.approx(values, rel=1e-4), "the resumed run ends as the straight one"
+    assert losses(halved) == pytest.approx(values, rel=1e-4), (
+        "the resumed run ends as the straight one"
+    )
 
     subgoals = {}
     for adapter in (None, str(straight)):
-        options = {"name": "qwenvl", "model": "tiny", "device": "cpu", "max_new_tokens": 24, "adapter": adapter}
+        options = {
+            "name": "qwenvl",
+            "model": "tiny",
+            "device": "cpu",
+            "max_new_tokens": 24,
+            "adapter": adapter,
+        }
         predictor = build_predictor(options)
         row = question_of(read_rows(data / "grounded.jsonl")[0], data)
         episode = predictor.start_episode("goal", row.videos[0].frames)
         episode.observe(row.images[0][None])
         subgoals[adapter] = predictor.predict([episode])[0]
     assert subgoals[str(straight)].reply != subgoals[None].reply
-    assert "pick up" in subgoals[str(straight)].reply or "container" in subgoals[str(straight)].reply
+    assert (
+        "pick up" in subgoals[str(straight)].reply or "container" in subgoals[str(straight)].reply
+    )
 
 
 def test_the_effective_batch_is_what_was_requested():
-    assert accumulation(64, 4, 4) == 4 and accumulation(48, 4, 4) == 3 and accumulation(64, 4, 1) == 16
+    assert (
+        accumulation(64, 4, 4) == 4 and accumulation(48, 4, 4) == 3 and accumulation(64, 4, 1) == 16
+    )
     with pytest.raises(UserError, match="no multiple"):
         accumulation(64, 4, 3)
     recipe = compose("subgoal_train", ["rows=x"])
-    assert (recipe.lora.rank, recipe.lora.alpha, recipe.lr, recipe.batch, recipe.epochs, recipe.warmup) == (
-        16, 32, 1e-4, 64, 2, 0.05,
-    )  # fmt: skip
+    assert (
+        recipe.lora.rank,
+        recipe.lora.alpha,
+        recipe.lr,
+        recipe.batch,
+        recipe.epochs,
+        recipe.warmup,
+    ) == (
+        16,
+        32,
+        1e-4,
+        64,
+        2,
+        0.05,
+    )

@@ -43,11 +43,15 @@ def labelled(policy: MMEPolicy) -> Batch:
     return replace(batch, history=replace(batch.history, labels=labels))
 
 
-def loss_of(policy: MMEPolicy, batch: Batch, **weights: float) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+def loss_of(
+    policy: MMEPolicy, batch: Batch, **weights: float
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     policy.loss_weights = weights
     policy.zero_grad()
     noise = policy.training_noise(2, torch.Generator().manual_seed(3))
-    loss, metrics = policy(batch, noise | {"changes": policy._sample_augmentation(2, torch.Generator().manual_seed(4))})
+    loss, metrics = policy(
+        batch, noise | {"changes": policy._sample_augmentation(2, torch.Generator().manual_seed(4))}
+    )
     loss.backward()
     return loss.detach(), metrics
 
@@ -81,7 +85,8 @@ def test_evaluation_has_no_auxiliary_loss(policy: MMEPolicy) -> None:
     loss, metrics = policy(labelled(policy), noise)
     assert set(metrics) == {"loss"}
     assert torch.equal(
-        loss, policy(replace(labelled(policy), history=random_batch(policy, valid=32).history), noise)[0]
+        loss,
+        policy(replace(labelled(policy), history=random_batch(policy, valid=32).history), noise)[0],
     )
 
 
@@ -107,7 +112,9 @@ def test_integration_and_backbone_may_return_losses() -> None:
     class Sums(type(small_policy("framesamp_modul").integration), AuxiliaryLosses):  # type: ignore[misc]
         reads_labels = ("speed",)
 
-        def losses(self, batch: Batch, injection: Injection, memory: MemoryTokens | None) -> dict[str, torch.Tensor]:
+        def losses(
+            self, batch: Batch, injection: Injection, memory: MemoryTokens | None
+        ) -> dict[str, torch.Tensor]:
             return {"speed": batch.labels["speed"] * memory.tokens.square().mean((1, 2))}
 
     policy = small_policy("framesamp_modul").train()
@@ -120,18 +127,28 @@ def test_labels_lie_at_the_frames_of_the_tokens(policy: MMEPolicy, tmp_path: Pat
     from mme_vla.training.data import prepare_data
 
     data = {
-        "name": "sample", "sources": ["sample"], "val_fraction": 0.0, "val_episodes": [], "action_offset": 0,
-        "mask_padding": False, "jitter": False, "weights": "frame_index",
+        "name": "sample",
+        "sources": ["sample"],
+        "val_fraction": 0.0,
+        "val_episodes": [],
+        "action_offset": 0,
+        "mask_padding": False,
+        "jitter": False,
+        "weights": "frame_index",
         "cache": {"root": str(tmp_path), "batch_size": 32, "max_build_frames": 5000},
-    }  # fmt: skip
+    }
     dataset = prepare_data(policy, data, 0, say=lambda line: None).train
     item = dataset[150]
     source, episode, frame = item["place"]
-    texts = [dataset.sources[source].subgoals(episode, i)["simple_subgoal"] for i in range(frame + 1)]
+    texts = [
+        dataset.sources[source].subgoals(episode, i)["simple_subgoal"] for i in range(frame + 1)
+    ]
     begins = [float(i == 0 or texts[i] != texts[i - 1]) for i in range(frame + 1)]
     history = item["history"]
     frames = history.positions[:, 0].long().tolist()
-    expected = [begins[f] if valid else 0.0 for f, valid in zip(frames, history.mask.tolist(), strict=True)]
+    expected = [
+        begins[f] if valid else 0.0 for f, valid in zip(frames, history.mask.tolist(), strict=True)
+    ]
     assert history.labels[BOUNDARY].tolist() == expected
     assert item["weight"] == frame
     batch = policy.require_processor().collate([item, dataset[10]])
@@ -151,28 +168,47 @@ def test_joined_memories_read_labels_and_return_losses(policy: MMEPolicy) -> Non
 
 
 CASES: list[tuple[str, Callable[[np.ndarray], pa.Array], str]] = [
-    ("missing", lambda v: pa.array([None if i == 400 else x for i, x in enumerate(v.tolist())]), "has no value"),
-    ("infinite", lambda v: pa.array(np.where(np.arange(len(v)) == 400, np.inf, v)), "is missing or not finite"),
-    ("ragged", lambda v: pa.array([[x] * (3 if i == 400 else 2) for i, x in enumerate(v)]), "does not hold 2 numbers"),
+    (
+        "missing",
+        lambda v: pa.array([None if i == 400 else x for i, x in enumerate(v.tolist())]),
+        "has no value",
+    ),
+    (
+        "infinite",
+        lambda v: pa.array(np.where(np.arange(len(v)) == 400, np.inf, v)),
+        "is missing or not finite",
+    ),
+    (
+        "ragged",
+        lambda v: pa.array([[x] * (3 if i == 400 else 2) for i, x in enumerate(v)]),
+        "does not hold 2 numbers",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("name", "change", "problem"), CASES, ids=[case[0] for case in CASES])
-def test_a_bad_label_names_column_and_episode(name: str, change: Any, problem: str, tmp_path: Path) -> None:
+def test_a_bad_label_names_column_and_episode(
+    name: str, change: Any, problem: str, tmp_path: Path
+) -> None:
     root = tmp_path / "sample"
     shutil.copytree(SAMPLE, root)
     (root / "SHA256SUMS").unlink(missing_ok=True)
     table = pq.read_table(root / TABLE)
-    pq.write_table(table.append_column("reward", change(np.arange(len(table), dtype=np.float64))), root / TABLE)
+    pq.write_table(
+        table.append_column("reward", change(np.arange(len(table), dtype=np.float64))), root / TABLE
+    )
     source = EpisodeSource(root)
     episode, frame = source.locate(400)
-    with pytest.raises(UserError, match=rf"'reward' of sample {problem} at frame {frame} of episode {episode} "):
+    with pytest.raises(
+        UserError, match=rf"'reward' of sample {problem} at frame {frame} of episode {episode} "
+    ):
         label_column(source, "reward", "data.weights")
 
 
 def test_an_absent_column_is_reported() -> None:
     with pytest.raises(
-        UserError, match=r"Unknown column of sample \(data.weights\) 'step_id'. Did you mean 'step_idx'"
+        UserError,
+        match=r"Unknown column of sample \(data.weights\) 'step_id'. Did you mean 'step_idx'",
     ):
         label_column(EpisodeSource("sample"), "step_id", "data.weights")
 

@@ -1,4 +1,6 @@
-"""Shards of a sharded run that are damaged, unchecked or elsewhere: the library's error names the file."""
+"""Shards of a sharded run that are damaged, unchecked or elsewhere: the library's error names the
+file.
+"""
 
 import shutil
 import warnings
@@ -60,7 +62,9 @@ def test_a_shard_without_its_checksum_is_refused(policy: MMEPolicy, checkpoint: 
         read_weights(checkpoint, policy)
 
 
-def test_damage_is_an_error_of_the_library_whatever_the_checksum_says(policy: MMEPolicy, checkpoint: Path) -> None:
+def test_damage_is_an_error_of_the_library_whatever_the_checksum_says(
+    policy: MMEPolicy, checkpoint: Path
+) -> None:
     (file,) = shard_files(checkpoint)
     content, rng = file.read_bytes(), np.random.default_rng(0)
     header = 8 + int.from_bytes(content[:8], "little")
@@ -85,11 +89,15 @@ def test_damage_is_an_error_of_the_library_whatever_the_checksum_says(policy: MM
         add_sums(checkpoint)
         file.write_bytes(content)
         add_sums(checkpoint)
-    assert refused > 80  # a flipped bit of a weight that has a checksum of its own is another weight
+    assert (
+        refused > 80
+    )  # a flipped bit of a weight that has a checksum of its own is another weight
 
 
 @pytest.mark.parametrize("name", ["shard", "checksum", "folder"])
-def test_links_out_of_the_checkpoint_are_not_followed(policy: MMEPolicy, checkpoint: Path, name: str) -> None:
+def test_links_out_of_the_checkpoint_are_not_followed(
+    policy: MMEPolicy, checkpoint: Path, name: str
+) -> None:
     (file,) = shard_files(checkpoint)
     place = {"shard": file, "checksum": file.with_suffix(".sha256"), "folder": file.parent}[name]
     place.rename(checkpoint.parent / place.name)

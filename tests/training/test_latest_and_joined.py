@@ -1,4 +1,6 @@
-"""`latest` is understood wherever weights are opened, and several memories take what a release or a command says."""
+"""`latest` is understood wherever weights are opened, and several memories take what a release or a
+command says.
+"""
 
 import shutil
 from pathlib import Path
@@ -53,16 +55,26 @@ def test_a_list_of_memories_in_a_file_says_where_its_keys_are(tmp_path: Path) ->
     (tmp_path / "model" / "keyed.yaml").write_text(head + keyed)
     single = compose("policy", ["model=both"], extra_dirs=[tmp_path]).memory
     assert single == compose("policy", ["model=keyed"], extra_dirs=[tmp_path]).memory
-    with pytest.raises(UserError, match=r"'memory.budget=256'.*list \[framesamp, ttt\].*`/memory: joined`.*memory=\["):
+    with pytest.raises(
+        UserError,
+        match=r"'memory.budget=256'.*list \[framesamp, ttt\].*`/memory: joined`.*memory=\[",
+    ):
         compose("policy", ["model=both", "memory.budget=256"], extra_dirs=[tmp_path])
     for words in (["model=keyed"], ["model=framesamp_ttt_modul"], ["memory=[framesamp,ttt]"]):
-        assert compose("policy", [*words, "memory.budget=256"], extra_dirs=[tmp_path]).memory.budget == 256, words
+        assert (
+            compose("policy", [*words, "memory.budget=256"], extra_dirs=[tmp_path]).memory.budget
+            == 256
+        ), words
 
 
 @pytest.mark.parametrize(("released", "place"), [("ttt_modul", 1), ("framesamp_modul", 0)])
-def test_a_joined_memory_takes_the_member_that_a_released_run_holds(released: str, place: int, tmp_path: Path) -> None:
+def test_a_joined_memory_takes_the_member_that_a_released_run_holds(
+    released: str, place: int, tmp_path: Path
+) -> None:
     alone = small_policy(released, seed=1, **({"memory": {"hidden": 16}} if place else {}))
-    save_file({k: v.contiguous() for k, v in to_released(alone).items()}, tmp_path / "model.safetensors")
+    save_file(
+        {k: v.contiguous() for k, v in to_released(alone).items()}, tmp_path / "model.safetensors"
+    )
     members = ["framesamp", TTT]
     joined = small_policy("framesamp_ttt_modul", seed=2, memory={"members": members})
     before = {name: value.clone() for name, value in joined.state_dict().items()}
@@ -71,7 +83,9 @@ def test_a_joined_memory_takes_the_member_that_a_released_run_holds(released: st
     for name, value in other_state.items():
         assert torch.equal(after[f"memory.members.{place}.{name}"], value), name
     other = [name for name in after if name.startswith(f"memory.members.{1 - place}.")]
-    assert other and all(torch.equal(after[name], before[name]) for name in other), "the other one stays as it was"
+    assert other and all(torch.equal(after[name], before[name]) for name in other), (
+        "the other one stays as it was"
+    )
     assert set(start.new) == set(other) and start.left == []
     with pytest.raises(UserError, match=r"JoinedMemory .*start_from\(\)"):
         load_weights(joined, tmp_path)

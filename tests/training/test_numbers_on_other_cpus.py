@@ -1,7 +1,8 @@
-"""What a seed means beside scenes (noise, order of samples, bootstraps, tokens) has the same bits on every CPU.
+"""What a seed means beside scenes (noise, order of samples, bootstraps, tokens) has the same bits
+on every CPU.
 
-`torch.randn` of 16 and more numbers uses vector instructions for logarithm and sine where a CPU has AVX2. The digest of
-noise holds for these CPUs, which all that the library is tested on are.
+`torch.randn` of 16 and more numbers uses vector instructions for logarithm and sine where a CPU has
+AVX2. The digest of noise holds for these CPUs, which all that the library is tested on are.
 """
 
 import json
@@ -21,7 +22,11 @@ RECORDED = {
     "tokens": "0d9a53aa3b8de47b",
 }
 SETTINGS = [
-    {"NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"},
+    {
+        "NPY_DISABLE_CPU_FEATURES": (
+            "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+        )
+    },
     {"OPENBLAS_CORETYPE": "Prescott"},
     {"MKL_CBWR": "COMPATIBLE"},
     {"MKL_CBWR": "AVX2"},
@@ -41,11 +46,17 @@ def test_noise_of_a_seed_has_the_recorded_bits() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: "-".join(*setting.items()).split()[0])
+@pytest.mark.parametrize(
+    "setting", SETTINGS, ids=lambda setting: "-".join(*setting.items()).split()[0]
+)
 def test_numbers_of_a_seed_do_not_depend_on_the_kernels_of_a_cpu(setting: dict[str, str]) -> None:
-    environment = os.environ | setting | {"PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"}
+    environment = (
+        os.environ | setting | {"PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"}
+    )
     command = [sys.executable, "-W", "ignore", "-m", "helpers.number_digests"]
-    finished = subprocess.run(command, env=environment, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    finished = subprocess.run(
+        command, env=environment, cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
     assert finished.returncode == 0, finished.stderr[-2000:]
     digests = json.loads(finished.stdout.splitlines()[-1])
     expected = dict(RECORDED)

@@ -19,7 +19,9 @@ def test_learning_rate_follows_the_released_schedule(parity: Path) -> None:
     golden = json.loads((parity / "unit_optimizer.json").read_text())["lr_schedule"]
     for step, rate in golden.items():
         # The released schedule runs in float32 and cancels at its first steps: 4e-8 of the peak.
-        assert learning_rate(int(step), 5e-5, 10_000) == pytest.approx(rate, rel=2e-6, abs=5e-5 * 1e-7)
+        assert learning_rate(int(step), 5e-5, 10_000) == pytest.approx(
+            rate, rel=2e-6, abs=5e-5 * 1e-7
+        )
 
 
 def test_updates_and_averages_equal_the_released_ones(parity: Path) -> None:
@@ -36,8 +38,12 @@ def test_updates_and_averages_equal_the_released_ones(parity: Path) -> None:
         optimizer.step()
         ema.update()
         for name in names:
-            torch.testing.assert_close(module[name].data, golden[f"out/step{step}/{name}"], rtol=2e-6, atol=1e-7)
-            torch.testing.assert_close(ema.tensors()[name], golden[f"out/ema{step}/{name}"], rtol=2e-6, atol=1e-7)
+            torch.testing.assert_close(
+                module[name].data, golden[f"out/step{step}/{name}"], rtol=2e-6, atol=1e-7
+            )
+            torch.testing.assert_close(
+                ema.tensors()[name], golden[f"out/ema{step}/{name}"], rtol=2e-6, atol=1e-7
+            )
 
 
 def test_gradients_below_the_norm_stay_as_they_are() -> None:
@@ -71,7 +77,9 @@ def test_every_epoch_sees_each_sample_once_in_a_new_order() -> None:
 
 def test_pieces_and_processes_share_out_the_same_batch() -> None:
     full = list(BatchOrder(16, 8, 0, range(2)))
-    shares = [list(BatchOrder(16, 8, 0, range(2), accumulate=2, process=p, processes=2)) for p in range(2)]
+    shares = [
+        list(BatchOrder(16, 8, 0, range(2), accumulate=2, process=p, processes=2)) for p in range(2)
+    ]
     assert [shares[0][0] + shares[1][0] + shares[0][1] + shares[1][1]] == full[:1]
 
 

@@ -6,7 +6,9 @@ from mme_vla.data import console as module
 from mme_vla.data.console import progress
 
 
-def test_without_a_terminal_a_line_now_and_then_says_what_is_done_and_what_is_left(monkeypatch, capsys) -> None:
+def test_without_a_terminal_a_line_now_and_then_says_what_is_done_and_what_is_left(
+    monkeypatch, capsys
+) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")  # as in notebooks: colours, and still no terminal
     now = [100.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
@@ -24,7 +26,10 @@ def test_time_left_does_not_count_what_comes_before_the_first_step(monkeypatch, 
     now = [100.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     with progress("record", total=1000) as advance:
-        for seconds, steps in ((19.0, 500), (1.0, 10)):  # start-up and those of an interrupted run, new ones
+        for seconds, steps in (
+            (19.0, 500),
+            (1.0, 10),
+        ):  # start-up and those of an interrupted run, new ones
             now[0] += seconds
             advance(steps)
     line = Text.from_ansi(capsys.readouterr().err).plain.splitlines()[0]

@@ -21,11 +21,21 @@ from mme_vla.training.logging import read_metrics
 
 STEPS, SAVE_EVERY = 9, 4
 SMALL = [
-    "model=tokendrop_expert", "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=32",
-    "backbone.vision.patch_size=2", "memory.budget=64", f"train.steps={STEPS}", f"train.save_every={SAVE_EVERY}",
-    "train.log_every=1", "train.val_every=3", "train.val_samples=2", "train.batch_size=2", "train.open_loop_chunks=2",
+    "model=tokendrop_expert",
+    "backbone.depth=1",
+    "backbone.vision.depth=1",
+    "backbone.vision.image_size=32",
+    "backbone.vision.patch_size=2",
+    "memory.budget=64",
+    f"train.steps={STEPS}",
+    f"train.save_every={SAVE_EVERY}",
+    "train.log_every=1",
+    "train.val_every=3",
+    "train.val_samples=2",
+    "train.batch_size=2",
+    "train.open_loop_chunks=2",
     "train.device=cpu",
-]  # fmt: skip
+]
 
 
 def start(cache: Path, *overrides: str) -> "subprocess.Popen[str]":
@@ -49,7 +59,9 @@ def numbers(folder: Path) -> list[dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """The runs `whole`, which nothing interrupts, and `killed`: the folder above them, and what the first printed."""
+    """The runs `whole`, which nothing interrupts, and `killed`: the folder above them, and what the
+    first printed.
+    """
     base = tmp_path_factory.mktemp("runs")
     killed = start(base, "output=killed", "train.steps=500")
     deadline = time.monotonic() + 200
@@ -60,7 +72,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     killed.kill()
     assert commands.finish(killed).returncode == -signal.SIGKILL
     printed = io.StringIO()
-    with redirect_stdout(printed):  # in this process, which has imported everything: the same numbers, sooner
+    with redirect_stdout(
+        printed
+    ):  # in this process, which has imported everything: the same numbers, sooner
         main(compose("train", [*SMALL, f"data.cache.root={base}", f"output={base / 'whole'}"]))
     return base, printed.getvalue()
 
@@ -75,7 +89,9 @@ def test_a_killed_run_resumes_with_the_same_losses(runs: tuple[Path, str]) -> No
     assert f"continuing from {killed / 'checkpoints' / f'step_{SAVE_EVERY:06d}'}" in printed
     assert numbers(killed) == numbers(straight)
     assert not (runs[0] / "unused").exists()
-    resumed_run, straight_run = (json.loads((folder / "summary.json").read_text()) for folder in (killed, straight))
+    resumed_run, straight_run = (
+        json.loads((folder / "summary.json").read_text()) for folder in (killed, straight)
+    )
     assert resumed_run["open_loop"] == straight_run["open_loop"]
 
 
@@ -110,7 +126,10 @@ def test_a_finished_run_holds_everything(runs: tuple[Path, str]) -> None:
         (["output=whole"], "never overwritten"),
         (["resume=whole", "train.steps=20", "train.lr=0.5"], r"train\.lr: 0.003 then, 0.5 now"),
         (["resume=nowhere"], "No checkpoint at nowhere"),
-        (["output=new", "train.batch_size=3", "train.accumulate=2"], r"multiple of train\.accumulate=2"),
+        (
+            ["output=new", "train.batch_size=3", "train.accumulate=2"],
+            r"multiple of train\.accumulate=2",
+        ),
         (["output=new", "train.batch_size=4000"], r"fewer than train\.batch_size=4000"),
         (["output=new", "data.sources=[missing]"], "No LeRobot dataset at 'missing'"),
         (["output=new", "init_from=nowhere"], "No checkpoint at nowhere"),

@@ -1,4 +1,6 @@
-"""A run that continues from a checkpoint has the weights of one that never stopped, to the last bit."""
+"""A run that continues from a checkpoint has the weights of one that never stopped, to the last
+bit.
+"""
 
 import shutil
 from pathlib import Path
@@ -13,12 +15,27 @@ from mme_vla.config.composition import compose
 from mme_vla.policy.tensor_files import assign_tensors, load_tensors, take_memory
 
 WORDS = [
-    "model=ttt_modul", "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=32",
-    "backbone.vision.patch_size=2", "memory.budget=64", "memory.max_steps=3", "memory.max_video=2", "memory.chunk=2",
-    "train.steps=3", "train.save_every=1", "train.val_every=2",
-    "train.val_samples=1", "train.batch_size=1", "train.open_loop_chunks=0", "train.device=cpu", "train.workers=0",
-    "train.keep.last=3", "logger=none", "resume=auto",
-]  # fmt: skip
+    "model=ttt_modul",
+    "backbone.depth=1",
+    "backbone.vision.depth=1",
+    "backbone.vision.image_size=32",
+    "backbone.vision.patch_size=2",
+    "memory.budget=64",
+    "memory.max_steps=3",
+    "memory.max_video=2",
+    "memory.chunk=2",
+    "train.steps=3",
+    "train.save_every=1",
+    "train.val_every=2",
+    "train.val_samples=1",
+    "train.batch_size=1",
+    "train.open_loop_chunks=0",
+    "train.device=cpu",
+    "train.workers=0",
+    "train.keep.last=3",
+    "logger=none",
+    "resume=auto",
+]
 
 
 def test_weights_and_moments_after_resuming_are_equal_to_the_last_bit(tmp_path: Path) -> None:
@@ -30,7 +47,12 @@ def test_weights_and_moments_after_resuming_are_equal_to_the_last_bit(tmp_path: 
         shutil.rmtree(run / "checkpoints" / f"step_{step:06d}")
     main(compose("train", words))
     last = Path("checkpoints") / "step_000003"
-    for name in ("raw.safetensors", "optimizer.safetensors", "model.safetensors", "training_state.json"):
+    for name in (
+        "raw.safetensors",
+        "optimizer.safetensors",
+        "model.safetensors",
+        "training_state.json",
+    ):
         assert (run / last / name).read_bytes() == (straight / last / name).read_bytes(), name
 
 

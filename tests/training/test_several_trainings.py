@@ -1,4 +1,6 @@
-"""`train trainings=2`: one command, two seeds, one vision cache; it continues with the first that is unfinished."""
+"""`train trainings=2`: one command, two seeds, one vision cache; it continues with the first that
+is unfinished.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -16,13 +18,26 @@ from mme_vla.policy.run_folders import find_run, locate_checkpoint, trainings_in
 from mme_vla.training.runs import check_finished
 
 SMALL = [
-    "model=framesamp_modul", "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=32",
-    "backbone.vision.patch_size=2", "memory.budget=64", "train.steps=2", "train.log_every=1", "train.val_samples=0",
-    "train.batch_size=2", "train.open_loop_chunks=0", "train.device=cpu", "train.workers=0", "trainings=2",
-]  # fmt: skip
+    "model=framesamp_modul",
+    "backbone.depth=1",
+    "backbone.vision.depth=1",
+    "backbone.vision.image_size=32",
+    "backbone.vision.patch_size=2",
+    "memory.budget=64",
+    "train.steps=2",
+    "train.log_every=1",
+    "train.val_samples=0",
+    "train.batch_size=2",
+    "train.open_loop_chunks=0",
+    "train.device=cpu",
+    "train.workers=0",
+    "trainings=2",
+]
 
 
-def test_several_trainings_resume_and_share_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_trainings_resume_and_share_a_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     output = tmp_path / "runs" / "two"
     words = [*SMALL, f"output={output}", f"data.cache.root={tmp_path / 'cache'}"]
     original, calls = command.train, []
@@ -39,11 +54,18 @@ def test_several_trainings_resume_and_share_a_cache(tmp_path: Path, monkeypatch:
     first = trainings_in(output)[0] / "summary.json"
     stored = first.stat().st_mtime_ns
     command.main(compose("train", words))
-    assert calls == ["training_0", "training_1", "training_1"] and first.stat().st_mtime_ns == stored
+    assert (
+        calls == ["training_0", "training_1", "training_1"] and first.stat().st_mtime_ns == stored
+    )
     policies = [MMEPolicy.from_pretrained(locate_checkpoint(run)) for run in trainings_in(output)]
     facts = [facts_of(policy, None, "one", RolloutSettings(), None).training for policy in policies]
-    assert [one and one.seed for one in facts] == [42, 43] and len({one and one.recipe for one in facts}) == 1
-    assert len({one and one.data for one in facts}) == 1 and len({one and one.weights for one in facts}) == 2
+    assert [one and one.seed for one in facts] == [42, 43] and len(
+        {one and one.recipe for one in facts}
+    ) == 1
+    assert (
+        len({one and one.data for one in facts}) == 1
+        and len({one and one.weights for one in facts}) == 2
+    )
     fingerprints = {policy.vision_fingerprint() for policy in policies}
     assert len(fingerprints) == 1
     assert len([path for path in (tmp_path / "cache").glob("*/*") if path.is_dir()]) == 1
@@ -54,7 +76,11 @@ def test_several_trainings_resume_and_share_a_cache(tmp_path: Path, monkeypatch:
         locate_checkpoint(output)
     assert find_run(output.parent / "latest") == output
     evaluated: list[tuple[str, str]] = []
-    monkeypatch.setattr(evaluation, "evaluate_one", lambda cfg, name="": evaluated.append((str(cfg.checkpoint), name)))
+    monkeypatch.setattr(
+        evaluation,
+        "evaluate_one",
+        lambda cfg, name="": evaluated.append((str(cfg.checkpoint), name)),
+    )
     evaluation.main(compose("evaluate", [f"checkpoint={output}", "tasks=StopCube"]))
     assert evaluated == [(str(run), run.name) for run in trainings_in(output)]
     with pytest.raises(UserError, match="other settings"):

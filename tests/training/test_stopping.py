@@ -1,4 +1,6 @@
-"""Being asked to stop, by one process or many; and what is computed only for updates that are logged."""
+"""Being asked to stop, by one process or many; and what is computed only for updates that are
+logged.
+"""
 
 import os
 import signal
@@ -49,12 +51,16 @@ def test_all_processes_stop_after_the_same_update_when_one_is_queried(tmp_path: 
     (tmp_path / "asked.py").write_text(ASKED_ONCE)
     words = (str(tmp_path / "asked.py"), str(tmp_path / "meeting"))
     started = [commands.start(*words, str(rank)) for rank in range(2)]
-    assert [commands.finish(process).stdout.strip() for process in started] == ["stopped after 3"] * 2
+    assert [commands.finish(process).stdout.strip() for process in started] == [
+        "stopped after 3"
+    ] * 2
 
 
 @pytest.fixture
 def default_interrupt() -> Iterator[None]:
-    """Ctrl-C as Python has it: a process that a script starts in its background ignores it from the start."""
+    """Ctrl-C as Python has it: a process that a script starts in its background ignores it from the
+    start.
+    """
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -81,7 +87,13 @@ def test_a_memory_reports_only_for_updates_that_are_logged(tmp_path: Path) -> No
     built.policy.memory.forward = noting
     with ProgressLine(5, 0, visible=False) as line:
         assert built.run(line, loggers(tmp_path))
-    assert reported == [False, True, True, True, True]  # 2 and 4 are logged, 3 is saved, 5 is the last
+    assert reported == [
+        False,
+        True,
+        True,
+        True,
+        True,
+    ]  # 2 and 4 are logged, 3 is saved, 5 is the last
     lines = [line for line in read_metrics(tmp_path) if "train/loss" in line]
     assert [line["step"] for line in lines] == [2, 3, 4, 5]
     assert all("train/memory/inner_loss_before" in line for line in lines)

@@ -57,7 +57,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     train(tmp_path / "parts", steps=3)
     checkpoint = resolve_checkpoint(tmp_path / "parts")
     assert checkpoint.name == "step_000003"
-    resumed = train(tmp_path, built=policy(seed=9), run=Run(tmp_path / "parts", checkpoint, 3), workers=1)
+    resumed = train(
+        tmp_path, built=policy(seed=9), run=Run(tmp_path / "parts", checkpoint, 3), workers=1
+    )
     assert losses(tmp_path / "parts") == losses(tmp_path / "whole")
     for name, weight in straight.policy.state_dict().items():
         assert torch.equal(weight, resumed.policy.state_dict()[name]), name
@@ -68,18 +70,26 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
 def test_computing_a_batch_in_pieces_gives_the_same_update(tmp_path: Path) -> None:
     built = policy(policy={"augment": False})
     straight = train(tmp_path / "a", built=built, steps=2, val_every=9)
-    pieces = train(tmp_path / "b", built=policy(policy={"augment": False}), steps=2, val_every=9, accumulate=2)
+    pieces = train(
+        tmp_path / "b", built=policy(policy={"augment": False}), steps=2, val_every=9, accumulate=2
+    )
     assert losses(tmp_path / "a") == pytest.approx(losses(tmp_path / "b"), rel=1e-5)
     for name, weight in straight.policy.state_dict().items():
         torch.testing.assert_close(weight, pieces.policy.state_dict()[name], rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["pi05", "tokendrop_expert", "framesamp_modul", "framesamp_context"])
-def test_all_trained_weights_are_updated_and_the_frozen_tower_is_not(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["pi05", "tokendrop_expert", "framesamp_modul", "framesamp_context"]
+)
+def test_all_trained_weights_are_updated_and_the_frozen_tower_is_not(
+    tmp_path: Path, name: str
+) -> None:
     built = policy(name)
     before = {key: value.clone() for key, value in built.state_dict().items()}
     after = train(tmp_path, built=built, gradient_checkpointing=True).policy
-    unchanged = {key for key, value in after.state_dict().items() if torch.equal(value, before[key])}
+    unchanged = {
+        key for key, value in after.state_dict().items() if torch.equal(value, before[key])
+    }
     assert unchanged == {key for key in before if key.startswith("backbone.vision.")}
 
 
@@ -119,7 +129,9 @@ def test_validation_loss_does_not_depend_on_when_it_is_queried() -> None:
     assert validation.loss(built.train()) == first
     assert built.training
     assert validation.indices == [0, 2, 4]
-    assert Validation(Samples(built, 5), collate, 3, 3, seed=1).loss(built) == pytest.approx(first, rel=1e-5)
+    assert Validation(Samples(built, 5), collate, 3, 3, seed=1).loss(built) == pytest.approx(
+        first, rel=1e-5
+    )
 
 
 def test_a_folder_that_holds_a_run_is_never_overwritten(two_steps: Path) -> None:
@@ -143,7 +155,12 @@ def test_resuming_with_other_settings_lists_them(two_steps: Path, tmp_path: Path
 
 def test_a_setting_that_came_or_went_counts_as_changed() -> None:
     assert differing_keys({"a": {"b": 1}}, {"a": {"c": 1}}) == {"a.b": (1, None), "a.c": (None, 1)}
-    assert differing_keys({"logger": {"name": "wandb"}, "keep": (1, 2)}, {"logger": None, "keep": [1, 2]}) == {}
+    assert (
+        differing_keys(
+            {"logger": {"name": "wandb"}, "keep": (1, 2)}, {"logger": None, "keep": [1, 2]}
+        )
+        == {}
+    )
 
 
 def test_auto_resumes_the_newest_unfinished_run_or_begins(two_steps: Path, tmp_path: Path) -> None:
@@ -165,13 +182,21 @@ def write_unsummed(file: Path, text: str) -> None:
     [
         (lambda folder: (folder / "training_state.json").unlink(), "nothing to resume"),
         (lambda folder: (folder / "training_state.json").write_text("{"), "damaged"),
-        (lambda folder: write_unsummed(folder / "training_state.json", '{"format": "theirs"}'), "not written by"),
+        (
+            lambda folder: write_unsummed(folder / "training_state.json", '{"format": "theirs"}'),
+            "not written by",
+        ),
         (lambda folder: (folder / "optimizer.safetensors").unlink(), "lacks optimizer.safetensors"),
-        (lambda folder: (folder / "raw.safetensors").write_bytes(b"broken"), "raw.safetensors is damaged"),
+        (
+            lambda folder: (folder / "raw.safetensors").write_bytes(b"broken"),
+            "raw.safetensors is damaged",
+        ),
         (lambda folder: (folder / "model.safetensors").write_bytes(b"\0" * 64), "damaged"),
     ],
 )
-def test_broken_checkpoints_are_refused(copied: Path, tmp_path: Path, break_it: Any, message: str) -> None:
+def test_broken_checkpoints_are_refused(
+    copied: Path, tmp_path: Path, break_it: Any, message: str
+) -> None:
     folder = resolve_checkpoint(copied)
     break_it(folder)
     with pytest.raises(UserError, match=message):
@@ -181,12 +206,20 @@ def test_broken_checkpoints_are_refused(copied: Path, tmp_path: Path, break_it: 
 
 def test_a_checkpoint_of_another_model_does_not_fit(two_steps: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="does not fit this policy"):
-        trainer(tmp_path, built=policy("tokendrop_expert"), run=Run(two_steps, resolve_checkpoint(two_steps), 2))
+        trainer(
+            tmp_path,
+            built=policy("tokendrop_expert"),
+            run=Run(two_steps, resolve_checkpoint(two_steps), 2),
+        )
 
 
-@pytest.mark.parametrize("files", [["29999/params/_METADATA"], ["29999/params/_METADATA", "history_config.txt"],
-                                   ["79999.zip"]])  # fmt: skip
-def test_a_checkpoint_of_the_released_code_names_the_command_that_converts_it(tmp_path: Path, files: list[str]) -> None:
+@pytest.mark.parametrize(
+    "files",
+    [["29999/params/_METADATA"], ["29999/params/_METADATA", "history_config.txt"], ["79999.zip"]],
+)
+def test_a_checkpoint_of_the_released_code_names_the_command_that_converts_it(
+    tmp_path: Path, files: list[str]
+) -> None:
     for file in files:
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).touch()
@@ -202,14 +235,21 @@ def test_the_tower_under_a_memory_stays_frozen() -> None:
         check_frozen(policy("tokendrop_expert"), freeze_vision=False)
 
 
-def test_too_small_a_disk_is_detected_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shutil.disk_usage", lambda path: os.terminal_size((0, 0)) and type("Usage", (), {"free": 10}))
+def test_too_small_a_disk_is_detected_before_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "shutil.disk_usage",
+        lambda path: os.terminal_size((0, 0)) and type("Usage", (), {"free": 10}),
+    )
     with pytest.raises(UserError, match="free"):
         check_disk(tmp_path / "not" / "there", policy(), KeepRule())
     low = policy().bfloat16()  # stored in float32
     needed = 2 * sum(4 * p.numel() * (4 if p.requires_grad else 1) for p in low.parameters())
     for free, fits in ((needed, True), (needed - 1, False)):
-        monkeypatch.setattr("shutil.disk_usage", lambda path, free=free: type("Usage", (), {"free": free}))
+        monkeypatch.setattr(
+            "shutil.disk_usage", lambda path, free=free: type("Usage", (), {"free": free})
+        )
         with nullcontext() if fits else pytest.raises(UserError, match="free"):
             check_disk(tmp_path, low, KeepRule(last=1))
 
@@ -282,12 +322,25 @@ def test_missing_logger_package_is_reported(monkeypatch: pytest.MonkeyPatch, nam
 
 def test_loss_change_compares_both_ends() -> None:
     lines = [{"step": step, "train/loss": float(100 - step)} for step in range(10, 101, 10)]
-    assert loss_change([*lines, {"step": 9, "val/loss": 7}]) == {"first_loss": 90.0, "last_loss": 0.0, "val_loss": 7}
+    assert loss_change([*lines, {"step": 9, "val/loss": 7}]) == {
+        "first_loss": 90.0,
+        "last_loss": 0.0,
+        "val_loss": 7,
+    }
     assert loss_change([]) == {}
 
 
-@pytest.mark.parametrize("overrides", [[], ["experiment=robomme"], ["logger=wandb"], ["logger=none"],
-                                       ["logger=trackio"], ["logger=mlflow"]])  # fmt: skip
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["experiment=robomme"],
+        ["logger=wandb"],
+        ["logger=none"],
+        ["logger=trackio"],
+        ["logger=mlflow"],
+    ],
+)
 def test_shipped_recipes_are_valid(overrides: list[str]) -> None:
     config = OmegaConf.to_container(compose("train", overrides), resolve=True)
     TrainSettings.from_dict(config["train"], config["seed"])
@@ -297,7 +350,13 @@ def test_shipped_recipes_are_valid(overrides: list[str]) -> None:
 def test_the_papers_recipe_is_the_papers() -> None:
     config = compose("train", ["experiment=robomme", "model=framesamp_modul"])
     recipe = config.train
-    assert (recipe.steps, recipe.batch_size, recipe.lr, recipe.warmup, recipe.ema) == (80_000, 64, 5e-5, 10_000, 0.999)
+    assert (recipe.steps, recipe.batch_size, recipe.lr, recipe.warmup, recipe.ema) == (
+        80_000,
+        64,
+        5e-5,
+        10_000,
+        0.999,
+    )
     assert config.policy.compute_dtype == "bfloat16"
     assert config.backbone.vlm.width == 2048
     assert config.name == "framesamp_modul"
@@ -306,12 +365,20 @@ def test_the_papers_recipe_is_the_papers() -> None:
 def test_weights_to_be_replaced_are_not_rendered_but_a_memory_is_fresh(tmp_path: Path) -> None:
     base = policy(seed=5)
     base.save_pretrained(tmp_path)
-    words = ["model=framesamp_expert", "memory.budget=64", *(f"backbone.{k}={v}" for k, v in (("depth", 1),))]
+    words = [
+        "model=framesamp_expert",
+        "memory.budget=64",
+        *(f"backbone.{k}={v}" for k, v in (("depth", 1),)),
+    ]
     words += [f"backbone.vision.{key}={value}" for key, value in SMALL["vision"].items()]
     built = build_from_config(compose("policy", words), fresh_backbone=False)
     start_from(built, str(tmp_path))
     fresh = built.state_dict()
     assert all(torch.equal(fresh[key], value) for key, value in base.state_dict().items())
-    norm = next(value for key, value in fresh.items() if ".experts.memory.attention_norm.scale" in key)
-    weight = next(value for key, value in fresh.items() if ".experts.memory." in key and value.ndim == 2)
+    norm = next(
+        value for key, value in fresh.items() if ".experts.memory.attention_norm.scale" in key
+    )
+    weight = next(
+        value for key, value in fresh.items() if ".experts.memory." in key and value.ndim == 2
+    )
     assert (norm == 0).all() and 0 < weight.std() < 1

@@ -1,4 +1,6 @@
-"""Several processes of a launcher train one policy, or are refused; a model that is wrapped exchanges its gradients."""
+"""Several processes of a launcher train one policy, or are refused; a model that is wrapped
+exchanges its gradients.
+"""
 
 import json
 from pathlib import Path
@@ -16,7 +18,12 @@ from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 from mme_vla.utils import started_processes
 
 TORCHRUN = ("torch.distributed.run", "--nproc-per-node", "2", "--master-port")
-TINY = ("backbone=tiny", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1")
+TINY = (
+    "backbone=tiny",
+    "backbone.vision.depth=1",
+    "backbone.vision.image_size=16",
+    "backbone.vision.patch_size=1",
+)
 
 
 def small_model() -> tuple[MMEModel, tuple]:
@@ -43,7 +50,9 @@ def test_hooks_of_a_model_run_when_it_is_called() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "port"), [("ddp", "29613"), ("fsdp", "29614")])
-def test_two_processes_exchange_the_gradients_of_a_model_that_is_called(kind: str, port: str, tmp_path: Path) -> None:
+def test_two_processes_exchange_the_gradients_of_a_model_that_is_called(
+    kind: str, port: str, tmp_path: Path
+) -> None:
     script = str(Path(commands.__file__).with_name("ddp_gradients.py"))
     done = commands.run(*TORCHRUN, port, script, kind, str(tmp_path), env={"OMP_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr[-3000:]
@@ -53,8 +62,16 @@ def test_two_processes_exchange_the_gradients_of_a_model_that_is_called(kind: st
 
 @pytest.mark.slow
 def test_two_processes_without_a_gpu_train_one_policy(tmp_path: Path) -> None:
-    words = ("model=pi05", *TINY, "train.steps=2", "train.batch_size=2", f"output={tmp_path / 'run'}")
-    done = commands.run(*TORCHRUN, "29615", "-m", "mme_vla.train", *words, env={"CUDA_VISIBLE_DEVICES": ""})
+    words = (
+        "model=pi05",
+        *TINY,
+        "train.steps=2",
+        "train.batch_size=2",
+        f"output={tmp_path / 'run'}",
+    )
+    done = commands.run(
+        *TORCHRUN, "29615", "-m", "mme_vla.train", *words, env={"CUDA_VISIBLE_DEVICES": ""}
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     assert "2 × " in done.stdout
     runs = sorted(path.parent for path in tmp_path.rglob("summary.json"))
@@ -75,7 +92,9 @@ ALONE = {module for module, _ in COMMANDS.values()} - SHARED - READING
 
 
 @pytest.mark.parametrize("module", sorted(ALONE))
-def test_commands_that_share_no_work_are_refused_under_a_launcher(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_that_share_no_work_are_refused_under_a_launcher(
+    module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(UserError, match="would do all of this command"):
         check_launcher(module)

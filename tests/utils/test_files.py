@@ -1,4 +1,6 @@
-"""The readers and writers every room uses: what lies in a file's place, names that lead elsewhere, sums, locks."""
+"""The readers and writers every room uses: what lies in a file's place, names that lead elsewhere,
+sums, locks.
+"""
 
 import json
 import os
@@ -34,13 +36,20 @@ DEEP = "[" * 200_000
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"{", "not valid JSON"), (b"", "not valid JSON"), (DEEP.encode(), "nested too deeply"), (b"[1]", "an object"),
-        (b'{"a": 1' + b"0" * 5000 + b"}", "not valid JSON"), (b'{"a": Infinity}', "Infinity is not a number"),
-        (b'{"a": 1e999}', "out of range"), (b'{"a": "\xff"}', "not UTF-8"),
+        (b"{", "not valid JSON"),
+        (b"", "not valid JSON"),
+        (DEEP.encode(), "nested too deeply"),
+        (b"[1]", "an object"),
+        (b'{"a": 1' + b"0" * 5000 + b"}", "not valid JSON"),
+        (b'{"a": Infinity}', "Infinity is not a number"),
+        (b'{"a": 1e999}', "out of range"),
+        (b'{"a": "\xff"}', "not UTF-8"),
     ],
     ids=["cut", "empty", "deep", "list", "digits", "infinity", "overflow", "latin"],
-)  # fmt: skip
-def test_damaged_json_is_one_short_sentence_that_names_the_file(tmp_path: Path, content: bytes, words: str) -> None:
+)
+def test_damaged_json_is_one_short_sentence_that_names_the_file(
+    tmp_path: Path, content: bytes, words: str
+) -> None:
     file = tmp_path / "plan.json"
     file.write_bytes(content)
     with pytest.raises(UserError, match=words) as caught:
@@ -66,7 +75,10 @@ def named(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_lines_are_read_back(tmp_path: Path) -> None:
-    file, values = tmp_path / "log.jsonl", [{"name": "\u2028", "ages": [3, 4]}, {"name": "b", "value": None}]
+    file, values = (
+        tmp_path / "log.jsonl",
+        [{"name": "\u2028", "ages": [3, 4]}, {"name": "b", "value": None}],
+    )
     file.write_text("".join(f"{to_line(value)}\n" for value in values))
     assert read_lines(file, named) == values
 
@@ -74,10 +86,13 @@ def test_lines_are_read_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ('{"name"', "line 2 is not valid JSON"), ("{}", "line 2: there is no name"), ("[]", "an object"),
-        ('{"name": NaN}', "NaN"), ('{"name": "a", "crc32": "0"}', "line 2 is not what was written"),
+        ('{"name"', "line 2 is not valid JSON"),
+        ("{}", "line 2: there is no name"),
+        ("[]", "an object"),
+        ('{"name": NaN}', "NaN"),
+        ('{"name": "a", "crc32": "0"}', "line 2 is not what was written"),
     ],
-)  # fmt: skip
+)
 def test_damaged_line_is_reported_with_its_number(tmp_path: Path, line: str, message: str) -> None:
     file = tmp_path / "log.jsonl"
     file.write_text(f'{{"name": "a", "value": 1}}\n{line}\n')
@@ -152,9 +167,15 @@ def test_the_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
 
 def test_folder_lock_holds_until_its_process_is_killed(tmp_path: Path) -> None:
     hold = "import sys; from pathlib import Path; from mme_vla.utils import FolderLock\n"
-    hold += "lock = FolderLock(Path(sys.argv[1])).acquire(); print('held', flush=True); sys.stdin.read()"
+    hold += (
+        "lock = FolderLock(Path(sys.argv[1])).acquire(); print('held', flush=True);"
+        " sys.stdin.read()"
+    )
     other = subprocess.Popen(
-        [sys.executable, "-c", hold, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", hold, tmp_path],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert other.stdout is not None
     assert other.stdout.readline() == "held\n"
@@ -183,7 +204,9 @@ os._exit(0)
 
 
 def test_forked_process_does_not_keep_the_lock(tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, "-c", FORK, tmp_path], stdout=subprocess.PIPE, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", FORK, tmp_path], stdout=subprocess.PIPE, text=True, check=True
+    )
     try:
         FolderLock(tmp_path).acquire().release()
     finally:

@@ -1,4 +1,6 @@
-"""A sample of `benchmarks/kill.py`: a conversion that is killed and repeated ends as an undisturbed one."""
+"""A sample of `benchmarks/kill.py`: a conversion that is killed and repeated ends as an undisturbed
+one.
+"""
 
 import json
 from pathlib import Path

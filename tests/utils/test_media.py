@@ -38,7 +38,10 @@ class ThreeCameras:
 
     def _observation(self, count: int) -> dict[str, list[np.ndarray]]:
         views = {"front": baseline(GREEN), "wrist": baseline(BLUE), "side": baseline(YELLOW, 48)}
-        joints = {"joint_state_list": [np.zeros(7)] * count, "gripper_state_list": [np.zeros(2)] * count}
+        joints = {
+            "joint_state_list": [np.zeros(7)] * count,
+            "gripper_state_list": [np.zeros(2)] * count,
+        }
         return joints | {f"{name}_rgb_list": [view] * count for name, view in views.items()}
 
     def reset(self) -> tuple:
@@ -51,18 +54,27 @@ class ThreeCameras:
 
 
 @pytest.mark.parametrize("names", [("side", "front", "wrist"), ("side", "wrist")])
-def test_an_episodes_video_shows_every_camera_of_the_robot(tmp_path: Path, names: tuple[str, ...]) -> None:
+def test_an_episodes_video_shows_every_camera_of_the_robot(
+    tmp_path: Path, names: tuple[str, ...]
+) -> None:
     robot = replace(ROBOMME_JOINT, cameras=tuple(map(Camera, names)), memory_camera="side")
-    env = ChunkEnv(ThreeCameras, video=EpisodeVideo(lambda outcome, goal: tmp_path / "a.mp4"), robot=robot)
+    env = ChunkEnv(
+        ThreeCameras, video=EpisodeVideo(lambda outcome, goal: tmp_path / "a.mp4"), robot=robot
+    )
     env.reset()
     env.step({"actions": np.zeros((1, 8), np.float32)})
     env.close()
     frames = decoded(tmp_path / "a.mp4")
     assert len(frames) == 3 and frames[0].shape == (64 + CAPTION, 3 * 64, 3)
     inside = [frames[2][24, 64 * view + 32] for view in range(3)]
-    order = [*names, *(name for name in ("front", "wrist") if name not in names)]  # the benchmark's own come last
+    order = [
+        *names,
+        *(name for name in ("front", "wrist") if name not in names),
+    ]  # the benchmark's own come last
     for colour, name in zip(inside, order, strict=True):
-        assert np.abs(colour - {"front": GREEN, "wrist": BLUE, "side": YELLOW}[name]).max() < 25, name
+        assert np.abs(colour - {"front": GREEN, "wrist": BLUE, "side": YELLOW}[name]).max() < 25, (
+            name
+        )
     assert frames[2][56, 32].max() < 25, "a lower image stands on the upper edge, on black"
 
 
@@ -71,12 +83,18 @@ def test_the_border_lies_around_all_views_and_nowhere_else() -> None:
     framed, bare = (video_frame(views, video=video) for video in (True, False))
     assert framed.shape == bare.shape == (64 + CAPTION, 98, 3), "sides are even"
     changed = (framed != bare).any(-1)
-    assert changed[:BORDER, :97].all() and changed[:64, :BORDER].all() and not changed[BORDER:54, BORDER:87].any()
+    assert (
+        changed[:BORDER, :97].all()
+        and changed[:64, :BORDER].all()
+        and not changed[BORDER:54, BORDER:87].any()
+    )
     assert (framed[changed] == RED).all()
 
 
 def test_a_caption_that_is_too_long_ends_within_the_image() -> None:
-    captioned = video_frame([baseline(GREEN)], "pick up the red cube and place it on the target " * 5)
+    captioned = video_frame(
+        [baseline(GREEN)], "pick up the red cube and place it on the target " * 5
+    )
     assert captioned[64:, :58].max() > 200 and captioned[64:, -4:].max() == 0
 
 
@@ -109,7 +127,11 @@ def test_equal_frames_make_equal_bytes_and_odd_sides_survive(tmp_path: Path) -> 
 
 
 def test_a_contact_sheet_holds_every_tile_and_outlines_the_highlighted_ones() -> None:
-    tiles = [Tile(baseline(GREEN), "one"), Tile(baseline(BLUE), "two", RED), Tile(baseline(YELLOW), "three")]
+    tiles = [
+        Tile(baseline(GREEN), "one"),
+        Tile(baseline(BLUE), "two", RED),
+        Tile(baseline(YELLOW), "three"),
+    ]
     sheet = np.asarray(contact_sheet(tiles, columns=2, title="all"))
     for tile in tiles:
         assert (sheet == tile.image[0, 0]).all(-1).sum() > 150**2, tile.label

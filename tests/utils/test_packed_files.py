@@ -1,4 +1,6 @@
-"""Packed files are read to their end, within a limit; what is no packed file is refused in words."""
+"""Packed files are read to their end, within a limit; what is no packed file is
+refused in words.
+"""
 
 import lzma
 from pathlib import Path
@@ -19,7 +21,9 @@ def packed(folder: Path, data: bytes) -> Path:
 
 @pytest.mark.parametrize("padding", [b"", b"\0" * 4, b"\0" * 8])
 def test_all_streams_of_a_file_are_read(padding: bytes, tmp_path: Path) -> None:
-    path = packed(tmp_path, lzma.compress(FIRST) + padding + lzma.compress(SECOND) + lzma.compress(b""))
+    path = packed(
+        tmp_path, lzma.compress(FIRST) + padding + lzma.compress(SECOND) + lzma.compress(b"")
+    )
     assert read_unpacked(path) == FIRST + SECOND
 
 

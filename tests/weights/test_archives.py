@@ -1,4 +1,6 @@
-"""Released checkpoints as they are published: a zip in a folder of a hub repository, read where it lies."""
+"""Released checkpoints as they are published: a zip in a folder of a hub repository, read where it
+lies.
+"""
 
 import zipfile
 from collections.abc import Callable
@@ -39,7 +41,9 @@ def published(policy: MMEPolicy, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder
 
 
-@pytest.mark.parametrize("named", [lambda folder: folder, lambda folder: folder / "79999.zip"], ids=["folder", "zip"])
+@pytest.mark.parametrize(
+    "named", [lambda folder: folder, lambda folder: folder / "79999.zip"], ids=["folder", "zip"]
+)
 def test_an_archive_is_loaded_completely_with_its_statistics(
     policy: MMEPolicy, published: Path, named: Callable[[Path], Path]
 ) -> None:
@@ -59,7 +63,9 @@ def test_the_variant_is_recognised_from_the_name_of_the_folder(
     assert same(MMEPolicy.from_pretrained(tmp_path / "ours"), policy)
 
 
-def test_a_file_in_the_archive_tells_it_before_the_folder_does(published: Path, tmp_path: Path) -> None:
+def test_a_file_in_the_archive_tells_it_before_the_folder_does(
+    published: Path, tmp_path: Path
+) -> None:
     archive = tmp_path / "79999.zip"
     archive.write_bytes((published / "79999.zip").read_bytes())
     assert open_source(archive).model is None
@@ -73,7 +79,9 @@ def test_a_folder_on_the_hub_is_fetched_alone(
 ) -> None:
     requests = []
 
-    def snapshot(repository: str, revision: str | None, token: str | None, allow_patterns: list[str]) -> str:
+    def snapshot(
+        repository: str, revision: str | None, token: str | None, allow_patterns: list[str]
+    ) -> str:
         requests.append((repository, revision, allow_patterns))
         return str(published.parent)
 
@@ -99,13 +107,21 @@ def write(file: Path, **contents: bytes) -> Path:
         ({"../params/manifest.ocdbt": b"x"}, "lies outside of it"),
         ({"/params/manifest.ocdbt": b"x"}, "lies outside of it"),
         ({"C:/params/manifest.ocdbt": b"x"}, "lies outside of it"),
-        ({"params/manifest.ocdbt": b"x", "params/d/1": bytes(20_000_000)}, "unpacks to 20,000,000 bytes"),
+        (
+            {"params/manifest.ocdbt": b"x", "params/d/1": bytes(20_000_000)},
+            "unpacks to 20,000,000 bytes",
+        ),
         ({"notes.txt": b"x"}, "no Orbax arrays"),
         ({"params/manifest.ocdbt": b"x"}, "is damaged or incomplete"),
-        ({"params/manifest.ocdbt": b"x", "assets/a b/norm_stats.json": b"{}"}, "cannot name a folder"),
+        (
+            {"params/manifest.ocdbt": b"x", "assets/a b/norm_stats.json": b"{}"},
+            "cannot name a folder",
+        ),
     ],
 )
-def test_what_no_checkpoint_holds_is_refused(tmp_path: Path, contents: dict[str, bytes], message: str) -> None:
+def test_what_no_checkpoint_holds_is_refused(
+    tmp_path: Path, contents: dict[str, bytes], message: str
+) -> None:
     with pytest.raises(UserError, match=message):
         load_weights(build_policy("pi05"), write(tmp_path / "1.zip", **contents))
 

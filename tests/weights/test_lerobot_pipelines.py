@@ -1,4 +1,6 @@
-"""Exported π0.5 in LeRobot's own pipelines: the words, the numbers and the actions are the policy's."""
+"""Exported π0.5 in LeRobot's own pipelines: the words, the numbers and the actions are the
+policy's.
+"""
 
 import json
 from pathlib import Path
@@ -73,7 +75,9 @@ def test_lerobots_pipelines_and_policy_give_our_actions(
     assert fetched == ["google/paligemma-3b-pt-224"]
     assert config.n_action_steps == 1  # LeRobot's loop cannot anchor later ones
 
-    size = policy.backbone.image_size  # at another one the two libraries resize a little differently
+    size = (
+        policy.backbone.image_size
+    )  # at another one the two libraries resize a little differently
     frames, state = moving_frames(2, size), np.linspace(-0.4, 0.4, 8, dtype=np.float32)
     episode = policy.start_episode(GOAL, seed=4)
     episode.observe({"front": frames[:1], "wrist": frames[1:]}, state[None])
@@ -82,9 +86,12 @@ def test_lerobots_pipelines_and_policy_give_our_actions(
     views = torch.from_numpy(frames).permute(0, 3, 1, 2) / 255
     names = ("observation.images.image", "observation.images.wrist_image")
     inputs = before(
-        {**dict(zip(names, views.split(1), strict=True)), "observation.state": torch.from_numpy(state)[None],
-         "task": [GOAL]}
-    )  # fmt: skip
+        {
+            **dict(zip(names, views.split(1), strict=True)),
+            "observation.state": torch.from_numpy(state)[None],
+            "task": [GOAL],
+        }
+    )
     chunk = after(loaded.predict_action_chunk(inputs, noise=noise[None]))
     assert np.abs(expected - state).max() > 0.1
     np.testing.assert_allclose(chunk[0].numpy(), expected, atol=2e-4)
@@ -92,9 +99,14 @@ def test_lerobots_pipelines_and_policy_give_our_actions(
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [({"tokenizer": "sample"}, "is none that LeRobot could fetch"), ({"prompt": "state"}, "no step that writes")],
+    [
+        ({"tokenizer": "sample"}, "is none that LeRobot could fetch"),
+        ({"prompt": "state"}, "no step that writes"),
+    ],
 )
-def test_what_lerobot_has_no_step_for_is_reported(tmp_path: Path, changes: dict[str, str], message: str) -> None:
+def test_what_lerobot_has_no_step_for_is_reported(
+    tmp_path: Path, changes: dict[str, str], message: str
+) -> None:
     policy = exportable()
     policy.config["processor"] |= changes
     policy.save_pretrained(tmp_path / "ours")
@@ -105,9 +117,13 @@ def test_what_lerobot_has_no_step_for_is_reported(tmp_path: Path, changes: dict[
 
 
 @pytest.mark.parametrize("setting", ["use_visual_memory", "use_proprioceptive_memory"])
-def test_lerobots_short_window_memory_is_named_and_its_weights_are_a_start(tmp_path: Path, setting: str) -> None:
+def test_lerobots_short_window_memory_is_named_and_its_weights_are_a_start(
+    tmp_path: Path, setting: str
+) -> None:
     policy = small_policy("pi05")
-    tensors = {name: tensor.clone() for name, tensor in to_lerobot(policy, policy.state_dict()).items()}
+    tensors = {
+        name: tensor.clone() for name, tensor in to_lerobot(policy, policy.state_dict()).items()
+    }
     if setting == "use_proprioceptive_memory":
         tensors["model.proprio_history_proj.weight"] = torch.ones(8, 32)
         tensors["model.proprio_history_proj.bias"] = torch.ones(8)
@@ -118,6 +134,8 @@ def test_lerobots_short_window_memory_is_named_and_its_weights_are_a_start(tmp_p
         load_weights(small_policy("pi05", seed=1), tmp_path)
     fresh = small_policy("framesamp_modul", seed=1)
     start = transfer(fresh, tmp_path)
-    assert start.left == sorted(name.removeprefix("model.") for name in tensors if "proprio_history_proj" in name)
+    assert start.left == sorted(
+        name.removeprefix("model.") for name in tensors if "proprio_history_proj" in name
+    )
     original, loaded = policy.state_dict(), fresh.state_dict()
     assert all(torch.equal(loaded[name], tensor) for name, tensor in original.items())

@@ -1,4 +1,6 @@
-"""Runs in the layout of the published memory-clock checkpoints: an unknown configuration, no position features."""
+"""Runs in the layout of the published memory-clock checkpoints: an unknown configuration, no
+position features.
+"""
 
 import shutil
 from pathlib import Path
@@ -62,24 +64,40 @@ def test_a_run_without_positions_becomes_a_memory_without_positions(
     noclock: MMEPolicy, run: Path, tmp_path: Path
 ) -> None:
     source = open_source(name(run, "framesamp-noclock"))
-    assert source.params is not None and f"{FEATURES}/pos_proj/kernel" not in leaf_names(source.params)
+    assert source.params is not None and f"{FEATURES}/pos_proj/kernel" not in leaf_names(
+        source.params
+    )
     convert(run, tmp_path / "back", ["backbone=tiny"])
     back = MMEPolicy.from_pretrained(tmp_path / "back")
-    assert back.config["memory"]["positions"] == "none" and back.require_processor().stats is not None
-    loaded = load_weights(small_policy("framesamp_modul", seed=9, memory={"positions": "none"}), run)
+    assert (
+        back.config["memory"]["positions"] == "none" and back.require_processor().stats is not None
+    )
+    loaded = load_weights(
+        small_policy("framesamp_modul", seed=9, memory={"positions": "none"}), run
+    )
     batch = random_batch(noclock)
     noise = torch.zeros_like(batch.actions)
     for policy in (back, loaded):
-        assert torch.equal(policy.sample_actions(batch, noise), noclock.sample_actions(batch, noise))
+        assert torch.equal(
+            policy.sample_actions(batch, noise), noclock.sample_actions(batch, noise)
+        )
     with pytest.raises(UserError, match="pos_proj"):
         load_weights(small_policy("framesamp_modul"), run)
 
 
 def test_tensors_that_two_variants_have_need_a_name(run: Path, tmp_path: Path) -> None:
     name(run, "noclock")
-    with pytest.raises(UserError, match="framesamp_modul, tokendrop_modul: name one of these, such as model=framesamp"):
+    with pytest.raises(
+        UserError,
+        match="framesamp_modul, tokendrop_modul: name one of these, such as model=framesamp",
+    ):
         convert(run, tmp_path / "back", ["backbone=tiny"])
-    with pytest.raises(UserError, match="says it is framesamp_modul, tokendrop_modul, but model=ttt_modul"):
+    with pytest.raises(
+        UserError, match="says it is framesamp_modul, tokendrop_modul, but model=ttt_modul"
+    ):
         convert(run, tmp_path / "back", ["backbone=tiny", "model=ttt_modul"])
     convert(run, tmp_path / "back", ["backbone=tiny", "model=framesamp_modul"])
-    assert MMEPolicy.from_pretrained(tmp_path / "back").config["name"] == "framesamp_modul-positions_none"
+    assert (
+        MMEPolicy.from_pretrained(tmp_path / "back").config["name"]
+        == "framesamp_modul-positions_none"
+    )

@@ -1,4 +1,6 @@
-"""Orbax checkpoints read and written without JAX. `data/make_orbax.py` made the ones here with Orbax itself."""
+"""Orbax checkpoints read and written without JAX. `data/make_orbax.py` made the ones here with
+Orbax itself.
+"""
 
 import hashlib
 import json
@@ -47,7 +49,9 @@ def test_unboxed_layout_reads_with_and_without_outer_names() -> None:
 def test_a_pipe_in_the_place_of_a_part_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     folder = tmp_path / "params"
     shutil.copytree(RUN / "100" / "params", folder)
-    part = max((file for file in folder.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
+    part = max(
+        (file for file in folder.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size
+    )
     part.unlink()
     os.mkfifo(part)
     with pytest.raises(UserError, match=f"{part.name} is not a file"):
@@ -85,7 +89,9 @@ def test_what_is_saved_reads_back(dtype: torch.dtype, tmp_path: Path) -> None:
     write_orbax(tree, tmp_path / "params")
     back = read_orbax(tmp_path / "params")
     assert set(back) == set(tree)
-    assert all(torch.equal(back[name], leaf) and back[name].dtype == dtype for name, leaf in tree.items())
+    assert all(
+        torch.equal(back[name], leaf) and back[name].dtype == dtype for name, leaf in tree.items()
+    )
 
 
 def test_a_checkpoint_without_its_values_is_refused(tmp_path: Path) -> None:
@@ -99,6 +105,8 @@ def test_a_checkpoint_without_its_values_is_refused(tmp_path: Path) -> None:
 def test_all_leaves_that_do_not_fit_are_listed_together(tmp_path: Path) -> None:
     policy = small_policy("framesamp_modul")
     before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
-    with pytest.raises(UserError, match=r"(?s)orbax_plain.*missing.*unexpected:\s+scale.*2 misshapen"):
+    with pytest.raises(
+        UserError, match=r"(?s)orbax_plain.*missing.*unexpected:\s+scale.*2 misshapen"
+    ):
         load_weights(policy, BASELINE)
     assert all(torch.equal(tensor, before[name]) for name, tensor in policy.state_dict().items())

@@ -38,8 +38,12 @@ def renamed(*changes: tuple[str, str]) -> Callable[[Tensors], Tensors]:
 SPELLINGS: dict[str, Callable[[Tensors], Tensors]] = {
     "as openpi's state dict": lambda tensors: tensors,
     "with model. in front": renamed((r"^", "model.")),
-    "embedding only as lm_head": lambda tensors: {n: t for n, t in tensors.items() if n != EMBEDDING},
-    "no lm_head at all": lambda tensors: {n: t for n, t in tensors.items() if not n.endswith("lm_head.weight")},
+    "embedding only as lm_head": lambda tensors: {
+        n: t for n, t in tensors.items() if n != EMBEDDING
+    },
+    "no lm_head at all": lambda tensors: {
+        n: t for n, t in tensors.items() if not n.endswith("lm_head.weight")
+    },
     "flattened vision tower": renamed((r"vision_tower\.vision_model\.", "vision_tower.")),
     "before transformers 4.52": renamed(
         (r"paligemma\.lm_head\.", "paligemma.language_model.lm_head."),
@@ -63,7 +67,10 @@ def pi05() -> MMEPolicy:
 
 def saved(tensors: Tensors, folder: Path) -> Path:
     folder.mkdir(exist_ok=True)
-    save_file({name: tensor.detach().clone() for name, tensor in tensors.items()}, folder / "model.safetensors")
+    save_file(
+        {name: tensor.detach().clone() for name, tensor in tensors.items()},
+        folder / "model.safetensors",
+    )
     return folder
 
 
@@ -72,14 +79,19 @@ def empty_pi05(**overrides: Any) -> MMEPolicy:
 
 
 @pytest.mark.parametrize("spelling", SPELLINGS)
-def test_every_spelling_loads_the_same_policy(spelling: str, pi05: MMEPolicy, tmp_path: Path) -> None:
+def test_every_spelling_loads_the_same_policy(
+    spelling: str, pi05: MMEPolicy, tmp_path: Path
+) -> None:
     folder = saved(SPELLINGS[spelling](to_openpi(pi05, pi05.state_dict())), tmp_path / "source")
     assert same(load_weights(empty_pi05(), folder), pi05)
     assert same(load_weights(empty_pi05(), folder / "model.safetensors"), pi05)
 
 
 def test_format_is_recognised_from_names_and_config(pi05: MMEPolicy, tmp_path: Path) -> None:
-    assert detect_format(saved(to_lerobot(pi05, pi05.state_dict()), tmp_path / "prefixed")) == "lerobot"
+    assert (
+        detect_format(saved(to_lerobot(pi05, pi05.state_dict()), tmp_path / "prefixed"))
+        == "lerobot"
+    )
     bare = saved(to_openpi(pi05, pi05.state_dict()), tmp_path / "bare")
     assert detect_format(bare) == "openpi"
     (bare / "config.json").write_text('{"type": "pi05"}')
@@ -92,7 +104,10 @@ def test_bfloat16_becomes_float32_masters_or_stays(pi05: MMEPolicy, tmp_path: Pa
         for name, tensor in to_openpi(pi05, pi05.state_dict()).items()
     }
     folder = saved(mixed, tmp_path / "mixed")
-    wide, narrow = load_weights(empty_pi05(), folder), load_weights(empty_pi05(), folder, dtype="bfloat16")
+    wide, narrow = (
+        load_weights(empty_pi05(), folder),
+        load_weights(empty_pi05(), folder, dtype="bfloat16"),
+    )
     assert {p.dtype for p in wide.parameters()} == {torch.float32}
     assert {p.dtype for p in narrow.parameters()} == {torch.bfloat16}
     for name, tensor in pi05.state_dict().items():
@@ -116,14 +131,18 @@ def test_full_size_names_and_shapes_are_those_of_both_ports(shared: Path) -> Non
 def test_lerobots_policy_loads_our_export_and_replies_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pi05 = small_policy("pi05", backbone={"num_heads": 8})  # a number that LeRobot's attention has written in
+    pi05 = small_policy(
+        "pi05", backbone={"num_heads": 8}
+    )  # a number that LeRobot's attention has written in
     lerobot_module = reduce_sizes(monkeypatch, pi05.backbone.config)
     pi05.save_pretrained(tmp_path / "ours")
     convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
     config = lerobot_module.PreTrainedConfig.from_pretrained(tmp_path / "lerobot")
     config.device = "cpu"
     loaded = lerobot_module.PI05Policy.from_pretrained(tmp_path / "lerobot", config=config).eval()
-    assert "All keys loaded successfully" in capsys.readouterr().out  # it only prints what went wrong
+    assert (
+        "All keys loaded successfully" in capsys.readouterr().out
+    )  # it only prints what went wrong
 
     batch = random_batch(pi05)
     batch.image_mask[0, 1] = False
@@ -131,16 +150,22 @@ def test_lerobots_policy_loads_our_export_and_replies_the_same(
     time = torch.tensor([0.2, 0.8])
     views = list((batch.images.float() / 127.5 - 1).unbind(1))
     masks = list(batch.image_mask.unbind(1))
-    loss = loaded.model.forward(views, masks, batch.prompt, batch.prompt_mask, batch.actions, noise, time).mean()
+    loss = loaded.model.forward(
+        views, masks, batch.prompt, batch.prompt_mask, batch.actions, noise, time
+    ).mean()
     assert abs(float(loss - pi05(batch, noise, time)[0])) < 1e-5
-    chunk = loaded.model.sample_actions(views, masks, batch.prompt, batch.prompt_mask, noise=noise, num_steps=10)
+    chunk = loaded.model.sample_actions(
+        views, masks, batch.prompt, batch.prompt_mask, noise=noise, num_steps=10
+    )
     assert (chunk - pi05.sample_actions(batch, noise)).abs().max() < 1e-4
 
     saved(loaded.state_dict(), tmp_path / "back")
     assert same(load_weights(empty_pi05(backbone={"num_heads": 8}), tmp_path / "back"), pi05)
 
 
-def test_openpis_strict_reader_finds_one_name_of_the_tied_pair(pi05: MMEPolicy, tmp_path: Path) -> None:
+def test_openpis_strict_reader_finds_one_name_of_the_tied_pair(
+    pi05: MMEPolicy, tmp_path: Path
+) -> None:
     pi05.save_pretrained(tmp_path / "ours")
     convert(tmp_path / "ours", tmp_path / "openpi", to="openpi", dtype="bfloat16")
     tensors = load_file(tmp_path / "openpi" / "model.safetensors")
@@ -167,11 +192,18 @@ def test_all_that_does_not_fit_is_listed_together(pi05: MMEPolicy, tmp_path: Pat
 def test_pi0_is_recognised_from_pi05_by_its_tensors(pi05: MMEPolicy, tmp_path: Path) -> None:
     # The folder's name says pi05 and means nothing.
     tensors = to_openpi(pi05, pi05.state_dict())
-    renamed = {n.replace(".dense.weight", ".weight"): t for n, t in tensors.items() if not n.endswith(".dense.bias")}
+    renamed = {
+        n.replace(".dense.weight", ".weight"): t
+        for n, t in tensors.items()
+        if not n.endswith(".dense.bias")
+    }
     with pytest.raises(UserError, match="no time-conditioned norms, as π0"):
         load_weights(empty_pi05(), saved(renamed, tmp_path / "pi05_plain"))
     with pytest.raises(UserError, match="a state projection, as π0"):
-        load_weights(empty_pi05(), saved({**tensors, "state_proj.bias": torch.zeros(4)}, tmp_path / "pi05_state"))
+        load_weights(
+            empty_pi05(),
+            saved({**tensors, "state_proj.bias": torch.zeros(4)}, tmp_path / "pi05_state"),
+        )
 
 
 def test_a_tensor_that_is_there_twice_is_refused(pi05: MMEPolicy, tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-"""Files of `torch.save`: whatever is wrong with one, reading it raises one clear error and runs nothing."""
+"""Files of `torch.save`: whatever is wrong with one, reading it raises one clear error and runs
+nothing.
+"""
 
 import os
 import pickle
@@ -45,7 +47,8 @@ def test_both_layouts_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("read", [read_torch_file, open_source])
 @pytest.mark.parametrize(
-    "damage", ["empty", "cut", "old cut", "old", "text", "number", "list", "object", "pipe", "folder"]
+    "damage",
+    ["empty", "cut", "old cut", "old", "text", "number", "list", "object", "pipe", "folder"],
 )
 def test_damaged_file_raises_one_error(tmp_path: Path, damage: str, read: Any) -> None:
     path = tmp_path / "w.pth"

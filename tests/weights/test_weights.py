@@ -1,4 +1,6 @@
-"""The commands of weights: loading, starting another variant, converting, and the statistics beside foreign weights."""
+"""The commands of weights: loading, starting another variant, converting, and the statistics beside
+foreign weights.
+"""
 
 import json
 import shutil
@@ -13,7 +15,14 @@ from helpers.memory_fakes import same
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli.weights import convert
 from mme_vla.testing.small import PERCEPTUAL, random_batch, small_policy, unit_stats
-from mme_vla.weights import detect_format, load_weights, open_source, read_stats, start_from, transfer
+from mme_vla.weights import (
+    detect_format,
+    load_weights,
+    open_source,
+    read_stats,
+    start_from,
+    transfer,
+)
 from mme_vla.weights.released import released_table
 from mme_vla.weights.tables import memory_parameters
 
@@ -38,7 +47,9 @@ def base(bases: dict[str, Path]) -> MMEPolicy:
 
 
 @pytest.mark.parametrize("fmt", FORMATS)
-def test_every_format_is_reported_and_fills_a_policy_on_meta(fmt: str, bases: dict[str, Path], base: MMEPolicy) -> None:
+def test_every_format_is_reported_and_fills_a_policy_on_meta(
+    fmt: str, bases: dict[str, Path], base: MMEPolicy
+) -> None:
     assert detect_format(bases[fmt]) == fmt
     loaded = load_weights(build_policy("pi05", device="meta"), bases[fmt])
     assert same(loaded, base)
@@ -47,7 +58,10 @@ def test_every_format_is_reported_and_fills_a_policy_on_meta(fmt: str, bases: di
 
 @pytest.mark.parametrize(
     ("variant", "fmt"),
-    [*(("framesamp_modul", fmt) for fmt in FORMATS[:-1]), *((variant, "released") for variant in PERCEPTUAL)],
+    [
+        *(("framesamp_modul", fmt) for fmt in FORMATS[:-1]),
+        *((variant, "released") for variant in PERCEPTUAL),
+    ],
 )
 def test_only_the_memorys_parameters_are_new_when_starting_from_pi05(
     variant: str, fmt: str, bases: dict[str, Path], base: MMEPolicy
@@ -71,7 +85,8 @@ def test_another_variants_memory_is_left_behind_and_reported(tmp_path: Path) -> 
         assert start.left
         assert "left behind" in str(start)
         assert torch.equal(
-            policy.backbone.action_in.weight, MMEPolicy.from_pretrained(tmp_path / "expert").backbone.action_in.weight
+            policy.backbone.action_in.weight,
+            MMEPolicy.from_pretrained(tmp_path / "expert").backbone.action_in.weight,
         )
 
 
@@ -91,7 +106,9 @@ def test_a_start_never_hides_what_is_missing(bases: dict[str, Path], tmp_path: P
     save_file(tensors, tmp_path / "model.safetensors")
     policy = build_policy("framesamp_modul")
     before = policy.backbone.action_in.weight.clone()
-    with pytest.raises(UserError, match=r"(?s)1 missing:\s+backbone\.time_in\.bias.*embedding.*instead of"):
+    with pytest.raises(
+        UserError, match=r"(?s)1 missing:\s+backbone\.time_in\.bias.*embedding.*instead of"
+    ):
         start_from(policy, tmp_path)
     assert torch.equal(policy.backbone.action_in.weight, before)
     with pytest.raises(UserError, match="real device"):
@@ -101,7 +118,9 @@ def test_a_start_never_hides_what_is_missing(bases: dict[str, Path], tmp_path: P
 def test_another_tokenizer_is_not_a_start(bases: dict[str, Path], tmp_path: Path) -> None:
     MMEPolicy.from_pretrained(bases["ours"]).save_pretrained(tmp_path)
     about = json.loads((tmp_path / "processor.json").read_text())
-    (tmp_path / "processor.json").write_text(json.dumps({**about, "tokenizer_fingerprint": "another"}))
+    (tmp_path / "processor.json").write_text(
+        json.dumps({**about, "tokenizer_fingerprint": "another"})
+    )
     (tmp_path / "SHA256SUMS").unlink()
     with pytest.raises(UserError, match="another tokenizer"):
         start_from(build_policy("framesamp_modul"), tmp_path)
@@ -146,7 +165,9 @@ def test_the_variant_a_run_names_cannot_be_overruled(tmp_path: Path) -> None:
         convert(tmp_path / "ours", tmp_path / "x", ["model=framesamp_expert"])
 
 
-def test_foreign_and_broken_sources_say_what_is_wrong(bases: dict[str, Path], tmp_path: Path) -> None:
+def test_foreign_and_broken_sources_say_what_is_wrong(
+    bases: dict[str, Path], tmp_path: Path
+) -> None:
     policy = build_policy("pi05")
     with pytest.raises(UserError, match="no such file"):
         load_weights(policy, tmp_path / "nowhere")
@@ -165,12 +186,16 @@ def test_foreign_and_broken_sources_say_what_is_wrong(bases: dict[str, Path], tm
     (tmp_path / "model.safetensors.index.json").write_text('{"weight_map": 3}')
     with pytest.raises(UserError, match="not an index"):
         load_weights(policy, tmp_path)
-    (tmp_path / "model.safetensors.index.json").write_text('{"weight_map": {"a": "shard.safetensors"}}')
+    (tmp_path / "model.safetensors.index.json").write_text(
+        '{"weight_map": {"a": "shard.safetensors"}}'
+    )
     with pytest.raises(UserError, match=r"shard\.safetensors"):
         load_weights(policy, tmp_path)
 
 
-def test_a_memory_of_the_user_starts_from_a_released_base(bases: dict[str, Path], monkeypatch: Any) -> None:
+def test_a_memory_of_the_user_starts_from_a_released_base(
+    bases: dict[str, Path], monkeypatch: Any
+) -> None:
     policy = build_policy("framesamp_context")
     monkeypatch.setattr("mme_vla.weights.names.jax_memory.released_names", lambda memory: {})
     with pytest.raises(UserError, match="no released names"):
@@ -181,13 +206,17 @@ def test_a_memory_of_the_user_starts_from_a_released_base(bases: dict[str, Path]
 # Statistics
 
 
-def test_of_several_datasets_statistics_none_is_taken_with_a_report(bases: dict[str, Path], tmp_path: Path) -> None:
+def test_of_several_datasets_statistics_none_is_taken_with_a_report(
+    bases: dict[str, Path], tmp_path: Path
+) -> None:
     folder = tmp_path / "base"
     shutil.copytree(bases["openpi"], folder)
     (folder / "assets" / "droid").mkdir(parents=True)
     unit_stats().save(folder / "assets" / "droid" / "norm_stats.json")
     policy = build_policy("pi05")
-    with pytest.warns(UserWarning, match=r"statistics of droid, robomme; none were taken.*read_stats\("):
+    with pytest.warns(
+        UserWarning, match=r"statistics of droid, robomme; none were taken.*read_stats\("
+    ):
         load_weights(policy, folder)
     assert policy.require_processor().stats is None
 
@@ -206,14 +235,29 @@ def test_statistics_of_openpi_and_of_several_datasets(tmp_path: Path) -> None:
     assert statistics.to_dict() == unit_stats().to_dict()
 
 
-def test_statistics_of_a_lerobot_processor_come_from_the_file_its_json_names(tmp_path: Path) -> None:
+def test_statistics_of_a_lerobot_processor_come_from_the_file_its_json_names(
+    tmp_path: Path,
+) -> None:
     file = "policy_preprocessor_step_7_normalizer_processor.safetensors"
-    steps = [{"registry_name": "to_batch"}, {"registry_name": "normalizer_processor", "state_file": file}]
+    steps = [
+        {"registry_name": "to_batch"},
+        {"registry_name": "normalizer_processor", "state_file": file},
+    ]
     (tmp_path / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}))
     low, high = -torch.arange(1.0, 9.0), torch.arange(1.0, 9.0)
-    values = {"mean": torch.zeros(8), "std": torch.ones(8), "q01": low, "q99": high, "min": low, "count": torch.ones(1)}
+    values = {
+        "mean": torch.zeros(8),
+        "std": torch.ones(8),
+        "q01": low,
+        "q99": high,
+        "min": low,
+        "count": torch.ones(1),
+    }
     features = ("action", "observation.state")
-    save_file({f"{f}.{key}": value.clone() for f in features for key, value in values.items()}, tmp_path / file)
+    save_file(
+        {f"{f}.{key}": value.clone() for f in features for key, value in values.items()},
+        tmp_path / file,
+    )
     stats = read_stats(tmp_path)
     assert stats is not None
     assert stats.actions.q99.tolist() == high.tolist()

@@ -1,4 +1,6 @@
-"""What demonstrations cover: which goals of another split, in words, occur among them and which never do."""
+"""What demonstrations cover: which goals of another split, in words, occur among them and which
+never do.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +14,9 @@ from mme_vla.utils import read_json
 
 
 def goal_of(spec: EpisodeSpec) -> str:
-    """The goal of an episode as policies are told it; its scene is built for that, without images."""
+    """The goal of an episode as policies are told it; its scene is built for that,
+    without images.
+    """
     env = make_task(spec.task, render=False, **spec.options)
     try:
         goal: str = env.goals()[0].lower()
@@ -22,12 +26,16 @@ def goal_of(spec: EpisodeSpec) -> str:
 
 
 def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, set[str]]:
-    """The goals of a recording, by task: out of its dataset, or of its official files where there is none."""
+    """The goals of a recording, by task: out of its dataset, or of its official files where there
+    is none.
+    """
     goals: dict[str, set[str]] = {}
     if dataset is not None:
         from mme_vla.data.lerobot_files import SIDE_FILE
 
-        for episode in read_json(dataset / SIDE_FILE, "the facts of a recorded dataset")["episodes"]:
+        for episode in read_json(dataset / SIDE_FILE, "the facts of a recorded dataset")[
+            "episodes"
+        ]:
             goals.setdefault(episode["task"], set()).add(episode["goals"][0])
         return goals
     from mme_vla.data.hdf5 import list_episodes, open_episode
@@ -40,7 +48,9 @@ def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, 
 
 @dataclass
 class TaskCoverage:
-    """Of one task: how many goals and episodes there are, and the numbers of the episodes whose goal is missing."""
+    """Of one task: how many goals and episodes there are, and the numbers of the episodes whose
+    goal is missing.
+    """
 
     goals: int = 0
     episodes: int = 0
@@ -53,11 +63,21 @@ class TaskCoverage:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
-        counts = {"goals": self.goals, "goals_covered": self.goals - len(self.missing), "episodes": self.episodes}
-        return {**counts, "episodes_covered": self.episodes - self.missing_episodes, "missing": self.missing}
+        counts = {
+            "goals": self.goals,
+            "goals_covered": self.goals - len(self.missing),
+            "episodes": self.episodes,
+        }
+        return {
+            **counts,
+            "episodes_covered": self.episodes - self.missing_episodes,
+            "missing": self.missing,
+        }
 
 
-def compare(recorded: Mapping[str, set[str]], requested: Iterable[tuple[EpisodeSpec, str]]) -> dict[str, TaskCoverage]:
+def compare(
+    recorded: Mapping[str, set[str]], requested: Iterable[tuple[EpisodeSpec, str]]
+) -> dict[str, TaskCoverage]:
     """Which of the goals of episodes were recorded, by task.
 
     Args:
@@ -81,6 +101,12 @@ def in_words(coverage: Mapping[str, TaskCoverage], split: str) -> str:
     lines = []
     for name, task in coverage.items():
         covered, episodes = task.goals - len(task.missing), task.episodes - task.missing_episodes
-        lines.append(f"{name}: {covered} of {task.goals} goals of {split!r}, {episodes} of {task.episodes} episodes")
-        lines += [f"  never shown: {goal} (episode {listed(numbers, 5)})" for goal, numbers in task.missing.items()]
+        lines.append(
+            f"{name}: {covered} of {task.goals} goals of {split!r}, {episodes} of {task.episodes}"
+            " episodes"
+        )
+        lines += [
+            f"  never shown: {goal} (episode {listed(numbers, 5)})"
+            for goal, numbers in task.missing.items()
+        ]
     return "\n".join(lines)

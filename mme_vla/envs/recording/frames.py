@@ -1,4 +1,6 @@
-"""Which frames of a demonstration are rendered: those of decisions, and those that a memory reads there."""
+"""Which frames of a demonstration are rendered: those of decisions, and those that a memory reads
+there.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mme_vla.data.waypoints import CHOICE_NUMBERS, Motions, find_choices, find_motions, known_poses, row_of
+from mme_vla.data.waypoints import (
+    CHOICE_NUMBERS,
+    Motions,
+    find_choices,
+    find_motions,
+    known_poses,
+    row_of,
+)
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.envs.episodes import spans
 from mme_vla.envs.observations import RenderRequest
@@ -19,7 +28,10 @@ if TYPE_CHECKING:
     from mme_vla.memory.base import Memory
 
 DECISIONS, CHOICES = "decisions", "choices"
-GRAMMAR = "decisions, choices, a number n for every n-th frame of the execution, or numbers and ranges such as [0-9,40]"
+GRAMMAR = (
+    "decisions, choices, a number n for every n-th frame of the execution, or numbers and ranges"
+    " such as [0-9,40]"
+)
 MEMORY_CAMERA = "front"
 _SOME_WIDTH = 64  # which frames a memory reads does not depend on the width of its tokens
 
@@ -28,11 +40,13 @@ _SOME_WIDTH = 64  # which frames a memory reads does not depend on the width of 
 class FrameChoice:
     """The rendered frames of every demonstration; all other steps have no images.
 
-    at: the frames that both cameras show. `decisions`: the last frame before each planned motion of the execution,
-        where a waypoint policy acts; `choices`: the last frame before each part of it, where one acts that chooses
-        among options; n: the execution's first frame and every n-th after it; or numbers and ranges, counted from the
-        episode's first stored frame.
-    memory: a section of a memory; the front camera also shows what this memory may read at those frames, and so does
+    at: the frames that both cameras show. `decisions`: the last frame before each planned motion of
+    the execution,
+        where a waypoint policy acts; `choices`: the last frame before each part of it, where one
+        acts that chooses among options; n: the execution's first frame and every n-th after it; or
+        numbers and ranges, counted from the episode's first stored frame.
+    memory: a section of a memory; the front camera also shows what this memory may read at those
+    frames, and so does
         the other where the memory gives a backbone past views.
     every: stride over the decisions, for a policy that executes several motions of a chunk.
     """
@@ -50,7 +64,9 @@ class FrameChoice:
             _build(self.memory)
 
     def beforehand(self) -> RenderRequest | None:
-        """The request, where it does not depend on the demonstration: numbers without a memory; else None."""
+        """The request, where it does not depend on the demonstration: numbers without a memory;
+        else None.
+        """
         if isinstance(self.at, int) or self.at in (DECISIONS, CHOICES) or self.memory is not None:
             return None
         numbers = frozenset(k for span in spans(self.at, "frames", GRAMMAR) for k in span)
@@ -63,7 +79,9 @@ class FrameChoice:
         frames = {camera: frozenset(numbers) for camera in CAMERAS}
         if self.memory is not None:
             read = self.read(np.array(numbers, np.int64), video)
-            for camera in CAMERAS if past_view_spec(_build(self.memory)) is not None else (MEMORY_CAMERA,):
+            for camera in (
+                CAMERAS if past_view_spec(_build(self.memory)) is not None else (MEMORY_CAMERA,)
+            ):
                 frames[camera] |= read
         return RenderRequest(frames, now=())
 
@@ -75,7 +93,10 @@ class FrameChoice:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
-        return {"at": self.at if isinstance(self.at, str | int) else list(self.at), "memory": self.memory}
+        return {
+            "at": self.at if isinstance(self.at, str | int) else list(self.at),
+            "memory": self.memory,
+        }
 
     def _frame_numbers(self, steps: Sequence["RecordedStep"], video: int) -> list[int]:
         if isinstance(self.at, int):

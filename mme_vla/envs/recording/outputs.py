@@ -35,11 +35,16 @@ class EpisodeWriter:
         frames: the choice of frames that are rendered, where not all are.
     """
 
-    def __init__(self, path: Path, index: int, task: "Task", frames: "FrameChoice | None" = None) -> None:
+    def __init__(
+        self, path: Path, index: int, task: "Task", frames: "FrameChoice | None" = None
+    ) -> None:
         self._file = h5py.File(path, "w")
         self._episode = self._file.create_group(f"episode_{index}")
         self._steps = 0
-        choices = [{"label": c.label, "action": c.action, "need_parameter": c.needs_point} for c in task.choices()]
+        choices = [
+            {"label": c.label, "action": c.action, "need_parameter": c.needs_point}
+            for c in task.choices()
+        ]
         setup = self._episode.create_group("setup")
         setup["seed"] = np.int64(task.seed)
         texts = {"difficulty": task.difficulty, "available_multi_choices": json.dumps(choices)}
@@ -63,9 +68,12 @@ class EpisodeWriter:
         if isinstance(value, str):
             # As in the official files; every text of the benchmark is ASCII.
             encoding = "ascii" if name in _BYTES else "utf-8"
-            group.create_dataset(path, data=value.encode(encoding), dtype=h5py.string_dtype(encoding))
+            group.create_dataset(
+                path, data=value.encode(encoding), dtype=h5py.string_dtype(encoding)
+            )
         elif isinstance(value, np.ndarray) and value.ndim == 3:
-            # One chunk: the dozens that h5py would make of it double the time that storing a step takes.
+            # One chunk: the dozens that h5py would make of it double the time that storing a step
+            # takes.
             group.create_dataset(path, data=value, compression="lzf", chunks=value.shape)
         else:
             group[path] = value
@@ -129,7 +137,9 @@ class Job:
         return None if self.frames is None else self.frames.to_dict()
 
     def made(self, seed: int | None, difficulty: str | None, frames: Any) -> bool:
-        """Whether an episode of this seed, difficulty and rendered frames can be what this job records."""
+        """Whether an episode of this seed, difficulty and rendered frames can be what this job
+        records.
+        """
         right = seed is not None and self.seed <= seed < self.seed + self.retries
         return right and difficulty == self.difficulty and frames == self.frame_selection
 
@@ -138,8 +148,8 @@ class Job:
 class RecordingPlan:
     """The results of a recording.
 
-    jobs: its episodes. dataset: folder of the LeRobot dataset, if one is wanted. hdf5: folder of the official files,
-    one a task, if they are.
+    jobs: its episodes. dataset: folder of the LeRobot dataset, if one is wanted. hdf5: folder of
+    the official files, one a task, if they are.
     """
 
     jobs: Sequence[Job]
@@ -161,13 +171,15 @@ class RecordingPlan:
                 continue
             require(
                 self._is_dataset(options) if place == self.dataset else self._is_official(place),
-                f"{place} exists already, and is not what this command records; choose another place, or remove it "
-                "yourself.",
+                f"{place} exists already, and is not what this command records; choose another"
+                " place, or remove it yourself.",
             )
         return missing
 
     def write(self, missing: Sequence[Path], episodes: Path, options: "ConvertOptions") -> None:
-        """Write these places from the recorded files in `episodes`; each appears whole or not at all."""
+        """Write these places from the recorded files in `episodes`; each appears whole or not at
+        all.
+        """
         from mme_vla.data.convert import convert
         from mme_vla.data.hdf5 import EpisodeRef
 
@@ -176,11 +188,15 @@ class RecordingPlan:
                 place.parent.mkdir(parents=True, exist_ok=True)
                 join([episodes / f"{job.name}.h5" for job in self._of(place)], place)
         if self.dataset is not None and self.dataset in missing:
-            refs = [EpisodeRef(episodes / f"{job.name}.h5", job.episode, job.task) for job in self.jobs]
+            refs = [
+                EpisodeRef(episodes / f"{job.name}.h5", job.episode, job.task) for job in self.jobs
+            ]
             convert(refs, self.dataset, options)
 
     def tidy(self) -> None:
-        """Remove what earlier runs left beside the dataset, which is there; the caller holds the recording's folder."""
+        """Remove what earlier runs left beside the dataset, which is there; the caller holds the
+        recording's folder.
+        """
         from mme_vla.data.convert import drop_work
 
         if self.dataset is not None:
@@ -217,7 +233,8 @@ class RecordingPlan:
         entries = side.get("episodes", [])
         return (
             side.get("plan", {}).get("options") == planned_options(options)
-            and [(e.get("task"), e.get("source_episode")) for e in entries] == [(j.task, j.episode) for j in self.jobs]
+            and [(e.get("task"), e.get("source_episode")) for e in entries]
+            == [(j.task, j.episode) for j in self.jobs]
             and all(
                 job.made(e.get("seed"), e.get("difficulty"), e.get("frames"))
                 for job, e in zip(self.jobs, entries, strict=True)

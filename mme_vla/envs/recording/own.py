@@ -25,8 +25,8 @@ def record_own(
 ) -> tuple[int, list[EpisodeSpec]]:
     """Demonstrate episodes into a new dataset; those that do not succeed are left out.
 
-    The columns are `observation.images.<camera>`, `observation.state`, `action`, and `is_demo` for the frames of a
-    conditioning video. `output` appears when it is whole.
+    The columns are `observation.images.<camera>`, `observation.state`, `action`, and `is_demo` for
+    the frames of a conditioning video. `output` appears when it is whole.
 
     Args:
         work: folder that keeps each episode until then; those in it are not demonstrated again.
@@ -34,7 +34,10 @@ def record_own(
     Returns:
         Frames, and the episodes that did not succeed.
     """
-    draft, episodes = work / "dataset", {work / f"{spec.task}-{spec.episode}.npz": spec for spec in specs}
+    draft, episodes = (
+        work / "dataset",
+        {work / f"{spec.task}-{spec.episode}.npz": spec for spec in specs},
+    )
     shutil.rmtree(draft, ignore_errors=True)
     dataset: Any = None
     failures, frames = [], 0
@@ -52,14 +55,19 @@ def record_own(
             with np.load(path) as loaded:
                 columns = dict(loaded)
             goal = str(columns.pop("task"))
-            rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+            rows = [
+                dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
+            ]
             dataset = dataset or _create(rows[0], draft, fps)
             for row in rows:
                 dataset.add_frame({**row, "task": goal})
             dataset.save_episode()
             frames += len(rows)
         if dataset is None:
-            raise UserError(f"None of {len(specs)} demonstrations ended with info['success']: nothing was written.")
+            raise UserError(
+                f"None of {len(specs)} demonstrations ended with info['success']: nothing was"
+                " written."
+            )
         dataset.finalize()
     draft.rename(output)
     return frames, failures
@@ -71,14 +79,25 @@ def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.n
     try:
         rows = []
         for observation, action, visible in env.demonstration():
-            images = {f"{IMAGES}{name}": np.asarray(image) for name, image in observation.items() if name != "state"}
+            images = {
+                f"{IMAGES}{name}": np.asarray(image)
+                for name, image in observation.items()
+                if name != "state"
+            }
             state = np.asarray(observation["state"], np.float32)
             rows.append(
-                {**images, STATE: state, ACTION: np.asarray(action, np.float32), "is_demo": np.array([visible])}
+                {
+                    **images,
+                    STATE: state,
+                    ACTION: np.asarray(action, np.float32),
+                    "is_demo": np.array([visible]),
+                }
             )
         if not env.success:
             return None
-        return {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {"task": np.array(env.goal)}
+        return {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {
+            "task": np.array(env.goal)
+        }
     finally:
         env.close()
 
@@ -89,8 +108,14 @@ def _create(row: dict[str, Any], root: Path, fps: int) -> Any:
     features: dict[str, Any] = {"is_demo": {"dtype": "bool", "shape": (1,), "names": None}}
     for name, value in row.items():
         if name.startswith(IMAGES):
-            features[name] = {"dtype": "image", "shape": value.shape, "names": ["height", "width", "channel"]}
+            features[name] = {
+                "dtype": "image",
+                "shape": value.shape,
+                "names": ["height", "width", "channel"],
+            }
         elif name in (STATE, ACTION):
             names = [f"{name.rpartition('.')[2]} {i}" for i in range(len(value))]
             features[name] = {"dtype": "float32", "shape": value.shape, "names": names}
-    return LeRobotDataset.create(f"local/{root.name}", fps=fps, features=features, root=root, use_videos=False)
+    return LeRobotDataset.create(
+        f"local/{root.name}", fps=fps, features=features, root=root, use_videos=False
+    )

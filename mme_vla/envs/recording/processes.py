@@ -18,7 +18,8 @@ def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> 
     if workers == 1 or len(jobs) < 2:
         import mme_vla.envs.task  # noqa: F401
 
-        gc.freeze()  # scenes are built faster when no collection walks through the simulator's modules
+        # scenes are built faster when no collection walks through the simulator's modules
+        gc.freeze()
         yield from map(work, jobs)
         return
     with simulation_pool(workers) as pool:

@@ -22,11 +22,15 @@ if TYPE_CHECKING:
     from mme_vla.envs.task import Task
 
 
-def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["SubTask"] | None = None) -> bool:
-    """Perform the sub-tasks of a task that has just been reset, evaluated `as_recorded`; whether it succeeded.
+def demonstrate(
+    env: "Task", demonstrator: Demonstrator, subtasks: Sequence["SubTask"] | None = None
+) -> bool:
+    """Perform the sub-tasks of a task that has just been reset, evaluated `as_recorded`; whether it
+    succeeded.
 
-    The task is evaluated before and after each sub-task; `env.progress.planned` moves at these evaluations only. In a
-    recovery demonstration the sampled pick of the execution fails once first.
+    The task is evaluated before and after each sub-task; `env.progress.planned` moves at these
+    evaluations only. In a recovery demonstration the sampled pick of the execution fails once
+    first.
 
     Args:
         subtasks: by default all of the task's.
@@ -56,7 +60,9 @@ def _ended(env: "Task") -> bool:
 
 
 MAX_STEPS, MAX_STEPS_OOD = 2000, 4000
-"""Control steps after which a recording is given up: the benchmark's, and of the longer scenes of RoboMME-OOD."""
+"""Control steps after which a recording is given up: the benchmark's, and of the longer scenes of
+RoboMME-OOD.
+"""
 SEAM, AT_REST = 5e-8, 1e-5  # rad
 GRIPPER_CLOSED = 0.03
 """Finger position below which the gripper counts as closed, metres."""
@@ -68,7 +74,9 @@ class TooLongError(RuntimeError):
 
 @dataclass(frozen=True)
 class RecordedStep:
-    """One stored time step with the keys of the official files; the observation was made after the action."""
+    """One stored time step with the keys of the official files; the observation was made after the
+    action.
+    """
 
     obs: dict[str, Any]
     action: dict[str, Any]
@@ -92,13 +100,14 @@ class Recording:
 
 
 class Recorder:
-    """Demonstrates a task and records its steps, except those of sub-tasks without a text (`NO_RECORD`).
+    """Demonstrates a task and records its steps, except those of sub-tasks without a text
+    (`NO_RECORD`).
 
     Args:
         task: created with the observation mode `none`.
         render: take images; without them frames hold states, actions and plain texts only.
-        render_request: which stored steps, counted from 0, are rendered by which cameras; by default all. Where a text
-            needs a pixel, the front camera renders in any case.
+        render_request: which stored steps, counted from 0, are rendered by which cameras; by
+            default all. Where a text needs a pixel, the front camera renders in any case.
         on_step: takes each stored step; by default they are collected in `Recording.frames`.
     """
 
@@ -109,7 +118,12 @@ class Recorder:
         on_step: Callable[[RecordedStep], None] | None = None,
         render_request: RenderRequest | None = None,
     ) -> None:
-        self._task, self._render, self._on_step, self._render_request = task, render, on_step, render_request
+        self._task, self._render, self._on_step, self._render_request = (
+            task,
+            render,
+            on_step,
+            render_request,
+        )
         depth = {"include_front_depth": render, "include_wrist_depth": render}
         poses = {"include_front_camera_extrinsic": True, "include_wrist_camera_extrinsic": True}
         self._observer = Observer(task, Include.from_options(depth | poses), render)
@@ -120,7 +134,9 @@ class Recorder:
         task.reset()
         self._observer.start()
         self._planned = Grounding(retry=False)
-        self._online = Grounding(retry=False)  # unlike a running environment's, a file's text is made once
+        self._online = Grounding(
+            retry=False
+        )  # unlike a running environment's, a file's text is made once
         self._action_angles = AngleTrack()
         self._roll_shift: float | None = None
         self._waypoint: np.ndarray | None = None
@@ -142,7 +158,9 @@ class Recorder:
         if self._result.steps >= limit:
             raise TooLongError(f"not done after {limit} control steps")
         self._action = np.asarray(action, np.float64)
-        self._displayed = self._task.progress.displayed  # the text is set before the evaluation moves the pointer
+        self._displayed = (
+            self._task.progress.displayed
+        )  # the text is set before the evaluation moves the pointer
         self._task.step(np.asarray(action, np.float32))
         self._result.steps += 1
 
@@ -163,7 +181,9 @@ class Recorder:
         self._enter_phase()
         if planned.text == NO_RECORD:
             return
-        step = RecordedStep(self._observation(evaluated), self._actions(planned), self._texts(planned))
+        step = RecordedStep(
+            self._observation(evaluated), self._actions(planned), self._texts(planned)
+        )
         self._result.stored += 1
         self._result.video += planned.video
         if self._on_step is None:
@@ -172,7 +192,9 @@ class Recorder:
             self._on_step(step)
 
     def _enter_phase(self) -> None:
-        """Drop the video's waypoint where the execution begins: at its first step, or at a waypoint before that."""
+        """Drop the video's waypoint where the execution begins: at its first step, or at a waypoint
+        before that.
+        """
         video = self._task.progress.demonstrated.video
         if self._in_video is not None and video != self._in_video:
             self._waypoint = None
@@ -184,22 +206,33 @@ class Recorder:
         frame = self._observer.frame(evaluated, cameras)
         frame = {name: value for name, value in frame.items() if value is not None}
         closed = self._task.stick or bool((frame["gripper_state"] < GRIPPER_CLOSED).any())
-        return frame | {"eef_state": frame["eef_state"].astype(np.float32), "is_gripper_close": closed}
+        return frame | {
+            "eef_state": frame["eef_state"].astype(np.float32),
+            "is_gripper_close": closed,
+        }
 
     def _actions(self, planned: "SubTask") -> dict[str, Any]:
         task, action = self._task, self._action
         pose = self._demonstrator.arm.forward(action[:ARM_JOINTS])
         gripper = -1.0 if task.stick else float(action[ARM_JOINTS])
         angles = self._action_angles.follow(pose.q)
-        if self._roll_shift is None:  # a gripper begins straight down, which the official files have at +pi
+        if (
+            self._roll_shift is None
+        ):  # a gripper begins straight down, which the official files have at +pi
             self._roll_shift = 2 * np.pi if abs(angles[0] + np.pi) < AT_REST else 0.0
         angles[0] += self._roll_shift
-        pixel = list(project(planned.targets[0].position)) if planned.choice and planned.targets else []
+        pixel = (
+            list(project(planned.targets[0].position)) if planned.choice and planned.targets else []
+        )
         return {
             "joint_action": np.append(action[:ARM_JOINTS], gripper),
             "eef_action": np.concatenate([pose.p, angles, [gripper]]).astype(np.float64),
-            "waypoint_action": np.full(len(POSE) + 1, np.nan, np.float32) if self._waypoint is None else self._waypoint,
-            "choice_action": json.dumps({"choice": planned.choice.upper(), "point": [round(float(v)) for v in pixel]}),
+            "waypoint_action": np.full(len(POSE) + 1, np.nan, np.float32)
+            if self._waypoint is None
+            else self._waypoint,
+            "choice_action": json.dumps(
+                {"choice": planned.choice.upper(), "point": [round(float(v)) for v in pixel]}
+            ),
         }
 
     def _texts(self, planned: "SubTask") -> dict[str, Any]:

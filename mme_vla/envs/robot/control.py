@@ -1,6 +1,7 @@
 """The base of the demonstrator: planned motions, gripper, waiting, and the way back to the start.
 
-Every motion is a sequence of joint targets, one a control step, passed to a callable that performs the step.
+Every motion is a sequence of joint targets, one a control step, passed to a callable that performs
+the step.
 """
 
 import math
@@ -26,7 +27,9 @@ LONG_DETOUR = 200
 """Steps above which a sampled motion is planned again."""
 HOME = (0.0, 0.0, 0.2)
 LIMITS = {False: (0.9, 0.9), True: (0.3, 0.9)}
-"""Joint velocity and acceleration limits, rad/s and rad/s², of the gripper robot and of the stick robot (`stick`)."""
+"""Joint velocity and acceleration limits, rad/s and rad/s², of the gripper robot and of the stick
+robot (`stick`).
+"""
 
 
 class PlanningError(RuntimeError):
@@ -38,8 +41,10 @@ class RobotControl:
 
     Args:
         env: the task, after its reset.
-        step: performs one control step with joint targets and gripper [8], or joint targets [7] for the stick.
-        on_waypoint: called with a pose of the tool and its gripper command before the motion there begins.
+        step: performs one control step with joint targets and gripper [8], or joint targets [7] for
+            the stick.
+        on_waypoint: called with a pose of the tool and its gripper command before the motion there
+            begins.
     """
 
     def __init__(
@@ -53,7 +58,9 @@ class RobotControl:
         self.gripper = OPEN
         """The command the gripper was last given; motions keep it."""
         self.left = 0
-        """Steps that are known to follow the present one: those left of a motion or a grip, and `and_then`."""
+        """Steps that are known to follow the present one: those left of a motion or a grip, and
+        `and_then`.
+        """
         self.and_then = 0
         """Steps that the caller will add to the motion under way."""
         self._step = step
@@ -69,7 +76,8 @@ class RobotControl:
 
         Args:
             pose: of the tool centre point in the world.
-            gripper: announce the pose as a waypoint with this gripper command; None announces nothing.
+            gripper: announce the pose as a waypoint with this gripper command; None announces
+                nothing.
 
         Raises:
             PlanningError: neither a screw motion nor sampling found a way; nothing has moved.
@@ -148,7 +156,8 @@ class RobotControl:
         if plan is None:
             place, orientation = ([round(float(x), 4) for x in part] for part in (pose.p, pose.q))
             raise PlanningError(
-                f"No way to {place}, orientation {orientation} (wxyz): out of the arm's reach or blocked."
+                f"No way to {place}, orientation {orientation} (wxyz): out of the arm's reach or"
+                " blocked."
             )
         return plan
 

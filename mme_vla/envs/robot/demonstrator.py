@@ -1,4 +1,6 @@
-"""The demonstrator: primitives for the gripper, for cubes and pegs, and for the stick, in one class."""
+"""The demonstrator: primitives for the gripper, for cubes and pegs, and for the stick, in one
+class.
+"""
 
 from typing import Literal
 
@@ -18,11 +20,15 @@ BEHIND = 0.05
 HOOK_BACK, HOOK_ASIDE, HOOK_STOP = 0.1, 0.1, 0.03
 """Where a hook begins behind and beside the cube, and how far before the goal it ends, metres."""
 ABOVE_PEG, ABOVE_DRAG, PEG_DRAGGED, PEG_ON_TABLE = 0.2, 0.12, 0.04, 0.015
-"""Heights of the tool over a peg, likewise before it drags one, while it does, and where it lets one go, metres."""
+"""Heights of the tool over a peg, likewise before it drags one, while it does, and where it lets
+one go, metres.
+"""
 TIP = 0.012
 """From the middle of a peg's end to where it is taken to be dragged, metres."""
 INSERT_START, INSERT_NEAR, INSERT_PAST, INSERT_RAISED = 0.2, 0.15, 0.05, 0.15
-"""Stations of an insertion, along the hole from where the end is in the box's middle, and the first one's height."""
+"""Stations of an insertion, along the hole from where the end is in the box's middle, and the first
+one's height.
+"""
 
 
 class PegPrimitives(RobotControl):
@@ -34,7 +40,8 @@ class PegPrimitives(RobotControl):
     def push(self, cube: Thing, goal: Thing) -> None:
         """Push a cube to a goal with closed fingers, then open them."""
         way, z = _direction(cube, goal), cube.position[2]
-        # The gripper never looks back to the robot: for a push towards it, it is turned by half a turn.
+        # The gripper never looks back to the robot: for a push towards it, it is turned by half a
+        # turn.
         q = pointing_down(way if goal.position[0] >= cube.position[0] else -way)
         self.open()
         self.move_to(self.at([*(cube.position[:2] - BEHIND * way), z], q), CLOSE)
@@ -48,8 +55,8 @@ class PegPrimitives(RobotControl):
         """Draw a cube to a goal with a peg that is held by its tail, then let go.
 
         Args:
-            side: +1 if the gripper passes the cube on the right of the way (the peg reaches to the left), -1 for the
-                other; by default by the sides of cube and goal.
+            side: +1 if the gripper passes the cube on the right of the way (the peg reaches to the
+                left), -1 for the other; by default by the sides of cube and goal.
         """
         if side is None:
             side = 1 if cube.position[1] > goal.position[1] else -1
@@ -84,10 +91,11 @@ class PegPrimitives(RobotControl):
         self.close()
 
     def insert_peg(self, peg: Peg, grasped_end: Thing | PegEnd, side: int, box: Thing) -> None:
-        """Put the free end of a held peg into the hole of a box, as the benchmark's demonstrator does.
+        """Put the free end of a held peg into the hole of a box, as the benchmark's demonstrator
+        does.
 
-        Held by its tail and inserted from the right, the peg stops short of the hole, now and then too short;
-        `insert_peg_fully` makes up for that.
+        Held by its tail and inserted from the right, the peg stops short of the hole, now and then
+        too short; `insert_peg_fully` makes up for that.
 
         Args:
             grasped_end: the end that is held; the other one goes in.
@@ -125,11 +133,20 @@ class PegPrimitives(RobotControl):
         """
         head_first = grasped_end in ("tail", peg.tail)
         free = peg.head if head_first else peg.tail
-        hole = box.pose if head_first == (side > 0) else sapien.Pose(box.pose.p, turned(box.pose.q, "z", np.pi))
+        hole = (
+            box.pose
+            if head_first == (side > 0)
+            else sapien.Pose(box.pose.p, turned(box.pose.q, "z", np.pi))
+        )
         outward = -1 if head_first else 1
 
         def station(along: float, raised: float = 0.0) -> sapien.Pose:
-            return hole * sapien.Pose([outward * along, 0, raised]) * free.pose.inv() * self.env.tcp_pose
+            return (
+                hole
+                * sapien.Pose([outward * along, 0, raised])
+                * free.pose.inv()
+                * self.env.tcp_pose
+            )
 
         if not begun:
             self.move_to(station(INSERT_START, INSERT_RAISED), CLOSE)
@@ -138,7 +155,9 @@ class PegPrimitives(RobotControl):
         self.move_to(station(0.0), CLOSE)
 
     def drag_peg(self, peg: Peg, end: PegEnd, way: np.ndarray, flip: bool = False) -> None:
-        """Take a peg by one tip and draw it over the table, hardly lifted, along `way` [2] in metres."""
+        """Take a peg by one tip and draw it over the table, hardly lifted, along `way` [2] in
+        metres.
+        """
         self.open()
         grasp = _peg_grasp(getattr(peg, end), flip, outward=TIP if end == "head" else -TIP)
         self.move_to(self.at([*grasp.p[:2], ABOVE_DRAG], grasp.q), OPEN)
@@ -169,7 +188,9 @@ def _peg_grasp(end: Thing, flip: bool, outward: float = 0.0) -> sapien.Pose:
 
 
 def _looks_back(grasp: sapien.Pose) -> bool:
-    """Whether the gripper's x axis points towards the robot's base; RoboMME-OOD then turns the grasp by half a turn."""
+    """Whether the gripper's x axis points towards the robot's base; RoboMME-OOD then turns the
+    grasp by half a turn.
+    """
     forward = grasp.to_transformation_matrix()[:2, 0]
     return bool(forward @ (grasp.p[:2] - np.array(ROBOT_BASE[:2])) < 0)
 
@@ -213,7 +234,9 @@ class StickPrimitives(RobotControl):
         for pose in poses:
             solution = self.arm.ik(pose, joints)
             if solution is None:
-                raise PlanningError(f"The arc to {target.name} leaves the arm's reach at {pose.p.tolist()}.")
+                raise PlanningError(
+                    f"The arc to {target.name} leaves the arm's reach at {pose.p.tolist()}."
+                )
             targets.append(solution)
             joints = solution
         middle = len(poses) // 2
@@ -226,7 +249,9 @@ class StickPrimitives(RobotControl):
         self.follow(targets)
 
 
-def arc(start: np.ndarray, end: np.ndarray, direction: Literal["clockwise", "counterclockwise"]) -> np.ndarray:
+def arc(
+    start: np.ndarray, end: np.ndarray, direction: Literal["clockwise", "counterclockwise"]
+) -> np.ndarray:
     """Points of a quadratic Bezier curve between two places at the stick's height.
 
     Args:
@@ -248,8 +273,8 @@ def arc(start: np.ndarray, end: np.ndarray, direction: Literal["clockwise", "cou
 class Demonstrator(GripperPrimitives, PegPrimitives, StickPrimitives):
     """Performs the primitives that demonstrations and multi-choice options are made of.
 
-    Motions are planned from where the arm is and carried out without looking; the same scene gives the same steps.
-    Waypoints are announced before the motion that leads there.
+    Motions are planned from where the arm is and carried out without looking; the same scene gives
+    the same steps. Waypoints are announced before the motion that leads there.
 
     Example:
         >>> demonstrator = Demonstrator(env, env.step)  # doctest: +SKIP

@@ -1,4 +1,6 @@
-"""Primitives of the gripper: pick, place, put down, drop, press, hover; and the orientations they need."""
+"""Primitives of the gripper: pick, place, put down, drop, press, hover; and the orientations they
+need.
+"""
 
 from collections.abc import Sequence
 
@@ -15,7 +17,9 @@ from mme_vla.envs.scene.things import Thing
 
 DOWN = np.array([0.0, 0.0, -1.0])
 DOWNWARD_Q = (float(np.cos(np.float32(np.pi / 2))), 1.0, 0.0, 0.0)
-"""The gripper straight down, its x axis along the world's (roll pi in single precision, as recorded); wxyz."""
+"""The gripper straight down, its x axis along the world's (roll pi in single precision, as
+recorded); wxyz.
+"""
 SQUARE = 0.01
 """Two sides whose ratio is within this of 1 are equally good to grasp."""
 
@@ -23,8 +27,9 @@ SQUARE = 0.01
 def grasp_orientation(thing: Thing, closing: np.ndarray) -> np.ndarray:
     """Orientation of the tool for grasping an object from above.
 
-    The fingers close along the shorter of the two horizontal axes of the object's smallest bounding box; where these
-    are equal, along the one nearer to `closing`, their present direction [3]. Returns a quaternion [4], wxyz.
+    The fingers close along the shorter of the two horizontal axes of the object's smallest bounding
+    box; where these are equal, along the one nearer to `closing`, their present direction [3].
+    Returns a quaternion [4], wxyz.
     """
     body = thing.entity._objs[0].find_component_by_type(physx.PhysxRigidDynamicComponent)
     box = get_component_mesh(body).bounding_box_oriented.primitive
@@ -32,7 +37,9 @@ def grasp_orientation(thing: Thing, closing: np.ndarray) -> np.ndarray:
     first, second = np.argsort(np.abs(axes @ DOWN))[:2]
     if extents[second] < extents[first]:
         first, second = second, first
-    if extents[first] / extents[second] > 1 - SQUARE and abs(closing @ axes[second]) > abs(closing @ axes[first]):
+    if extents[first] / extents[second] > 1 - SQUARE and abs(closing @ axes[second]) > abs(
+        closing @ axes[first]
+    ):
         first = second
     across = axes[first] * (1 if closing @ axes[first] >= 0 else -1)
     across = across - (across @ DOWN) * DOWN
@@ -43,7 +50,9 @@ def grasp_orientation(thing: Thing, closing: np.ndarray) -> np.ndarray:
 
 
 def pointing_down(forward: np.ndarray) -> np.ndarray:
-    """Orientation wxyz of a gripper that points down, its x axis along a horizontal direction [2] or [3]."""
+    """Orientation wxyz of a gripper that points down, its x axis along a horizontal direction [2]
+    or [3].
+    """
     x = np.array([forward[0], forward[1], 0.0])
     x /= np.linalg.norm(x)
     return wxyz(Rotation.from_matrix(np.stack([x, np.cross(DOWN, x), DOWN], axis=1)))
@@ -51,7 +60,9 @@ def pointing_down(forward: np.ndarray) -> np.ndarray:
 
 def turned(q: np.ndarray, axis: str, angle: float) -> np.ndarray:
     """An orientation wxyz turned about one of its own axes by an angle in radians."""
-    return (sapien.Pose(q=q) * sapien.Pose(q=np.roll(Rotation.from_euler(axis, angle).as_quat(), 1))).q
+    return (
+        sapien.Pose(q=q) * sapien.Pose(q=np.roll(Rotation.from_euler(axis, angle).as_quat(), 1))
+    ).q
 
 
 def wxyz(rotation: Rotation) -> np.ndarray:
@@ -86,7 +97,9 @@ class GripperPrimitives(RobotControl):
     """The primitives of tasks in which things are grasped and buttons pressed."""
 
     fail_next_pick: str | None = None
-    """`z` or `xy`: the next `pick` or `pick_container` fails once before it succeeds; that clears it."""
+    """`z` or `xy`: the next `pick` or `pick_container` fails once before it succeeds; that clears
+    it.
+    """
 
     def pick(self, thing: Thing) -> None:
         """Grasp a cube on the table and lift it."""
@@ -103,14 +116,19 @@ class GripperPrimitives(RobotControl):
             z: height of the tool at the release, metres; by default the target's own.
         """
         q = self.env.tcp_pose.q
-        above, below = self._over(target, ABOVE, q), self._over(target, target.position[2] if z is None else z, q)
+        above, below = (
+            self._over(target, ABOVE, q),
+            self._over(target, target.position[2] if z is None else z, q),
+        )
         self.move_to(above, CLOSE)
         self.move_to(below, OPEN)
         self.open()
         self.move_to(above, OPEN)
 
     def put_down(self, release_z: float = 0.07) -> None:
-        """Lower what is held straight down to a height of the tool in metres, let go, and withdraw."""
+        """Lower what is held straight down to a height of the tool in metres, let go,
+        and withdraw.
+        """
         here = self.env.tcp_pose
         self.move_to(self.at([*here.p[:2], release_z], here.q), OPEN)
         self.open()
@@ -184,7 +202,9 @@ class GripperPrimitives(RobotControl):
 
     def _grasp_pose(self, thing: Thing, depth: float) -> sapien.Pose:
         closing = self.env.tcp_pose.to_transformation_matrix()[:3, 1]
-        return sapien.Pose(thing.position + np.array([0, 0, depth]), grasp_orientation(thing, closing))
+        return sapien.Pose(
+            thing.position + np.array([0, 0, depth]), grasp_orientation(thing, closing)
+        )
 
     @staticmethod
     def _over(target: Thing, z: float, q: np.ndarray | Sequence[float]) -> sapien.Pose:

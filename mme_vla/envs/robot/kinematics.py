@@ -1,7 +1,8 @@
 """Forward and inverse kinematics of the arm by Pinocchio, in double precision.
 
-The simulator's own kinematic model rounds poses to single precision, which screw plans and then contacts amplify.
-Poses are in the world unless named otherwise; the model itself works in the base frame. Radians and metres.
+The simulator's own kinematic model rounds poses to single precision, which screw plans and then
+contacts amplify. Poses are in the world unless named otherwise; the model itself works in the base
+frame. Radians and metres.
 """
 
 from functools import cache
@@ -18,7 +19,9 @@ TCP, WRIST = "panda_hand_tcp", "panda_link7"
 LIMIT_TOLERANCE = 1e-3
 """Tolerance of the joint limits, radians (metres for the fingers)."""
 IK_TOLERANCE = 1e-3
-"""Largest accepted distance of an inverse-kinematics solution: metres plus the chord of the two quaternions."""
+"""Largest accepted distance of an inverse-kinematics solution: metres plus the chord of the two
+quaternions.
+"""
 _RESTARTS = 19
 _STEP, _DAMPING, _CONVERGED, _ITERATIONS = 0.1, 1e-12, 1e-5, 1000
 
@@ -39,7 +42,8 @@ def matrix_of(pose: sapien.Pose) -> np.ndarray:
 class Arm:
     """The kinematic model of a ManiSkill Panda, with gripper or with stick.
 
-    Joint vectors may be [7] (the arm) or longer (arm, then fingers, which do not move the tool centre point).
+    Joint vectors may be [7] (the arm) or longer (arm, then fingers, which do not move the tool
+    centre point).
 
     Args:
         agent: a ManiSkill agent on the CPU simulator whose tool centre point's link is `TCP`.
@@ -71,23 +75,33 @@ class Arm:
     def heights(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Places [3] of the tool centre point and of the hand's mounting, in the base frame."""
         tool = np.array(self._place(self._padded(qpos), self._tcp).translation)
-        return tool, np.array(pinocchio.updateFramePlacement(self._model, self._data, self._wrist).translation)
+        return tool, np.array(
+            pinocchio.updateFramePlacement(self._model, self._data, self._wrist).translation
+        )
 
     def jacobian(self, qpos: np.ndarray) -> np.ndarray:
-        """Spatial Jacobian [6, 7] in the base frame: linear velocity of the point at its origin, then angular."""
+        """Spatial Jacobian [6, 7] in the base frame: linear velocity of the point at its origin,
+        then angular.
+        """
         full, frame = self._padded(qpos), pinocchio.ReferenceFrame.WORLD
-        return np.array(pinocchio.computeFrameJacobian(self._model, self._data, full, self._tcp, frame))[:, :ARM_JOINTS]
+        return np.array(
+            pinocchio.computeFrameJacobian(self._model, self._data, full, self._tcp, frame)
+        )[:, :ARM_JOINTS]
 
     def within_limits(self, qpos: np.ndarray) -> bool:
         """Whether every arm joint is inside its limits, up to `LIMIT_TOLERANCE`."""
         arm = np.asarray(qpos)[:ARM_JOINTS]
-        return bool(np.all(arm >= self.lower - LIMIT_TOLERANCE) and np.all(arm <= self.upper + LIMIT_TOLERANCE))
+        return bool(
+            np.all(arm >= self.lower - LIMIT_TOLERANCE)
+            and np.all(arm <= self.upper + LIMIT_TOLERANCE)
+        )
 
     def ik(self, pose: sapien.Pose, qpos: np.ndarray) -> np.ndarray | None:
         """Joint angles that bring the tool centre point to a pose, by damped closed-loop iteration.
 
-        The iteration starts at the given joints, and, where that does not converge within the limits, at up to 19
-        random configurations, always the same ones. Angles are wrapped into the limits where a full turn allows it.
+        The iteration starts at the given joints, and, where that does not converge within the
+        limits, at up to 19 random configurations, always the same ones. Angles are wrapped into the
+        limits where a full turn allows it.
 
         Args:
             pose: target in the world.
@@ -109,7 +123,9 @@ class Arm:
         return None
 
     def _iterate(self, target: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Follow the displacement to a target [4, 4] from joints; the joints [7] where that ended."""
+        """Follow the displacement to a target [4, 4] from joints; the joints [7] where
+        that ended.
+        """
         goal, joints = pinocchio.SE3(target), start.copy()
         damping, frame = _DAMPING * np.eye(6), pinocchio.ReferenceFrame.LOCAL
         for _ in range(_ITERATIONS):
@@ -134,4 +150,6 @@ class Arm:
 
 def pose_distance(a: sapien.Pose, b: sapien.Pose) -> float:
     """Distance of two poses: metres between the origins plus the chord between the quaternions."""
-    return float(np.linalg.norm(a.p - b.p) + min(np.linalg.norm(a.q - b.q), np.linalg.norm(a.q + b.q)))
+    return float(
+        np.linalg.norm(a.p - b.p) + min(np.linalg.norm(a.q - b.q), np.linalg.norm(a.q + b.q))
+    )

@@ -1,8 +1,10 @@
-"""The two robots of the benchmark: a Panda with a gripper and a Panda with a stick, both with a camera on the hand.
+"""The two robots of the benchmark: a Panda with a gripper and a Panda with a stick, both with a
+camera on the hand.
 
-The stock simulator describes both; here the wrist camera gets the benchmark's size, and the stick robot, which has no
-camera in stock, gets the mount of the gripper robot. Robots are also described without visual shapes, so that
-physics can run where there is no renderer, and the wrist camera's own body with no more detail than shows.
+The stock simulator describes both; here the wrist camera gets the benchmark's size, and the stick
+robot, which has no camera in stock, gets the mount of the gripper robot. Robots are also described
+without visual shapes, so that physics can run where there is no renderer, and the wrist camera's
+own body with no more detail than shows.
 """
 
 import hashlib
@@ -57,25 +59,33 @@ class WristCamPanda(PandaWristCam):
 
 @register_agent()
 class StickPanda(PandaStick):
-    """Panda with a fixed stick in place of the fingers, and the same wrist camera on the same mount."""
+    """Panda with a fixed stick in place of the fingers, and the same wrist camera on the same
+    mount.
+    """
 
     uid = STICK
 
     @property
     def urdf_path(self) -> str:
-        return description(PandaStick.urdf_path, mount_from=PandaWristCam.urdf_path, visible=self.scene.can_render())
+        return description(
+            PandaStick.urdf_path,
+            mount_from=PandaWristCam.urdf_path,
+            visible=self.scene.can_render(),
+        )
 
     _sensor_configs = property(_camera)
 
 
 @cache
 def description(stock: str, mount_from: str | None = None, visible: bool = True) -> str:
-    """Path of a robot description derived from a stock one; written once, next to a copy of its collision rules.
+    """Path of a robot description derived from a stock one; written once, next to a copy of its
+    collision rules.
 
     Args:
         stock: URDF file to start from.
         mount_from: URDF file whose camera mount is added.
-        visible: keep what is there to be seen; without it the robot can be built where there is no renderer.
+        visible: keep what is there to be seen; without it the robot can be built where there is no
+            renderer.
     """
     source = Path(stock)
     robot = ElementTree.parse(source).getroot()
@@ -98,7 +108,11 @@ def description(stock: str, mount_from: str | None = None, visible: bool = True)
 
 
 def _add_mount(robot: ElementTree.Element, donor: ElementTree.Element) -> None:
-    joints = [joint for joint in donor.findall("joint") if joint.find("child").attrib["link"] in MOUNT]  # type: ignore[union-attr]
+    joints = []
+    for joint in donor.findall("joint"):
+        child = joint.find("child")
+        if child is not None and child.attrib["link"] in MOUNT:
+            joints.append(joint)
     links = [link for link in donor.findall("link") if link.attrib["name"] in MOUNT]
     for visual in [visual for link in links for visual in link.findall("visual")]:
         for material in visual.findall("material"):  # the camera is white in the official images
@@ -129,15 +143,17 @@ def coarsen(corners: np.ndarray, cell: float = CELL) -> np.ndarray:
         cell: width of a cell, metres.
 
     Returns:
-        Corners [m, 3, 3] float32, m <= n, of the triangles whose corners lie in three cells, each once and with its
-        side kept, in an order that depends on nothing else.
+        Corners [m, 3, 3] float32, m <= n, of the triangles whose corners lie in three cells, each
+        once and with its side kept, in an order that depends on nothing else.
     """
     points = corners.reshape(-1, 3)
     _, cells, counts = np.unique(
         np.floor(points / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
     cells = cells.reshape(-1)
-    means = np.stack([np.bincount(cells, points[:, axis]) for axis in range(3)], 1) / counts[:, None]
+    means = (
+        np.stack([np.bincount(cells, points[:, axis]) for axis in range(3)], 1) / counts[:, None]
+    )
     triangles = cells.reshape(-1, 3)
     different = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
     triangles = triangles[different]

@@ -25,7 +25,9 @@ X_UP = euler2quat(0, -np.pi / 2, 0)
 
 
 class Button(Thing):
-    """A cap on a spring that is pressed down into its base; the cap's foot is its position and goes down with it."""
+    """A cap on a spring that is pressed down into its base; the cap's foot is its position and goes
+    down with it.
+    """
 
     def __init__(self, name: str, articulation: Any) -> None:
         self.articulation = articulation
@@ -38,7 +40,9 @@ class Button(Thing):
 
     @property
     def position(self) -> np.ndarray:
-        """Foot of the cap in the world [3], metres: above the centre of the base, lower while pressed."""
+        """Foot of the cap in the world [3], metres: above the centre of the base, lower while
+        pressed.
+        """
         return np.asarray(pose_of(self.entity).p)
 
     @property
@@ -59,7 +63,8 @@ class Button(Thing):
 
 
 class Peg(Thing):
-    """A rod of two halves; its position is the middle of the head half, and the tail lies behind that along x.
+    """A rod of two halves; its position is the middle of the head half, and the tail lies behind
+    that along x.
 
     Args:
         length: of each half, metres. radius: half the thickness, metres.
@@ -105,7 +110,9 @@ def build_button(env: "Stage", xy: XY, name: str = "button") -> Button:
         pose_in_child=sapien.Pose(q=X_UP),
     )
     middle = sapien.Pose([0, 0, CAP_HALF_LENGTH], X_UP)
-    Shapes(env, cap).cylinder(CAP_RADIUS, CAP_HALF_LENGTH, CAP_COLOUR, middle, collision=True, density=CAP_DENSITY)
+    Shapes(env, cap).cylinder(
+        CAP_RADIUS, CAP_HALF_LENGTH, CAP_COLOUR, middle, collision=True, density=CAP_DENSITY
+    )
     builder.initial_pose = at(xy, BUTTON_BASE[2])
     articulation = builder.build(name, fix_root_link=True)
     joint = articulation.active_joints[0]
@@ -140,7 +147,10 @@ def build_peg(
     tail.set_name("tail")
     tail.set_joint_name("middle")
     tail.set_joint_properties(
-        type="fixed", limits=[], pose_in_parent=sapien.Pose([-length, 0, 0]), pose_in_child=sapien.Pose()
+        type="fixed",
+        limits=[],
+        pose_in_parent=sapien.Pose([-length, 0, 0]),
+        pose_in_child=sapien.Pose(),
     )
     Shapes(env, tail).box(half, tail_colour, collision=touched, density=PEG_DENSITY, glossy=True)
     builder.initial_pose = at(xy, z, yaw)

@@ -1,9 +1,10 @@
 """The smallest box around a mesh, and its shadow on the table, to the same bit on every CPU.
 
-The search is that of trimesh 4, with which the official scenes were made: one direction after the other is tried among
-the normals of the convex hull, and the box of least volume wins. For a cube all candidates have the same volume but for
-rounding, so the last bit decides which axes come first. Hull and adjacency are trimesh's and Qhull's. What trimesh
-leaves to BLAS and to NumPy's vectorised inverse functions is computed here.
+The search is that of trimesh 4, with which the official scenes were made: one direction after the
+other is tried among the normals of the convex hull, and the box of least volume wins. For a cube
+all candidates have the same volume but for rounding, so the last bit decides which axes come first.
+Hull and adjacency are trimesh's and Qhull's. What trimesh leaves to BLAS and to NumPy's vectorised
+inverse functions is computed here.
 """
 
 import math
@@ -23,7 +24,9 @@ _SMALLEST_COMPONENT = 1e-8
 
 
 @lru_cache(maxsize=256)
-def shadow_of_smallest_box(vertices: bytes, faces: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def shadow_of_smallest_box(
+    vertices: bytes, faces: bytes
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the first two axes of a mesh's smallest box cover on the table.
 
     Cached, since an object is an obstacle for all that are placed after it.
@@ -32,9 +35,13 @@ def shadow_of_smallest_box(vertices: bytes, faces: bytes) -> tuple[np.ndarray, n
         vertices: [n, 3], float64 in bytes, metres. faces: [m, 3], int64 in bytes.
 
     Returns:
-        Centre [2], the two axes [2, 2], one a row, of length one or, where upright, zero, and half the widths [2].
+        Centre [2], the two axes [2, 2], one a row, of length one or, where upright, zero, and half
+        the widths [2].
     """
-    points, triangles = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3)
+    points, triangles = (
+        np.frombuffer(vertices).reshape(-1, 3),
+        np.frombuffer(faces, np.int64).reshape(-1, 3),
+    )
     rotation, widths = smallest_box(Trimesh(points, triangles, process=False))
     corners = matrix_product(rotation, points.T)
     middle = corners.min(axis=1) + np.ptp(corners, axis=1) * 0.5
@@ -60,7 +67,8 @@ def smallest_box(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray]:
         visible = _along(normals, turn[2]) > -_SHORTEST_EDGE
         if not visible.any():
             continue
-        # The outline seen from this direction: edges of which one face is visible and the other is not.
+        # The outline seen from this direction: edges of which one face is visible and the other is
+        # not.
         first, second = visible[hull.face_adjacency.T]
         outline = hull.face_adjacency_edges[first != second]
         turned = matrix_product(turn, vertices.T).T
@@ -77,9 +85,13 @@ def smallest_box(mesh: Trimesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _directions(normals: np.ndarray) -> np.ndarray:
-    """Azimuth and inclination [n, 2] of the normals that differ by a tenth of a radian, taken to the upper half."""
+    """Azimuth and inclination [n, 2] of the normals that differ by a tenth of a radian, taken to
+    the upper half.
+    """
     upper = util.vector_hemisphere(normals)
-    lengths = np.sqrt(upper[:, 0] * upper[:, 0] + upper[:, 1] * upper[:, 1] + upper[:, 2] * upper[:, 2])
+    lengths = np.sqrt(
+        upper[:, 0] * upper[:, 0] + upper[:, 1] * upper[:, 1] + upper[:, 2] * upper[:, 2]
+    )
     units = upper * (1.0 / lengths)[:, None]
     units[np.abs(units) < _SMALLEST_COMPONENT] = 0.0
     angles = np.array([(math.atan2(y, x), math.acos(min(1.0, z))) for x, y, z in units])
@@ -99,11 +111,15 @@ def _turn_to_vertical(azimuth: float, inclination: float) -> np.ndarray:
 
 def _along(vectors: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Components [n] of vectors [n, 3] along a direction [3]."""
-    return vectors[:, 0] * direction[0] + vectors[:, 1] * direction[1] + vectors[:, 2] * direction[2]
+    return (
+        vectors[:, 0] * direction[0] + vectors[:, 1] * direction[1] + vectors[:, 2] * direction[2]
+    )
 
 
 def _unit_edges(ends: np.ndarray) -> np.ndarray:
-    """Directions [m, 2] of edges given by their ends [n, 2, 2]; edges without length are left out."""
+    """Directions [m, 2] of edges given by their ends [n, 2, 2]; edges without length
+    are left out.
+    """
     edges = ends[:, 1] - ends[:, 0]
     lengths = np.sqrt(edges[:, 0] * edges[:, 0] + edges[:, 1] * edges[:, 1])
     long_enough = lengths > _SHORTEST_EDGE
@@ -113,11 +129,14 @@ def _unit_edges(ends: np.ndarray) -> np.ndarray:
 def _widths_along(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Widths [m, 2] of points [n, 2] along each of the directions [m, 2] and across it."""
     across = np.column_stack((-edges[:, 1], edges[:, 0]))
-    return np.column_stack([np.ptp(matrix_product(axes, points.T), axis=1) for axes in (edges, across)])
+    return np.column_stack(
+        [np.ptp(matrix_product(axes, points.T), axis=1) for axes in (edges, across)]
+    )
 
 
 def _smallest_rectangle(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rotation [3, 3] about the vertical that lays the longer side of the smallest rectangle along x.
+    """The rotation [3, 3] about the vertical that lays the longer side of the smallest rectangle
+    along x.
 
     Args:
         points: [n, 2].

@@ -1,4 +1,5 @@
-"""What the script of a task moves: containers, swaps, highlights, marks, traces, and the cue discs of twin scenes.
+"""What the script of a task moves: containers, swaps, highlights, marks, traces, and the cue discs
+of twin scenes.
 
 Motions are functions of the number of control steps done, or of the state of the task.
 """
@@ -12,7 +13,15 @@ import numpy as np
 import sapien
 
 from mme_vla.envs.scene.arithmetic import norm
-from mme_vla.envs.scene.objects import BELOW_TABLE, COLOURS, RGB, WHITE, Disc, build_highlight, build_sphere
+from mme_vla.envs.scene.objects import (
+    BELOW_TABLE,
+    COLOURS,
+    RGB,
+    WHITE,
+    Disc,
+    build_highlight,
+    build_sphere,
+)
 from mme_vla.envs.scene.things import AWAY, Thing, distance_xy
 
 if TYPE_CHECKING:
@@ -34,7 +43,9 @@ def smoothstep(x: float) -> float:
 
 
 def parked(group: int, i: int) -> Place:
-    """A place of its own for object `i` of a group, out of the scene: many at one place press against each other."""
+    """A place of its own for object `i` of a group, out of the scene: many at one place press
+    against each other.
+    """
     return 20 + 0.5 * (i % PARKED_ROW), 20 + 0.5 * (4 * group + i // PARKED_ROW), 10.0
 
 
@@ -54,7 +65,9 @@ class Appear:
 
 
 class Cover:
-    """Containers are away for half of a window and then stand over what lay open. active: they are away."""
+    """Containers are away for half of a window and then stand over what lay open. active: they are
+    away.
+    """
 
     active = False
 
@@ -73,10 +86,12 @@ class Cover:
 
 
 class Swap:
-    """Two objects change places on arcs around each other while all others stand still. active: they move.
+    """Two objects change places on arcs around each other while all others stand still. active:
+    they move.
 
     Args:
-        initiator: one of the two; the other is `partner`, by default the nearest one when the swap begins.
+        initiator: one of the two; the other is `partner`, by default the nearest one when the swap
+            begins.
         group: every object that takes part or is to be kept in its place.
         start: step at which it begins.
         lane: how far the two evade each other sideways, metres.
@@ -94,7 +109,13 @@ class Swap:
         partner: Thing | None = None,
         steps: int = SWAP_STEPS,
     ) -> None:
-        self.initiator, self.partner, self.start, self.lane, self.steps = initiator, partner, start, lane, steps
+        self.initiator, self.partner, self.start, self.lane, self.steps = (
+            initiator,
+            partner,
+            start,
+            lane,
+            steps,
+        )
         self._group = list(group)
         self._poses: dict[Thing, sapien.Pose] = {}
 
@@ -132,7 +153,9 @@ class Swap:
 
 
 def sequential_swaps(initiators: Sequence[Thing], group: Sequence[Thing], start: int) -> list[Swap]:
-    """One swap after another, the first at step `start`; the partner is the nearest object when a swap begins."""
+    """One swap after another, the first at step `start`; the partner is the nearest object when a
+    swap begins.
+    """
     return [Swap(thing, group, start + i * SWAP_STEPS) for i, thing in enumerate(initiators)]
 
 
@@ -145,19 +168,28 @@ def blend(a: np.ndarray, b: np.ndarray, alpha: float) -> np.ndarray:
 def planned_swaps(
     pairs: Sequence[Sequence[int]], group: Sequence[Thing], start: int, steps: int = SWAP_STEPS
 ) -> list[Swap]:
-    """One swap after another, the first at step `start`; both objects of each are given by their indices."""
-    return [Swap(group[a], group, start + i * steps, partner=group[b], steps=steps) for i, (a, b) in enumerate(pairs)]
+    """One swap after another, the first at step `start`; both objects of each are given by their
+    indices.
+    """
+    return [
+        Swap(group[a], group, start + i * steps, partner=group[b], steps=steps)
+        for i, (a, b) in enumerate(pairs)
+    ]
 
 
 def active_motions(motions: "Sequence[Cover | Swap | Highlight]") -> set[str]:
     """Names of the motions that take place, by their kind and number: `swap 0`."""
-    return {f"{type(motion).__name__.lower()} {i}" for i, motion in enumerate(motions) if motion.active}
+    return {
+        f"{type(motion).__name__.lower()} {i}" for i, motion in enumerate(motions) if motion.active
+    }
 
 
 class Hide:
     """Hidden objects are away during a window; at its end each lies under its container again."""
 
-    def __init__(self, hidden: Sequence[tuple[Thing, Thing]], start: int, end: int, group: int | None = None) -> None:
+    def __init__(
+        self, hidden: Sequence[tuple[Thing, Thing]], start: int, end: int, group: int | None = None
+    ) -> None:
         """`group`: park each object at a place of its own (`parked`); None: all at one."""
         self._hidden, self._start, self._end = list(hidden), start, end
         self._homes = [thing.pose for thing, _ in self._hidden]
@@ -165,7 +197,9 @@ class Hide:
 
     def apply(self, k: int) -> None:
         """Move the hidden objects for the step before which `k` steps were done."""
-        for (thing, container), home, away in zip(self._hidden, self._homes, self._away, strict=True):
+        for (thing, container), home, away in zip(
+            self._hidden, self._homes, self._away, strict=True
+        ):
             if self._start <= k < self._end:
                 thing.move_to(sapien.Pose(away, home.q))
             elif k == self._end:
@@ -173,7 +207,9 @@ class Hide:
 
 
 class Highlight:
-    """A white disc under an object from one step to another, both included. active: it is visible."""
+    """A white disc under an object from one step to another, both included. active: it
+    is visible.
+    """
 
     active = False
     DEPTH = 0.01

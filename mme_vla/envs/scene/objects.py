@@ -1,7 +1,7 @@
 """Objects without joints, and how each is built; without a renderer they have no visual shapes.
 
-`env` is the task whose scene an object goes into, `name` is unique in it, `xy` is the centre on the table. Lengths are
-in metres, angles in radians, colours RGB in 0 … 1.
+`env` is the task whose scene an object goes into, `name` is unique in it, `xy` is the centre on the
+table. Lengths are in metres, angles in radians, colours RGB in 0 … 1.
 """
 
 from collections.abc import Sequence
@@ -62,7 +62,9 @@ class Shapes:
         if collision is not None:
             self._builder.add_box_collision(pose, half_size=tuple(collision), density=density)
         if self._visible:
-            self._builder.add_box_visual(pose, half_size=tuple(half_size), material=_material(colour, glossy))
+            self._builder.add_box_visual(
+                pose, half_size=tuple(half_size), material=_material(colour, glossy)
+            )
         return self
 
     def solid_box(self, half_size: Sequence[float], colour: RGB | None, **options: Any) -> "Shapes":
@@ -93,9 +95,15 @@ class Shapes:
         return self
 
     def rings(self, radius: float, half_length: float, colour: RGB) -> "Shapes":
-        """Five cylinders one in the other, of the colour and white by turns; inner ones are a little longer."""
+        """Five cylinders one in the other, of the colour and white by turns; inner ones are a
+        little longer.
+        """
         for k in range(5):
-            self.cylinder(radius * (1 - 0.2 * k), half_length + k * 1e-5, colour if k % 2 == 0 else (1.0, 1.0, 1.0))
+            self.cylinder(
+                radius * (1 - 0.2 * k),
+                half_length + k * 1e-5,
+                colour if k % 2 == 0 else (1.0, 1.0, 1.0),
+            )
         return self
 
     def build(self, name: str, pose: sapien.Pose, kinematic: bool = False) -> Any:
@@ -173,8 +181,8 @@ class Board(Thing):
 def cube_pose(xy: XY, yaw: float, half_size: float = H) -> sapien.Pose:
     """Pose of a cube on the table, turned in single precision, as in the benchmark.
 
-    The last bit of its quaternion decides the order of the axes of its bounding box, and so where the next object is
-    placed.
+    The last bit of its quaternion decides the order of the axes of its bounding box, and so where
+    the next object is placed.
     """
     return sapien.Pose([float(xy[0]), float(xy[1]), half_size], quaternion_about_z(yaw))
 
@@ -182,8 +190,9 @@ def cube_pose(xy: XY, yaw: float, half_size: float = H) -> sapien.Pose:
 def quaternion_about_z(yaw: float) -> np.ndarray:
     """Quaternion wxyz of a turn about the vertical, float32 [4], w not negative.
 
-    It is taken from the entries of the rotation matrix, in the order of operations in which ManiSkill takes it from a
-    matrix of tensors: the larger of w and z by its square, the other one by the off-diagonal entries.
+    It is taken from the entries of the rotation matrix, in the order of operations in which
+    ManiSkill takes it from a matrix of tensors: the larger of w and z by its square, the other one
+    by the off-diagonal entries.
     """
     angle = torch.tensor(yaw)
     cos, sin = np.float32(angle.cos().item()), np.float32(angle.sin().item())
@@ -198,7 +207,9 @@ def quaternion_about_z(yaw: float) -> np.ndarray:
     return -quaternion if quaternion[0] < 0 else quaternion
 
 
-def build_cube(env: "Stage", name: str, colour: str | RGB, xy: XY, yaw: float = 0.0, half_size: float = H) -> Cube:
+def build_cube(
+    env: "Stage", name: str, colour: str | RGB, xy: XY, yaw: float = 0.0, half_size: float = H
+) -> Cube:
     """A cube lying on the table."""
     rgb = COLOURS[colour] if isinstance(colour, str) else colour
     actor = Shapes(env).solid_box([half_size] * 3, rgb).build(name, cube_pose(xy, yaw, half_size))
@@ -217,9 +228,16 @@ def build_moving_cube(env: "Stage", name: str, colour: RGB, xy: XY, z: float) ->
 
 
 def build_disc(
-    env: "Stage", name: str, radius: float, thickness: float, colour: str, xy: XY, z: float | None = None
+    env: "Stage",
+    name: str,
+    radius: float,
+    thickness: float,
+    colour: str,
+    xy: XY,
+    z: float | None = None,
 ) -> Disc:
-    """A target without collision: five rings, alternately of a colour of `TARGET_COLOURS` and white.
+    """A target without collision: five rings, alternately of a colour of `TARGET_COLOURS` and
+    white.
 
     Args:
         z: height of the centre; by default the thickness.
@@ -230,17 +248,31 @@ def build_disc(
 
 
 def build_highlight(
-    env: "Stage", name: str, radius: float, half_length: float, colour: RGB = WHITE, rings: bool = False
+    env: "Stage",
+    name: str,
+    radius: float,
+    half_length: float,
+    colour: RGB = WHITE,
+    rings: bool = False,
 ) -> Disc:
-    """A disc that marks something for a while; it waits below the table. With `rings` it looks like a target."""
+    """A disc that marks something for a while; it waits below the table. With `rings` it looks like
+    a target.
+    """
     shapes = Shapes(env)
-    shapes = shapes.rings(radius, half_length, colour) if rings else shapes.cylinder(radius, half_length, colour)
+    shapes = (
+        shapes.rings(radius, half_length, colour)
+        if rings
+        else shapes.cylinder(radius, half_length, colour)
+    )
     return Disc(name, shapes.build(name, sapien.Pose(BELOW_TABLE, UPRIGHT), kinematic=True), radius)
 
 
 def build_sphere(env: "Stage", name: str, radius: float, colour: RGB = WHITE) -> Thing:
     """A ball that nothing can touch; it waits below the table."""
-    return Thing(name, Shapes(env).sphere(radius, colour).build(name, sapien.Pose(BELOW_TABLE), kinematic=True))
+    return Thing(
+        name,
+        Shapes(env).sphere(radius, colour).build(name, sapien.Pose(BELOW_TABLE), kinematic=True),
+    )
 
 
 def build_container(env: "Stage", name: str, xy: XY, yaw: float = 0.0) -> Container:
@@ -249,14 +281,20 @@ def build_container(env: "Stage", name: str, xy: XY, yaw: float = 0.0) -> Contai
     middle = CONTAINER_INNER / 2 + wall
     # In the actor's own frame the opening is up: heights count downwards from the handle's middle.
     rim = CONTAINER_Z - CONTAINER_HEIGHT / 2
-    # Walls and lid end at the middle of the wall they meet. Where a container settles depends on that and on the order.
+    # Walls and lid end at the middle of the wall they meet. Where a container settles depends on
+    # that and on the order.
     shapes = Shapes(env).solid_box([H] * 3, None)
     for side in (-1, 1):
         shapes.solid_box([wall, middle, CONTAINER_HEIGHT / 2], None, centre=[side * middle, 0, rim])
         shapes.solid_box([middle, wall, CONTAINER_HEIGHT / 2], None, centre=[0, side * middle, rim])
     shapes.solid_box([middle, middle, lid], None, centre=[0, 0, lid])
-    # Turned about its own vertical, which then points down: seen from above the turn goes the other way.
-    pose = at(xy, CONTAINER_Z) * sapien.Pose(q=euler2quat(np.pi, 0, 0)) * sapien.Pose(q=euler2quat(0, 0, yaw))
+    # Turned about its own vertical, which then points down: seen from above the turn goes the other
+    # way.
+    pose = (
+        at(xy, CONTAINER_Z)
+        * sapien.Pose(q=euler2quat(np.pi, 0, 0))
+        * sapien.Pose(q=euler2quat(0, 0, yaw))
+    )
     return Container(name, shapes.build(name, pose))
 
 
@@ -284,18 +322,25 @@ def build_aperture_box(
     """A box with a square hole along its x axis, standing on the table.
 
     Args:
-        inner: half the width of the hole. outer: half the width of the box. half_depth: half its length along the hole.
+        inner: half the width of the hole. outer: half the width of the box. half_depth: half its
+            length along the hole.
     """
     wall = (outer - inner) / 2
     shapes = Shapes(env)
     for sign in (-1, 1):
         offset = sign * (inner + wall)
-        shapes.solid_box([half_depth, wall, outer], APERTURE_COLOUR, centre=[0, offset, 0], glossy=True)
-        shapes.solid_box([half_depth, outer, wall], APERTURE_COLOUR, centre=[0, 0, offset], glossy=True)
+        shapes.solid_box(
+            [half_depth, wall, outer], APERTURE_COLOUR, centre=[0, offset, 0], glossy=True
+        )
+        shapes.solid_box(
+            [half_depth, outer, wall], APERTURE_COLOUR, centre=[0, 0, offset], glossy=True
+        )
     return Thing(name, shapes.build(name, at(xy, APERTURE_Z, yaw), kinematic=True))
 
 
 def build_obstacle(env: "Stage", name: str, xy: XY, yaw: float, colour: RGB) -> Thing:
     """An upright block, thin along its y axis, to be circled around."""
     half = [0.03, 0.015, 0.05]
-    return Thing(name, Shapes(env).solid_box(half, colour).build(name, at(xy, half[2], yaw), kinematic=True))
+    return Thing(
+        name, Shapes(env).solid_box(half, colour).build(name, at(xy, half[2], yaw), kinematic=True)
+    )

@@ -1,9 +1,10 @@
 """Random numbers of a scene, and random places on the table that keep clear of the objects there.
 
-The same seed samples the same layout as the official benchmark. All layout randomness comes from CPU torch generators
-seeded with the episode's seed; the order of the samples is part of the benchmark's definition. So are the tests for a
-free place: an obstacle is the shadow of the first two axes of its bounding box, whichever these are, and what counts as
-the gap depends on what is placed.
+The same seed samples the same layout as the official benchmark. All layout randomness comes from
+CPU torch generators seeded with the episode's seed; the order of the samples is part of the
+benchmark's definition. So are the tests for a free place: an obstacle is the shadow of the first
+two axes of its bounding box, whichever these are, and what counts as the gap depends on what is
+placed.
 """
 
 import math
@@ -34,13 +35,18 @@ class Draws:
         return torch.rand(1, generator=self._generator).item()
 
     def uniforms(self, n: int) -> Tensor:
-        """`n` numbers in [0, 1) in one call, float32 [n]; not the same stream as `n` single samples."""
+        """`n` numbers in [0, 1) in one call, float32 [n]; not the same stream as `n` single
+        samples.
+        """
         return torch.rand(n, generator=self._generator)
 
     def between(self, low: float, high: float) -> float:
-        """One number in [low, high), as torch's `uniform_` gives it where it multiplies and adds at once."""
+        """One number in [low, high), as torch's `uniform_` gives it where it multiplies and adds at
+        once.
+        """
         low_bound, high_bound = np.float32(low), np.float32(high)
-        # Exact in double precision but for the last addition, so that the float32 is rounded once on every CPU.
+        # Exact in double precision but for the last addition, so that the float32 is rounded once
+        # on every CPU.
         width = np.float64(high_bound - low_bound)
         return float(np.float32(np.float64(self.uniform()) * width + np.float64(low_bound)))
 
@@ -77,7 +83,9 @@ class SceneError(RuntimeError):
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle along the table's axes; `half` is half its width, one number or one per axis; metres."""
+    """A rectangle along the table's axes; `half` is half its width, one number or one per axis;
+    metres.
+    """
 
     centre: tuple[float, float]
     half: float | tuple[float, float]
@@ -94,7 +102,8 @@ class Region:
 class Box2D:
     """A rectangle on the table in any direction; an axis of length zero makes it a line.
 
-    centre: [2]. axes: [2, 2], one direction a row. half: half its width along each axis [2]; metres.
+    centre: [2]. axes: [2, 2], one direction a row. half: half its width along each axis [2];
+    metres.
     """
 
     centre: np.ndarray
@@ -134,7 +143,9 @@ class Box2D:
 
     def _reach(self, direction: np.ndarray) -> float:
         """How far the rectangle extends from its centre along a direction, metres."""
-        return self.half[0] * abs(_dot(self.axes[0], direction)) + self.half[1] * abs(_dot(self.axes[1], direction))
+        return self.half[0] * abs(_dot(self.axes[0], direction)) + self.half[1] * abs(
+            _dot(self.axes[1], direction)
+        )
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> float:
@@ -152,8 +163,8 @@ type Avoid = Thing | Box2D
 def obstacle_box(thing: Thing) -> Box2D:
     """What an object occupies: its bounding box's first two axes on the table.
 
-    The axes of a smallest bounding box come in no particular order. Where one of the first two is the vertical, the
-    obstacle is only a line.
+    The axes of a smallest bounding box come in no particular order. Where one of the first two is
+    the vertical, the obstacle is only a line.
 
     Raises:
         SceneError: nothing of the object can be touched.
@@ -187,7 +198,12 @@ def board_boxes(board: Board) -> list[Box2D]:
 
 
 def draw_cube(
-    draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005, yaw: bool = True, half: float = H
+    draws: Draws,
+    region: Region,
+    avoid: Sequence[Avoid] = (),
+    gap: float = 0.005,
+    yaw: bool = True,
+    half: float = H,
 ) -> tuple[np.ndarray, float] | None:
     """Sample the position and the yaw of a cube; targets are no obstacles.
 
@@ -233,9 +249,14 @@ def draw_disc(
 
 
 def draw_container(
-    draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005, degrees: bool = False
+    draws: Draws,
+    region: Region,
+    avoid: Sequence[Avoid] = (),
+    gap: float = 0.005,
+    degrees: bool = False,
 ) -> tuple[np.ndarray, float] | None:
-    """Sample the position of a container and then its yaw, 0 … 90°; the gap to other objects counts twice.
+    """Sample the position of a container and then its yaw, 0 … 90°; the gap to other objects counts
+    twice.
 
     Args:
         region: the container lies inside it.
@@ -288,7 +309,9 @@ SHIFT = 0.1
 
 
 def rotated_anchors(draws: Draws, count: int) -> list[Point]:
-    """Three anchors in a triangle or on a line, or four in a square, rotated about the table's middle."""
+    """Three anchors in a triangle or on a line, or four in a square, rotated about the table's
+    middle.
+    """
     on_line = draws.integer(0, 2)  # sampled for four anchors, too
     angle = draws.uniforms(1) * ANGLE_RANGE
     triangle = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.0)]
@@ -300,7 +323,9 @@ def rotated_anchors(draws: Draws, count: int) -> list[Point]:
 
 
 def shifted_anchors(draws: Draws, count: int) -> list[Point]:
-    """Three anchors in a triangle or on a line, each shifted forward, or four of which pairs are shifted sideways."""
+    """Three anchors in a triangle or on a line, each shifted forward, or four of which pairs are
+    shifted sideways.
+    """
     left, right = (draws.uniform() * SHIFT for _ in range(2))
     a, b = ([draws.uniform() * SHIFT for _ in range(3)] for _ in range(2))
     on_line = draws.integer(0, 2)

@@ -1,4 +1,6 @@
-"""Predicates on objects and the robot: picked up, dropped, pressed, over, static. Thresholds are the benchmark's."""
+"""Predicates on objects and the robot: picked up, dropped, pressed, over, static. Thresholds are
+the benchmark's.
+"""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -37,11 +39,17 @@ def container_picked_up(container: Thing) -> bool:
 
 def container_put_down(env: "Stage", container: Thing) -> bool:
     """A container stands on the table again and the gripper has left it."""
-    return container.position[2] <= 0.07 and not env.is_grasping(container) and env.tcp_pose.p[2] > 0.05
+    return (
+        container.position[2] <= 0.07
+        and not env.is_grasping(container)
+        and env.tcp_pose.p[2] > 0.05
+    )
 
 
 def dropped(env: "Stage", thing: Thing) -> bool:
-    """The object was let go: near the table. While recording it may still be falling, if the gripper is away."""
+    """The object was let go: near the table. While recording it may still be falling, if the
+    gripper is away.
+    """
     z = thing.position[2]
     low = (z <= 0.2 and env.tcp_pose.p[2] > 0.05) if env.recording else z <= 0.035
     return bool(low) and not env.is_grasping(thing)

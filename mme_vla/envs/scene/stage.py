@@ -49,7 +49,9 @@ class Stage(BaseEnv):
         self.seed = seed
         self.second_tries = second_tries
         self.recording = False
-        """`dropped` is evaluated as it was when the official data were recorded; see `as_recorded`."""
+        """`dropped` is evaluated as it was when the official data were recorded; see
+        `as_recorded`.
+        """
         self.reset_in_progress = False
         """The arm is being driven back between the conditioning video and the execution."""
         self.after_video = False
@@ -59,10 +61,13 @@ class Stage(BaseEnv):
         self.unrecorded_steps = 0
         """Steps of this episode that a recording of it does not have."""
         super().__init__(
-            *args, robot_uids=robot_uids or (STICK if self.stick else WRISTCAM), control_mode=control_mode, **kwargs
+            *args,
+            robot_uids=robot_uids or (STICK if self.stick else WRISTCAM),
+            control_mode=control_mode,
+            **kwargs,
         )
 
-    # The scene ----------------------------------------------------------------------------------------------------
+    # The scene ------------------------------------------------------------------------------------
 
     def add[T: Thing](self, thing: T) -> T:
         """Count an object as part of the scene, so that a reset brings it back."""
@@ -80,13 +85,15 @@ class Stage(BaseEnv):
     def _clear(self) -> None:
         """Release the scene by cutting its reference cycle.
 
-        ManiSkill collects all garbage instead, which is 0.4 s of the 0.5 s that an episode without images
-        takes to begin and end.
+        ManiSkill collects all garbage instead, which is 0.4 s of the 0.5 s that an episode without
+        images takes to begin and end.
         """
         self._close_viewer()
         if self.scene is not None:
             self.scene.__dict__.clear()
-        self.__dict__.update(scene=None, agent=None, _sensors={}, _human_render_cameras={}, _hidden_objects=[])
+        self.__dict__.update(
+            scene=None, agent=None, _sensors={}, _human_render_cameras={}, _hidden_objects=[]
+        )
 
     def _setup_sensors(self, options: dict) -> None:
         configs = self._custom_sensor_configs
@@ -121,11 +128,13 @@ class Stage(BaseEnv):
         self.stored_qpos = None
         self.unrecorded_steps = 0
 
-    # Steps --------------------------------------------------------------------------------------------------------
+    # Steps ----------------------------------------------------------------------------------------
 
     @contextmanager
     def as_recorded(self) -> Iterator[None]:
-        """Evaluate as when the official data were recorded, while a demonstrator acts; afterwards as before."""
+        """Evaluate as when the official data were recorded, while a demonstrator acts; afterwards
+        as before.
+        """
         before, self.recording = self.recording, True
         try:
             yield
@@ -139,7 +148,9 @@ class Stage(BaseEnv):
 
     @property
     def steps_waited(self) -> int:
-        """Likewise, as a wait counts them: evaluated `as_recorded`, without those that a recording does not have."""
+        """Likewise, as a wait counts them: evaluated `as_recorded`, without those that a recording
+        does not have.
+        """
         return self.steps_done - self.unrecorded_steps if self.recording else self.steps_done
 
     @property
@@ -156,7 +167,7 @@ class Stage(BaseEnv):
         """Always zero: the benchmark has no reward."""
         return torch.zeros(self.num_envs)
 
-    # Robot state --------------------------------------------------------------------------------------------------
+    # Robot state ----------------------------------------------------------------------------------
 
     @property
     def tcp_pose(self) -> sapien.Pose:
@@ -177,7 +188,7 @@ class Stage(BaseEnv):
         """Whether both fingers press on the object; never for the stick."""
         return not self.stick and bool(self.agent.is_grasping(thing.entity)[0])
 
-    # Cameras ------------------------------------------------------------------------------------------------------
+    # Cameras --------------------------------------------------------------------------------------
 
     @property
     def _default_sensor_configs(self) -> Sequence[CameraConfig]:

@@ -1,4 +1,6 @@
-"""Objects of a scene as the tasks use them: an entity with a name, a pose, and a pose to be restored to."""
+"""Objects of a scene as the tasks use them: an entity with a name, a pose, and a pose to be
+restored to.
+"""
 
 from typing import Any
 
@@ -14,7 +16,9 @@ UNDER_THE_FLOOR = -5.0
 
 
 def pose_of(entity: Any) -> sapien.Pose:
-    """Pose in the world of an `Actor` or a `Link`, straight from the simulator: tensors take fifty times as long."""
+    """Pose in the world of an `Actor` or a `Link`, straight from the simulator: tensors take fifty
+    times as long.
+    """
     simulated = entity._objs[0]
     return simulated.pose if isinstance(entity, Actor) else simulated.entity_pose
 
@@ -53,12 +57,20 @@ class Thing:
             self.entity.set_angular_velocity(np.zeros((1, 3), np.float32))
 
     def show(self) -> None:
-        """Draw the object, or leave it out, as its height says: due where its pose was set from outside."""
+        """Draw the object, or leave it out, as its height says: due where its pose was set from
+        outside.
+        """
         self._draw(bool(self.position[2] > UNDER_THE_FLOOR))
 
     def _draw(self, visible: bool) -> None:
-        """Leave out of the images what the floor hides anyway: dozens of marks cost a third of the rendering."""
-        body = self.entity._objs[0].find_component_by_type(RenderBodyComponent) if self._may_sink else None
+        """Leave out of the images what the floor hides anyway: dozens of marks cost a third of the
+        rendering.
+        """
+        body = (
+            self.entity._objs[0].find_component_by_type(RenderBodyComponent)
+            if self._may_sink
+            else None
+        )
         if body is not None and bool(body.visibility) != visible:
             body.visibility = float(visible)
 

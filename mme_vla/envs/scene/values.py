@@ -1,8 +1,9 @@
 """The values of a scene: noted while it is sampled from a seed, or read from a row.
 
-A row's `spec` has up to four parts: `layout` (places), `objects` (counts, colours, choices), `actions` (what happens)
-and `initializations` (what is sampled when an episode begins, of which the last entry counts). A value's name is its
-path, such as `layout.button_xy`; a number in it is an index. Building from a row uses no random number.
+A row's `spec` has up to four parts: `layout` (places), `objects` (counts, colours, choices),
+`actions` (what happens) and `initializations` (what is sampled when an episode begins, of which the
+last entry counts). A value's name is its path, such as `layout.button_xy`; a number in it is an
+index. Building from a row uses no random number.
 
 Units: `[x, y]` is a centre in metres. `[x, y, yaw]` of a cube has radians, of a container degrees.
 """
@@ -21,7 +22,9 @@ from mme_vla.errors import UserError, brief
 BOUND = 2.0
 """Largest coordinate of a place in a row, metres: the table ends before it."""
 OVERLAP = 0.005
-"""How far two objects of a row may reach into each other, metres: turned cubes of the benchmark may touch."""
+"""How far two objects of a row may reach into each other, metres: turned cubes of the benchmark may
+touch.
+"""
 
 
 class Values:
@@ -66,16 +69,22 @@ class Values:
 
     def check_place(self, name: str, value: Any, size: int) -> list[float]:
         """A place that a row gives, if it is one."""
-        numbers = isinstance(value, list) and len(value) == size and all(_is_number(v) for v in value)
+        numbers = (
+            isinstance(value, list) and len(value) == size and all(_is_number(v) for v in value)
+        )
         if not numbers or max(abs(value[0]), abs(value[1])) > BOUND:
-            raise self.error(name, f"is {brief(value)}; expected {size} numbers, x and y within {BOUND} m")
+            raise self.error(
+                name, f"is {brief(value)}; expected {size} numbers, x and y within {BOUND} m"
+            )
         return [float(v) for v in value]
 
     def integer(self, name: str, sample: Callable[[], int], least: int = 0, most: int | None = None,
                 default: int | None = None) -> int:  # fmt: skip
         """A whole number from `least` to `most`, both included."""
         value = self(name, sample, default)
-        if self.specified and (type(value) is not int or value < least or (most is not None and value > most)):
+        if self.specified and (
+            type(value) is not int or value < least or (most is not None and value > most)
+        ):
             limit = f"at least {least}" if most is None else f"{least} to {most}"
             raise self.error(name, f"is {brief(value)}; expected a whole number, {limit}")
         return value
@@ -94,14 +103,20 @@ class Values:
             raise self.error(name, f"is {brief(value)}; expected true or false")
         return value
 
-    def indices(self, name: str, sample: Callable[[], list[int]], count: int, distinct: bool = True) -> list[int]:
+    def indices(
+        self, name: str, sample: Callable[[], list[int]], count: int, distinct: bool = True
+    ) -> list[int]:
         """Indices into a list of `count` entries."""
         value = self(name, sample)
         if self.specified:
-            valid = isinstance(value, list) and all(type(v) is int and 0 <= v < count for v in value)
+            valid = isinstance(value, list) and all(
+                type(v) is int and 0 <= v < count for v in value
+            )
             if not valid or (distinct and len(set(value)) < len(value)):
                 once = ", each once" if distinct else ""
-                raise self.error(name, f"is {brief(value)}; expected numbers from 0 to {count - 1}{once}")
+                raise self.error(
+                    name, f"is {brief(value)}; expected numbers from 0 to {count - 1}{once}"
+                )
         return value
 
     def pairs(self, name: str, count: int) -> list[list[int]] | None:
@@ -110,12 +125,20 @@ class Values:
         if value is None:
             return None
         for pair in value if isinstance(value, list) else [value]:
-            two = isinstance(pair, list) and len(pair) == 2 and all(type(i) is int and 0 <= i < count for i in pair)
+            two = (
+                isinstance(pair, list)
+                and len(pair) == 2
+                and all(type(i) is int and 0 <= i < count for i in pair)
+            )
             if not two or pair[0] == pair[1]:
-                raise self.error(name, f"has {brief(pair)}; expected two different numbers from 0 to {count - 1}")
+                raise self.error(
+                    name, f"has {brief(pair)}; expected two different numbers from 0 to {count - 1}"
+                )
         return list(value)
 
-    def words(self, name: str, sample: Callable[[], list[str]], known: Mapping[str, Any]) -> list[str]:
+    def words(
+        self, name: str, sample: Callable[[], list[str]], known: Mapping[str, Any]
+    ) -> list[str]:
         """Names, each of those `known`, such as colours."""
         value = self(name, sample)
         for word in value if isinstance(value, list) else [value]:

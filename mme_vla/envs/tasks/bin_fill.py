@@ -11,7 +11,13 @@ import sapien
 from mme_vla.envs.scene.motions import Appear, Cue, row, tally
 from mme_vla.envs.scene.objects import Cube, H, build_board, build_cube
 from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_cube
-from mme_vla.envs.scene.predicates import ON_TARGET, any_picked_up, dropped, pressed, released_and_away
+from mme_vla.envs.scene.predicates import (
+    ON_TARGET,
+    any_picked_up,
+    dropped,
+    pressed,
+    released_and_away,
+)
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
@@ -42,24 +48,36 @@ class BinFill(Task):
 
     def build(self, draws: Draws) -> None:
         values = self.values
-        self.streaming = values.flag("actions.streaming", lambda: draws.integer(0, 2) == 0, default=False)
+        self.streaming = values.flag(
+            "actions.streaming", lambda: draws.integer(0, 2) == 0, default=False
+        )
         self.button = add_button(self, draws, (-0.2, 0))
         dx, y, degrees = values.place(
             "layout.board_offsets",
-            lambda: [0.2 * draws.uniform() - 0.2, -0.2 + 0.4 * draws.uniform(), -20 + 40 * draws.uniform()],
+            lambda: [
+                0.2 * draws.uniform() - 0.2,
+                -0.2 + 0.4 * draws.uniform(),
+                -20 + 40 * draws.uniform(),
+            ],
             size=3,
         )
         self.board = self.add(build_board(self, (BOARD_X + dx, y), math.radians(degrees)))
         numbers = values("objects.target_numbers", lambda: self._draw_counts(draws))
         full = isinstance(numbers, list) and all(type(n) is int and n >= 0 for n in numbers)
         if not full or len(numbers) != len(COLOURS) or not any(numbers):
-            raise values.error("objects.target_numbers", f"is {numbers}; expected three numbers: red, blue, green")
+            raise values.error(
+                "objects.target_numbers", f"is {numbers}; expected three numbers: red, blue, green"
+            )
         self.goal = Counter(dict(zip(COLOURS, numbers, strict=True)))
         self.cubes: dict[str, list[Cube]] = {colour: [] for colour in COLOURS}
-        for colour, (x, y, yaw) in self._specified_cubes() if values.specified else self._draw_cubes(draws):
+        for colour, (x, y, yaw) in (
+            self._specified_cubes() if values.specified else self._draw_cubes(draws)
+        ):
             cubes = self.cubes[colour]
             values.occupy("layout.slots", (x, y), H, yaw)
-            cubes.append(self.add(build_cube(self, f"cube_{colour}_{len(cubes)}", colour, (x, y), yaw)))
+            cubes.append(
+                self.add(build_cube(self, f"cube_{colour}_{len(cubes)}", colour, (x, y), yaw))
+            )
         for colour in COLOURS:
             if len(self.cubes[colour]) < self.goal[colour]:
                 problem = f"a {colour} cube for the bin"
@@ -74,11 +92,15 @@ class BinFill(Task):
         names: Any = self.values("objects.slot_assignment", list)
         count = self.values.count("layout.slots")
         if not isinstance(names, list) or len(names) != count:
-            raise self.values.error("objects.slot_assignment", f"must name a cube for each of the {count} slots")
+            raise self.values.error(
+                "objects.slot_assignment", f"must name a cube for each of the {count} slots"
+            )
         for i, name in enumerate(names):
             colour = str(name).split("_")[0]
             if colour not in COLOURS:
-                raise self.values.error(f"objects.slot_assignment.{i}", f"is {name!r}; expected {', '.join(COLOURS)}")
+                raise self.values.error(
+                    f"objects.slot_assignment.{i}", f"is {name!r}; expected {', '.join(COLOURS)}"
+                )
             yield colour, self.values.place(f"layout.slots.{i}", list, size=3)
 
     def _draw_cubes(self, draws: Draws) -> Iterator[tuple[str, list[float]]]:
@@ -90,28 +112,40 @@ class BinFill(Task):
             place = draw_cube(draws, TABLE, [self.button, self.board, *self.all_cubes()], gap=H)
             if place is not None:
                 self.values.note(f"layout.slots.{count}", [*place[0], place[1]])
-                self.values.note(f"objects.slot_assignment.{count}", f"{colour}_{len(self.cubes[colour])}")
+                self.values.note(
+                    f"objects.slot_assignment.{count}", f"{colour}_{len(self.cubes[colour])}"
+                )
                 count += 1
                 yield colour, [*place[0], place[1]]
 
     def _draw_counts(self, draws: Draws) -> list[int]:
-        """How many red, blue and green cubes belong into the bin; also samples how many lie on the table."""
+        """How many red, blue and green cubes belong into the bin; also samples how many lie on the
+        table.
+        """
         available = [COLOURS[i] for i in draws.permutation(3)][: AVAILABLE[self.difficulty]]
         low, high = GOAL_COLOURS[self.difficulty]
         selected = available[: draws.integer(low, high + 1)]
         low, high = GOAL_CUBES[self.difficulty]
         total = draws.integer(low, high + 1)
-        picks = [0] * total if len(selected) == 1 else [draws.integer(0, len(selected)) for _ in range(total)]
+        picks = (
+            [0] * total
+            if len(selected) == 1
+            else [draws.integer(0, len(selected)) for _ in range(total)]
+        )
         goal = Counter(selected[i] for i in picks)
         low, high = CUBES[self.difficulty]
         cubes = draws.integer(low, high + 1)
         self.spawned = Counter({colour: max(1, goal[colour]) for colour in available})
         for _ in range(cubes - self.spawned.total()):
-            self.spawned[available[draws.integer(0, len(available)) if len(available) > 1 else 0]] += 1
+            self.spawned[
+                available[draws.integer(0, len(available)) if len(available) > 1 else 0]
+            ] += 1
         return [goal[colour] for colour in COLOURS]
 
     def start_episode(self, draws: Draws) -> None:
-        order = self.values.indices("initializations.color_order", lambda: draws.permutation(3), len(ORDERED))
+        order = self.values.indices(
+            "initializations.color_order", lambda: draws.permutation(3), len(ORDERED)
+        )
         self.order = [ORDERED[i] for i in order]
         self.filled: Counter[str] = Counter()
         self._streams = [
@@ -203,7 +237,11 @@ class BinFill(Task):
 
     def goals(self) -> list[str]:
         parts = [
-            f"{number(n)} {colour} cube{'s' if n > 1 else ''}" for colour in COLOURS if (n := self.goal[colour]) > 0
+            f"{number(n)} {colour} cube{'s' if n > 1 else ''}"
+            for colour in COLOURS
+            if (n := self.goal[colour]) > 0
         ]
         cubes = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-        return [f"put {cubes} into the bin{end} press the button to stop" for end in (", then", " and")]
+        return [
+            f"put {cubes} into the bin{end} press the button to stop" for end in (", then", " and")
+        ]

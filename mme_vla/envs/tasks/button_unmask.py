@@ -1,9 +1,16 @@
-"""ButtonUnmask (Permanence): press a button while containers cover three cubes; pick up the right container."""
+"""ButtonUnmask (Permanence): press a button while containers cover three cubes; pick up the right
+container.
+"""
 
 from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.containers import Unmask, container_choices, container_picks, hiding_goal
+from mme_vla.envs.tasks.families.containers import (
+    Unmask,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
 from mme_vla.envs.tasks.families.stages import add_button, press
 
 LETTERS = ("b", "c")
@@ -34,4 +41,6 @@ class ButtonUnmask(Unmask):
         return [push, *container_choices(self.containers, LETTERS)]
 
     def goals(self) -> list[str]:
-        return [f"first press the button, then {hiding_goal([colour for colour, _ in self.targets])}"]
+        return [
+            f"first press the button, then {hiding_goal([colour for colour, _ in self.targets])}"
+        ]

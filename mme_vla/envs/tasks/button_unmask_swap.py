@@ -1,4 +1,6 @@
-"""ButtonUnmaskSwap (Permanence): press two buttons while containers cover cubes and swap; pick up the right one."""
+"""ButtonUnmaskSwap (Permanence): press two buttons while containers cover cubes and swap; pick up
+the right one.
+"""
 
 from mme_vla.envs.scene.articulated import Button
 from mme_vla.envs.scene.placement import Draws, shifted_anchors
@@ -27,7 +29,9 @@ class ButtonUnmaskSwap(UnmaskSwap):
             add_button(self, draws, (-0.2, y), (0.05, 0.05), name, f"layout.buttons_xy.{i}")
             for i, (name, y) in enumerate((("button_left", -0.1), ("button_right", 0.1)))
         )
-        self.build_containers(draws, shifted_anchors(draws, CONTAINERS[self.difficulty]), [self.left, self.right])
+        self.build_containers(
+            draws, shifted_anchors(draws, CONTAINERS[self.difficulty]), [self.left, self.right]
+        )
 
     def start_episode(self, draws: Draws) -> None:
         super().start_episode(draws)
@@ -36,7 +40,11 @@ class ButtonUnmaskSwap(UnmaskSwap):
     def subtasks(self) -> list[SubTask]:
         presses = [self._press("first", self.right, "a"), self._press("second", self.left, "b")]
         watch = [self._watch()] if self.tier else []
-        return [*presses, *watch, *container_picks(self, self.targets, self.all_containers, LETTERS)]
+        return [
+            *presses,
+            *watch,
+            *container_picks(self, self.targets, self.all_containers, LETTERS),
+        ]
 
     def _watch(self) -> SubTask:
         return SubTask(
@@ -68,8 +76,15 @@ class ButtonUnmaskSwap(UnmaskSwap):
             Choice("a", "press the first button", lambda demo, _: demo.press(self.left)),
             Choice("b", "press the second button", lambda demo, _: demo.press(self.right)),
             *container_choices(self.containers, LETTERS),
-            *([Choice(WAIT_LETTER, "wait", lambda demo, _: demo.hold_until(self.swapped_after))] if self.tier else []),
+            *(
+                [Choice(WAIT_LETTER, "wait", lambda demo, _: demo.hold_until(self.swapped_after))]
+                if self.tier
+                else []
+            ),
         ]
 
     def goals(self) -> list[str]:
-        return [f"first press both buttons on the table, then {hiding_goal([colour for colour, _ in self.targets])}"]
+        return [
+            "first press both buttons on the table, then"
+            f" {hiding_goal([colour for colour, _ in self.targets])}"
+        ]

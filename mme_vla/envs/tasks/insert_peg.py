@@ -1,4 +1,6 @@
-"""InsertPeg (Imitation): the video grasps one end of a peg and inserts it from one side; do the same with that peg."""
+"""InsertPeg (Imitation): the video grasps one end of a peg and inserts it from one side; do the
+same with that peg.
+"""
 
 import math
 from collections.abc import Callable
@@ -13,7 +15,13 @@ from mme_vla.envs.robot.demonstrator import PegEnd
 from mme_vla.envs.robot.robots import ROBOT_BASE
 from mme_vla.envs.scene.articulated import build_peg
 from mme_vla.envs.scene.motions import Cue, Highlight, Mark, build_mark, on_table
-from mme_vla.envs.scene.objects import APERTURE_COLOUR, APERTURE_Z, at, build_aperture_box, build_highlight
+from mme_vla.envs.scene.objects import (
+    APERTURE_COLOUR,
+    APERTURE_Z,
+    at,
+    build_aperture_box,
+    build_highlight,
+)
 from mme_vla.envs.scene.placement import Draws, SceneError
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up
 from mme_vla.envs.scene.things import Thing, distance_xy
@@ -35,7 +43,9 @@ DISPLAY_STEPS = 20  # how long the box shows an insertion
 HOLD_STEPS = 100
 OPEN_FROM_BOX, OPEN_FROM_PEG = 0.18, 0.13
 """Free distance that the hand needs around a peg: to the box, to other pegs; metres."""
-SIDEWAYS = -0.4  # cosine between the way from a near box and the way a peg may be pulled: a little past sideways
+SIDEWAYS = (
+    -0.4
+)  # cosine between the way from a near box and the way a peg may be pulled: a little past sideways
 WORKSPACE = (0.4, 0.72)  # nearest and farthest from the robot's base that a peg is moved to, metres
 FLUNG = 0.05  # from its place in one step, metres
 MARK = (0.015, 0.055)  # radius and half length of the disc on the box
@@ -43,7 +53,9 @@ MARK = (0.015, 0.055)  # radius and half length of the disc on the box
 
 @register_task
 class InsertPeg(Task):
-    """The first peg is the target; positions are sampled per episode, and the difficulty has no effect."""
+    """The first peg is the target; positions are sampled per episode, and the difficulty has no
+    effect.
+    """
 
     shared_draws = True
 
@@ -55,8 +67,14 @@ class InsertPeg(Task):
         draws.integer(0, 3)
         self.box = self.add(build_aperture_box(self, (0, 0), math.pi / 2))
         self.pegs = [
-            self.add(build_peg(self, f"peg_{i}", PEG_LENGTH, PEG_RADIUS, head, tail, (0.2, 0.2 * (i - 1)), 0))
-            for i in range(self.values.count("initializations.pegs") if self.values.specified else PEGS)
+            self.add(
+                build_peg(
+                    self, f"peg_{i}", PEG_LENGTH, PEG_RADIUS, head, tail, (0.2, 0.2 * (i - 1)), 0
+                )
+            )
+            for i in range(
+                self.values.count("initializations.pegs") if self.values.specified else PEGS
+            )
         ]
         if not self.pegs:
             raise self.values.error("initializations.pegs", "is missing or empty")
@@ -66,13 +84,23 @@ class InsertPeg(Task):
 
     def start_episode(self, draws: Draws) -> None:
         values = self.values
-        x, y = values.place("initializations.box_jitter", lambda: [-0.1 + 0.2 * draws.uniform() for _ in range(2)])
-        yaw = values.number("initializations.box_yaw", lambda: math.radians(90 - 20 + 40 * draws.uniform()))
+        x, y = values.place(
+            "initializations.box_jitter", lambda: [-0.1 + 0.2 * draws.uniform() for _ in range(2)]
+        )
+        yaw = values.number(
+            "initializations.box_yaw", lambda: math.radians(90 - 20 + 40 * draws.uniform())
+        )
         self.box.set_home(at((x, y), APERTURE_Z, yaw))
-        for peg, (place, rotation) in zip(self.pegs, self._read_pegs() or self._draw_pegs(draws, (x, y)), strict=True):
+        for peg, (place, rotation) in zip(
+            self.pegs, self._read_pegs() or self._draw_pegs(draws, (x, y)), strict=True
+        ):
             peg.set_home(at(place, 0, rotation))
-        self.end: PegEnd = ENDS[values.integer("initializations.obj_sample", lambda: draws.integer(0, 2), most=1)]
-        self.side = (-1, 1)[values.integer("initializations.dir_sample", lambda: draws.integer(0, 2), most=1)]
+        self.end: PegEnd = ENDS[
+            values.integer("initializations.obj_sample", lambda: draws.integer(0, 2), most=1)
+        ]
+        self.side = (-1, 1)[
+            values.integer("initializations.dir_sample", lambda: draws.integer(0, 2), most=1)
+        ]
         below = self.box.position - [0, 0, Highlight.DEPTH]
         self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
         self.mark = Mark(self._red_disc, self.box.position, DISPLAY_STEPS)
@@ -86,13 +114,17 @@ class InsertPeg(Task):
             entry, name = values.find("initializations.pegs")[i], f"initializations.pegs.{i}"
             if not isinstance(entry, list) or len(entry) != 2:
                 raise values.error(name, f"is {entry!r}; expected [[x, y], yaw]")
-            place = values.check_place(name, [*entry[0], entry[1]] if isinstance(entry[0], list) else entry, 3)
+            place = values.check_place(
+                name, [*entry[0], entry[1]] if isinstance(entry[0], list) else entry, 3
+            )
             if any(math.dist(place[:2], other) < PEG_RADIUS for other, _ in pegs):
                 raise values.error(name, "overlaps another peg")
             pegs.append((place[:2], place[2]))
         return pegs
 
-    def _draw_pegs(self, draws: Draws, box: tuple[float, float]) -> list[tuple[tuple[float, float], float]]:
+    def _draw_pegs(
+        self, draws: Draws, box: tuple[float, float]
+    ) -> list[tuple[tuple[float, float], float]]:
         places: list[tuple[float, float]] = []
         yaws = []
         for _ in self.pegs:
@@ -102,10 +134,14 @@ class InsertPeg(Task):
         self.values.note("initializations.pegs", pegs)
         return pegs
 
-    def _draw_place(self, draws: Draws, box: tuple[float, float], others: list) -> tuple[float, float]:
+    def _draw_place(
+        self, draws: Draws, box: tuple[float, float], others: list
+    ) -> tuple[float, float]:
         for _ in range(TRIES):
             place = (-0.2 + 0.4 * draws.uniform(), -0.3 + 0.6 * draws.uniform())
-            if math.dist(place, box) > FROM_BOX and all(math.dist(place, other) > FROM_PEG for other in others):
+            if math.dist(place, box) > FROM_BOX and all(
+                math.dist(place, other) > FROM_PEG for other in others
+            ):
                 return place
         raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
 
@@ -122,14 +158,15 @@ class InsertPeg(Task):
         self._restoring = self.reset_in_progress
 
     def _flung(self) -> bool:
-        """Whether the peg left at once where it was put back: it keeps what speed the hand or the box gave it.
+        """Whether the peg left at once where it was put back: it keeps what speed the hand or the
+        box gave it.
 
-        No official episode shows that, since its demonstrator could not continue from there; the peg is laid down at
-        rest.
+        No official episode shows that, since its demonstrator could not continue from there; the
+        peg is laid down at rest.
         """
         return float(np.linalg.norm(self.peg.position - self.peg.initial_pose.p)) > FLUNG
 
-    # Predicates ---------------------------------------------------------------------------------------------------
+    # Predicates -----------------------------------------------------------------------------------
 
     def ends(self, end: str) -> tuple[Thing, Thing]:
         """The grasped end of the peg and the one that is inserted."""
@@ -142,7 +179,9 @@ class InsertPeg(Task):
         return bool(grasped.position[2] > LIFTED_Z and nearer)
 
     def _is_near(self, grasped: Thing, free: Thing) -> bool:
-        """Whether the grasped end is the nearer one: along x, or in rows of RoboMME-OOD by the distance."""
+        """Whether the grasped end is the nearer one: along x, or in rows of RoboMME-OOD by the
+        distance.
+        """
         if not self.tier:
             return bool(grasped.position[0] < free.position[0])
         near = [distance_xy(thing.position, np.array(ROBOT_BASE)) for thing in (grasped, free)]
@@ -158,12 +197,17 @@ class InsertPeg(Task):
         nearer = np.linalg.norm(free.position - box) < np.linalg.norm(grasped.position - box)
         return self._inside(free) and bool(nearer) and (self.tcp_pose.p[1] - box[1]) * side < 0
 
-    # Sub-tasks ----------------------------------------------------------------------------------------------------
+    # Sub-tasks ------------------------------------------------------------------------------------
 
     def subtasks(self) -> list[SubTask]:
         between = [
             end_video(self),
-            SubTask(NO_RECORD, StaticFor(self, HOLD_STEPS), lambda demo: demo.hold(HOLD_STEPS), video=True),
+            SubTask(
+                NO_RECORD,
+                StaticFor(self, HOLD_STEPS),
+                lambda demo: demo.hold(HOLD_STEPS),
+                video=True,
+            ),
         ]
         return [*self._both(video=True), *between, *self._both(video=False)]
 
@@ -207,14 +251,22 @@ class InsertPeg(Task):
             ),
         ]
 
-    # Demonstration ------------------------------------------------------------------------------------------------
+    # Demonstration --------------------------------------------------------------------------------
 
-    # Where the benchmark's demonstrator fails, other motions follow; where it does not, there are none.
+    # Where the benchmark's demonstrator fails, other motions follow; where it does not, there are
+    # none.
 
     def _demonstrate_grasp(self, demo: "Demonstrator") -> None:
-        """Grasp as the benchmark does; where the box is in the hand's way, move the peg by its other end first."""
+        """Grasp as the benchmark does; where the box is in the hand's way, move the peg by its
+        other end first.
+        """
         other: PegEnd = "tail" if self.end == "head" else "head"
-        plans: list[tuple[PegEnd, bool] | None] = [None, (other, False), (other, True), (self.end, True)]
+        plans: list[tuple[PegEnd, bool] | None] = [
+            None,
+            (other, False),
+            (other, True),
+            (self.end, True),
+        ]
         if not self.second_tries:
             return demo.grasp_peg(self.peg, self.end)
         # What helped in the video is likely to help again.
@@ -228,7 +280,8 @@ class InsertPeg(Task):
                 self._helpful = plans.index(drag)
                 return
         raise PlanningError(
-            f"{self.peg.name} cannot be grasped by its {self.end}: it is out of reach, or the box is in the way."
+            f"{self.peg.name} cannot be grasped by its {self.end}: it is out of reach, or the box"
+            " is in the way."
         )
 
     def _way_out(self) -> np.ndarray:
@@ -240,19 +293,33 @@ class InsertPeg(Task):
             near, farthest = WORKSPACE
             reached = near < np.linalg.norm(place - ROBOT_BASE[:2]) < farthest
             apart = np.linalg.norm(place - self.box.position[:2]) > OPEN_FROM_BOX
-            return bool(reached and apart and all(np.linalg.norm(place - other) > OPEN_FROM_PEG for other in others))
+            return bool(
+                reached
+                and apart
+                and all(np.linalg.norm(place - other) > OPEN_FROM_PEG for other in others)
+            )
 
         angles, lengths = np.linspace(0, 2 * np.pi, 16, endpoint=False), np.arange(0.04, 0.4, 0.02)
-        ways = [length * np.array([np.cos(angle), np.sin(angle)]) for length in lengths for angle in angles]
+        ways = [
+            length * np.array([np.cos(angle), np.sin(angle)])
+            for length in lengths
+            for angle in angles
+        ]
         away = middle - self.box.position[:2]
         # A peg beside the box is not pulled through it; one that is only far away may come nearer.
         beside = np.linalg.norm(away) < OPEN_FROM_BOX
         most = SIDEWAYS * np.linalg.norm(away)
-        open_ways = (w for w in ways if (not beside or w @ away >= most * np.linalg.norm(w)) and is_open(middle + w))
+        open_ways = (
+            w
+            for w in ways
+            if (not beside or w @ away >= most * np.linalg.norm(w)) and is_open(middle + w)
+        )
         return next(open_ways, 0.1 * away / np.linalg.norm(away))
 
     def _demonstrate_insertion(self, demo: "Demonstrator") -> None:
-        """Insert as the benchmark does; where that fails, push on, begin anew, and at last from another grasp."""
+        """Insert as the benchmark does; where that fails, push on, begin anew, and at last from
+        another grasp.
+        """
         task = (self.peg, self.end, self.side, self.box)
         tries: list[Callable[[], None]] = [
             lambda: demo.insert_peg(*task),
@@ -274,7 +341,7 @@ class InsertPeg(Task):
         if self._lifted(self.end):
             demo.insert_peg_fully(self.peg, self.end, self.side, self.box)
 
-    # Choices ------------------------------------------------------------------------------------------------------
+    # Choices --------------------------------------------------------------------------------------
 
     def choices(self) -> list[Choice]:
         def every_end() -> list[Thing]:
@@ -282,8 +349,12 @@ class InsertPeg(Task):
 
         return [
             Choice("a", "pick up the peg by grasping one end", self._grasp, every_end),
-            Choice("b", "insert the peg from the right side", lambda demo, _: self._insert(demo, 1)),
-            Choice("c", "insert the peg from the left side", lambda demo, _: self._insert(demo, -1)),
+            Choice(
+                "b", "insert the peg from the right side", lambda demo, _: self._insert(demo, 1)
+            ),
+            Choice(
+                "c", "insert the peg from the left side", lambda demo, _: self._insert(demo, -1)
+            ),
         ]
 
     def _grasp(self, demo: "Demonstrator", thing: Thing | None) -> None:
@@ -303,8 +374,16 @@ class InsertPeg(Task):
         goal = "watch the video carefully, then grasp the same"
         if self.in_view:
             side = "right" if self.side == 1 else "left"
-            return [f"grasp the marked end of the peg and insert it into the {side} side of the box"]
+            return [
+                f"grasp the marked end of the peg and insert it into the {side} side of the box"
+            ]
         return [
-            f"{goal} end of the same peg you've picked before and insert it into the same side of the box",
-            f"{goal} peg at the same end and insert it into the same side of the box as in the video",
+            (
+                f"{goal} end of the same peg you've picked before and insert it into the same side"
+                " of the box"
+            ),
+            (
+                f"{goal} peg at the same end and insert it into the same side of the box as in the"
+                " video"
+            ),
         ]

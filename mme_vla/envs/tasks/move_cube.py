@@ -1,4 +1,6 @@
-"""MoveCube (Imitation): the video moves a cube to a target in one of three manners; move it in the same manner."""
+"""MoveCube (Imitation): the video moves a cube to a target in one of three manners; move it in the
+same manner.
+"""
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -36,7 +38,9 @@ MORE_TRIES = 2  # where the cube did not stay on the target
 
 @register_task
 class MoveCube(Task):
-    """Hook it with a peg, push it with the closed gripper, or pick and place it; the difficulty changes nothing."""
+    """Hook it with a peg, push it with the closed gripper, or pick and place it; the difficulty
+    changes nothing.
+    """
 
     shared_draws = True
     dials = frozenset({"delay"})
@@ -50,9 +54,20 @@ class MoveCube(Task):
         video_goal = self.values.place("layout.demo.goal_xy", lambda: self._draw_goal(draws, 0.15))
         goal = self.values.place("layout.execution.goal_xy", lambda: self._draw_goal(draws, 0.1))
         self.peg = self.add(
-            build_peg(self, "peg", PEG_LENGTH, PEG_RADIUS, PEG_COLOUR, PEG_COLOUR, video_peg[:2], video_peg[2])
+            build_peg(
+                self,
+                "peg",
+                PEG_LENGTH,
+                PEG_RADIUS,
+                PEG_COLOUR,
+                PEG_COLOUR,
+                video_peg[:2],
+                video_peg[2],
+            )
         )
-        self.target = self.add(build_disc(self, "target", TARGET_RADIUS, 0.005, "purple", video_goal))
+        self.target = self.add(
+            build_disc(self, "target", TARGET_RADIUS, 0.005, "purple", video_goal)
+        )
         xy, yaw = self._place_cube(draws, PARTS[0], video_goal, [])
         self.cube = self.add(build_cube(self, "cube", "red", xy, yaw))
         xy, yaw = self._place_cube(draws, PARTS[1], goal, [self.cube])
@@ -72,7 +87,9 @@ class MoveCube(Task):
         _, x, y = self.values.place(f"layout.{part}.peg_offsets", list, size=3)
         return x, y, self.values.number(f"layout.{part}.peg_yaw", float)
 
-    def _place_cube(self, draws: Draws, part: str, goal: Any, avoid: list) -> tuple[tuple[float, float], float]:
+    def _place_cube(
+        self, draws: Draws, part: str, goal: Any, avoid: list
+    ) -> tuple[tuple[float, float], float]:
         """Place and yaw of the cube in the video or in the execution."""
 
         def sample() -> list[float]:
@@ -105,10 +122,14 @@ class MoveCube(Task):
                 if place is not None:
                     return place
                 break
-        raise SceneError(f"MoveCube, seed {self.seed}: the cube finds no place away from the target.")
+        raise SceneError(
+            f"MoveCube, seed {self.seed}: the cube finds no place away from the target."
+        )
 
     def start_episode(self, draws: Draws) -> None:
-        self.manner = MANNERS[self.values.integer("initializations.way_idx", lambda: draws.integer(0, 3), most=2)]
+        self.manner = MANNERS[
+            self.values.integer("initializations.way_idx", lambda: draws.integer(0, 3), most=2)
+        ]
 
     def after_step(self, k: int) -> None:
         if self.reset_in_progress:
@@ -195,7 +216,15 @@ class MoveCube(Task):
             return self._on_target() or self._holds_peg()
 
         return [
-            pick(self, self.cube, "Pick up the cube", "d", failed=misplaced, video=video, operation="how"),
+            pick(
+                self,
+                self.cube,
+                "Pick up the cube",
+                "d",
+                failed=misplaced,
+                video=video,
+                operation="how",
+            ),
             SubTask(
                 "place the cube onto the target",
                 done=lambda: dropped_onto(self, self.cube, self.target),
@@ -216,10 +245,14 @@ class MoveCube(Task):
                 lambda demo, _: demo.hook(self.cube, self.target, self._side()),
             ),
             Choice(
-                "c", "close gripper and push the cube to the target", lambda demo, _: demo.push(self.cube, self.target)
+                "c",
+                "close gripper and push the cube to the target",
+                lambda demo, _: demo.push(self.cube, self.target),
             ),
             Choice("d", "pick up the cube", lambda demo, _: demo.pick(self.cube)),
-            Choice("e", "place the cube onto the target", lambda demo, _: demo.place_on(self.target)),
+            Choice(
+                "e", "place the cube onto the target", lambda demo, _: demo.place_on(self.target)
+            ),
         ]
 
     def goals(self) -> list[str]:

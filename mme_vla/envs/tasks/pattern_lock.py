@@ -1,4 +1,6 @@
-"""PatternLock (Imitation): the video traces a path over a grid of discs with the stick; trace it again."""
+"""PatternLock (Imitation): the video traces a path over a grid of discs with the stick; trace it
+again.
+"""
 
 import itertools
 from collections.abc import Sequence
@@ -26,9 +28,15 @@ NEIGHBOURS = ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 
 MARK_RADIUS, MARK_STEPS = 0.02004, 40
 TRIES = 1000
 DIRECTIONS = {
-    "forward": (1, 0), "backward": (-1, 0), "left": (0, 1), "right": (0, -1),
-    "forward-left": (1, 1), "forward-right": (1, -1), "backward-left": (-1, 1), "backward-right": (-1, -1),
-}  # fmt: skip
+    "forward": (1, 0),
+    "backward": (-1, 0),
+    "left": (0, 1),
+    "right": (0, -1),
+    "forward-left": (1, 1),
+    "forward-right": (1, -1),
+    "backward-left": (-1, 1),
+    "backward-right": (-1, -1),
+}
 """Signs of the way in x and y, as the robot sees them."""
 REACH = 0.2  # how far away the disc a direction means may lie
 
@@ -43,14 +51,24 @@ class PatternLock(Task):
     def build(self, draws: Draws) -> None:
         n = GRID[self.difficulty]
         middle = (n - 1) / 2
-        places = [(CENTRE[0] + (r - middle) * SPACING, CENTRE[1] + (c - middle) * SPACING) for r, c in np.ndindex(n, n)]
-        self.discs = [self.add(build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy)) for i, xy in enumerate(places)]
+        places = [
+            (CENTRE[0] + (r - middle) * SPACING, CENTRE[1] + (c - middle) * SPACING)
+            for r, c in np.ndindex(n, n)
+        ]
+        self.discs = [
+            self.add(build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy))
+            for i, xy in enumerate(places)
+        ]
         nodes = self.values.indices("actions.path_nodes", lambda: self._draw_path(draws, n), n * n)
         steps = [np.subtract(divmod(a, n), divmod(b, n)) for a, b in itertools.pairwise(nodes)]
         if len(nodes) < 2 or any(np.abs(step).max() > 1 for step in steps):
-            raise self.values.error("actions.path_nodes", f"is {nodes}; expected a path over neighbours, {n} a row")
+            raise self.values.error(
+                "actions.path_nodes", f"is {nodes}; expected a path over neighbours, {n} a row"
+            )
         self.path = [self.discs[i] for i in nodes]
-        self._marks = [build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(n * n)]
+        self._marks = [
+            build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(n * n)
+        ]
         self._trace = Trace(self)
 
     def _draw_path(self, draws: Draws, n: int) -> list[int]:
@@ -60,10 +78,14 @@ class PatternLock(Task):
             path = search(draws, n, start, goal, {start})
             if path is not None and low <= len(path) <= high:
                 return path
-        raise SceneError(f"PatternLock, seed {self.seed}: no path of {low} to {high} discs in {TRIES} tries.")
+        raise SceneError(
+            f"PatternLock, seed {self.seed}: no path of {low} to {high} discs in {TRIES} tries."
+        )
 
     def start_episode(self, draws: Draws) -> None:
-        self.marks = [Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)]
+        self.marks = [
+            Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)
+        ]
         self._trace.restart()
         self.visited: list[Disc] = []
 
@@ -96,7 +118,12 @@ class PatternLock(Task):
             run=lambda demo: demo.stick_to(first, store=True),
             video=True,
         )
-        return [approach, *self._moves(video=True), *end_stick_video(self), *self._moves(video=False)]
+        return [
+            approach,
+            *self._moves(video=True),
+            *end_stick_video(self),
+            *self._moves(video=False),
+        ]
 
     def _moves(self, video: bool) -> list[SubTask]:
         return [self._move(a, b, video) for a, b in zip(self.path, self.path[1:], strict=False)]
@@ -115,7 +142,9 @@ class PatternLock(Task):
         )
 
     def choices(self) -> list[Choice]:
-        return [self._choice(letter, word) for letter, word in zip("abcdefgh", DIRECTIONS, strict=True)]
+        return [
+            self._choice(letter, word) for letter, word in zip("abcdefgh", DIRECTIONS, strict=True)
+        ]
 
     def _choice(self, letter: str, word: str) -> Choice:
         return Choice(letter, f"move {word}", lambda demo, _: self._go(demo, word))
@@ -128,7 +157,9 @@ class PatternLock(Task):
             demo.stick_to(goal)
 
     def disc_towards(self, here: Disc, word: str) -> Disc | None:
-        """The disc within reach that lies in a direction: the best aligned, then the nearest one."""
+        """The disc within reach that lies in a direction: the best aligned, then the
+        nearest one.
+        """
         signs = np.array(DIRECTIONS[word])
         way = signs / np.linalg.norm(signs)
 
@@ -145,9 +176,15 @@ class PatternLock(Task):
         return min(filter(fits, self.discs), key=preference, default=None)
 
     def goals(self) -> list[str]:
-        goal = "watch the video carefully, then use the stick attached to the robot to retrace the same pattern"
+        goal = (
+            "watch the video carefully, then use the stick attached to the robot to retrace the"
+            " same pattern"
+        )
         if self.in_view:
-            moves = [direction(b.position - a.position) for a, b in zip(self.path, self.path[1:], strict=False)]
+            moves = [
+                direction(b.position - a.position)
+                for a, b in zip(self.path, self.path[1:], strict=False)
+            ]
             goal = f"{goal}: {', then '.join(f'move {word}' for word in moves)}"
         return [goal, f"{goal} shown in the video"]
 
@@ -157,7 +194,9 @@ def search(draws: Draws, n: int, node: int, goal: int, visited: set[int]) -> lis
     if node == goal:
         return [node]
     row, column = divmod(node, n)
-    places = [(row + r, column + c) for r, c in NEIGHBOURS if 0 <= row + r < n and 0 <= column + c < n]
+    places = [
+        (row + r, column + c) for r, c in NEIGHBOURS if 0 <= row + r < n and 0 <= column + c < n
+    ]
     for i in draws.permutation(len(places)):
         following = places[i][0] * n + places[i][1]
         if following not in visited:

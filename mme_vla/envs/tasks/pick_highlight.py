@@ -1,4 +1,6 @@
-"""PickHighlight (Reference): some cubes are briefly underlaid with white; press the button, then pick up just those."""
+"""PickHighlight (Reference): some cubes are briefly underlaid with white; press the button, then
+pick up just those.
+"""
 
 from collections.abc import Collection, Mapping
 
@@ -31,25 +33,34 @@ class PickHighlight(Task):
         self._add_cubes(draws, "cube", "layout.cubes", CUBES[self.difficulty])
         count = len(self.cubes)
         goals = self.values.indices(
-            "objects.highlight_ids", lambda: draws.permutation(count)[: GOALS[self.difficulty]], count
+            "objects.highlight_ids",
+            lambda: draws.permutation(count)[: GOALS[self.difficulty]],
+            count,
         )
         if not goals:
             raise self.values.error("objects.highlight_ids", "is empty; expected at least one cube")
         self.goal_cubes = [self.cubes[i] for i in goals]
-        self._discs = [build_highlight(self, f"highlight_{i}", 0.05, 0.001) for i in range(len(self.goal_cubes))]
+        self._discs = [
+            build_highlight(self, f"highlight_{i}", 0.05, 0.001)
+            for i in range(len(self.goal_cubes))
+        ]
         self._add_cubes(draws, "distractor", "layout.distractors", self.turned("distractors"))
 
     def _add_cubes(self, draws: Draws, name: str, part: str, count: int) -> None:
         for i in range(self.values.count(part) if self.values.specified else count):
             colour, value = self._colour(draws, len(self.cubes)), f"{part}.{i}"
             avoid = [self.button, *self.cubes]
-            self.cubes.append(add_cube(self, draws, f"{name}_{i}", colour, TABLE, avoid, gap=2 * H, value=value))
+            self.cubes.append(
+                add_cube(self, draws, f"{name}_{i}", colour, TABLE, avoid, gap=2 * H, value=value)
+            )
 
     def _colour(self, draws: Draws, i: int) -> str | RGB:
         """A name, or in rows of RoboMME-OOD any colour."""
         if self.values.find("objects.color_rgba") is not None:
             return self.values.colour(f"objects.color_rgba.{i}", list)
-        return self.values.word(f"objects.colors.{i}", lambda: ("red", "blue", "green")[draws.integer(0, 3)], COLOURS)
+        return self.values.word(
+            f"objects.colors.{i}", lambda: ("red", "blue", "green")[draws.integer(0, 3)], COLOURS
+        )
 
     def cues(self) -> list[Cue]:
         return [under(cube) for cube in self.goal_cubes]
@@ -84,8 +95,14 @@ class PickHighlight(Task):
         return [*steps, press(self.button, "press the button", "a")] if self.tier else steps[:-1]
 
     def _pick(self, i: int, cube: Cube) -> SubTask:
-        which = "highlighted cube" if len(self.goal_cubes) == 1 and not self.tier else f"{ordinal(i)} highlighted cube"
-        text = f"pick up the {which}" if self.tier else f"pick up the {which}, which is {cube.colour}"
+        which = (
+            "highlighted cube"
+            if len(self.goal_cubes) == 1 and not self.tier
+            else f"{ordinal(i)} highlighted cube"
+        )
+        text = (
+            f"pick up the {which}" if self.tier else f"pick up the {which}, which is {cube.colour}"
+        )
         return pick(self, cube, text, "b", pick=True, operation="which")
 
     def _place(self, cube: Cube) -> SubTask:
@@ -101,7 +118,12 @@ class PickHighlight(Task):
     def choices(self) -> list[Choice]:
         return [
             Choice("a", "press button", lambda demo, _: demo.press(self.button)),
-            Choice("b", "pick up the highlighted cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
+            Choice(
+                "b",
+                "pick up the highlighted cube",
+                lambda demo, cube: demo.pick(cube),
+                lambda: self.cubes,
+            ),
             Choice("c", "place the cube onto the table", lambda demo, _: demo.put_down(RELEASE_Z)),
         ]
 
@@ -109,12 +131,23 @@ class PickHighlight(Task):
         if self.tier:
             cubes = "every cube highlighted with a white area on the table one at a time"
             return [
-                "first press the button, then pick up all highlighted cubes one by one, finally press the button to "
-                "stop",
-                f"first press the button, then pick up {cubes}, finally press the button again to stop",
+                (
+                    "first press the button, then pick up all highlighted cubes one by one, finally"
+                    " press the button to stop"
+                ),
+                (
+                    f"first press the button, then pick up {cubes}, finally press the button again"
+                    " to stop"
+                ),
             ]
         return [
             # The spelling is the benchmark's.
-            "first press the button, then pick up all cubes that have been highlighteted with white areas on the table",
-            "first press the button, then pick up all highlighted cubes, finally press the button again to stop",
+            (
+                "first press the button, then pick up all cubes that have been highlighteted with"
+                " white areas on the table"
+            ),
+            (
+                "first press the button, then pick up all highlighted cubes, finally press the"
+                " button again to stop"
+            ),
         ]

@@ -1,4 +1,6 @@
-"""PickXtimes (Counting): put the cube of one colour on the target a number of times, then press the button."""
+"""PickXtimes (Counting): put the cube of one colour on the target a number of times, then press the
+button.
+"""
 
 from collections.abc import Collection, Mapping
 
@@ -39,7 +41,9 @@ class PickXtimes(Task):
     def plan(self, draws: Draws) -> None:
         fewest, most = REPETITIONS[self.difficulty]
         self.repetitions = self.values.integer(
-            "objects.num_repeats", lambda: draws.integer(fewest, most + 1) + self.turned("count"), least=1
+            "objects.num_repeats",
+            lambda: draws.integer(fewest, most + 1) + self.turned("count"),
+            least=1,
         )
 
     def build(self, draws: Draws) -> None:
@@ -50,12 +54,18 @@ class PickXtimes(Task):
         for name in cube_names(self, "layout.cubes", colours):
             colour, avoid = name.split("_")[0], [self.button, *self.cubes]
             value = f"layout.cubes.{name}"
-            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, TABLE, avoid, value=value))
+            self.cubes.append(
+                add_cube(self, draws, f"cube_{colour}", colour, TABLE, avoid, value=value)
+            )
         avoid = [self.button, *self.cubes]
-        self.target = add_target(self, draws, "target", "layout.goal_xy", TABLE, TARGET_RADIUS, avoid, gap=2 * H)
+        self.target = add_target(
+            self, draws, "target", "layout.goal_xy", TABLE, TARGET_RADIUS, avoid, gap=2 * H
+        )
         count = len(self.cubes)
         self.cube = self.cubes[
-            self.values.integer("objects.target_cube_idx", lambda: draws.integer(0, count), most=count - 1)
+            self.values.integer(
+                "objects.target_cube_idx", lambda: draws.integer(0, count), most=count - 1
+            )
         ]
         check_colour(self, self.cube.colour)
         self.distractors = add_distractors(self, draws, TABLE)
@@ -70,12 +80,17 @@ class PickXtimes(Task):
         steps = []
         for i in range(self.repetitions):
             steps += [self._pick(i), self._place()]
-        stop = {"failed": lambda: any_picked_up(self, [*self.cubes, *self.distractors]), "operation": "how many"}
+        stop = {
+            "failed": lambda: any_picked_up(self, [*self.cubes, *self.distractors]),
+            "operation": "how many",
+        }
         return [*steps, press(self.button, "press the button to stop", "c", **stop)]
 
     def _pick(self, i: int) -> SubTask:
         text = f"pick up the {self.cube.colour} cube for the {ordinal(i)} time"
-        return pick(self, self.cube, text, failed=self._strayed, pick=True, operation=self._mistaken)
+        return pick(
+            self, self.cube, text, failed=self._strayed, pick=True, operation=self._mistaken
+        )
 
     def _place(self) -> SubTask:
         return SubTask(
@@ -103,9 +118,14 @@ class PickXtimes(Task):
     def choices(self) -> list[Choice]:
         return [
             Choice(
-                "a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: [*self.cubes, *self.distractors]
+                "a",
+                "pick up the cube",
+                lambda demo, cube: demo.pick(cube),
+                lambda: [*self.cubes, *self.distractors],
             ),
-            Choice("b", "place the cube onto the target", lambda demo, _: demo.place_on(self.target)),
+            Choice(
+                "b", "place the cube onto the target", lambda demo, _: demo.place_on(self.target)
+            ),
             Choice("c", "press the button to stop", lambda demo, _: demo.press(self.button)),
         ]
 
@@ -114,6 +134,7 @@ class PickXtimes(Task):
         if self.repetitions == 1:
             return [f"{start}, then press the button to stop"]
         return [
-            f"{start}, repeating this {action} {number(self.repetitions)} times, then press the button to stop"
+            f"{start}, repeating this {action} {number(self.repetitions)} times, then press the"
+            " button to stop"
             for action in ("action", "pick-and-place action")
         ]

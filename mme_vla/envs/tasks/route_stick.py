@@ -1,4 +1,6 @@
-"""RouteStick (Imitation): the video winds around obstacles from disc to disc; follow the same route."""
+"""RouteStick (Imitation): the video winds around obstacles from disc to disc; follow the same
+route.
+"""
 
 import itertools
 import math
@@ -31,8 +33,11 @@ DOTS = range(8, 40, 7)  # of an arc's 45 points
 Direction = Literal["clockwise", "counterclockwise"]
 TURNS = dict.fromkeys(("clockwise", "counterclockwise"))
 SIDES: tuple[tuple[str, Direction], ...] = (
-    ("left", "clockwise"), ("right", "clockwise"), ("left", "counterclockwise"), ("right", "counterclockwise"),
-)  # fmt: skip
+    ("left", "clockwise"),
+    ("right", "clockwise"),
+    ("left", "counterclockwise"),
+    ("right", "counterclockwise"),
+)
 
 
 @register_task
@@ -43,16 +48,22 @@ class RouteStick(Task):
     latch_failure = True
 
     def build(self, draws: Draws) -> None:
-        angle = math.radians(self.values.number("layout.rotation_deg", lambda: -30 + 60 * draws.uniform()))
+        angle = math.radians(
+            self.values.number("layout.rotation_deg", lambda: -30 + 60 * draws.uniform())
+        )
         cos, sin = math.cos(angle), math.sin(angle)
         row = [(i - PLACES // 2) * SPACING for i in range(PLACES)]
         places = [np.array([cos * CENTRE_X - sin * y, sin * CENTRE_X + cos * y]) for y in row]
         self.all_discs = [
-            self.add(build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy, z=-0.01 if i % 2 else 0.01))
+            self.add(
+                build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy, z=-0.01 if i % 2 else 0.01)
+            )
             for i, xy in enumerate(places)
         ]
         for i in range(1, PLACES, 2):
-            colour = self.values.colour(f"layout.obstacle_rgb.{i // 2}", lambda: draws.uniforms(3).tolist())
+            colour = self.values.colour(
+                f"layout.obstacle_rgb.{i // 2}", lambda: draws.uniforms(3).tolist()
+            )
             self.add(build_obstacle(self, f"obstacle_{i // 2}", places[i], angle, colour))
         self.discs = self.all_discs[::2]
         self._draw_route(draws)
@@ -62,9 +73,13 @@ class RouteStick(Task):
     def _draw_route(self, draws: Draws) -> None:
         """The row's route and turns, or random ones."""
         values, count = self.values, len(self.discs)
-        route = values.indices("actions.route", lambda: self._sample_route(draws), count, distinct=False)
+        route = values.indices(
+            "actions.route", lambda: self._sample_route(draws), count, distinct=False
+        )
         if len(route) < 2 or any(abs(a - b) != 1 for a, b in itertools.pairwise(route)):
-            raise values.error("actions.route", f"is {route}; expected a way from disc to neighbouring disc")
+            raise values.error(
+                "actions.route", f"is {route}; expected a way from disc to neighbouring disc"
+            )
         moves = len(route) - 1
 
         def sample() -> list[str]:
@@ -73,7 +88,9 @@ class RouteStick(Task):
         self.route = [self.discs[i] for i in route]
         self.directions: list[Direction] = values.words("actions.turns", sample, TURNS)  # type: ignore[assignment]
         if len(self.directions) != moves:
-            raise values.error("actions.turns", f"has {len(self.directions)} turns for {moves} moves")
+            raise values.error(
+                "actions.turns", f"has {len(self.directions)} turns for {moves} moves"
+            )
 
     def _sample_route(self, draws: Draws) -> list[int]:
         low, high = MOVES[self.difficulty]
@@ -99,10 +116,15 @@ class RouteStick(Task):
 
             return place
 
-        return [Cue("yellow", point(-1), CUE_RADIUS), *(Cue("yellow", point(i), DOT_RADIUS) for i in DOTS)]
+        return [
+            Cue("yellow", point(-1), CUE_RADIUS),
+            *(Cue("yellow", point(i), DOT_RADIUS) for i in DOTS),
+        ]
 
     def start_episode(self, draws: Draws) -> None:
-        self.marks = [Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)]
+        self.marks = [
+            Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)
+        ]
         self._dots.restart()
         self._way: list[np.ndarray] = []
         self._way_of: SubTask | None = None
@@ -121,7 +143,9 @@ class RouteStick(Task):
         return False
 
     def _turned(self, previous: Disc, goal: Disc) -> Direction:
-        """How the tool went around what lies between two discs: on which side of the chord it was on average."""
+        """How the tool went around what lies between two discs: on which side of the chord it was
+        on average.
+        """
         way = np.mean(self._way, axis=0) - previous.position[:2]
         chord = goal.position[:2] - previous.position[:2]
         return "clockwise" if chord[0] * way[1] - chord[1] * way[0] > 0 else "counterclockwise"
@@ -134,7 +158,12 @@ class RouteStick(Task):
             run=lambda demo: demo.stick_to(first, store=True),
             video=True,
         )
-        return [approach, *self._moves(video=True), *end_stick_video(self, HOME_STEPS), *self._moves(video=False)]
+        return [
+            approach,
+            *self._moves(video=True),
+            *end_stick_video(self, HOME_STEPS),
+            *self._moves(video=False),
+        ]
 
     def _moves(self, video: bool) -> list[SubTask]:
         legs = zip(self.route, self.route[1:], self.directions, strict=False)
@@ -166,10 +195,15 @@ class RouteStick(Task):
         return f"move to the nearest {side} target by circling around the stick {direction}"
 
     def choices(self) -> list[Choice]:
-        return [self._choice(letter, side, direction) for letter, (side, direction) in zip("abcd", SIDES, strict=True)]
+        return [
+            self._choice(letter, side, direction)
+            for letter, (side, direction) in zip("abcd", SIDES, strict=True)
+        ]
 
     def _choice(self, letter: str, side: str, direction: Direction) -> Choice:
-        return Choice(letter, self._text(side, direction), lambda demo, _: self._go(demo, side, direction))
+        return Choice(
+            letter, self._text(side, direction), lambda demo, _: self._go(demo, side, direction)
+        )
 
     def _go(self, demo: "Demonstrator", side: str, direction: Direction) -> None:
         tcp = self.tcp_pose.p

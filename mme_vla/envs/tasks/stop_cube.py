@@ -1,4 +1,6 @@
-"""StopCube (Counting): a cube goes back and forth over a target; stop it there on the right visit."""
+"""StopCube (Counting): a cube goes back and forth over a target; stop it there on the
+right visit.
+"""
 
 import math
 from collections.abc import Collection, Mapping
@@ -37,9 +39,13 @@ class StopCube(Task):
     dials = frozenset({"count"})
 
     def build(self, draws: Draws) -> None:
-        self.passes = self.values.integer("actions.motion_segments", lambda: PASSES + self.turned("count"), least=1)
+        self.passes = self.values.integer(
+            "actions.motion_segments", lambda: PASSES + self.turned("count"), least=1
+        )
         self.button = add_button(self, draws, (-0.2, 0))
-        xy = self.values.place("layout.target_xy", lambda: [draws.between(-0.1, 0.1), draws.between(-0.1, 0.1)])
+        xy = self.values.place(
+            "layout.target_xy", lambda: [draws.between(-0.1, 0.1), draws.between(-0.1, 0.1)]
+        )
         self.target = self.add(build_disc(self, "target", 0.036, 0.01, "purple", xy))
         colour = self.values.colour("objects.cube_rgb", lambda: draws.uniforms(3).tolist())
         self.cube = self.add(build_moving_cube(self, "cube", colour, xy, z=0.01))
@@ -47,9 +53,14 @@ class StopCube(Task):
     def start_episode(self, draws: Draws) -> None:
         draws, values = Draws(self.seed), self.values
         draws.integer(27, 33)
-        self.interval = values.integer("actions.move_interval", lambda: INTERVALS[draws.integer(0, 3)], least=2)
+        self.interval = values.integer(
+            "actions.move_interval", lambda: INTERVALS[draws.integer(0, 3)], least=2
+        )
         self.visit = values.integer(
-            "actions.stop_time", lambda: draws.integer(2, 6) + self.turned("count"), least=1, most=self.passes
+            "actions.stop_time",
+            lambda: draws.integer(2, 6) + self.turned("count"),
+            least=1,
+            most=self.passes,
         )
         angle = math.radians(values.number("actions.rotation_deg", lambda: draws.between(-30, 30)))
         self._reach = REACH * np.array([-math.sin(angle), math.cos(angle)])
@@ -66,7 +77,9 @@ class StopCube(Task):
         self.cube.move_to(sapien.Pose([*xy, self.cube.position[2]]))
 
     def cues(self) -> list[Cue]:
-        """The visits until the cube is to be stopped, that one included; a disc goes where the cube turns round."""
+        """The visits until the cube is to be stopped, that one included; a disc goes where the cube
+        turns round.
+        """
 
         def left() -> int:
             now = self.steps_done if self.stopped_at is None else self.stopped_at
@@ -88,7 +101,10 @@ class StopCube(Task):
         return self.interval * self.visit
 
     def _in_time(self) -> bool:
-        return self.stopped_at is not None and self.deadline - self.interval <= self.stopped_at <= self.deadline
+        return (
+            self.stopped_at is not None
+            and self.deadline - self.interval <= self.stopped_at <= self.deadline
+        )
 
     def _on_target(self) -> bool:
         return distance_xy(self.cube.position, self.target.position) <= STOPPED_AT
@@ -133,7 +149,9 @@ class StopCube(Task):
         return "" if self._in_time() else "how many"
 
     def _press(self, demo: "Demonstrator") -> None:
-        """Press; if the wait before it ended so late that the cube would have passed, without closing the fingers."""
+        """Press; if the wait before it ended so late that the cube would have passed, without
+        closing the fingers.
+        """
         crossing = self.deadline - self.interval // 2
         tolerated = self.interval // 15  # steps that the cube takes over half the target
         demo.press(
@@ -157,7 +175,11 @@ class StopCube(Task):
 
     def choices(self) -> list[Choice]:
         return [
-            Choice("a", "move to the top of the button to prepare", lambda demo, _: demo.hover(self.button)),
+            Choice(
+                "a",
+                "move to the top of the button to prepare",
+                lambda demo, _: demo.hover(self.button),
+            ),
             Choice("b", "remain static", lambda demo, _: demo.hold_until(self._next_checkpoint())),
             Choice("c", "press button to stop the cube", lambda demo, _: self._press(demo)),
         ]

@@ -1,4 +1,6 @@
-"""SwingXtimes (Counting): swing a cube between two targets a number of times, put it down, press the button."""
+"""SwingXtimes (Counting): swing a cube between two targets a number of times, put it down, press
+the button.
+"""
 
 from collections.abc import Collection, Mapping
 
@@ -65,7 +67,9 @@ class SwingXtimes(Task):
     def plan(self, draws: Draws) -> None:
         low, high = SWINGS[self.difficulty]
         self.repetitions = self.values.integer(
-            "objects.num_repeats", lambda: draws.integer(low, high + 1) + self.turned("count"), least=1
+            "objects.num_repeats",
+            lambda: draws.integer(low, high + 1) + self.turned("count"),
+            least=1,
         )
 
     def build(self, draws: Draws) -> None:
@@ -76,19 +80,33 @@ class SwingXtimes(Task):
         for name in cube_names(self, "layout.cubes", colours):
             colour, value = name.split("_")[0], f"layout.cubes.{name}"
             avoid: list[Avoid] = [self.button, *self.cubes]
-            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, TABLE, avoid, value=value))
+            self.cubes.append(
+                add_cube(self, draws, f"cube_{colour}", colour, TABLE, avoid, value=value)
+            )
         targets: list[Disc] = []
         for i, y in enumerate((-0.2, 0.2)):
             place, avoid = Region((-0.1, y), 0.1), [self.button, *self.cubes, *targets]
             value = f"layout.targets.{i}"
             targets.append(
-                add_target(self, draws, f"target_{i}", value, place, TARGET_RADIUS, avoid, gap=H, colour="gray")
+                add_target(
+                    self,
+                    draws,
+                    f"target_{i}",
+                    value,
+                    place,
+                    TARGET_RADIUS,
+                    avoid,
+                    gap=H,
+                    colour="gray",
+                )
             )
         # Right and left as the robot sees them.
         self.right, self.left = sorted(targets, key=lambda target: target.position[1])
         count = len(self.cubes)
         self.cube = self.cubes[
-            self.values.integer("objects.target_cube_idx", lambda: draws.integer(0, count), most=count - 1)
+            self.values.integer(
+                "objects.target_cube_idx", lambda: draws.integer(0, count), most=count - 1
+            )
         ]
         check_colour(self, self.cube.colour)
         self.distractors = add_distractors(self, draws, TABLE)
@@ -97,14 +115,18 @@ class SwingXtimes(Task):
     def start_episode(self, draws: Draws) -> None:
         self.swings = [Swings(self.cube, target) for target in (self.right, self.left)]
         targets = (self.right, self.left)
-        self.marks = [Mark(d, t.position, MARK_STEPS) for d, t in zip(self._marks, targets, strict=True)]
+        self.marks = [
+            Mark(d, t.position, MARK_STEPS) for d, t in zip(self._marks, targets, strict=True)
+        ]
 
     def cues(self) -> list[Cue]:
         """A tally for each target, on its side: which one is next is to be seen as well."""
 
         def visits(target: Disc, side: int) -> list[Cue]:
             places = [side * TALLY_SPACING * (i + 1) for i in range(self.repetitions)]
-            return tally(places, lambda: sum(target in step.targets for step in self.progress.to_come))
+            return tally(
+                places, lambda: sum(target in step.targets for step in self.progress.to_come)
+            )
 
         return [*visits(self.right, -1), *visits(self.left, 1)]
 
@@ -116,7 +138,11 @@ class SwingXtimes(Task):
         for swings in self.swings:
             swings.update()
         early = self.progress.index < len(self.progress.subtasks) - 1 and pressed(self.button)
-        return early or self._wrong_cube() or sum(swings.count for swings in self.swings) > 2 * self.repetitions
+        return (
+            early
+            or self._wrong_cube()
+            or sum(swings.count for swings in self.swings) > 2 * self.repetitions
+        )
 
     def subtasks(self) -> list[SubTask]:
         cube, colour = self.cube, self.cube.colour
@@ -150,7 +176,9 @@ class SwingXtimes(Task):
         return "" if self._wrong_cube() else "how many"
 
     def _wrong_cube(self) -> bool:
-        return any_picked_up(self, [cube for cube in (*self.cubes, *self.distractors) if cube is not self.cube])
+        return any_picked_up(
+            self, [cube for cube in (*self.cubes, *self.distractors) if cube is not self.cube]
+        )
 
     def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
         return choices_made(ended, "b", video=False)
@@ -159,16 +187,27 @@ class SwingXtimes(Task):
         targets = [self.right, self.left]
         return [
             Choice(
-                "a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: [*self.cubes, *self.distractors]
+                "a",
+                "pick up the cube",
+                lambda demo, cube: demo.pick(cube),
+                lambda: [*self.cubes, *self.distractors],
             ),
-            Choice("b", "move to the top of the target", lambda demo, disc: demo.move_over(disc, 0.1), lambda: targets),
+            Choice(
+                "b",
+                "move to the top of the target",
+                lambda demo, disc: demo.move_over(disc, 0.1),
+                lambda: targets,
+            ),
             Choice("c", "put the cube on the table", lambda demo, _: demo.put_down()),
             Choice("d", "press the button", lambda demo, _: demo.press(self.button)),
         ]
 
     def goals(self) -> list[str]:
         pick = f"pick up the {self.cube.colour} cube, move it to the"
-        first, second = f"{pick} top of the right-side target, then", f"{pick} right-side target and then"
+        first, second = (
+            f"{pick} top of the right-side target, then",
+            f"{pick} right-side target and then",
+        )
         if self.repetitions == 1:
             return [
                 f"{first} put it down on the left-side target, finally press the button to stop",
@@ -176,8 +215,12 @@ class SwingXtimes(Task):
             ]
         times = f"{number(self.repetitions)} times"
         return [
-            f"{first} move it to the top of the left-side target, repeating this back-and-forth motion {times}, "
-            "finally press the button to stop",
-            f"{second} to the left-side target, repeating this right-to-left swing motion {times}, then put down the "
-            "cube and press the button to stop",
+            (
+                f"{first} move it to the top of the left-side target, repeating this back-and-forth"
+                f" motion {times}, finally press the button to stop"
+            ),
+            (
+                f"{second} to the left-side target, repeating this right-to-left swing motion"
+                f" {times}, then put down the cube and press the button to stop"
+            ),
         ]

@@ -1,4 +1,6 @@
-"""VideoPlaceButton (Reference): put the cube on the target it was on before, or after, the button was pressed."""
+"""VideoPlaceButton (Reference): put the cube on the target it was on before, or after, the button
+was pressed.
+"""
 
 from typing import ClassVar
 
@@ -20,11 +22,14 @@ class VideoPlaceButton(VideoPlace):
         values, count = self.values, len(self.targets)
         self.before = values.flag("objects.task_flag", draws.coin)
         self._extra = {
-            when: self._indices(f"objects.extra_place_target_ids.{when}", count) for when in ("before", "after")
+            when: self._indices(f"objects.extra_place_target_ids.{when}", count)
+            for when in ("before", "after")
         }
         goal = values.find("actions.target_target_id")
         if goal is not None and goal != self.targets.index(self.goal_target):
-            raise values.error("actions.target_target_id", f"is {goal}; the other values give another target")
+            raise values.error(
+                "actions.target_target_id", f"is {goal}; the other values give another target"
+            )
 
     def _indices(self, name: str, count: int) -> list[int]:
         """Targets on which a row has the cube put beside the first two."""
@@ -38,9 +43,16 @@ class VideoPlaceButton(VideoPlace):
     def visits(self) -> list[SubTask]:
         before = [0, *self._extra["before"]]
         after = [1, *self._extra["after"]]
-        visible = [[step for i in part for step in (self.show_pick(), self.show_drop(self.targets[i]))]
-                 for part in (before, after)]  # fmt: skip
-        return [*visible[0], self.show_press(), *visible[1], *(self.put_back(self.cube) if self.tier else [])]
+        visible = [
+            [step for i in part for step in (self.show_pick(), self.show_drop(self.targets[i]))]
+            for part in (before, after)
+        ]
+        return [
+            *visible[0],
+            self.show_press(),
+            *visible[1],
+            *(self.put_back(self.cube) if self.tier else []),
+        ]
 
     def goals(self) -> list[str]:
         place = f"place the {self.cube.colour} cube on the target"
@@ -51,7 +63,10 @@ class VideoPlaceButton(VideoPlace):
             return [f"{start} where it was {order} the button was pressed"]
         return [
             f"{start} right {when} the button was pressed",
-            f"watch the video carefully, and {place} where it was placed immediately {when} the button was pressed",
+            (
+                f"watch the video carefully, and {place} where it was placed immediately {when} the"
+                " button was pressed"
+            ),
             f"{start} where it was previously placed {when} the button was pressed",
             f"{start} where it was {order} the button was pressed",
         ]

@@ -1,4 +1,6 @@
-"""VideoPlaceOrder (Reference): put the cube on the first, second, … target it was placed on in the video."""
+"""VideoPlaceOrder (Reference): put the cube on the first, second, … target it was placed on in the
+video.
+"""
 
 from typing import ClassVar
 
@@ -11,7 +13,9 @@ from mme_vla.envs.tasks.families.video_place import VideoPlace
 
 @register_task
 class VideoPlaceOrder(VideoPlace):
-    """The video visits some of the targets in random order; a press of the button comes in between."""
+    """The video visits some of the targets in random order; a press of the button
+    comes in between.
+    """
 
     shared_draws = True
     recovery_sampled_per_episode = True
@@ -28,8 +32,13 @@ class VideoPlaceOrder(VideoPlace):
 
         rows = max(values.count("objects.visit_ids_by_object"), 1)
         if rows != len(self.demonstrated):
-            raise values.error("objects.visit_ids_by_object", f"has {rows} lists for {len(self.demonstrated)} cubes")
-        visits = [values.indices(f"objects.visit_ids_by_object.{i}", sample, targets) for i in range(rows)]
+            raise values.error(
+                "objects.visit_ids_by_object",
+                f"has {rows} lists for {len(self.demonstrated)} cubes",
+            )
+        visits = [
+            values.indices(f"objects.visit_ids_by_object.{i}", sample, targets) for i in range(rows)
+        ]
         requested = values.integer("objects.answer_demo_index", lambda: 0, most=rows - 1)
         total = sum(map(len, visits))
         self.cube = self.cubes[self.demonstrated[requested]]
@@ -39,7 +48,9 @@ class VideoPlaceOrder(VideoPlace):
         ]
         self.visited = self._visits[requested][1]
         count = len(self.visited)
-        self.rank = values.integer("objects.which_in_subset", lambda: draws.integer(1, count + 1), least=1, most=count)
+        self.rank = values.integer(
+            "objects.which_in_subset", lambda: draws.integer(1, count + 1), least=1, most=count
+        )
         self.press_after = values.integer(
             "objects.button_after_visit_index", lambda: draws.integer(0, count), most=total - 1
         )
@@ -61,7 +72,10 @@ class VideoPlaceOrder(VideoPlace):
         return steps
 
     def goals(self) -> list[str]:
-        cube, which = f"place the {self.cube.colour} cube on the", f"{ordinal(self.rank - 1)} target"
+        cube, which = (
+            f"place the {self.cube.colour} cube on the",
+            f"{ordinal(self.rank - 1)} target",
+        )
         return [
             f"watch the video carefully, then {cube} {which} it was previously placed on",
             f"watch the video carefully and {cube} {which} where it was placed",

@@ -1,4 +1,6 @@
-"""VideoRepick (Reference): the video picks up a cube; pick the same one up again, wherever it is now."""
+"""VideoRepick (Reference): the video picks up a cube; pick the same one up again, wherever it is
+now.
+"""
 
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
@@ -62,9 +64,13 @@ class VideoRepick(Task):
     def build(self, draws: Draws) -> None:
         self.button = add_button(self, draws, (-0.2, 0), (0.1, 0.1))
         self.cubes: list[Cube] = []
-        target, initiators = self._draw_cubes(draws) if not self.values.specified else self._read_cubes(draws)
+        target, initiators = (
+            self._draw_cubes(draws) if not self.values.specified else self._read_cubes(draws)
+        )
         count = len(self.cubes)
-        self.cube = self.cubes[self.values.integer("objects.target", lambda: target, most=count - 1)]
+        self.cube = self.cubes[
+            self.values.integer("objects.target", lambda: target, most=count - 1)
+        ]
         self.pairs = self.values.pairs("actions.swap_pairs", count)
         if self.pairs is None:
             initiators = self.values.indices("actions.swap_initiators", lambda: initiators, count)
@@ -72,7 +78,9 @@ class VideoRepick(Task):
         swaps = len(initiators if self.pairs is None else self.pairs)
         self.swap_count = self.values.integer("objects.n_swaps", lambda: swaps)
         if self.swap_count != swaps:
-            raise self.values.error("objects.n_swaps", f"is {self.swap_count}, and actions has {swaps} swaps")
+            raise self.values.error(
+                "objects.n_swaps", f"is {self.swap_count}, and actions has {swaps} swaps"
+            )
 
     def _read_cubes(self, draws: Draws) -> tuple[int, list[int]]:
         """Add the row's cubes, all of one colour or each of its own."""
@@ -108,7 +116,9 @@ class VideoRepick(Task):
         i, avoid = len(self.cubes), [self.button, *self.cubes]
         if not self.values.specified:
             self.values.note(f"objects.colors.{i}", colour)
-        self.cubes.append(add_cube(self, draws, f"cube_{i}", colour, region, avoid, value=f"layout.cubes.{i}"))
+        self.cubes.append(
+            add_cube(self, draws, f"cube_{i}", colour, region, avoid, value=f"layout.cubes.{i}")
+        )
 
     def start_episode(self, draws: Draws) -> None:
         self.swaps: list[Swap] = []
@@ -136,12 +146,16 @@ class VideoRepick(Task):
         return ended_choices | active_motions(self.swaps)
 
     def failure(self) -> bool:
-        """Notes whether the swaps may begin, one step after their stage is entered; the rules belong to the stages."""
+        """Notes whether the swaps may begin, one step after their stage is entered; the rules
+        belong to the stages.
+        """
         self._swaps_due = self._swap_stage is not None and self.progress.current is self._swap_stage
         return False
 
     def _pressed_early(self, kind: str, i: int) -> bool:
-        """Whether the button is down in the window of a stage; in RoboMME-OOD each round has one of its own."""
+        """Whether the button is down in the window of a stage; in RoboMME-OOD each round has one of
+        its own.
+        """
         first, last = PRESS_PUNISHED
         if self.tier and i:
             kind, first = f"{kind} {i}", 0
@@ -223,19 +237,29 @@ class VideoRepick(Task):
         ]
 
     def goals(self) -> list[str]:
-        watch, same_cube = "watch the video carefully", "pick up the same cube that was previously picked up"
+        watch, same_cube = (
+            "watch the video carefully",
+            "pick up the same cube that was previously picked up",
+        )
         same_block = "the same block that was previously picked up"
         if self.repetitions == 1:
             return [
-                f"{watch}, then pick up {same_block} again, finally put it down and press the button to stop",
+                (
+                    f"{watch}, then pick up {same_block} again, finally put it down and press the"
+                    " button to stop"
+                ),
                 f"{watch}, then {same_cube} again, finally press the button to stop",
             ]
         times = f"{number(self.repetitions)} times"
         short = "twice" if self.repetitions == 2 else times
         return [
-            f"{watch}, then repeatedly pick up and put down {same_block} for {times}, finally put it down and press "
-            "the button to stop",
+            (
+                f"{watch}, then repeatedly pick up and put down {same_block} for {times}, finally"
+                " put it down and press the button to stop"
+            ),
             f"{watch}, then {same_cube} {short}, and finally press the button to stop",
-            f"{watch}, identify the cube that was picked up, then pick up and place down the same cube {short}, "
-            "finally press the button to stop",
+            (
+                f"{watch}, identify the cube that was picked up, then pick up and place down the"
+                f" same cube {short}, finally press the button to stop"
+            ),
         ]

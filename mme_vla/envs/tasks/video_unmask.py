@@ -1,10 +1,17 @@
-"""VideoUnmask (Permanence): cubes lie open in the video, containers then cover them; pick up the right container."""
+"""VideoUnmask (Permanence): cubes lie open in the video, containers then cover them; pick up the
+right container.
+"""
 
 from mme_vla.envs.scene.motions import COVER_STEPS
 from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.containers import Unmask, container_choices, container_picks, hiding_goal
+from mme_vla.envs.tasks.families.containers import (
+    Unmask,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
 from mme_vla.envs.tasks.families.stages import delay, wait
 
 
@@ -25,4 +32,6 @@ class VideoUnmask(Unmask):
         return container_choices(self.containers)
 
     def goals(self) -> list[str]:
-        return [f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.targets])}"]
+        return [
+            f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.targets])}"
+        ]

@@ -1,4 +1,6 @@
-"""VideoUnmaskSwap (Permanence): in the video containers cover three cubes and change places; pick up the right one."""
+"""VideoUnmaskSwap (Permanence): in the video containers cover three cubes and change places; pick
+up the right one.
+"""
 
 from mme_vla.envs.scene.placement import Draws, rotated_anchors
 from mme_vla.envs.subtasks import Choice, SubTask
@@ -30,4 +32,6 @@ class VideoUnmaskSwap(UnmaskSwap):
         return container_choices(self.containers)
 
     def goals(self) -> list[str]:
-        return [f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.targets])}"]
+        return [
+            f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.targets])}"
+        ]

@@ -6,10 +6,11 @@
         while envs.busy:
             for reply in envs.recv():
                 ...  # reply.job, reply.observation, reply.info; then
-                envs.send(reply.worker, action)  # or, when reply.done: envs.start_next(reply.worker)
+                # or, when reply.done: envs.start_next(reply.worker)
+                envs.send(reply.worker, action)
 
-Processes inherit nothing of the script that makes one (`worker.py`), which therefore keeps its work under
-`if __name__ == "__main__":`.
+Processes inherit nothing of the script that makes one (`worker.py`), which therefore keeps its work
+under `if __name__ == "__main__":`.
 """
 
 import time
@@ -54,7 +55,9 @@ class Reply:
     truncated: bool
     info: dict[str, Any]
     crashed: bool = False
-    """The worker died or hung and was replaced, or the environment raised: no result of the policy."""
+    """The worker died or hung and was replaced, or the environment raised: no result
+    of the policy.
+    """
 
     @property
     def done(self) -> bool:
@@ -106,9 +109,11 @@ class VecEnv:
     Args:
         jobs: the episodes, in the order `start_next` hands them out.
         workers: number of processes.
-        factory: makes an environment from `task`, `split`, `episode` and `options`; importable by name.
+        factory: makes an environment from `task`, `split`, `episode` and `options`; importable by
+            name.
         options: further arguments of `factory`.
-        timeout: seconds after which a command without result counts as hung, and its worker is replaced.
+        timeout: seconds after which a command without result counts as hung, and its worker is
+            replaced.
     """
 
     def __init__(
@@ -119,7 +124,10 @@ class VecEnv:
         options: dict[str, Any] | None = None,
         timeout: float = 600.0,
     ) -> None:
-        require(type(workers) is int and workers >= 1, f"workers is {workers!r}; expected a positive integer.")
+        require(
+            type(workers) is int and workers >= 1,
+            f"workers is {workers!r}; expected a positive integer.",
+        )
         require(timeout > 0, f"timeout is {timeout!r}; expected a positive number of seconds.")
         self.jobs = deque(jobs)
         """Episodes that no worker has begun yet."""
@@ -136,7 +144,7 @@ class VecEnv:
             self.close()
             raise
 
-    # Commands -----------------------------------------------------------------------------------------------------
+    # Commands -------------------------------------------------------------------------------------
 
     @property
     def workers(self) -> int:
@@ -171,15 +179,18 @@ class VecEnv:
     def send(self, worker: int, action: Any) -> None:
         """Let a worker perform an action; returns at once."""
         state = self._idle(worker)
-        require(state.job is not None, f"Worker {worker} runs no episode; call start() or start_next() first.")
+        require(
+            state.job is not None,
+            f"Worker {worker} runs no episode; call start() or start_next() first.",
+        )
         state.resetting = False
         self._command(worker, protocol.STEP, action)
 
     def recv(self, timeout: float | None = None) -> list[Reply]:
         """Wait until at least one worker is ready, and take the replies of all that are.
 
-        A worker that died or hangs, or whose renderer failed, is replaced, and reported by a reply with `crashed` and
-        the status `error`; the others continue.
+        A worker that died or hangs, or whose renderer failed, is replaced, and reported by a reply
+        with `crashed` and the status `error`; the others continue.
 
         Args:
             timeout: seconds to wait at most; None waits as long as commands may take.
@@ -206,7 +217,8 @@ class VecEnv:
         for state in self._workers:
             try:
                 protocol.send(state.connection, protocol.CLOSE)
-                # A worker that waits to send a piece takes this for the acknowledgement, then the pipe is closed.
+                # A worker that waits to send a piece takes this for the acknowledgement, then the
+                # pipe is closed.
                 state.connection.close()
             except OSError:
                 pass  # it is gone already
@@ -222,7 +234,7 @@ class VecEnv:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # Workers ------------------------------------------------------------------------------------------------------
+    # Workers --------------------------------------------------------------------------------------
 
     def _spawn(self) -> _Worker:
         here, there = self._context.Pipe()
@@ -246,7 +258,9 @@ class VecEnv:
     def _command(self, worker: int, *message: Any) -> None:
         state = self._workers[worker]
         state.running, state.arrays = True, []
-        state.deadline = time.monotonic() + self.timeout + (_STARTING_SECONDS if state.resetting else 0)
+        state.deadline = (
+            time.monotonic() + self.timeout + (_STARTING_SECONDS if state.resetting else 0)
+        )
         try:
             protocol.send(state.connection, *message)
         except OSError:
@@ -255,7 +269,8 @@ class VecEnv:
     def _poll(self, index: int, state: _Worker) -> Reply | None:
         """Take what a worker has sent; its reply if that is complete."""
         try:
-            # A long video comes in many pieces, each sent when the last was taken; wait for the next one.
+            # A long video comes in many pieces, each sent when the last was taken; wait for the
+            # next one.
             while state.connection.poll(_NEXT_PIECE_SECONDS if state.arrays else 0):
                 kind, *content = protocol.receive(state.connection)
                 if kind == protocol.PIECE:
@@ -265,7 +280,10 @@ class VecEnv:
                 elif kind == protocol.RESULT:
                     state.running = False
                     return Reply.of_outcome(
-                        index, state.begun, state.resetting, protocol.restore(content[0], state.arrays)
+                        index,
+                        state.begun,
+                        state.resetting,
+                        protocol.restore(content[0], state.arrays),
                     )
                 elif kind == protocol.FAILURE:
                     state.running = False

@@ -1,7 +1,7 @@
 """Processes that simulate: how they start, and the worker of a `VecEnv`.
 
-They start quickly and inherit only the settings of the process that starts them. A worker builds environments, steps
-them, and sends frames through shared memory.
+They start quickly and inherit only the settings of the process that starts them. A worker builds
+environments, steps them, and sends frames through shared memory.
 """
 
 import gc
@@ -19,14 +19,17 @@ from mme_vla.envs.rendering import renderer_works
 from mme_vla.utils.processes import end_with_parent
 
 PRELOADED = ["mme_vla.envs.task"]
-"""Modules that simulating processes import before they begin; fixed when the first of them is started."""
+"""Modules that simulating processes import before they begin; fixed when the first of them is
+started.
+"""
 
 
 def simulating_processes() -> Any:
     """The context of `multiprocessing` in which processes that simulate are started.
 
-    They are forked from one process that has only imported the simulator and holds no GPU and no renderer, which saves
-    each of them 5 s of CPU time. Its environment variables may be out of date, so `begin` renews them.
+    They are forked from one process that has only imported the simulator and holds no GPU and no
+    renderer, which saves each of them 5 s of CPU time. Its environment variables may be out of
+    date, so `begin` renews them.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
@@ -52,8 +55,10 @@ FRAMES_PER_BLOCK = 8
 BLOCK_BYTES = FRAMES_PER_BLOCK * 2 * 256 * 256 * 3
 """Shared memory of one worker: long videos are handed over in pieces of this size."""
 
-# Messages from a worker. PIECE: the arrays described lie in the block, and the worker waits for any reply. RESULT: the
-# outcome of a command. FAILURE: the command raised. LOST: it raised, and the process is of no further use.
+# Messages from a worker. PIECE: the arrays described lie in the block, and the worker waits for any
+# reply. RESULT: the outcome of a command. FAILURE: the command raised. LOST: it raised, and the
+# process is of no
+# further use.
 PIECE, RESULT, FAILURE, LOST = "piece", "result", "failure", "lost"
 # Commands to a worker.
 RESET, STEP, CLOSE, CONTINUE = "reset", "step", "close", "continue"
@@ -76,7 +81,9 @@ class Slot:
 
 
 def send(connection: Any, *message: Any) -> None:
-    """Send a message as a plain pickle, so that tensors travel by value and not as file descriptors."""
+    """Send a message as a plain pickle, so that tensors travel by value and not as file
+    descriptors.
+    """
     connection.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
 
 
@@ -88,7 +95,9 @@ def receive(connection: Any) -> tuple:
 def read(block: Any, slots: list[Slot]) -> list[np.ndarray]:
     """Copies of the arrays that lie in a block."""
     return [
-        np.frombuffer(block, slot.dtype, int(np.prod(slot.shape)), slot.offset).reshape(slot.shape).copy()
+        np.frombuffer(block, slot.dtype, int(np.prod(slot.shape)), slot.offset)
+        .reshape(slot.shape)
+        .copy()
         for slot in slots
     ]
 
@@ -104,7 +113,9 @@ def restore(value: Any, arrays: list[np.ndarray]) -> Any:
     return value
 
 
-def serve(connection: Any, block: Any, factory: Callable[..., Any], options: dict[str, Any]) -> None:
+def serve(
+    connection: Any, block: Any, factory: Callable[..., Any], options: dict[str, Any]
+) -> None:
     """Run commands until `CLOSE`, until the connection ends, or until the renderer has failed."""
     end_with_parent()
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
@@ -152,7 +163,11 @@ def _hand_over(connection: Any, block: Any, outcome: Any) -> None:
 
 def _lift(value: Any, large: list[np.ndarray]) -> Any:
     """Take the large arrays out of a nested value."""
-    if isinstance(value, np.ndarray) and LARGE <= value.nbytes <= BLOCK_BYTES and value.dtype != object:
+    if (
+        isinstance(value, np.ndarray)
+        and LARGE <= value.nbytes <= BLOCK_BYTES
+        and value.dtype != object
+    ):
         large.append(value)
         return Placed(len(large) - 1)
     if isinstance(value, dict):
@@ -183,7 +198,11 @@ def last_words(process: Any) -> str:
     """How a process ended."""
     process.join(1.0)
     code = process.exitcode
-    return f"died of signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
+    return (
+        f"died of signal {-code}"
+        if code is not None and code < 0
+        else f"ended with exit code {code}"
+    )
 
 
 def end(process: Any) -> None:

@@ -1,11 +1,12 @@
-"""What a model costs: FLOPs and parameters, counted on the meta device, so that full size needs no memory.
+"""What a model costs: FLOPs and parameters, counted on the meta device, so that full size needs no
+memory.
 
-FLOPs are those of PyTorch's `FlopCounterMode` over the real code: two for each multiply-add of linear layers,
-convolutions, matrix products and attention (on meta its kernel is taken apart into counted products; `count_model`
-makes sure of that). Elementwise work, norms, softmax and embedding look-ups are not counted. Batch 1, two cameras,
-every prompt as long as its model's config allows, a full memory; recurrent memories read a full window. Past frames
-arrive as stored tokens, as they do in training; what the vision tower spends on them in an episode is a number of its
-own.
+FLOPs are those of PyTorch's `FlopCounterMode` over the real code: two for each multiply-add of
+linear layers, convolutions, matrix products and attention (on meta its kernel is taken apart into
+counted products; `count_model` makes sure of that). Elementwise work, norms, softmax and embedding
+look-ups are not counted. Batch 1, two cameras, every prompt as long as its model's config allows, a
+full memory; recurrent memories read a full window. Past frames arrive as stored tokens, as they do
+in training; what the vision tower spends on them in an episode is a number of its own.
 """
 
 from collections.abc import Callable
@@ -74,7 +75,10 @@ def _check_attention_is_counted() -> None:
     mask = torch.zeros(1, 1, 20, 50, device="meta")
     counted = flops(lambda: nn.functional.scaled_dot_product_attention(q, k, k, attn_mask=mask))
     if counted != 2 * (2 * 8 * 20 * 50 * 32):
-        raise UserError(f"This PyTorch ({torch.__version__}) counts {counted} FLOPs for an attention of 1,024,000.")
+        raise UserError(
+            f"This PyTorch ({torch.__version__}) counts {counted} FLOPs for an attention of"
+            " 1,024,000."
+        )
 
 
 def _streamed(policy: Policy, batch: Any) -> int | None:

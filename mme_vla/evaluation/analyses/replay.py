@@ -1,4 +1,6 @@
-"""Recorded episodes run through a policy: its chunks, its recurrence, and what its memory selects."""
+"""Recorded episodes run through a policy: its chunks, its recurrence, and what its
+memory selects.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -31,9 +33,14 @@ def check_episode(source: EpisodeSource, episode: Any) -> None:
 
 
 def replay(
-    policy: MMEPolicy, source: EpisodeSource, episode: int, stride: int = STRIDE, most: int | None = None
+    policy: MMEPolicy,
+    source: EpisodeSource,
+    episode: int,
+    stride: int = STRIDE,
+    most: int | None = None,
 ) -> Iterator[tuple[int, Episode]]:
-    """Show a recorded episode frame by frame and let the policy act at every `stride`-th execution step.
+    """Show a recorded episode frame by frame and let the policy act at every `stride`-th execution
+    step.
 
     A robot whose actions are motions acts wherever it decides.
 
@@ -55,7 +62,9 @@ def replay(
         n_observed = step + 1
         if text is not None:
             texts = source.subgoals(episode, step)
-            require(text.kind in texts, f"{source.name} has no {text.kind}, which this policy reads.")
+            require(
+                text.kind in texts, f"{source.name} has no {text.kind}, which this policy reads."
+            )
             running.subgoal = texts[text.kind]
         policy.act([running])
         yield step, running
@@ -94,8 +103,8 @@ def give_statistics(policy: MMEPolicy, source: EpisodeSource) -> None:
 class RecurrenceCurves:
     """One episode's recurrence: frames [t] it took, in order, and a number of each by name.
 
-    TTT: `inner_loss_before` and `inner_loss_after` the update by this frame, `step_size`, `clipped_gradients`,
-    `clipped_rates` (shares). RMT: `slot_change`, relative.
+    TTT: `inner_loss_before` and `inner_loss_after` the update by this frame, `step_size`,
+    `clipped_gradients`, `clipped_rates` (shares). RMT: `slot_change`, relative.
     """
 
     episode: int
@@ -105,11 +114,15 @@ class RecurrenceCurves:
 
 
 @torch.no_grad()
-def recurrence_curves(policy: MMEPolicy, source: EpisodeSource, episode: int, stride: int = STRIDE) -> RecurrenceCurves:
+def recurrence_curves(
+    policy: MMEPolicy, source: EpisodeSource, episode: int, stride: int = STRIDE
+) -> RecurrenceCurves:
     """Run the memory over the window it has at an episode's last chunk."""
     memory = policy.memory
     if not isinstance(memory, RecurrentMemory):
-        raise UserError("This policy has no recurrent memory: choose one such as ttt_modul or rmt_expert.")
+        raise UserError(
+            "This policy has no recurrent memory: choose one such as ttt_modul or rmt_expert."
+        )
     last = None
     for last in replay(policy, source, episode, stride):  # noqa: B007  (only the last is wanted)
         pass
@@ -135,7 +148,8 @@ _PAIR = ("inner_loss_before", "inner_loss_after")
 
 
 def recurrence_plot(episodes: Sequence[RecurrenceCurves], title: str) -> str:
-    """One panel a number, one colour an episode, over the frames taken; a dotted line where its video ends.
+    """One panel a number, one colour an episode, over the frames taken; a dotted line where its
+    video ends.
 
     TTT's loss before and after a frame's update share a panel: dashed before, solid after.
     """
@@ -145,17 +159,28 @@ def recurrence_plot(episodes: Sequence[RecurrenceCurves], title: str) -> str:
         for panel, name in zip(axes, panels, strict=True):
             for i, episode in enumerate(episodes):
                 colour = COLOURS[i % len(COLOURS)]
-                curve_styles = [(_PAIR[0], "--"), (_PAIR[1], "-")] if name == "inner loss" else [(name, "-")]
+                curve_styles = (
+                    [(_PAIR[0], "--"), (_PAIR[1], "-")] if name == "inner loss" else [(name, "-")]
+                )
                 for curve, style in curve_styles:
                     label = f"episode {episode.episode}" if style == "-" else None
-                    panel.plot(episode.frames, episode.curves[curve], style, color=colour, lw=1.4, label=label)
+                    panel.plot(
+                        episode.frames,
+                        episode.curves[curve],
+                        style,
+                        color=colour,
+                        lw=1.4,
+                        label=label,
+                    )
                 if episode.exec_start:
                     panel.axvline(episode.exec_start, color=colour, ls=":", lw=0.9)
             panel.set_title(name.replace("_", " "), loc="left", fontsize=10)
             panel.set_ylim(bottom=0)
         axes[-1].set_xlabel("frame of the episode")
         canvas.suptitle(title, x=0.02, ha="left", color=FAINT, fontsize=10)
-        canvas.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
+        canvas.legend(
+            *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9
+        )
         return svg(canvas)
 
 
@@ -173,7 +198,10 @@ def selection_sheets(
     require(every >= 1, f"every={every} must be at least 1: the steps between two images.")
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     frames = source.frames(episode, np.arange(length))
-    history, patches = OnlineHistory(memory.storage, make_scorer(memory), start), memory.storage.grid**2
+    history, patches = (
+        OnlineHistory(memory.storage, make_scorer(memory), start),
+        memory.storage.grid**2,
+    )
     motion = normalised_states(source.states(episode, 0, length))
     history.motion, history.state_width = motion.__getitem__, motion.shape[1]
     n_observed = 0
@@ -182,5 +210,11 @@ def selection_sheets(
         history.append(part, torch.zeros(len(history.to_encode(len(part))), patches, 1))
         n_observed = step + 1
         selected = memory.select(history, step)
-        title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode, step)}"
-        yield step, memory_sheet(frames[: step + 1], selected, memory.storage.grid, start, step, title)
+        title = (
+            f"{name} at step {step}: {len(selected)} of {memory.budget} tokens ·"
+            f" {source.goal(episode, step)}"
+        )
+        yield (
+            step,
+            memory_sheet(frames[: step + 1], selected, memory.storage.grid, start, step, title),
+        )

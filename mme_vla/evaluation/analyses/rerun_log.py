@@ -43,7 +43,9 @@ class RerunLog:
         self._log(name, image.compress(jpeg_quality=_JPEG_QUALITY))
 
     def number(self, name: str, value: float) -> None:
-        """Log a number; those below one parent (`attention/memory`, `attention/language`) share a plot."""
+        """Log a number; those below one parent (`attention/memory`, `attention/language`) share a
+        plot.
+        """
         self._log(name, self._rerun.Scalars(float(value)))
 
     def words(self, name: str, text: str) -> None:

@@ -22,15 +22,17 @@ PARTS = {"memory": "memory", "images": "observation", "prompt": "language", "act
 class AttentionMass:
     """Attention probability mass of the action tokens by layer and part.
 
-    parts: names of the columns. layers: [depth, parts], each row sums to 1: means over action tokens, heads, Euler
-    steps and samples.
+    parts: names of the columns. layers: [depth, parts], each row sums to 1: means over action
+    tokens, heads, Euler steps and samples.
     """
 
     parts: list[str]
     layers: Tensor
 
     def share(self, part: str) -> Tensor:
-        """Mass by layer [depth] outside the actions themselves, so that it adds up to 100 % as in the paper's table."""
+        """Mass by layer [depth] outside the actions themselves, so that it adds up to 100 % as in
+        the paper's table.
+        """
         self_mass = self.layers[:, self.parts.index("action")]
         return self.layers[:, self.parts.index(part)] / (1 - self_mass)
 
@@ -38,13 +40,17 @@ class AttentionMass:
         """(part, mean, maximum over layers) in percent; the actions' own share is of everything."""
         rows = []
         for part in self.parts:
-            values = self.layers[:, self.parts.index(part)] if part == "action" else self.share(part)
+            values = (
+                self.layers[:, self.parts.index(part)] if part == "action" else self.share(part)
+            )
             rows.append((part, 100 * float(values.mean()), 100 * float(values.max())))
         return rows
 
 
 class Watch[T]:
-    """Adds up numbers of a policy's modules while it is entered; a subclass adds the hooks and reads the sums."""
+    """Adds up numbers of a policy's modules while it is entered; a subclass adds the hooks and
+    reads the sums.
+    """
 
     def __init__(self, policy: MMEPolicy) -> None:
         self.policy = policy
@@ -69,7 +75,10 @@ class Watch[T]:
         return self._checked(since)
 
     def _checked(self, sums: Tensor) -> T:
-        require(sums.any(), f"{type(self).__name__} has seen nothing: let the policy act inside the `with` block.")
+        require(
+            sums.any(),
+            f"{type(self).__name__} has seen nothing: let the policy act inside the `with` block.",
+        )
         return self._read(sums)
 
     def _hooks(self) -> list[Any]:
@@ -154,7 +163,8 @@ class AttentionWatch(Watch[AttentionMass]):
 
 @dataclass
 class ModulationStats:
-    """Mean and deviation [depth] of a layer's predicted scales a and biases β, over samples, steps, tokens, features.
+    """Mean and deviation [depth] of a layer's predicted scales a and biases β, over samples, steps,
+    tokens, features.
 
     The residual stream is multiplied by 1 + a. `overall` pools the layers.
     """
@@ -171,17 +181,22 @@ class ModulationWatch(Watch[ModulationStats]):
         integration = self.policy.integration
         if not isinstance(integration, Modulator):
             raise UserError(
-                "This policy has no modulator to observe: choose integration=modulator, or framesamp_modul."
+                "This policy has no modulator to observe: choose integration=modulator, or"
+                " framesamp_modul."
             )
         if not self._sums.ndim:
             self._sums = torch.zeros(len(integration.layers), 2, 3, dtype=torch.float64)
         linears: list[Any] = [layer.modulation for layer in integration.layers]
-        return [linear.register_forward_hook(partial(self._take, i)) for i, linear in enumerate(linears)]
+        return [
+            linear.register_forward_hook(partial(self._take, i)) for i, linear in enumerate(linears)
+        ]
 
     def _read(self, sums: Tensor) -> ModulationStats:
         mean, std = _moments(sums)  # depth × (scale, bias) × (count, sum, squares)
         means, stds = _moments(sums.sum(0))
-        overall = {name: (float(means[i]), float(stds[i])) for i, name in enumerate(("scale", "bias"))}
+        overall = {
+            name: (float(means[i]), float(stds[i])) for i, name in enumerate(("scale", "bias"))
+        }
         return ModulationStats((mean[:, 0], std[:, 0]), (mean[:, 1], std[:, 1]), overall)
 
     def _take(self, index: int, _module: nn.Module, _args: tuple, output: Tensor) -> None:

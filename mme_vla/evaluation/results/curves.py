@@ -1,4 +1,6 @@
-"""A curve instead of a point: success over how far a dial of `split=stress:…` is turned; the test split is its zero."""
+"""A curve instead of a point: success over how far a dial of `split=stress:…` is turned; the test
+split is its zero.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +21,9 @@ from mme_vla.evaluation.results.tables import Table, task_tables
 
 @dataclass(frozen=True)
 class Point:
-    """Success of a model on a task at one place of a dial. interval: Wilson's, over distinct episodes; in percent."""
+    """Success of a model on a task at one place of a dial. interval: Wilson's, over distinct
+    episodes; in percent.
+    """
 
     turned: float
     won: int
@@ -36,7 +40,9 @@ Curves = dict[tuple[str, str, str], list[Point]]  # (model, task, dial) → poin
 
 
 class Place(NamedTuple):
-    """Where a record lies on a dial: the run at the dial's zero, the dial, how far it is turned, and its zero."""
+    """Where a record lies on a dial: the run at the dial's zero, the dial, how far it is turned,
+    and its zero.
+    """
 
     run: RunKey
     dial: str
@@ -44,8 +50,12 @@ class Place(NamedTuple):
     zero: float = 0
 
 
-def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:
-    """Success over every dial that records were made with; records of the test split are at its zero."""
+def stress_curves(
+    records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse"
+) -> Curves:
+    """Success over every dial that records were made with; records of the test split are at its
+    zero.
+    """
 
     def place(record: EpisodeRecord) -> Place | None:
         variant = read_variant(record.split)
@@ -54,7 +64,11 @@ def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, co
         return Place(record.run._replace(split=BASE), variant.dial, variant.turned)
 
     curves = curves_of(merge(records, conflicts), place, confidence)
-    require(curves, "None of these records is of a stress split: evaluate with split=stress:count=2, for instance.")
+    require(
+        curves,
+        "None of these records is of a stress split: evaluate with split=stress:count=2, for"
+        " instance.",
+    )
     return curves
 
 
@@ -66,11 +80,13 @@ def curves_of(
 ) -> Curves:
     """Success over every dial.
 
-    A point counts the episodes that the model has at every place of the dial: one curve is of the same episodes.
+    A point counts the episodes that the model has at every place of the dial: one curve is of the
+    same episodes.
 
-    records: merged. place: where a record lies; None for a record that lies on none, or at the zero. same_scenes:
-        whether a dial leaves the scene as it is, so that only equal scenes are counted; one that changes the scene
-        keeps the episode's number and seed alone.
+    records: merged. place: where a record lies; None for a record that lies on none, or at the
+    zero. same_scenes:
+        whether a dial leaves the scene as it is, so that only equal scenes are counted; one that
+        changes the scene keeps the episode's number and seed alone.
     """
     groups: dict[tuple[str, str, str, float], dict[float, list[EpisodeRecord]]] = {}
     for record in records:
@@ -112,7 +128,9 @@ def stress_table(curves: Curves, title: str = "Success over the dials") -> Table
     for (run, task, dial), points in sorted(curves.items()):
         for p in points:
             interval = f"[{p.interval.low:.1f}, {p.interval.high:.1f}]"
-            rows.append([run, task, dial, f"{p.turned:g}", str(p.episodes), f"{p.rate:.1f}", interval])
+            rows.append(
+                [run, task, dial, f"{p.turned:g}", str(p.episodes), f"{p.rate:.1f}", interval]
+            )
     return Table(title, ["run", "task", "dial", "at", "episodes", "success (%)", "interval"], rows)
 
 
@@ -130,21 +148,39 @@ def stress_figures(curves: Curves, unit: str = "more than in the benchmark") -> 
 
 
 def curve_figure(
-    runs: Mapping[str, Sequence[tuple[float, float, Interval]]], label: str, training: tuple[float, float] | None = None
+    runs: Mapping[str, Sequence[tuple[float, float, Interval]]],
+    label: str,
+    training: tuple[float, float] | None = None,
 ) -> str:
     """Success over an amount, a curve of every run, as SVG.
 
-    runs: name → amount, success in percent and its interval. label: of the amount. training: its shaded range.
+    runs: name → amount, success in percent and its interval. label: of the amount. training: its
+    shaded range.
     """
     with figure((5.6, 3.0 + 0.2 * (len(runs) + (training is not None)))) as (canvas, (axes,)):
         if training is not None:
             axes.axvspan(*training, color="0.9", label="training range")
-        for i, (name, points) in enumerate(zip(distinct_parts(list(runs)), runs.values(), strict=True)):
+        for i, (name, points) in enumerate(
+            zip(distinct_parts(list(runs)), runs.values(), strict=True)
+        ):
             amounts, rates, intervals = zip(*points, strict=True)
-            below = [max(rate - interval.low, 0) for rate, interval in zip(rates, intervals, strict=True)]
-            above = [max(interval.high - rate, 0) for rate, interval in zip(rates, intervals, strict=True)]
-            axes.errorbar(amounts, rates, [below, above], fmt="-o", ms=5, capsize=3, color=COLOURS[i % len(COLOURS)],
-                          label=name)  # fmt: skip
+            below = [
+                max(rate - interval.low, 0) for rate, interval in zip(rates, intervals, strict=True)
+            ]
+            above = [
+                max(interval.high - rate, 0)
+                for rate, interval in zip(rates, intervals, strict=True)
+            ]
+            axes.errorbar(
+                amounts,
+                rates,
+                [below, above],
+                fmt="-o",
+                ms=5,
+                capsize=3,
+                color=COLOURS[i % len(COLOURS)],
+                label=name,
+            )
         axes.set_xlabel(label)
         axes.set_ylabel("success (%)")
         axes.set_ylim(0, 100)
@@ -153,7 +189,9 @@ def curve_figure(
 
 
 def distinct_parts(runs: Sequence[str]) -> list[str]:
-    """The names of runs without what all of them share, for a legend; of one run its first part, the model."""
+    """The names of runs without what all of them share, for a legend; of one run its first part,
+    the model.
+    """
     parts = [run.split(", ") for run in runs]
     shared = set.intersection(*map(set, parts)) if len(parts) > 1 else set(parts[0][1:])
     return [", ".join(part for part in its if part not in shared) for its in parts]
@@ -161,8 +199,9 @@ def distinct_parts(runs: Sequence[str]) -> list[str]:
 
 EXTRA = "process"  # Where a record keeps it
 CAPTION = (
-    "Progress: sub-tasks done, of those there are. Then how many episodes ended by a wrong choice that is a mistake of "
-    "memory (which one, where, how many, in what order, how), by another wrong one, or with the time run out."
+    "Progress: sub-tasks done, of those there are. Then how many episodes ended by a wrong choice"
+    " that is a mistake of memory (which one, where, how many, in what order, how), by another"
+    " wrong one, or with the time run out."
 )
 
 
@@ -183,4 +222,9 @@ def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:
     progress = 100 * np.mean([score.done / max(score.of, 1) for score in scores])
     ends = Counter(score.operation or score.broke or "success" for score in scores)
     counts = [ends[kind] for kind in ("success", *OPERATIONS, MOTION, "stuck")]
-    return [name, str(len(scores)), f"{progress:.1f}", *("–" if not count else str(count) for count in counts)]
+    return [
+        name,
+        str(len(scores)),
+        f"{progress:.1f}",
+        *("–" if not count else str(count) for count in counts),
+    ]

@@ -1,4 +1,5 @@
-"""Runs with events beside their matched arms, the same scenes and noise without: pairs, and success over length.
+"""Runs with events beside their matched arms, the same scenes and noise without: pairs, and success
+over length.
 
 Trainings of one recipe on the same data are one row and one curve.
 """
@@ -33,11 +34,16 @@ def matched_methods(results: Results) -> list[tuple[Method, Method]]:
         return tuple(getattr(method, name) for name in names)
 
     baseline = {identity(method): method for method in results.methods if method.event is None}
-    return [(m, baseline[identity(m)]) for m in results.methods if m.event is not None and identity(m) in baseline]
+    return [
+        (m, baseline[identity(m)])
+        for m in results.methods
+        if m.event is not None and identity(m) in baseline
+    ]
 
 
 def matched_pairs(records: Sequence[EpisodeRecord]) -> tuple[dict[RunKey, list[Pair]], list[str]]:
-    """The pairs of every run with events, and notes on episodes that were not paired for their scenes.
+    """The pairs of every run with events, and notes on episodes that were not paired for their
+    scenes.
 
     An episode that ended in an error has no pair.
 
@@ -60,21 +66,29 @@ def matched_pairs(records: Sequence[EpisodeRecord]) -> tuple[dict[RunKey, list[P
 
 
 def did_not_act(record: EpisodeRecord) -> list[str]:
-    """The events of a record whose place never came: a sub-task that did not begin, a step beyond the end."""
+    """The events of a record whose place never came: a sub-task that did not begin, a step beyond
+    the end.
+    """
     return [entry["event"] for entry in record.extra.get("events", ()) if entry["step"] is None]
 
 
 def idle_events(records: Sequence[EpisodeRecord]) -> list[str]:
     """A line for each event that did not act in some episodes."""
-    counts = Counter(event for record in records if record.outcome != "error" for event in did_not_act(record))
-    return [f"event={event} did not act in {count} episodes: its place never came." for event, count in counts.items()]
+    counts = Counter(
+        event for record in records if record.outcome != "error" for event in did_not_act(record)
+    )
+    return [
+        f"event={event} did not act in {count} episodes: its place never came."
+        for event, count in counts.items()
+    ]
 
 
 def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> Table:
     """Of every recipe, event and task: both success rates, and which outcomes the event changed.
 
-    A rate is the mean over trainings, ± its sample standard deviation. Pairs are those of all trainings. p is a
-    sign test over scenes: one is lost, or gained, where more trainings lose it than gain it, or fewer.
+    A rate is the mean over trainings, ± its sample standard deviation. Pairs are those of all
+    trainings. p is a sign test over scenes: one is lost, or gained, where more trainings lose it
+    than gain it, or fewer.
     """
     merged = merge(records, conflicts)
     require(any(record.event for record in merged), NO_EVENTS)
@@ -90,10 +104,22 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
             rows.append([str(run._replace(event=None)), str(run.event), task, *_counts(there)])
         rules.add(len(rows))
     columns = [
-        "run", "event", "task", "trainings", "pairs", "without (%)", "with (%)", "kept", "lost", "gained", "p",
+        "run",
+        "event",
+        "task",
+        "trainings",
+        "pairs",
+        "without (%)",
+        "with (%)",
+        "kept",
+        "lost",
+        "gained",
+        "p",
         "did not act",
-    ]  # fmt: skip
-    return Table("Events beside their matched arms", columns, rows, rules - {len(rows)}, notes=notes)
+    ]
+    return Table(
+        "Events beside their matched arms", columns, rows, rules - {len(rows)}, notes=notes
+    )
 
 
 def _recipe(training: TrainingIdentity | None) -> TrainingIdentity | None:
@@ -106,23 +132,36 @@ def _counts(pairs: Sequence[Pair]) -> list[str]:
     for record, baseline in pairs:
         trainings.setdefault(record.training, []).append((baseline.success, record.success))
     outcomes = [outcome for part in trainings.values() for outcome in part]
-    retained, lost, gained = (outcomes.count(outcome) for outcome in ((True, True), (True, False), (False, True)))
+    retained, lost, gained = (
+        outcomes.count(outcome) for outcome in ((True, True), (True, False), (False, True))
+    )
     rates = 100 * np.array([np.mean(part, axis=0) for part in trainings.values()])
     texts = [f"{rate:.1f}" for rate in rates.mean(0)]
     if len(rates) > 1:
-        texts = [f"{text} ± {std:.1f}" for text, std in zip(texts, rates.std(0, ddof=1), strict=True)]
+        texts = [
+            f"{text} ± {std:.1f}" for text, std in zip(texts, rates.std(0, ddof=1), strict=True)
+        ]
     idle = sum(bool(did_not_act(record)) for record, _ in pairs)
     counts = [str(len(trainings)), str(len(pairs)), *texts, str(retained), str(lost), str(gained)]
     scenes: Counter[EpisodeKey] = Counter()
     for record, baseline in pairs:
         scenes[record.key] += baseline.success - record.success
-    p = sign_test(sum(balance > 0 for balance in scenes.values()), sum(balance < 0 for balance in scenes.values()))
+    p = sign_test(
+        sum(balance > 0 for balance in scenes.values()),
+        sum(balance < 0 for balance in scenes.values()),
+    )
     return [*counts, show_p(p), str(idle)]
 
 
-def event_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:
-    """Success over the number of every event that has one; the plain run is at its neutral number."""
-    merged = [replace(record, training=_recipe(record.training)) for record in merge(records, conflicts)]
+def event_curves(
+    records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse"
+) -> Curves:
+    """Success over the number of every event that has one; the plain run is at its
+    neutral number.
+    """
+    merged = [
+        replace(record, training=_recipe(record.training)) for record in merge(records, conflicts)
+    ]
     return curves_of(merged, _place, confidence, same_scenes=True)
 
 

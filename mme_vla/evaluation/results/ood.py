@@ -1,8 +1,9 @@
-"""RoboMME-OOD and the hard test episodes: tables by tier beside published figures, twins, and extrapolation.
+"""RoboMME-OOD and the hard test episodes: tables by tier beside published figures, twins, and
+extrapolation.
 
-The published figures are development records of the benchmark's authors (early October 2026): one run a policy, 1,600
-steps allowed, from `hongzefu/robomme_benchmark_MotionJEPA`, docs/validation (`v9-two-policy-gl10-20261002-01`,
-`sg-eval-gl-20261004-01`, `sg-eval-gl-20261006-03`).
+The published figures are development records of the benchmark's authors (early October 2026): one
+run a policy, 1,600 steps allowed, from `hongzefu/robomme_benchmark_MotionJEPA`, docs/validation
+(`v9-two-policy-gl10-20261002-01`, `sg-eval-gl-20261004-01`, `sg-eval-gl-20261006-03`).
 """
 
 from collections.abc import Sequence
@@ -38,7 +39,9 @@ AMOUNTS: dict[str, tuple[str, str, tuple[int, int]]] = {
     "PatternLock": ("path length", "actions.path_nodes", (2, 8)),
     "RouteStick": ("path length", "actions.turns", (2, 7)),
 }
-"""Task → what grows in harder scenes, the value that says it, and its range in the training episodes."""
+"""Task → what grows in harder scenes, the value that says it, and its range in the training
+episodes.
+"""
 
 
 @dataclass(frozen=True)
@@ -77,11 +80,24 @@ def base_of(split: str) -> str:
     return OOD if base.startswith(f"{OOD}:") else base
 
 
-def tier_tables(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> list[Table]:
+def tier_tables(
+    records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse"
+) -> list[Table]:
     """For each run on RoboMME-OOD: success by task and tier, beside the published figures."""
-    merged = [r for r in merge(records, conflicts) if base_of(r.split) == OOD and read_variant(r.split) is None]
+    merged = [
+        r
+        for r in merge(records, conflicts)
+        if base_of(r.split) == OOD and read_variant(r.split) is None
+    ]
     published = paper_table("ood")
-    columns = ["task", *TIERS, "all", "%", f"{100 * confidence:g} %", *(row["method"] for row in published)]
+    columns = [
+        "task",
+        *TIERS,
+        "all",
+        "%",
+        f"{100 * confidence:g} %",
+        *(row["method"] for row in published),
+    ]
     tables = []
     for run, members in by_run(merged).items():
         rows = []
@@ -90,8 +106,16 @@ def tier_tables(records: Sequence[EpisodeRecord], confidence: float = 0.95, conf
             cells = [[r for r in mine if r.difficulty == tier] for tier in TIERS]
             share = Share.of(mine, confidence)
             known = [_published(row, task) for row in published]
-            rows.append([task, *(str(Share.of(cell, confidence)) if cell else "–" for cell in cells), str(share),
-                         f"{share.rate:.1f}", share.span, *known])  # fmt: skip
+            rows.append(
+                [
+                    task,
+                    *(str(Share.of(cell, confidence)) if cell else "–" for cell in cells),
+                    str(share),
+                    f"{share.rate:.1f}",
+                    share.span,
+                    *known,
+                ]
+            )
         title = f"{run} on RoboMME-OOD; published: {SOURCE}"
         tables.append(Table(title, columns, rows, {len(rows) - 1}, {len(rows) - 1}))
     return tables
@@ -102,8 +126,12 @@ def _published(row: dict[str, str], task: str) -> str:
     return f"{100 * int(row[task]) / episodes:.1f}"
 
 
-def hard_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Table | None:
-    """Success on the test split's hard episodes beside the published figures; None without such records."""
+def hard_table(
+    records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse"
+) -> Table | None:
+    """Success on the test split's hard episodes beside the published figures; None without such
+    records.
+    """
     merged = [r for r in merge(records, conflicts) if r.split == HARD]
     if not merged:
         return None
@@ -115,18 +143,26 @@ def hard_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, confl
         won = [int(n) for n in row["won"].split()]
         rate = 100 * sum(won) / len(won) / int(row["episodes"])
         rows.append(
-            [f"{row['method']}, published", f"{', '.join(map(str, won))} of {row['episodes']}", f"{rate:.1f}", ""]
+            [
+                f"{row['method']}, published",
+                f"{', '.join(map(str, won))} of {row['episodes']}",
+                f"{rate:.1f}",
+                "",
+            ]
         )
     columns = ["run", "successes", "%", f"{100 * confidence:g} %"]
     return Table(f"Hard test episodes; published: {SOURCE}", columns, rows, {len(by_run(merged))})
 
 
-def twin_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Table | None:
+def twin_table(
+    records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse"
+) -> Table | None:
     """Each split beside its twin, on their common episodes; None without a pair.
 
-    In the twin what is to be remembered stays in view: what fails there is lost by control, and the difference to the
-    split itself by memory. Flips are episodes that were run more than once alike and ended otherwise. Episodes whose
-    scenes are not the same are left out, and counted in the table's notes.
+    In the twin what is to be remembered stays in view: what fails there is lost by control, and the
+    difference to the split itself by memory. Flips are episodes that were run more than once alike
+    and ended otherwise. Episodes whose scenes are not the same are left out, and counted in the
+    table's notes.
     """
     merged = merge(records, conflicts)
     repeats = repeated_episodes(records)
@@ -134,7 +170,9 @@ def twin_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, confl
     rows, notes = [], list[str]()
     for run, members in runs.items():
         twin = run._replace(split=TWIN if run.split == BASE else f"{TWIN}:{run.split}")
-        sides = [{record.key: [record] for record in side} for side in (members, runs.get(twin, []))]
+        sides = [
+            {record.key: [record] for record in side} for side in (members, runs.get(twin, []))
+        ]
         pairing = pair(sides)
         notes += pairing.notes(f"{run} and its twin")
         pairs = [(sides[0][key][0], sides[1][key][0]) for key in pairing.keys]
@@ -143,26 +181,45 @@ def twin_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, confl
         base, visible = (Share.of(side, confidence) for side in zip(*pairs, strict=True))
         better = sum(b.success and not a.success for a, b in pairs)
         worse = sum(a.success and not b.success for a, b in pairs)
-        repeated, flipped = (sum(n) for n in zip(repeats.get(run, (0, 0)), repeats.get(twin, (0, 0)), strict=True))
-        rows.append([
-            str(run), str(len(pairs)), f"{base.rate:.1f} {base.span}", f"{visible.rate:.1f} {visible.span}",
-            f"{visible.rate - base.rate:+.1f}", f"{100 - visible.rate:.1f}", f"{better} : {worse}",
-            f"{flipped} of {repeated}" if repeated else "none run twice",
-        ])  # fmt: skip
-    columns = ["run", "episodes", "split (%)", "twin (%)", "lost by memory", "lost by control", "gained : lost",
-               "flips of equal runs"]  # fmt: skip
+        repeated, flipped = (
+            sum(n) for n in zip(repeats.get(run, (0, 0)), repeats.get(twin, (0, 0)), strict=True)
+        )
+        rows.append(
+            [
+                str(run),
+                str(len(pairs)),
+                f"{base.rate:.1f} {base.span}",
+                f"{visible.rate:.1f} {visible.span}",
+                f"{visible.rate - base.rate:+.1f}",
+                f"{100 - visible.rate:.1f}",
+                f"{better} : {worse}",
+                f"{flipped} of {repeated}" if repeated else "none run twice",
+            ]
+        )
+    columns = [
+        "run",
+        "episodes",
+        "split (%)",
+        "twin (%)",
+        "lost by memory",
+        "lost by control",
+        "gained : lost",
+        "flips of equal runs",
+    ]
     title = "Twins: what memory loses and what control loses"
     return Table(title, columns, rows, notes=notes) if rows or notes else None
 
 
-# Extrapolation ----------------------------------------------------------------------------------------------------
+# Extrapolation ------------------------------------------------------------------------------------
 
 
 @cache
 def amount_of(task: str, split: str, key: EpisodeKey, scene: str | None = None) -> int | None:
-    """How often, how many or how long an episode is, by `AMOUNTS`; scenes without a row are built for that.
+    """How often, how many or how long an episode is, by `AMOUNTS`; scenes without a row are built
+    for that.
 
-    None where the scene cannot be built, or is another one here than the one with the digest `scene`.
+    None where the scene cannot be built, or is another one here than the one with the digest
+    `scene`.
     """
     from mme_vla.envs.scene.placement import SceneError
 
@@ -195,14 +252,18 @@ Extrapolation = dict[tuple[str, str], dict[int, Share]]
 def extrapolation(
     records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse"
 ) -> Extrapolation:
-    """Success against the amount of what grows, over all splits of a model: training, test, stress and OOD.
+    """Success against the amount of what grows, over all splits of a model: training, test, stress
+    and OOD.
 
-    Twins, splits with sessions, and scenes that cannot be built or are other ones here are left out.
+    Twins, splits with sessions, and scenes that cannot be built or are other ones here are left
+    out.
     """
     groups: dict[tuple[str, str], dict[int, list[EpisodeRecord]]] = {}
     for record in merge(records, conflicts):
         variant = read_variant(record.split)
-        if record.task not in AMOUNTS or (variant is not None and (variant.twin or variant.sessions)):
+        if record.task not in AMOUNTS or (
+            variant is not None and (variant.twin or variant.sessions)
+        ):
             continue
         amount = amount_of(record.task, record.split, record.key, record.named_scene)
         if amount is None:
@@ -216,14 +277,27 @@ def extrapolation(
 
 
 def extrapolation_table(curves: Extrapolation) -> Table | None:
-    """Every point, a row each; amounts beyond the training range are marked. None without a point."""
+    """Every point, a row each; amounts beyond the training range are marked. None
+    without a point.
+    """
     rows = []
     for (run, task), points in sorted(curves.items()):
         kind, _, (least, most) = AMOUNTS[task]
         for amount, share in points.items():
             trained = "trained" if least <= amount <= most else "beyond"
-            rows.append([run, task, kind, str(amount), trained, str(share), f"{share.rate:.1f}", share.span])
-    columns = ["run", "task", "what grows", "amount", "training range", "successes", "success (%)", "interval"]
+            rows.append(
+                [run, task, kind, str(amount), trained, str(share), f"{share.rate:.1f}", share.span]
+            )
+    columns = [
+        "run",
+        "task",
+        "what grows",
+        "amount",
+        "training range",
+        "successes",
+        "success (%)",
+        "interval",
+    ]
     return Table("Extrapolation", columns, rows) if rows else None
 
 

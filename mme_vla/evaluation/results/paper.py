@@ -20,7 +20,8 @@ class PaperMethod(NamedTuple):
     """A method of the paper, and what it is here.
 
     name: as the data files spell it. label: as one writes it.
-    model, subgoal: this library's names, None if it has none. family: none, symbolic, perceptual, recurrent or prior.
+    model, subgoal: this library's names, None if it has none. family: none, symbolic, perceptual,
+    recurrent or prior.
     """
 
     name: str
@@ -31,7 +32,9 @@ class PaperMethod(NamedTuple):
 
 
 class PaperResult(NamedTuple):
-    """A success rate in percent and its standard deviation over the runs; None where the paper prints none."""
+    """A success rate in percent and its standard deviation over the runs; None where the paper
+    prints none.
+    """
 
     mean: float
     std: float | None = None
@@ -58,7 +61,9 @@ def paper_methods() -> dict[str, PaperMethod]:
 
 def paper_method(model: str, subgoal: str | None = None) -> PaperMethod | None:
     """The paper's method that a model of this library is, or None."""
-    return next((m for m in paper_methods().values() if (m.model, m.subgoal) == (model, subgoal)), None)
+    return next(
+        (m for m in paper_methods().values() if (m.model, m.subgoal) == (model, subgoal)), None
+    )
 
 
 @cache
@@ -101,9 +106,10 @@ _COUNTED = Path(__file__).resolve().parents[2] / "assets" / "cost.csv"
 class ModelCost:
     """One model's cost; all but `prompt` (tokens) and `parameters` in FLOPs.
 
-    forward: the loss of one training sample. chunk: memory, prefix and ten Euler steps. memory: of these, encoding the
-    memory tokens from scratch. streamed: instead, a recurrent memory's update by one frame (None for others). frames:
-    the vision tower on those of `REPLAN` passing frames that the memory stores.
+    forward: the loss of one training sample. chunk: memory, prefix and ten Euler steps. memory: of
+    these, encoding the memory tokens from scratch. streamed: instead, a recurrent memory's update
+    by one frame (None for others). frames: the vision tower on those of `REPLAN` passing frames
+    that the memory stores.
     """
 
     model: str
@@ -121,8 +127,14 @@ def counted() -> dict[str, ModelCost]:
     """The shipped counts of every model at full size, made by `python -m mme_vla.analyse cost`."""
     with _COUNTED.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    numbers = [{key: int(text) if text else None for key, text in row.items() if key != "model"} for row in rows]
-    return {row["model"]: ModelCost(row["model"], **of) for row, of in zip(rows, numbers, strict=True)}  # type: ignore
+    numbers = [
+        {key: int(text) if text else None for key, text in row.items() if key != "model"}
+        for row in rows
+    ]
+    return {
+        row["model"]: ModelCost(row["model"], **of)  # type: ignore[arg-type]
+        for row, of in zip(rows, numbers, strict=True)
+    }
 
 
 def chunk_flops() -> dict[str, float]:
@@ -134,7 +146,9 @@ def write_costs(costs: list[ModelCost], path: Path) -> None:
     """Write counts as CSV."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [member.name for member in fields(ModelCost)], lineterminator="\n")
+        writer = csv.DictWriter(
+            file, [member.name for member in fields(ModelCost)], lineterminator="\n"
+        )
         writer.writeheader()
         writer.writerows(asdict(cost) for cost in costs)
 
@@ -150,7 +164,8 @@ def demo_records(
     seeds: Sequence[int] = PAPER_SEEDS,
     episodes: int = 50,
 ) -> list[EpisodeRecord]:
-    """Draw outcomes at random: right on average for the paper's per-task rates, and meaningless otherwise.
+    """Draw outcomes at random: right on average for the paper's per-task rates, and meaningless
+    otherwise.
 
     An episode is as hard for every method, so that runs agree as real ones do.
 
@@ -163,17 +178,37 @@ def demo_records(
         for task, result in per_task(known.name).items():
             number = PAPER_ORDER.index(task)
             levels = [_LEVELS[e % 4] for e in range(episodes)]
-            ease = np.random.default_rng([number]).normal(scale=1.5, size=episodes) + [_EASE[level] for level in levels]
+            ease = np.random.default_rng([number]).normal(scale=1.5, size=episodes) + [
+                _EASE[level] for level in levels
+            ]
             chances = _chances(ease, result.mean / 100)
             for checkpoint in checkpoints:
                 for seed in seeds:
-                    rng = np.random.default_rng([zlib.crc32(known.name.encode()), number, checkpoint, seed])
+                    rng = np.random.default_rng(
+                        [zlib.crc32(known.name.encode()), number, checkpoint, seed]
+                    )
                     for episode, won in enumerate(rng.random(episodes) < chances):
-                        steps = int(TASK_FACTS[task].steps * rng.uniform(0.7, 1.1)) if won else MAX_STEPS
-                        place = (model, checkpoint, seed, task, episode, 1000 * number + episode, levels[episode])
+                        steps = (
+                            int(TASK_FACTS[task].steps * rng.uniform(0.7, 1.1))
+                            if won
+                            else MAX_STEPS
+                        )
+                        place = (
+                            model,
+                            checkpoint,
+                            seed,
+                            task,
+                            episode,
+                            1000 * number + episode,
+                            levels[episode],
+                        )
                         ended = ("success" if won else "timeout", steps)
                         time = Seconds(0.02 * steps, 0.01 * steps, 0.03 * steps)
-                        records.append(EpisodeRecord(*place, *ended, time, subgoal=subgoal, extra={"made_up": True}))
+                        records.append(
+                            EpisodeRecord(
+                                *place, *ended, time, subgoal=subgoal, extra={"made_up": True}
+                            )
+                        )
     return records
 
 

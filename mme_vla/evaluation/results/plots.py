@@ -15,28 +15,48 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 COLOURS = ("#1f6f8b", "#e07a2f", "#5a9367", "#8d5a97", "#c44536", "#7a8b99", "#b8972f", "#3d5a80")
-FAMILIES = {"none": "#7a8b99", "symbolic": "#b8972f", "perceptual": "#1f6f8b", "recurrent": "#8d5a97",
-            "prior": "#b5523b"}  # fmt: skip
+FAMILIES = {
+    "none": "#7a8b99",
+    "symbolic": "#b8972f",
+    "perceptual": "#1f6f8b",
+    "recurrent": "#8d5a97",
+    "prior": "#b5523b",
+}
 INK, FAINT = "#2b2d42", "#8d99ae"
 MOST_BARS = 8
 SWEPT = ("framesamp_modul", "tokendrop_modul")  # Models whose memory budget the paper varies
 _STYLE = {
-    "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 10, "axes.edgecolor": FAINT,
-    "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK, "ytick.color": INK, "axes.spines.top": False,
-    "axes.spines.right": False, "axes.grid": True, "axes.grid.axis": "y", "grid.color": "#e3e6ec",
-    "axes.axisbelow": True, "legend.frameon": False, "svg.hashsalt": "mme_vla",
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "grid.color": "#e3e6ec",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "svg.hashsalt": "mme_vla",
     "text.parse_math": False,  # a name may hold dollar signs
-}  # fmt: skip
+}
 
 
 def bars(results: Results, kind: str, wide: bool = False) -> str:
-    """Success of every suite, functional group or difficulty, a bar a method; black lines are the paper's numbers.
+    """Success of every suite, functional group or difficulty, a bar a method; black lines are the
+    paper's numbers.
 
-    Whiskers are the confidence intervals; a method without a complete run has no bar. Beyond `MOST_BARS` methods the
-    tables and the heat map have to do.
+    Whiskers are the confidence intervals; a method without a complete run has no bar. Beyond
+    `MOST_BARS` methods the tables and the heat map have to do.
     """
     having = [
-        (i, m) for i, m in enumerate(results.methods) if any(f.complete for f in m.figures.get(kind, {}).values())
+        (i, m)
+        for i, m in enumerate(results.methods)
+        if any(f.complete for f in m.figures.get(kind, {}).values())
     ]
     having = having[:MOST_BARS]
     names = list(dict.fromkeys(name for _, method in having for name in method.figures[kind]))
@@ -45,15 +65,24 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
         for place, (i, method) in enumerate(having):
             shift = (place - (len(having) - 1) / 2) * width
             figures = [(j + shift, method.figures[kind][name]) for j, name in enumerate(names)]
-            complete = [(at, f.mean, f.interval) for at, f in figures if f.mean is not None and f.interval is not None]
+            complete = [
+                (at, f.mean, f.interval)
+                for at, f in figures
+                if f.mean is not None and f.interval is not None
+            ]
             xs, heights = [at for at, *_ in complete], [mean for _, mean, _ in complete]
-            gaps = [[mean - of.low for _, mean, of in complete], [of.high - mean for _, mean, of in complete]]
+            gaps = [
+                [mean - of.low for _, mean, of in complete],
+                [of.high - mean for _, mean, of in complete],
+            ]
             axes.bar(xs, heights, 0.88 * width, color=_colour(i), label=method.label)
             axes.errorbar(xs, heights, np.maximum(gaps, 0), fmt="none", ecolor=INK, elinewidth=0.9)
             lines += [(at, f.paper.mean) for at, f in figures if f.paper is not None]
         if lines:
             ends = [(at - 0.46 * width, at + 0.46 * width) for at, _ in lines]
-            axes.hlines([y for _, y in lines], *zip(*ends, strict=True), color="black", lw=2, label="paper")
+            axes.hlines(
+                [y for _, y in lines], *zip(*ends, strict=True), color="black", lw=2, label="paper"
+            )
         axes.set_xticks(range(len(names)), [_folded(name) for name in names])
         axes.set_ylabel("success (%)")
         axes.set_ylim(0, 100)
@@ -113,11 +142,29 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
                 x, y = flops[known.model] / 1e12, paper.average(known.name).mean
                 label = None if known.family in named else f"{_FAMILY_NAMES[known.family]} (paper)"
                 named.add(known.family)
-                axes.scatter(x, y, s=38, facecolors="none", edgecolors=FAMILIES[known.family], lw=1.3, label=label)
+                axes.scatter(
+                    x,
+                    y,
+                    s=38,
+                    facecolors="none",
+                    edgecolors=FAMILIES[known.family],
+                    lw=1.3,
+                    label=label,
+                )
         for i, method in enumerate(results.methods):
-            if method.model in flops and method.memory_budget is None and method.average.mean is not None:
+            if (
+                method.model in flops
+                and method.memory_budget is None
+                and method.average.mean is not None
+            ):
                 x, average = flops[method.model] / 1e12, method.average
-                style = {"color": _colour(i), "ecolor": INK, "elinewidth": 0.9, "ms": 7, "label": method.label}
+                style = {
+                    "color": _colour(i),
+                    "ecolor": INK,
+                    "elinewidth": 0.9,
+                    "ms": 7,
+                    "label": method.label,
+                }
                 axes.errorbar(x, method.average.mean, average.std or 0, fmt="o", **style)  # type: ignore[arg-type]
         axes.set_xlabel("TFLOPs of a sampled chunk at full size (counted)")
         axes.set_ylabel("average success (%)")
@@ -128,12 +175,18 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
         return svg(canvas)
 
 
-_FAMILY_NAMES = {"none": "no memory", "symbolic": "symbolic", "perceptual": "perceptual", "recurrent": "recurrent",
-                 "prior": "prior method"}  # fmt: skip
+_FAMILY_NAMES = {
+    "none": "no memory",
+    "symbolic": "symbolic",
+    "perceptual": "perceptual",
+    "recurrent": "recurrent",
+    "prior": "prior method",
+}
 
 
 def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) -> str:
-    """Success over the memory budget: the paper's sweep dashed, one's own models with their intervals.
+    """Success over the memory budget: the paper's sweep dashed, one's own models with their
+    intervals.
 
     points: as `budget_points` gives them.
     """
@@ -144,16 +197,44 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
         for marker, model in zip("ov", SWEPT, strict=True):
             values = [float(row[f"{model}_success"]) for row in table]
             colour = _colour(order.index(model)) if model in points else FAINT
-            axes.plot(budgets, values, f"--{marker}", color=colour, mfc="white", ms=5, lw=1.1, label=f"{model} (paper)")
+            axes.plot(
+                budgets,
+                values,
+                f"--{marker}",
+                color=colour,
+                mfc="white",
+                ms=5,
+                lw=1.1,
+                label=f"{model} (paper)",
+            )
         for model, model_points in points.items():
             complete = [
-                (b, f.mean, f.interval) for b, f in model_points if f.mean is not None and f.interval is not None
+                (b, f.mean, f.interval)
+                for b, f in model_points
+                if f.mean is not None and f.interval is not None
             ]
-            gaps = [[mean - of.low for _, mean, of in complete], [of.high - mean for _, mean, of in complete]]
-            style = {"color": _colour(order.index(model)), "lw": 1.8, "ms": 6, "capsize": 3, "label": model}
-            axes.errorbar([b for b, *_ in complete], [mean for _, mean, _ in complete], gaps, fmt="-s", **style)  # type: ignore[arg-type]
+            gaps = [
+                [mean - of.low for _, mean, of in complete],
+                [of.high - mean for _, mean, of in complete],
+            ]
+            style = {
+                "color": _colour(order.index(model)),
+                "lw": 1.8,
+                "ms": 6,
+                "capsize": 3,
+                "label": model,
+            }
+            axes.errorbar(
+                [b for b, *_ in complete],
+                [mean for _, mean, _ in complete],
+                gaps,
+                fmt="-s",
+                **style,  # type: ignore[arg-type]
+            )
         axes.set_xscale("log", base=2)
-        ticks = sorted({*budgets, *(b for model_points in points.values() for b, _ in model_points)})
+        ticks = sorted(
+            {*budgets, *(b for model_points in points.values() for b, _ in model_points)}
+        )
         axes.set_xticks(ticks, [f"{b:,}" for b in ticks])
         axes.minorticks_off()
         axes.set_xlabel("memory tokens")
@@ -164,11 +245,15 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
 
 
 def budget_points(methods: Sequence[Method], default: int) -> dict[str, list[tuple[int, Figure]]]:
-    """The average at each budget, ascending, of every model with a sweep, or that the paper swept; complete only."""
+    """The average at each budget, ascending, of every model with a sweep, or that the paper swept;
+    complete only.
+    """
     points: dict[str, list[tuple[int, Figure]]] = {}
     for method in methods:
         if method.average.mean is not None:
-            points.setdefault(method.model, []).append((method.memory_budget or default, method.average))
+            points.setdefault(method.model, []).append(
+                (method.memory_budget or default, method.average)
+            )
     return {
         model: sorted(model_points, key=lambda point: point[0])
         for model, model_points in points.items()
@@ -199,9 +284,16 @@ def legend(canvas: "Canvas", axes: "Axes", columns: int) -> None:
     """A legend above the panel, clear of its content, in so many columns at most."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        order = sorted(range(len(labels)), key=lambda i: labels[i].endswith("paper"))  # last, in the bars
-        canvas.legend([handles[i] for i in order], [labels[i] for i in order], loc="outside upper center",
-                      ncols=min(len(labels), columns), fontsize=9)  # fmt: skip
+        order = sorted(
+            range(len(labels)), key=lambda i: labels[i].endswith("paper")
+        )  # last, in the bars
+        canvas.legend(
+            [handles[i] for i in order],
+            [labels[i] for i in order],
+            loc="outside upper center",
+            ncols=min(len(labels), columns),
+            fontsize=9,
+        )
 
 
 def _colour(i: int) -> str:

@@ -1,4 +1,6 @@
-"""Reports: one self-contained HTML page with its images inside, and the training details of a submission."""
+"""Reports: one self-contained HTML page with its images inside, and the training details of a
+submission.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,8 +23,9 @@ from mme_vla.utils.pages import render
 class Section:
     """A box of a page.
 
-    figure: SVG from `plots.svg`. headed: whether tables stand under their titles. folded: tables behind a summary.
-    images: name and WEBP in base64. half: whether it takes half the width, beside another.
+    figure: SVG from `plots.svg`. headed: whether tables stand under their titles. folded: tables
+    behind a summary. images: name and WEBP in base64. half: whether it takes half the width, beside
+    another.
     """
 
     title: str
@@ -37,24 +40,45 @@ class Section:
 
 
 def html_page(
-    title: str, sections: Sequence[Section], subtitle: str = "", notes: Sequence[str] = (), sortable: bool = False
+    title: str,
+    sections: Sequence[Section],
+    subtitle: str = "",
+    notes: Sequence[str] = (),
+    sortable: bool = False,
 ) -> str:
-    """One self-contained page of these sections. sortable: whether a click on a heading sorts its table."""
-    return render("page.html", title=title, subtitle=subtitle, notes=notes, sections=sections, sortable=sortable)
+    """One self-contained page of these sections. sortable: whether a click on a heading sorts its
+    table.
+    """
+    return render(
+        "page.html",
+        title=title,
+        subtitle=subtitle,
+        notes=notes,
+        sections=sections,
+        sortable=sortable,
+    )
 
 
 def html_report(results: Results, comparisons: Sequence[Comparison], title: str) -> str:
-    """The page. results: of any number of methods. comparisons: shown if there are any. title: of the page."""
+    """The page. results: of any number of methods. comparisons: shown if there are any. title: of
+    the page.
+    """
     protocol = results.protocol
     methods, runs = len(results.methods), sum(len(method.runs) for method in results.methods)
     sub = f"{methods} method{'s' * (methods > 1)}, {runs} run{'s' * (runs > 1)} of "
-    sub += f"{len(protocol.averaged)} tasks × {protocol.episodes} episodes · {datetime.now(UTC):%Y-%m-%d}"
+    sub += (
+        f"{len(protocol.averaged)} tasks × {protocol.episodes} episodes ·"
+        f" {datetime.now(UTC):%Y-%m-%d}"
+    )
     average, whiskers = (
         overview(results),
         f"Whiskers: {100 * protocol.confidence:g} % intervals. Black lines: the paper.",
     )
     difficulty = "Mean over tasks of the episodes of a difficulty."
-    rings = "Rings: the paper's averages. Neither subgoal predictors nor the encoding of past frames are counted."
+    rings = (
+        "Rings: the paper's averages. Neither subgoal predictors nor the encoding of past frames"
+        " are counted."
+    )
     points = plots.budget_points(results.methods, DEFAULT_BUDGET)
     sections = [
         Section("Overview", tables=[average], caption=f"{average.title}."),
@@ -62,19 +86,30 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
         Section("Difficulty", plots.bars(results, "difficulty"), caption=difficulty, half=True),
         Section("Functional groups", plots.bars(results, "group", wide=True), caption=whiskers),
         Section("Tasks", plots.heat_map(results), caption="Success rate in percent."),
-        Section("Efficiency", plots.efficiency(results, chunk_flops()), caption=rings, half=bool(points)),
+        Section(
+            "Efficiency", plots.efficiency(results, chunk_flops()), caption=rings, half=bool(points)
+        ),
     ]
     if points:
         curve = plots.budget_curve(results, points)
-        sections.append(Section("Memory budget", curve, caption="Dashed: the paper's sweep.", half=True))
+        sections.append(
+            Section("Memory budget", curve, caption="Dashed: the paper's sweep.", half=True)
+        )
     if comparisons:
         verdicts = "; ".join(comparison.verdict for comparison in comparisons) + "."
-        sections.append(Section("Paired comparison", tables=[comparison_table(comparisons)], caption=verdicts))
+        sections.append(
+            Section("Paired comparison", tables=[comparison_table(comparisons)], caption=verdicts)
+        )
     if subgoals := subgoal_tables(results):
-        text = "Words are right when they equal the environment's, points aside; distances are of the points then."
+        text = (
+            "Words are right when they equal the environment's, points aside; distances are of the"
+            " points then."
+        )
         sections.append(Section("Subgoals", tables=subgoals, headed=True, caption=text))
     if chains := process_tables(results):
-        sections.append(Section("Where the chain broke", tables=chains, headed=True, caption=CAPTION))
+        sections.append(
+            Section("Where the chain broke", tables=chains, headed=True, caption=CAPTION)
+        )
     details = [(method.label, detail(method, results)) for method in results.methods]
     sections += [
         Section("Every method in full", folded=details),
@@ -88,23 +123,35 @@ def _method_text(results: Results) -> list[str]:
     protocol = results.protocol
     errors = "count as failures" if protocol.errors == "failure" else "count as not run"
     return [
-        "Means and sample standard deviations (n − 1) are over runs, one run being one checkpoint with one model seed; "
-        "suites, groups and the average are means over their tasks within a run first. Only runs that have every "
-        f"episode of a figure enter it. Episodes that ended in an error {errors}.",
-        f"Intervals ({100 * protocol.confidence:g} %): per task Wilson's, for the number of independent trials that "
-        f"all runs are worth; elsewhere a bootstrap over episodes within tasks ({protocol.samples:,} samples, seed "
-        f"{protocol.seed}). They describe other episodes of the same tasks, the deviation other seeds.",
-        "Comparisons pair the episodes of the same scenes: an exact sign test on the episodes that one method solves "
-        "in more of its runs than the other (McNemar's test where each has one run), corrected by Holm for the number "
-        "of pairs.",
+        (
+            "Means and sample standard deviations (n − 1) are over runs, one run being one"
+            " checkpoint with one model seed; suites, groups and the average are means over their"
+            " tasks within a run first. Only runs that have every episode of a figure enter it."
+            f" Episodes that ended in an error {errors}."
+        ),
+        (
+            f"Intervals ({100 * protocol.confidence:g} %): per task Wilson's, for the number of"
+            " independent trials that all runs are worth; elsewhere a bootstrap over episodes"
+            f" within tasks ({protocol.samples:,} samples, seed {protocol.seed}). They describe"
+            " other episodes of the same tasks, the deviation other seeds."
+        ),
+        (
+            "Comparisons pair the episodes of the same scenes: an exact sign test on the episodes"
+            " that one method solves in more of its runs than the other (McNemar's test where each"
+            " has one run), corrected by Holm for the number of pairs."
+        ),
     ]
 
 
 UNKNOWN = "not recorded with these results: state it manually"
 RECIPE = {
-    "steps": "updates", "batch_size": "samples an update", "lr": "peak learning rate", "warmup": "warm-up updates",
-    "ema": "decay of the averaged weights", "weight_decay": "weight decay",
-}  # fmt: skip
+    "steps": "updates",
+    "batch_size": "samples an update",
+    "lr": "peak learning rate",
+    "warmup": "warm-up updates",
+    "ema": "decay of the averaged weights",
+    "weight_decay": "weight decay",
+}
 """Settings of a training worth stating, and what they are called."""
 
 
@@ -128,16 +175,28 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
     for method in methods:
         for checkpoint in dict.fromkeys(run.key.checkpoint for run in method.runs):
             about = [
-                run for run in runs
-                if (run["settings"].get("model"), run["settings"].get("checkpoint")) == (method.model, checkpoint)
+                run
+                for run in runs
+                if (run["settings"].get("model"), run["settings"].get("checkpoint"))
+                == (method.model, checkpoint)
                 and method.composition in ((run.get("notes") or {}).get("composition"), None)
-            ]  # fmt: skip
-            facts = next((run["notes"]["policy"] for run in about if (run.get("notes") or {}).get("policy")), None)
-            seeds = sorted({run.key.model_seed for run in method.runs if run.key.checkpoint == checkpoint})
-            record = next(r for run in method.runs if run.key.checkpoint == checkpoint for r in run.records.values())
+            ]
+            facts = next(
+                (run["notes"]["policy"] for run in about if (run.get("notes") or {}).get("policy")),
+                None,
+            )
+            seeds = sorted(
+                {run.key.model_seed for run in method.runs if run.key.checkpoint == checkpoint}
+            )
+            record = next(
+                r
+                for run in method.runs
+                if run.key.checkpoint == checkpoint
+                for r in run.records.values()
+            )
             evaluation = (
-                f"split {record.split}, {record.action_space} actions, at most {record.max_steps} steps, "
-                f"model seeds {', '.join(map(str, seeds))}"
+                f"split {record.split}, {record.action_space} actions, at most {record.max_steps}"
+                f" steps, model seeds {', '.join(map(str, seeds))}"
             )
             title = f"{method.label}, checkpoint {checkpoint}"
             policies.append({"title": title, "facts": [*_lines(facts), ("evaluation", evaluation)]})
@@ -161,7 +220,11 @@ def _lines(facts: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def _settings(recipe: Mapping[str, Any]) -> str:
-    stated = (f"{words} {_text(recipe[name])}" for name, words in RECIPE.items() if recipe.get(name) is not None)
+    stated = (
+        f"{words} {_text(recipe[name])}"
+        for name, words in RECIPE.items()
+        if recipe.get(name) is not None
+    )
     return ", ".join(stated) or UNKNOWN
 
 

@@ -80,11 +80,12 @@ def task_facts(name: str) -> Task:
 class Protocol:
     """What a whole run consists of, and how its figures are made.
 
-    tasks, episodes: a run is complete with episodes 0 … episodes − 1 of every task; where some are the benchmark's, of
+    tasks, episodes: a run is complete with episodes 0 … episodes − 1 of every task; where some are
+    the benchmark's, of
         these: tasks of one's own have figures of their own, beside the average.
     task_suites: task → suite, of environments that are not RoboMME (`suites_of`).
-    errors: whether an episode that ended in an error is a `failure`, as in the official evaluation, or `missing`.
-    confidence, samples, seed: of the intervals; samples and seed are the bootstrap's.
+    errors: whether an episode that ended in an error is a `failure`, as in the official evaluation,
+    or `missing`. confidence, samples, seed: of the intervals; samples and seed are the bootstrap's.
     """
 
     tasks: tuple[str, ...] = PAPER_ORDER
@@ -97,12 +98,23 @@ class Protocol:
 
     def __post_init__(self) -> None:
         for holds, message in (
-            (self.tasks and len(set(self.tasks)) == len(self.tasks),
-             f"tasks={list(self.tasks)} must name at least one task, each once."),
-            (self.episodes >= 1, f"episodes={self.episodes} must be at least 1: how many a task has."),
-            (self.errors in ("failure", "missing"), f"errors={self.errors!r} must be failure or missing."),
-            (0 < self.confidence < 1, f"confidence={self.confidence} must lie between 0 and 1, for instance 0.95."),
-        ):  # fmt: skip
+            (
+                self.tasks and len(set(self.tasks)) == len(self.tasks),
+                f"tasks={list(self.tasks)} must name at least one task, each once.",
+            ),
+            (
+                self.episodes >= 1,
+                f"episodes={self.episodes} must be at least 1: how many a task has.",
+            ),
+            (
+                self.errors in ("failure", "missing"),
+                f"errors={self.errors!r} must be failure or missing.",
+            ),
+            (
+                0 < self.confidence < 1,
+                f"confidence={self.confidence} must lie between 0 and 1, for instance 0.95.",
+            ),
+        ):
             require(holds, message)
 
     def expects(self, key: EpisodeKey) -> bool:
@@ -110,7 +122,9 @@ class Protocol:
 
     @property
     def averaged(self) -> tuple[str, ...]:
-        """The tasks that the average is over: the benchmark's, or all where none is the benchmark's."""
+        """The tasks that the average is over: the benchmark's, or all where none is the
+        benchmark's.
+        """
         return tuple(task for task in self.tasks if task in TASK_FACTS) or self.tasks
 
     @property
@@ -125,7 +139,11 @@ class Protocol:
     def facts(self, task: str) -> Task:
         """What is known of a task; of an environment's own it is the suite."""
         facts = task_facts(task)
-        return facts if task in TASK_FACTS else facts._replace(suite=self.task_suites.get(task, USER_SUITE))
+        return (
+            facts
+            if task in TASK_FACTS
+            else facts._replace(suite=self.task_suites.get(task, USER_SUITE))
+        )
 
     def choose(self, attribute: str, value: str) -> list[str]:
         """The tasks of a suite or group that take part."""
@@ -134,14 +152,22 @@ class Protocol:
 
 def suites_of(records: Iterable[EpisodeRecord]) -> dict[str, str]:
     """Task → suite, as the records of other environments than RoboMME name it."""
-    return {r.task: str(r.extra["suite"]) for r in records if r.extra.get("suite") and r.task not in TASK_FACTS}
+    return {
+        r.task: str(r.extra["suite"])
+        for r in records
+        if r.extra.get("suite") and r.task not in TASK_FACTS
+    }
 
 
 def tasks_of(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
-    """The tasks that a run consists of by default: the benchmark's, if a record is of one, and the user's own."""
+    """The tasks that a run consists of by default: the benchmark's, if a record is of one, and the
+    user's own.
+    """
     names = {record.task for record in records}
     user_tasks = tuple(sorted(names - TASK_FACTS.keys()))
-    return (*PAPER_ORDER, *user_tasks) if names & TASK_FACTS.keys() or not user_tasks else user_tasks
+    return (
+        (*PAPER_ORDER, *user_tasks) if names & TASK_FACTS.keys() or not user_tasks else user_tasks
+    )
 
 
 class Scope(NamedTuple):
@@ -155,7 +181,9 @@ class Scope(NamedTuple):
 def scopes(protocol: Protocol) -> list[Scope]:
     """Everything figures are made of, whole tasks at a time (difficulties cut across them)."""
     result = [Scope("task", task, (task,)) for task in protocol.tasks]
-    result += [Scope("suite", suite, tuple(protocol.choose("suite", suite))) for suite in protocol.suites]
+    result += [
+        Scope("suite", suite, tuple(protocol.choose("suite", suite))) for suite in protocol.suites
+    ]
     result += [Scope("group", group, tuple(protocol.choose("group", group))) for group in GROUPS]
     result += [Scope("average", "average", protocol.averaged)]
     return [scope for scope in result if scope.tasks]

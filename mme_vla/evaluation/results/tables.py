@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 @dataclass
 class Table:
-    """A table of text. rules: rows before which a line is printed. strong: rows in bold. notes: sentences below it."""
+    """A table of text. rules: rows before which a line is printed. strong: rows in bold. notes:
+    sentences below it.
+    """
 
     title: str
     columns: Sequence[str]
@@ -36,15 +38,21 @@ def task_tables(
     columns: Sequence[str],
     row: Callable[[str, Sequence[EpisodeRecord]], list[str]],
 ) -> list[Table]:
-    """A table of every method whose records have `extra[key]`: a row for each task that has any, and one for all."""
+    """A table of every method whose records have `extra[key]`: a row for each task that has any,
+    and one for all.
+    """
     tables = []
     for method in results.methods:
-        records = [record for run in method.runs for record in run.records.values() if key in record.extra]
+        records = [
+            record for run in method.runs for record in run.records.values() if key in record.extra
+        ]
         by_task = {task: [r for r in records if r.task == task] for task in results.protocol.tasks}
         rows = [row(task, members) for task, members in by_task.items() if members]
         if records:
             rows.append(row("all", records))
-            tables.append(Table(f"{method.label}: {title}", columns, rows, {len(rows) - 1}, {len(rows) - 1}))
+            tables.append(
+                Table(f"{method.label}: {title}", columns, rows, {len(rows) - 1}, {len(rows) - 1})
+            )
     return tables
 
 
@@ -59,7 +67,11 @@ def show(figure: Figure, short: bool = False) -> str:
         partial = "" if figure.partial is None else f" ({figure.partial:.1f} so far)"
         return f"{figure.done:,} of {figure.expected:,} episodes{partial}"
     text = f"{figure.mean:.2f}" + ("" if figure.std is None else f" ± {figure.std:.2f}")
-    return text if figure.complete == figure.runs else f"{text} ({figure.complete} of {figure.runs} runs)"
+    return (
+        text
+        if figure.complete == figure.runs
+        else f"{text} ({figure.complete} of {figure.runs} runs)"
+    )
 
 
 def span(interval: Interval | None) -> str:
@@ -71,7 +83,9 @@ def show_paper(figure: Figure) -> str:
     """What the paper reports for a figure."""
     if figure.paper is None:
         return ""
-    return f"{figure.paper.mean:.2f}" + ("" if figure.paper.std is None else f" ± {figure.paper.std:.2f}")
+    return f"{figure.paper.mean:.2f}" + (
+        "" if figure.paper.std is None else f" ± {figure.paper.std:.2f}"
+    )
 
 
 def overview(results: Results) -> Table:
@@ -79,12 +93,23 @@ def overview(results: Results) -> Table:
     suites = results.protocol.suites
     level = f"{100 * results.protocol.confidence:g} %"
     nested = any(len(method.trainings) > 1 for method in results.methods)
-    columns = ["method", *(["trainings"] if nested else []), "runs", "episodes", *suites, "average", level, "paper"]
+    columns = [
+        "method",
+        *(["trainings"] if nested else []),
+        "runs",
+        "episodes",
+        *suites,
+        "average",
+        level,
+        "paper",
+    ]
     rows = []
     for method in results.methods:
         average = method.average
         episodes = (
-            f"{average.done:,}" if average.done == average.expected else f"{average.done:,} of {average.expected:,}"
+            f"{average.done:,}"
+            if average.done == average.expected
+            else f"{average.done:,} of {average.expected:,}"
         )
         cells = [show(method.figures["suite"][suite], short=True) for suite in suites]
         figures = [show(average, short=True), span(average.interval), show_paper(average)]
@@ -95,13 +120,19 @@ def overview(results: Results) -> Table:
 
 
 def detail(method: Method, results: Results) -> Table:
-    """One method: tasks by suite, suites, functional groups, difficulties, average, beside the paper's numbers."""
+    """One method: tasks by suite, suites, functional groups, difficulties, average, beside the
+    paper's numbers.
+    """
     level = f"{100 * results.protocol.confidence:g} %"
     rows: list[list[str]] = []
     rules, strong = set(), set()
 
     def add(name: str, figure: Figure, mark: bool = False) -> None:
-        gap = "" if figure.mean is None or figure.paper is None else f"{figure.mean - figure.paper.mean:+.2f}"
+        gap = (
+            ""
+            if figure.mean is None or figure.paper is None
+            else f"{figure.mean - figure.paper.mean:+.2f}"
+        )
         if mark:
             strong.add(len(rows))
         rows.append([name, show(figure), span(figure.interval), show_paper(figure), gap])
@@ -117,7 +148,9 @@ def detail(method: Method, results: Results) -> Table:
         rules.add(len(rows))
     add("average", method.average, True)
     title = f"{method.label}: {len(method.runs)} runs"
-    return Table(title, ["", "success (%)", level, "paper", "difference"], rows, rules - {len(rows)}, strong)
+    return Table(
+        title, ["", "success (%)", level, "paper", "difference"], rows, rules - {len(rows)}, strong
+    )
 
 
 def runs_table(results: Results) -> Table:
@@ -127,11 +160,23 @@ def runs_table(results: Results) -> Table:
     for method in results.methods:
         for run in method.runs:
             outcomes = run.outcomes
-            rate = f"{100 * outcomes['success'] / run.expected:.2f}" if run.complete else "incomplete"
+            rate = (
+                f"{100 * outcomes['success'] / run.expected:.2f}" if run.complete else "incomplete"
+            )
             done = f"{len(run.averaged)} of {run.expected}"
             counts = [str(outcomes[name]) for name in ("success", "fail", "timeout", "error")]
             seed = [str(run.key.training.seed) if run.key.training else ""] if named else []
-            rows.append([method.label, *seed, str(run.key.checkpoint), str(run.key.model_seed), done, *counts, rate])
+            rows.append(
+                [
+                    method.label,
+                    *seed,
+                    str(run.key.checkpoint),
+                    str(run.key.model_seed),
+                    done,
+                    *counts,
+                    rate,
+                ]
+            )
     trained = ["training seed"] if named else []
     ends = ["episodes", "success", "fail", "timeout", "error", "average (%)"]
     columns = ["method", *trained, "checkpoint", "seed", *ends]
@@ -143,12 +188,30 @@ def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     rows = []
     for c in comparisons:
         paired = f"{c.episodes}" if c.episodes == c.expected else f"{c.episodes} of {c.expected}"
-        rows.append([
-            f"{c.first} − {c.second}", paired, f"{c.first_rate:.2f}", f"{c.second_rate:.2f}", f"{c.difference:+.2f}",
-            f"[{c.interval.low:+.1f}, {c.interval.high:+.1f}]", c.better_worse, show_p(c.corrected),
-            "yes" if c.significant else "no",
-        ])  # fmt: skip
-    columns = ["pair", "episodes", "first", "second", "difference", "interval", "better : worse", "p", "significant"]
+        rows.append(
+            [
+                f"{c.first} − {c.second}",
+                paired,
+                f"{c.first_rate:.2f}",
+                f"{c.second_rate:.2f}",
+                f"{c.difference:+.2f}",
+                f"[{c.interval.low:+.1f}, {c.interval.high:+.1f}]",
+                c.better_worse,
+                show_p(c.corrected),
+                "yes" if c.significant else "no",
+            ]
+        )
+    columns = [
+        "pair",
+        "episodes",
+        "first",
+        "second",
+        "difference",
+        "interval",
+        "better : worse",
+        "p",
+        "significant",
+    ]
     return Table("Paired comparison, percentage points", columns, rows)
 
 
@@ -163,7 +226,10 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
         order = {seed: i for i, seed in enumerate(PAPER_SEEDS)}
         runs.sort(key=lambda run: (order.get(run.key.model_seed, len(order)), run.key.model_seed))
         several = len(by_training(runs)) > 1
-        names = [f"Training {run.key.training.seed}, " if several and run.key.training else "" for run in runs]
+        names = [
+            f"Training {run.key.training.seed}, " if several and run.key.training else ""
+            for run in runs
+        ]
         seeds = [f"{name}Seed {run.key.model_seed}" for name, run in zip(names, runs, strict=True)]
         columns = ["Task", *seeds, "Average"]
         values: list[list[float | str]] = []
@@ -181,7 +247,10 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
         run_columns = [[row[i] for row in values] for i in range(len(runs))]
         values.append([_mean(column) for column in run_columns])
         labels = [*results.protocol.averaged, "**Average**"]
-        rows = [[name, *map(_percent, row), _percent(_mean(row))] for name, row in zip(labels, values, strict=True)]
+        rows = [
+            [name, *map(_percent, row), _percent(_mean(row))]
+            for name, row in zip(labels, values, strict=True)
+        ]
         tables.append(Table(f"{method.label}, checkpoint {checkpoint}", columns, rows))
     return tables
 
@@ -202,16 +271,22 @@ def to_rich(table: Table) -> "RichTable":
 
     made = RichTable(title=Text(printable(table.title)), title_justify="left", title_style="bold")
     for i, column in enumerate(table.columns):
-        made.add_column(Text(printable(column)), justify="left" if i == 0 else "right", overflow="fold")
+        made.add_column(
+            Text(printable(column)), justify="left" if i == 0 else "right", overflow="fold"
+        )
     for i, row in enumerate(table.rows):
         if i in table.rules:
             made.add_section()
-        made.add_row(*(Text(printable(cell)) for cell in row), style="bold" if i in table.strong else None)
+        made.add_row(
+            *(Text(printable(cell)) for cell in row), style="bold" if i in table.strong else None
+        )
     return made
 
 
 def print_table(table: Table, width: int) -> None:
-    """Print for people: `width` columns, or as many as the table needs, so that no number is ever cut."""
+    """Print for people: `width` columns, or as many as the table needs, so that no number is ever
+    cut.
+    """
     from rich.console import Console
 
     made = to_rich(table)
@@ -226,10 +301,23 @@ def to_markdown(table: Table) -> str:
     return f"### {escape_markdown(table.title)}\n\n{body}\n"
 
 
-_LATEX = {"\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "±": r"$\pm$", "−": "$-$",
-          "<": "$<$", ">": "$>$",
-          "π": r"$\pi$", "$": r"\$", "{": r"\{", "}": r"\}",
-          "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}  # fmt: skip
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "_": r"\_",
+    "%": r"\%",
+    "&": r"\&",
+    "#": r"\#",
+    "±": r"$\pm$",
+    "−": "$-$",
+    "<": "$<$",
+    ">": "$>$",
+    "π": r"$\pi$",
+    "$": r"\$",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
 
 
 def to_latex(table: Table) -> str:
@@ -237,17 +325,31 @@ def to_latex(table: Table) -> str:
 
     def line(cells: Sequence[str], strong: bool = False) -> str:
         escaped = ("".join(_LATEX.get(letter, letter) for letter in cell) for cell in cells)
-        return " & ".join(rf"\textbf{{{cell}}}" if strong and cell else cell for cell in escaped) + r" \\"
+        return (
+            " & ".join(rf"\textbf{{{cell}}}" if strong and cell else cell for cell in escaped)
+            + r" \\"
+        )
 
     body = []
     for i, row in enumerate(table.rows):
         body += [r"\midrule"] * (i in table.rules) + [line(row, i in table.strong)]
     caption = line([table.title]).removesuffix(r" \\")
-    return "\n".join([
-        r"\begin{table}", r"\centering", rf"\caption{{{caption}}}",
-        rf"\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}",
-        r"\toprule", line(table.columns), r"\midrule", *body, r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            r"\begin{table}",
+            r"\centering",
+            rf"\caption{{{caption}}}",
+            rf"\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}",
+            r"\toprule",
+            line(table.columns),
+            r"\midrule",
+            *body,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+            "",
+        ]
+    )
 
 
 def _no_formula(text: str) -> str:
@@ -256,13 +358,26 @@ def _no_formula(text: str) -> str:
 
 
 CSV_COLUMNS = (
-    "method", "kind", "name", "mean", "std", "low", "high", "runs", "complete_runs", "episodes", "expected_episodes",
-    "paper_mean", "paper_std",
-)  # fmt: skip
+    "method",
+    "kind",
+    "name",
+    "mean",
+    "std",
+    "low",
+    "high",
+    "runs",
+    "complete_runs",
+    "episodes",
+    "expected_episodes",
+    "paper_mean",
+    "paper_std",
+)
 
 
 def to_csv(results: Results) -> str:
-    """Every figure as a row of numbers; names that a spreadsheet would run as formulas get an apostrophe first."""
+    """Every figure as a row of numbers; names that a spreadsheet would run as formulas get an
+    apostrophe first.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(CSV_COLUMNS)
@@ -271,7 +386,20 @@ def to_csv(results: Results) -> str:
             for name, f in figures.items():
                 low, high = f.interval or (None, None)
                 reported = f.paper or (None, None)
-                numbers = [f.mean, f.std, low, high, f.runs, f.complete, f.done, f.expected, *reported]
-                cells = [f"{n:.4f}" if isinstance(n, float) else ("" if n is None else str(n)) for n in numbers]
+                numbers = [
+                    f.mean,
+                    f.std,
+                    low,
+                    high,
+                    f.runs,
+                    f.complete,
+                    f.done,
+                    f.expected,
+                    *reported,
+                ]
+                cells = [
+                    f"{n:.4f}" if isinstance(n, float) else ("" if n is None else str(n))
+                    for n in numbers
+                ]
                 writer.writerow([*map(_no_formula, (method.label, kind, name)), *cells])
     return out.getvalue()

@@ -1,7 +1,8 @@
-"""The environment's side of a rollout, in a worker process: executes whole chunks and hands back every frame.
+"""The environment's side of a rollout, in a worker process: executes whole chunks and hands back
+every frame.
 
-A worker gets a chunk at a time, so it simulates on while the policy acts in others. Its frames come in the form the
-policy reads, and its report says where the time went.
+A worker gets a chunk at a time, so it simulates on while the policy acts in others. Its frames come
+in the form the policy reads, and its report says where the time went.
 """
 
 import time
@@ -36,7 +37,8 @@ REPORTED = (
 _BLIND = np.zeros((SIDE, SIDE, 3), np.uint8)
 
 Observation = dict[str, Any]
-"""Every camera by its name: lists of uint8 [H, W, 3], or None where a frame was not requested; `state`: float32 [t, s].
+"""Every camera by its name: lists of uint8 [H, W, 3], or None where a frame was not requested;
+`state`: float32 [t, s].
 
 The robot's `readings`, if it has any, are lists of all frames.
 """
@@ -49,13 +51,18 @@ class RenderClock:
         self.seconds = 0.0
 
     def watch(self, env: Any) -> None:
-        """Time the images of this environment; those of the official package are part of its simulation."""
+        """Time the images of this environment; those of the official package are part of its
+        simulation.
+        """
         scene = getattr(getattr(env, "task", None), "scene", None)
         if scene is None:
             return
         scene.update_render = self._timed(scene.update_render)
         for sensor in scene.sensors.values():
-            sensor.capture, sensor.get_obs = self._timed(sensor.capture), self._timed(sensor.get_obs)
+            sensor.capture, sensor.get_obs = (
+                self._timed(sensor.capture),
+                self._timed(sensor.get_obs),
+            )
 
     def _timed(self, call: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*args: Any, **kwargs: Any) -> Any:
@@ -73,12 +80,14 @@ class ChunkEnv:
 
     Args:
         make: builds an environment with the benchmark's interface.
-        stick: its robot holds a stick, and takes no command of the gripper, which is an action's last number.
-        max_steps: actions after which the outcome is `timeout`, should the environment itself not say so: one more
-            than this is executed, as in the benchmark.
+        stick: its robot holds a stick, and takes no command of the gripper, which is an action's
+            last number.
+        max_steps: actions after which the outcome is `timeout`, should the environment itself not
+            say so: one more than this is executed, as in the benchmark.
         video: records the episode.
         robot: the cameras that are read and the width of an action.
-        max_actions: actions that are executed at most, whatever frames they took; then the outcome is `timeout`.
+        max_actions: actions that are executed at most, whatever frames they took; then the outcome
+            is `timeout`.
         oracle: whether reports name the action [w] that the task's script takes next (`oracle`).
     """
 
@@ -106,7 +115,8 @@ class ChunkEnv:
         self._clock.watch(self._env)
 
     def reset(self, draw: RenderRequest | None = None) -> tuple[Observation, dict[str, Any]]:
-        """All frames of the conditioning video, the current one last, and the report, with the `scene`'s digest.
+        """All frames of the conditioning video, the current one last, and the report, with the
+        `scene`'s digest.
 
         draw: the requested images; by default all.
         """
@@ -119,20 +129,26 @@ class ChunkEnv:
         self._note_subgoal(info)
         self._draw(frames, count, demo=count - 1)
         self._returned = frames.leave(draw, 0)
-        scene = getattr(self._env, "scene_digest", NO_VALUES)  # environments of other packages do not know it
+        scene = getattr(
+            self._env, "scene_digest", NO_VALUES
+        )  # environments of other packages do not know it
         return frames.observation(), self._report(info) | {"scene": scene}
 
-    def step(self, command: dict[str, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, command: dict[str, Any]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Execute actions one after the other until they, or the episode, are over.
 
-        command: `actions` [n, w], or `hold`, the control steps for which the robot stays where it is; `subgoal`, the
-        text that is in the video meanwhile; `draw`, the images that are requested, where it is not all: frames are
-        counted from the reset on, and the newest is the last.
+        command: `actions` [n, w], or `hold`, the control steps for which the robot stays where it
+        is; `subgoal`, the text that is in the video meanwhile; `draw`, the images that are
+        requested, where it is not all: frames are counted from the reset on, and the newest is the
+        last.
 
         Returns:
-            The frames of the executed actions, the sum of their rewards, terminated, truncated, and the report with
-            `executed`, the number of actions, and `steps`, that of frames. After `hold` no action counts as executed,
-            and `held` is the action [w] that keeps the robot there, None before the first one.
+            The frames of the executed actions, the sum of their rewards, terminated, truncated, and
+            the report with `executed`, the number of actions, and `steps`, that of frames. After
+            `hold` no action counts as executed, and `held` is the action [w] that keeps the robot
+            there, None before the first one.
         """
         if "hold" in command:
             self._max_steps += command["hold"]
@@ -158,7 +174,9 @@ class ChunkEnv:
             self._note_pose(observation)
             self._note_subgoal(info)
             n_frames += count
-            self._steps += max(count, 1)  # a choice that moves nothing takes time too, or it could continue for ever
+            self._steps += max(
+                count, 1
+            )  # a choice that moves nothing takes time too, or it could continue for ever
             self._draw(frames, count, caption=command.get("subgoal"))
             spent = self._executed == self._max_actions
             if not (terminated or truncated) and (spent or self._steps > self._max_steps):
@@ -205,7 +223,11 @@ class ChunkEnv:
     def _note_pose(self, observation: dict[str, list[Any]]) -> None:
         if not self._robot.action.of_pose:
             return
-        _require(observation, "eef_state", f"The policy's actions are differences to 'eef_state', {MISSING}")
+        _require(
+            observation,
+            "eef_state",
+            f"The policy's actions are differences to 'eef_state', {MISSING}",
+        )
         if poses := observation["eef_state_list"]:
             self._pose = np.asarray(poses[-1], np.float64)
 
@@ -226,7 +248,10 @@ class ChunkEnv:
 
     def _report(self, info: dict[str, Any]) -> dict[str, Any]:
         report = {key: info[key] for key in REPORTED if key in info}
-        progress, subtask = getattr(getattr(self._env, "task", None), "progress", None), self._n_subgoals
+        progress, subtask = (
+            getattr(getattr(self._env, "task", None), "progress", None),
+            self._n_subgoals,
+        )
         if isinstance(progress, Progress):
             process = process_score(progress, str(report.get("status")))
             report["process"], subtask = process.to_dict(), min(process.done + 1, process.of)
@@ -242,9 +267,15 @@ class ChunkEnv:
 
     def _oracle_action(self) -> np.ndarray | None:
         choice = oracle_of(self._env)
-        return None if choice is None else choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
+        return (
+            None
+            if choice is None
+            else choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
+        )
 
-    def _draw(self, frames: "_Frames", count: int, demo: int = 0, caption: str | None = None) -> None:
+    def _draw(
+        self, frames: "_Frames", count: int, demo: int = 0, caption: str | None = None
+    ) -> None:
         if self._video is not None:
             for index, views in enumerate(frames.newest(count)):
                 self._video.add(views, caption, demo=index < demo)
@@ -257,7 +288,9 @@ class ChunkEnv:
 
 
 def _is_unreachable(observation: Any, info: dict[str, Any]) -> bool:
-    """Whether no joints or no motion reach an action's pose: the policy's failure, not the machine's."""
+    """Whether no joints or no motion reach an action's pose: the policy's failure, not the
+    machine's.
+    """
     return observation == {} or info.get("exception_type") == "PlanningError"
 
 
@@ -265,7 +298,10 @@ MISSING = "which this environment does not deliver"
 
 
 def _require(observation: dict[str, list[Any]], name: str, message: str) -> None:
-    require(f"{name}_list" in observation, f"{message}; there are only {', '.join(sorted(observation))}.")
+    require(
+        f"{name}_list" in observation,
+        f"{message}; there are only {', '.join(sorted(observation))}.",
+    )
 
 
 class _Frames:
@@ -273,8 +309,12 @@ class _Frames:
 
     def __init__(self, robot: Embodiment) -> None:
         self._cameras, self._width = robot.camera_names, robot.state.width
-        beside = CAMERAS if robot.action.space else ()  # the benchmark's videos show both of its cameras
-        self._images: dict[str, list[np.ndarray | None]] = {name: [] for name in (*self._cameras, *beside)}
+        beside = (
+            CAMERAS if robot.action.space else ()
+        )  # the benchmark's videos show both of its cameras
+        self._images: dict[str, list[np.ndarray | None]] = {
+            name: [] for name in (*self._cameras, *beside)
+        }
         self._readings: dict[str, list[np.ndarray]] = {name: [] for name in robot.readings}
         self._states: list[np.ndarray] = []
 
@@ -297,7 +337,9 @@ class _Frames:
         return len(states)
 
     def leave(self, draw: RenderRequest | None, first: int) -> int:
-        """Leave out the images that were not requested; from the first frame's number to the one that follows."""
+        """Leave out the images that were not requested; from the first frame's number to the one
+        that follows.
+        """
         stop = first + len(self._states)
         if draw is not None:
             for frame in range(first, stop):
@@ -308,12 +350,20 @@ class _Frames:
         return stop
 
     def newest(self, count: int) -> Iterator[tuple[Any, ...]]:
-        """The last frames before any was left out, each as its images: the robot's cameras, then the benchmark's."""
-        return zip(*(images[len(self._states) - count :] for images in self._images.values()), strict=True)
+        """The last frames before any was left out, each as its images: the robot's cameras, then
+        the benchmark's.
+        """
+        return zip(
+            *(images[len(self._states) - count :] for images in self._images.values()), strict=True
+        )
 
     def observation(self) -> Observation:
         state = np.stack(self._states) if self._states else np.zeros((0, self._width), np.float32)
-        return {**{name: self._images[name] for name in self._cameras}, **self._readings, "state": state}
+        return {
+            **{name: self._images[name] for name in self._cameras},
+            **self._readings,
+            "state": state,
+        }
 
 
 def make_rollout_env(
@@ -331,13 +381,16 @@ def make_rollout_env(
 ) -> ChunkEnv:
     """What every worker builds for an episode.
 
-    base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`. videos: folder, and
-    which outcomes are kept: `all`, `success` or `failure`. robot, max_actions: the policy's. oracle: see `ChunkEnv`.
+    base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`.
+    videos: folder, and which outcomes are kept: `all`, `success` or `failure`. robot, max_actions:
+    the policy's. oracle: see `ChunkEnv`.
     """
     video = None
     if videos is not None:
         folder, save_on = videos
-        video = EpisodeVideo(lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal), save_on)
+        video = EpisodeVideo(
+            lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal), save_on
+        )
     return ChunkEnv(
         lambda: base(task=task, split=split, episode=episode, max_steps=max_steps, **options),
         stick=task in STICK_TASKS or (task in TASKS and bool(getattr(TASKS[task], "stick", False))),

@@ -22,7 +22,9 @@ _NONE = np.zeros((0, 1, 1, 3), np.uint8)
 
 
 def episode_seed(seed: int, task: str, episode: int) -> int:
-    """The seed of an episode's noise: of these three alone, so that order, batches and resumption do not matter."""
+    """The seed of an episode's noise: of these three alone, so that order, batches and resumption
+    do not matter.
+    """
     digest = hashlib.sha256(f"{seed}/{task}/{episode}".encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1  # a signed 64-bit integer
 
@@ -30,10 +32,11 @@ def episode_seed(seed: int, task: str, episode: int) -> int:
 class RunningEpisode:
     """One episode between its first observation and its end.
 
-    Frames arrive all at once and are taken into memory in pieces (`read`), so that the hundreds of a conditioning
-    video do not keep other episodes waiting.
+    Frames arrive all at once and are taken into memory in pieces (`read`), so that the hundreds of
+    a conditioning video do not keep other episodes waiting.
 
-    subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals. events: what happens to it.
+    subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals. events: what
+    happens to it.
     """
 
     def __init__(
@@ -60,7 +63,9 @@ class RunningEpisode:
         self.scene = NOT_BUILT
         """Digest of the scene, once it is built."""
         self.process: dict[str, Any] = {}
-        """Where the chain of sub-tasks broke, once the episode is over; empty where it is not reported."""
+        """Where the chain of sub-tasks broke, once the episode is over; empty where it is not
+        reported.
+        """
         self.redrawn: int | None = None
         """Frames of the conditioning video, once it is being simulated again for its images."""
         self._actions = hashlib.sha256()
@@ -75,12 +80,16 @@ class RunningEpisode:
         self._at = 0
 
     def begin(self, frames: Observation, info: dict[str, Any]) -> None:
-        """Take the first observation: a conditioning video, if the task has one, and the current frame."""
+        """Take the first observation: a conditioning video, if the task has one, and the current
+        frame.
+        """
         goal = str(info["task_goal"][0])
         self.episode.goal = goal
         self._offer(info)
         length = len(frames["state"])
-        frames = self._observed(frames, length, np.append(self.events.video(length - 1), length - 1))
+        frames = self._observed(
+            frames, length, np.append(self.events.video(length - 1), length - 1)
+        )
         self.video_frames = len(frames["state"]) - 1
         if self._subgoals is not None:
             needs_video = self.video_frames and self._subgoals.sees_video
@@ -89,30 +98,43 @@ class RunningEpisode:
         self._expect(frames, np.arange(self.video_frames + 1) < self.video_frames, None, info)
 
     def resume(self, frames: Observation, info: dict[str, Any]) -> None:
-        """Take the frames that the executed actions led to: one each, unless an action is a motion of many."""
+        """Take the frames that the executed actions led to: one each, unless an action is a motion
+        of many.
+        """
         self._offer(info)
         count, length = self._count(info), len(frames["state"])
         if self.events.holding is not None:
             self.events.hold_steps += length
             n_frames = min(self.events.holding.observed, length)
             frames = self._observed(frames, length, np.arange(length - n_frames, length))
-            self._expect(frames, np.zeros(n_frames, bool), self._holding_actions(n_frames, info.get("held")), info)
+            self._expect(
+                frames,
+                np.zeros(n_frames, bool),
+                self._holding_actions(n_frames, info.get("held")),
+                info,
+            )
             return
         n_frames = count if self._robot.action.frames is not None else length
         self._observed(frames, length)
         self._expect(frames, np.zeros(n_frames, bool), self._sent[:count], info)
 
     def next_event(self) -> Event | None:
-        """Let the events take place that are due; the one that holds the robot before the policy acts, if there is."""
+        """Let the events take place that are due; the one that holds the robot before the policy
+        acts, if there is.
+        """
         return self.events.next(self.episode, self.steps, self._info.get("subtask", 0))
 
     @property
     def unobserved(self) -> int:
-        """Frames of the environment that events withheld so far; below 0 where they repeated some."""
+        """Frames of the environment that events withheld so far; below 0 where they
+        repeated some.
+        """
         return self._simulated - len(self._visible)
 
     def _offer(self, info: dict[str, Any]) -> None:
-        """Let the episode choose among the options of now: which of them are possible may change."""
+        """Let the episode choose among the options of now: which of them are possible
+        may change.
+        """
         if self._robot.action.choice and OPTIONS in info:
             self.episode.options = read_options(info[OPTIONS], len(self._robot.action.choice))
 
@@ -140,10 +162,18 @@ class RunningEpisode:
         views, rendered = self._views(part)
         views |= {name: np.stack(self._frames[name][part]) for name in self._robot.readings}
         led = self._led
-        if led is not None:  # one action a frame; or some motions, all given with the first of their frames
-            led = led[part] if self._robot.action.frames is not None else led[: len(led) if not self._at else 0]
+        if (
+            led is not None
+        ):  # one action a frame; or some motions, all given with the first of their frames
+            led = (
+                led[part]
+                if self._robot.action.frames is not None
+                else led[: len(led) if not self._at else 0]
+            )
         some = (
-            {} if all(len(places) == len(self._demo[part]) for places in rendered.values()) else {"rendered": rendered}
+            {}
+            if all(len(places) == len(self._demo[part]) for places in rendered.values())
+            else {"rendered": rendered}
         )
         self.episode.observe(views, self._frames["state"][part], self._demo[part], led, **some)
         if self.watched is not None and not self._demo[part][-1:].any():
@@ -161,8 +191,12 @@ class RunningEpisode:
         views, rendered = {}, {}
         for name in self._robot.camera_names:
             images = self._frames[name][part]
-            rendered[name] = np.array([i for i, image in enumerate(images) if image is not None], np.int64)
-            views[name] = np.stack([images[i] for i in rendered[name]]) if len(rendered[name]) else _NONE
+            rendered[name] = np.array(
+                [i for i, image in enumerate(images) if image is not None], np.int64
+            )
+            views[name] = (
+                np.stack([images[i] for i in rendered[name]]) if len(rendered[name]) else _NONE
+            )
         return views, rendered
 
     def add_policy_seconds(self, seconds: float) -> None:
@@ -191,10 +225,14 @@ class RunningEpisode:
 
     @property
     def actions_sha256(self) -> str:
-        """A digest of all executed actions: equal for two runs exactly if they did the same to the last bit."""
+        """A digest of all executed actions: equal for two runs exactly if they did the same to the
+        last bit.
+        """
         return self._actions.hexdigest()[:16]
 
-    def _observed(self, frames: Observation, length: int, numbers: np.ndarray | None = None) -> Observation:
+    def _observed(
+        self, frames: Observation, length: int, numbers: np.ndarray | None = None
+    ) -> Observation:
         """Those of the environment's next frames that the policy observes; by default all."""
         every = np.arange(length)
         numbers = every if numbers is None else numbers
@@ -202,14 +240,20 @@ class RunningEpisode:
         self._simulated += length
         if np.array_equal(numbers, every):
             return frames
-        lists = {name: [images[i] for i in numbers] for name, images in frames.items() if name != "state"}
+        lists = {
+            name: [images[i] for i in numbers] for name, images in frames.items() if name != "state"
+        }
         return {**lists, "state": frames["state"][numbers]}
 
     def _holding_actions(self, n_frames: int, action: np.ndarray | None) -> np.ndarray | None:
-        """The actions that led to frames at which the robot held its pose; None before the first action."""
+        """The actions that led to frames at which the robot held its pose; None before the first
+        action.
+        """
         if self._robot.action.frames is None:
             return self._sent[:0]
-        return None if action is None else np.repeat(np.asarray(action, np.float32)[None], n_frames, 0)
+        return (
+            None if action is None else np.repeat(np.asarray(action, np.float32)[None], n_frames, 0)
+        )
 
     def _count(self, info: dict[str, Any]) -> int:
         count = int(info.get("executed", 0))
@@ -217,11 +261,16 @@ class RunningEpisode:
         self._actions.update(np.ascontiguousarray(self._sent[:count], np.float32).tobytes())
         return count
 
-    def _expect(self, frames: Observation, demo: np.ndarray, led: np.ndarray | None, info: dict[str, Any]) -> None:
+    def _expect(
+        self, frames: Observation, demo: np.ndarray, led: np.ndarray | None, info: dict[str, Any]
+    ) -> None:
         if len(frames["state"]) != len(demo):
             raise UserError(
-                f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need one frame an action."
+                f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need"
+                " one frame an action."
             )
         self._frames, self._demo, self._led, self._info, self._at = frames, demo, led, info, 0
-        began = np.searchsorted(self._visible, info.get("began", ()))  # as numbers of observed frames
+        began = np.searchsorted(
+            self._visible, info.get("began", ())
+        )  # as numbers of observed frames
         self.episode.begun(began.tolist(), self.video_frames)

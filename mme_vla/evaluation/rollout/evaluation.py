@@ -1,4 +1,6 @@
-"""A whole evaluation: claim the folder, leave out what is done, run the rest, record every episode at once."""
+"""A whole evaluation: claim the folder, leave out what is done, run the rest, record every episode
+at once.
+"""
 
 import os
 import re
@@ -20,7 +22,15 @@ from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earl
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Waiting, Workload
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
-from mme_vla.evaluation.store import INDIFFERENT, RECORDS, Claims, RecordLog, claim_run, fingerprint, read_records
+from mme_vla.evaluation.store import (
+    INDIFFERENT,
+    RECORDS,
+    Claims,
+    RecordLog,
+    claim_run,
+    fingerprint,
+    read_records,
+)
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, ShowsDistractors
 from mme_vla.policy.saving import composition_digest
@@ -45,10 +55,18 @@ class Shard:
 
 
 def choose_episodes(
-    tasks: str | Sequence[str] = "all", episodes: Any = None, split: str = "test", env: str = "mme_vla"
+    tasks: str | Sequence[str] = "all",
+    episodes: Any = None,
+    split: str = "test",
+    env: str = "mme_vla",
 ) -> list[Job]:
-    """The episodes of a run, task by task, by the grammar of all commands (`mme_vla.envs.episodes`)."""
-    return [Job(spec.task, spec.split, spec.episode) for spec in choose_specs(tasks, episodes, split, env)]
+    """The episodes of a run, task by task, by the grammar of all commands
+    (`mme_vla.envs.episodes`).
+    """
+    return [
+        Job(spec.task, spec.split, spec.episode)
+        for spec in choose_specs(tasks, episodes, split, env)
+    ]
 
 
 def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:
@@ -63,7 +81,10 @@ def choose_shard(text: str | None, environment: Mapping[str, str] | None = None)
         text = f"{environment['RANK']}/{environment['WORLD_SIZE']}"
     match = re.fullmatch(r"(\d+)/(\d+)", str(text))
     shard = Shard(int(match[1]), int(match[2])) if match else Shard(1, 0)
-    require(shard.index < shard.count, f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.")
+    require(
+        shard.index < shard.count,
+        f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.",
+    )
     return shard
 
 
@@ -72,10 +93,11 @@ VIDEOS = "videos"
 
 
 class Evaluation(NamedTuple):
-    """What came of a run: the records of its episodes, old and new, and what the policy did this time.
+    """What came of a run: the records of its episodes, old and new, and what the policy did this
+    time.
 
-    Of several processes that share a run each has the records that it wrote. matched: those of the plain run, where
-    `records` are of events.
+    Of several processes that share a run each has the records that it wrote. matched: those of the
+    plain run, where `records` are of events.
     """
 
     records: list[EpisodeRecord]
@@ -84,7 +106,9 @@ class Evaluation(NamedTuple):
 
     @property
     def success_rate(self) -> float:
-        """Share of successes, 0 to 1; an episode that ended in an error is none. NaN without episodes."""
+        """Share of successes, 0 to 1; an episode that ended in an error is none. NaN without
+        episodes.
+        """
         won = [record.outcome == "success" for record in self.records]
         return sum(won) / len(won) if won else float("nan")
 
@@ -100,8 +124,8 @@ def evaluate_events(
 ) -> Evaluation:
     """Run every episode in `output`, then once more under each event, in a folder of its own below.
 
-    The runs have the same scenes and the same noise, and differ in the event alone. Without events it is `evaluate`,
-    which has the other arguments.
+    The runs have the same scenes and the same noise, and differ in the event alone. Without events
+    it is `evaluate`, which has the other arguments.
 
     events: arms, such as `pause:100@subtask:2`.
     """
@@ -112,7 +136,14 @@ def evaluate_events(
     records: list[EpisodeRecord] = []
     for arm in arms:
         named, folder = replace(facts, event=arm.event), output / folder_of(str(arm.event))
-        run = evaluate(policy, jobs, folder, named, arm, **{**how, "times_from": how.get("times_from") or output})
+        run = evaluate(
+            policy,
+            jobs,
+            folder,
+            named,
+            arm,
+            **{**how, "times_from": how.get("times_from") or output},
+        )
         records += run.records
     return Evaluation(records, run.workload, matched.records) if arms else matched
 
@@ -136,16 +167,16 @@ def evaluate(
 
     Args:
         policy: in eval mode, on its device, with statistics.
-        jobs: the episodes of the run. shard: which of how many processes this is; each takes the next episode that is
-            free when it has room (`store.Claims`).
+        jobs: the episodes of the run. shard: which of how many processes this is; each takes the
+            next episode that is free when it has room (`store.Claims`).
         output: the run's folder; one that holds a part of the same run is gone on with.
         facts: what the records say of the policy.
         subgoals: predicts the subgoal, where the policy reads one.
         source: where the weights are from; part of what makes a run the same.
         base: makes an environment with the benchmark's interface; importable by name.
         notes: kept in `run.json` and never compared.
-        times_from: earlier records, of any policy: the longest episodes begin first, and say how long all will take;
-            by default those in `output` and in the folders beside it.
+        times_from: earlier records, of any policy: the longest episodes begin first, and say how
+            long all will take; by default those in `output` and in the folders beside it.
     """
     policy.require_processor().require_stats()
     check_subgoals(policy, subgoals)
@@ -163,7 +194,10 @@ def evaluate(
         completed = [record for record in done if record.outcome != "error"]
         with RolloutProgress(len(jobs), completed, show_progress) as progress:
             if completed:
-                progress.say(f"{output} holds {len(completed)} of {len(jobs)} episodes: continuing with the others")
+                progress.say(
+                    f"{output} holds {len(completed)} of {len(jobs)} episodes: continuing with the"
+                    " others"
+                )
             workers = settings.worker_count(-(-len(missing) // shard.count))
             if forecast := durations.forecast(missing, workers, shard.count):
                 progress.say(str(forecast))
@@ -174,7 +208,17 @@ def evaluate(
                 folder = output / SUBGOALS if settings.subgoal_log else None
                 renders = base is make_env and settings.env in ROBOMME and settings.render
                 with envs, receipt(output / shard.file, policy, run, source, renders):
-                    rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, folder, progress, workload)
+                    rollout = Rollout(
+                        policy,
+                        envs,
+                        facts,
+                        settings,
+                        log.append,
+                        subgoals,
+                        folder,
+                        progress,
+                        workload,
+                    )
                     rollout.run(waiting)
     return Evaluation(_done(output, jobs, facts, shard), workload)
 
@@ -193,7 +237,11 @@ def _environments(
     if base is make_env:
         options |= {"only_possible": True} if settings.only_possible else {}
         options |= {"sessions": _n_distractors(policy)}
-        options |= {"env": settings.env, "render": settings.render, "action_space": robot.action.space}
+        options |= {
+            "env": settings.env,
+            "render": settings.render,
+            "action_space": robot.action.space,
+        }
         options |= {f"include_{name}": True for name in robot.readings}
     if settings.video != "none":
         options["videos"] = (str(output / VIDEOS), settings.video)
@@ -209,8 +257,8 @@ def run_settings(
 ) -> dict[str, Any]:
     """What decides the outcomes, as `run.json` keeps it.
 
-    How many workers or shards there are, and on which machine, does not belong to it; nor does the batch size, though
-    batches may change the last bits of an action.
+    How many workers or shards there are, and on which machine, does not belong to it; nor does the
+    batch size, though batches may change the last bits of an action.
     """
     names = ("seed", "split", "env", "max_steps", "render")
     dtype = str(next(policy.parameters()).dtype).removeprefix("torch.")
@@ -222,9 +270,14 @@ def run_settings(
         "dtype": dtype,
         "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
         "execute": settings.execute or policy.embodiment.action.execute,
-        "flow_steps": settings.flow_steps or (policy.sample_steps if isinstance(policy, SamplesInSteps) else 1),
+        "flow_steps": settings.flow_steps
+        or (policy.sample_steps if isinstance(policy, SamplesInSteps) else 1),
         **{name: getattr(settings, name) for name in names},
-        **{n: value for n in ("event", "max_actions", "only_possible") if (value := getattr(settings, n))},
+        **{
+            n: value
+            for n in ("event", "max_actions", "only_possible")
+            if (value := getattr(settings, n))
+        },
     }
 
 
@@ -236,7 +289,9 @@ def _predictor_facts(name: str | None, subgoals: SubgoalPredictor) -> dict[str, 
 
 
 def _end_of(place: str | None) -> str | None:
-    """The end of a path alone: machines that share a run may have the folder at different places."""
+    """The end of a path alone: machines that share a run may have the folder at
+    different places.
+    """
     return None if place is None else "/".join(Path(place).parts[-4:])
 
 
@@ -245,22 +300,34 @@ def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
     if subgoals is None:
         return
     if not policy.require_processor().prompt_spec.reads_subgoal:
-        raise UserError(f"{policy.config.get('name', 'The policy')} reads no subgoal: leave out subgoal=….")
+        raise UserError(
+            f"{policy.config.get('name', 'The policy')} reads no subgoal: leave out subgoal=…."
+        )
     kind = subgoal_kind(policy)
     if kind is not None and kind != f"{subgoals.kind}_subgoal":
         expected = kind.removesuffix("_subgoal")
-        raise UserError(f"The policy was trained with {expected} subgoals: set subgoal.kind={expected}.")
+        raise UserError(
+            f"The policy was trained with {expected} subgoals: set subgoal.kind={expected}."
+        )
 
 
 def kind_section(policy: Policy) -> dict[str, str]:
-    """The key `kind` of a predictor's section: what the policy was trained to read. Empty where it does not say."""
+    """The key `kind` of a predictor's section: what the policy was trained to read. Empty where it
+    does not say.
+    """
     kind = subgoal_kind(policy)
     return {} if kind is None else {"kind": kind.removesuffix("_subgoal")}
 
 
 def predictor_of(policy: Policy, subgoal: str | SubgoalPredictor | None) -> SubgoalPredictor | None:
-    """A predictor by its name, of the kind of subgoals that the policy reads; one that is given stays as it is."""
-    return build_predictor({"name": subgoal, **kind_section(policy)}) if isinstance(subgoal, str) else subgoal
+    """A predictor by its name, of the kind of subgoals that the policy reads; one that is given
+    stays as it is.
+    """
+    return (
+        build_predictor({"name": subgoal, **kind_section(policy)})
+        if isinstance(subgoal, str)
+        else subgoal
+    )
 
 
 def checkpoint_label(source: str | None) -> int | str:
@@ -273,17 +340,29 @@ def checkpoint_label(source: str | None) -> int | str:
 
 
 def facts_of(
-    policy: Policy, name: str | None, source: str | None, settings: RolloutSettings, subgoal: str | None
+    policy: Policy,
+    name: str | None,
+    source: str | None,
+    settings: RolloutSettings,
+    subgoal: str | None,
 ) -> RunFacts:
     """What the records of a run have in common.
 
-    name: of the model; None for the policy's own. source: the checkpoint. subgoal: name of the predictor.
+    name: of the model; None for the policy's own. source: the checkpoint. subgoal: name of the
+    predictor.
     """
     return RunFacts(
-        name or str(policy.config.get("name", "policy")), checkpoint_label(source), settings.seed, settings.split,
-        settings.max_steps, subgoal, memory_budget(policy), composition_digest(policy.config),
-        identity_of(policy.config), settings.event,
-    )  # fmt: skip
+        name or str(policy.config.get("name", "policy")),
+        checkpoint_label(source),
+        settings.seed,
+        settings.split,
+        settings.max_steps,
+        subgoal,
+        memory_budget(policy),
+        composition_digest(policy.config),
+        identity_of(policy.config),
+        settings.event,
+    )
 
 
 def memory_budget(policy: Policy) -> int | None:
@@ -293,7 +372,9 @@ def memory_budget(policy: Policy) -> int | None:
 
 
 def default_output(facts: RunFacts) -> Path:
-    """A folder that the same command finds again: `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`."""
+    """A folder that the same command finds again:
+    `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`.
+    """
     model = safe_name(facts.model, "the policy's name")  # which a checkpoint may have brought
     name = model if facts.memory_budget is None else f"{model}-{facts.memory_budget}"
     run = f"seed{facts.model_seed}" + (f"-{facts.subgoal}" if facts.subgoal else "")
@@ -301,14 +382,36 @@ def default_output(facts: RunFacts) -> Path:
     return Path("outputs", "evaluation", name, str(facts.checkpoint), run)
 
 
-def _done(output: Path, jobs: Sequence[Job], facts: RunFacts, shard: Shard | None = None) -> list[EpisodeRecord]:
-    """What the folder has of these episodes, whichever process wrote it, or this one; folders below hold other runs."""
+def _done(
+    output: Path, jobs: Sequence[Job], facts: RunFacts, shard: Shard | None = None
+) -> list[EpisodeRecord]:
+    """What the folder has of these episodes, whichever process wrote it, or this one; folders below
+    hold other runs.
+    """
     checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
-    run = RunKey(facts.model, facts.subgoal, facts.memory_budget, checkpoint, facts.model_seed, facts.split,
-                 facts.composition, facts.training, facts.event)  # fmt: skip
+    run = RunKey(
+        facts.model,
+        facts.subgoal,
+        facts.memory_budget,
+        checkpoint,
+        facts.model_seed,
+        facts.split,
+        facts.composition,
+        facts.training,
+        facts.event,
+    )
     keys = {(job.task, job.episode) for job in jobs}
-    files = sorted(output.glob("episodes*.jsonl")) if shard is None or shard.count == 1 else [output / shard.file]
+    files = (
+        sorted(output.glob("episodes*.jsonl"))
+        if shard is None or shard.count == 1
+        else [output / shard.file]
+    )
     records = [record for path in files for record in read_records(path)]
-    # run.json has seen to it that this is the same policy: records from before there were digests are of it too.
-    records = [replace(r, composition=facts.composition) if r.composition is None else r for r in records]
-    return [record for record in merge(records, "first") if record.run == run and record.key in keys]
+    # run.json has seen to it that this is the same policy: records from before there were digests
+    # are of it too.
+    records = [
+        replace(r, composition=facts.composition) if r.composition is None else r for r in records
+    ]
+    return [
+        record for record in merge(records, "first") if record.run == run and record.key in keys
+    ]

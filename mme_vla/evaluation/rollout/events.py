@@ -1,7 +1,9 @@
-"""Events of a rollout: what happens to an episode while it runs, at a control step or where a sub-task begins.
+"""Events of a rollout: what happens to an episode while it runs, at a control step or where a
+sub-task begins.
 
-An event acts in the simulation or on the stream of frames. An intervention of a probe acts on what memory reads.
-One of your own is a class registered with `register("event", name)` in a module that `plugins` names.
+An event acts in the simulation or on the stream of frames. An intervention of a probe acts on what
+memory reads. One of your own is a class registered with `register("event", name)` in a module that
+`plugins` names.
 """
 
 import re
@@ -25,10 +27,11 @@ _WORDS = re.compile(r"([A-Za-z]\w*)(?::(-?[\d.]+))?(?:@(\w+):(-?\d+))?")
 
 @dataclass(frozen=True)
 class Event:
-    """Changes nothing. A subclass overrides what happens; a dataclass, so that its number is its field.
+    """Changes nothing. A subclass overrides what happens; a dataclass, so that its number is its
+    field.
 
-    dial: the field that `name:value` sets. neutral: its value without effect, that of the matched arm in a curve.
-    placed: whether `@step:…` or `@subtask:…` may follow.
+    dial: the field that `name:value` sets. neutral: its value without effect, that of the matched
+    arm in a curve. placed: whether `@step:…` or `@subtask:…` may follow.
     """
 
     dial: ClassVar[str | None] = None
@@ -37,7 +40,9 @@ class Event:
 
     @property
     def hold(self) -> int:
-        """Control steps for which the robot holds its pose and the scene continues; the step limit grows by as many."""
+        """Control steps for which the robot holds its pose and the scene continues; the step limit
+        grows by as many.
+        """
         return 0
 
     @property
@@ -46,7 +51,9 @@ class Event:
         return self.hold
 
     def video(self, length: int) -> np.ndarray:
-        """How often each of the conditioning video's `length` frames is observed, int64 [length]."""
+        """How often each of the conditioning video's `length` frames is observed,
+        int64 [length].
+        """
         return np.ones(length, np.int64)
 
     def act(self, episode: "Episode") -> None:
@@ -59,7 +66,9 @@ class Event:
 @EVENTS.register("pause")
 @dataclass(frozen=True)
 class Pause(Event):
-    """The robot holds its pose for `steps` control steps, and the policy observes every frame of them."""
+    """The robot holds its pose for `steps` control steps, and the policy observes every frame of
+    them.
+    """
 
     steps: NonNegativeInt = 64
     dial: ClassVar = "steps"
@@ -72,7 +81,9 @@ class Pause(Event):
 @EVENTS.register("gap")
 @dataclass(frozen=True)
 class Gap(Event):
-    """The robot holds its pose, `frames` frames are not observed, and the policy decides at the next one."""
+    """The robot holds its pose, `frames` frames are not observed, and the policy decides at the
+    next one.
+    """
 
     frames: NonNegativeInt = 64
     dial: ClassVar = "frames"
@@ -105,7 +116,9 @@ class VideoSpeed(Event):
 @EVENTS.register("restart")
 @dataclass(frozen=True)
 class Restart(Event):
-    """The frame index restarts at 0: what is remembered keeps its content and its times, the clock begins anew."""
+    """The frame index restarts at 0: what is remembered keeps its content and its times, the clock
+    begins anew.
+    """
 
     def act(self, episode: "Episode") -> None:
         episode.restart_clock()
@@ -124,10 +137,11 @@ class Words(NamedTuple):
 
 
 class PlacedEvent(NamedTuple):
-    """An event and its place: at the first decision from control step `number` on, or in sub-task `number` on.
+    """An event and its place: at the first decision from control step `number` on, or in sub-task
+    `number` on.
 
-    Control steps are counted from 0 at the execution's first frame, without those for which an event held the robot;
-    sub-tasks of the execution from 1.
+    Control steps are counted from 0 at the execution's first frame, without those for which an
+    event held the robot; sub-tasks of the execution from 1.
     """
 
     text: str
@@ -152,7 +166,8 @@ def read_event(text: str) -> PlacedEvent:
     """One event from its text.
 
     Raises:
-        UserError: another form, an unknown event, a number that it does not take, or an unknown place.
+        UserError: another form, an unknown event, a number that it does not take, or an unknown
+            place.
     """
     key, words = f"event={text}", split_words(text)
     if words is None:
@@ -160,7 +175,10 @@ def read_event(text: str) -> PlacedEvent:
     check_choice(f"{key}: name", words.name, EVENTS)
     kind: Any = EVENTS[words.name]
     require(words.value is None or kind.dial is not None, f"{key}: {words.name} takes no number.")
-    require(words.unit is None or kind.placed, f"{key}: {words.name} takes no place; leave out @{words.unit}:….")
+    require(
+        words.unit is None or kind.placed,
+        f"{key}: {words.name} takes no place; leave out @{words.unit}:….",
+    )
     options = {} if words.value is None else {kind.dial: words.value}
     event: Event = read_section(kind, options, f"{key}: {words.name}")
     unit, number = words.unit or "step", words.number or 0
@@ -179,7 +197,9 @@ def event_arms(value: Any) -> list[str]:
     """The arms of the key `event`: none, one, or a list, each once."""
     arms = [] if value is None else [value] if isinstance(value, str) else value
     require(
-        isinstance(arms, Sequence) and all(isinstance(arm, str) for arm in arms) and len({*arms}) == len(arms),
+        isinstance(arms, Sequence)
+        and all(isinstance(arm, str) for arm in arms)
+        and len({*arms}) == len(arms),
         f"event={brief(value)}: {FORM}, [pause:50,pause:100] runs several arms, each once.",
     )
     for arm in arms:
@@ -195,8 +215,9 @@ def folder_of(arm: str) -> str:
 class EventCourse:
     """The events of one running episode.
 
-    log: of each its text as `event`, and as `step` the control step at which it acted; None while it has not.
-    hold_steps: control steps for which events held the robot. holding: the event whose frames come next.
+    log: of each its text as `event`, and as `step` the control step at which it acted; None while
+    it has not. hold_steps: control steps for which events held the robot. holding: the event whose
+    frames come next.
     """
 
     def __init__(self, events: Sequence[PlacedEvent]) -> None:
@@ -215,17 +236,22 @@ class EventCourse:
         return real
 
     def next(self, episode: "Episode", step: int, subtask: int) -> Event | None:
-        """Let events take place that are due at this decision, up to one that holds the robot, which is returned.
+        """Let events take place that are due at this decision, up to one that holds the robot,
+        which is returned.
 
         Args:
-            step: control steps so far. subtask: number of the current sub-task, 0 where the environment tells none.
+            step: control steps so far. subtask: number of the current sub-task, 0 where the
+                environment tells none.
         """
         self.holding = None
         for placed, entry in zip(self._events, self.log, strict=True):
             if entry["step"] is not None or not placed.event.placed:
                 continue
             if placed.unit == "subtask" and not subtask:
-                raise UserError(f"event={placed.text}: this environment tells no sub-tasks; place it by @step:<n>.")
+                raise UserError(
+                    f"event={placed.text}: this environment tells no sub-tasks; place it by"
+                    " @step:<n>."
+                )
             if placed.reached(step - self.hold_steps, subtask):
                 entry["step"] = step - self.hold_steps
                 placed.event.act(episode)

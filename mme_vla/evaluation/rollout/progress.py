@@ -1,4 +1,6 @@
-"""How long a run takes: a forecast from earlier records, and what a person sees of it as it goes."""
+"""How long a run takes: a forecast from earlier records, and what a person sees of it
+as it goes.
+"""
 
 import warnings
 from collections import Counter
@@ -9,7 +11,14 @@ from pathlib import Path
 from typing import Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
@@ -23,13 +32,20 @@ class RolloutProgress:
     total: episodes of this process. before: records of those that an earlier run has finished.
     """
 
-    def __init__(self, total: int, before: Sequence[EpisodeRecord] = (), visible: bool = True) -> None:
+    def __init__(
+        self, total: int, before: Sequence[EpisodeRecord] = (), visible: bool = True
+    ) -> None:
         self.console = Console(quiet=not visible, highlight=False, soft_wrap=True, stderr=True)
         self.total, self._outcomes = total, Counter(record.outcome for record in before)
         self._bar: Progress | None = None
         if self.console.is_terminal and self.console.file.isatty() and visible:
             clock = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-            columns = (BarColumn(24), MofNCompleteColumn(), TextColumn("{task.description}"), *clock)
+            columns = (
+                BarColumn(24),
+                MofNCompleteColumn(),
+                TextColumn("{task.description}"),
+                *clock,
+            )
             self._bar = Progress(*columns, console=self.console)
             self._task = self._bar.add_task(self.summary, total=total, completed=self.done)
 
@@ -51,7 +67,9 @@ class RolloutProgress:
     def summary(self) -> str:
         """The success so far, errors counting as failures."""
         success, errors = self._outcomes["success"], self._outcomes["error"]
-        text = f"success {success}/{self.done}" + (f" = {100 * success / self.done:.1f} %" if self.done else "")
+        text = f"success {success}/{self.done}" + (
+            f" = {100 * success / self.done:.1f} %" if self.done else ""
+        )
         return f"{text} · {errors} errors" if errors else text
 
     def episode(self, record: EpisodeRecord, again: bool = False) -> None:
@@ -60,9 +78,9 @@ class RolloutProgress:
             self._outcomes[record.outcome] += 1
         seconds = record.seconds
         line = (
-            f"{record.task} {record.episode} ({record.difficulty}): {record.outcome}, {record.steps} steps in "
-            f"{seconds.total:.0f} s (simulation {seconds.sim:.0f}, rendering {seconds.render:.0f}, "
-            f"policy {seconds.policy:.0f})"
+            f"{record.task} {record.episode} ({record.difficulty}): {record.outcome},"
+            f" {record.steps} steps in {seconds.total:.0f} s (simulation {seconds.sim:.0f},"
+            f" rendering {seconds.render:.0f}, policy {seconds.policy:.0f})"
         )
         line += f": {record.error}" if record.error else ""
         line += " · tried again" if again else ""
@@ -78,7 +96,9 @@ class RolloutProgress:
 
 
 def earlier_records(output: Path, named: Path | None) -> list[EpisodeRecord]:
-    """Records without errors of a file or folder, by default of `output` and the folders beside it."""
+    """Records without errors of a file or folder, by default of `output` and the
+    folders beside it.
+    """
     if named is not None:
         records = [record for path in find_records([named]) for record in read_records(path)]
     else:
@@ -113,7 +133,9 @@ class Durations:
             self._means[place] = environment, sum(r.seconds.policy for r in members) / len(members)
 
     def of(self, job: Job) -> tuple[float, float]:
-        """(environment, policy): of the episode itself, else the mean of its task, else of all; 0 without records."""
+        """(environment, policy): of the episode itself, else the mean of its task, else of all; 0
+        without records.
+        """
         for place in _places(job):
             if place in self._means:
                 return self._means[place]
@@ -141,7 +163,9 @@ class Durations:
 
 @dataclass(frozen=True)
 class Forecast:
-    """seconds: from now to the end. episodes: that are left. records: it is made from. at_once: environments."""
+    """seconds: from now to the end. episodes: that are left. records: it is made from. at_once:
+    environments.
+    """
 
     seconds: float
     episodes: int
@@ -152,6 +176,6 @@ class Forecast:
         hours = self.seconds / 3600
         time = f"{hours:.1f} h" if hours >= 1 else f"{self.seconds / 60:.0f} min"
         return (
-            f"forecast: about {time} for {self.episodes:,} episodes, {self.at_once} at a time, if they take as long as "
-            f"the {self.records:,} before them did"
+            f"forecast: about {time} for {self.episodes:,} episodes, {self.at_once} at a time, if"
+            f" they take as long as the {self.records:,} before them did"
         )

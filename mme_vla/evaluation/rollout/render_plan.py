@@ -1,8 +1,10 @@
-"""The images that a rollout requests of its environments: those that the policy and its predictor read, no others.
+"""The images that a rollout requests of its environments: those that the policy and its predictor
+read, no others.
 
-When a policy acts is known beforehand, so what its memory reads is too, but for one thing: how long the conditioning
-video is. An episode therefore begins without those of its images that depend on it. Where some turn out to be
-needed, it begins once more, and the same simulation then renders them.
+When a policy acts is known beforehand, so what its memory reads is too, but for one thing: how long
+the conditioning video is. An episode therefore begins without those of its images that depend on
+it. Where some turn out to be needed, it begins once more, and the same simulation then renders
+them.
 """
 
 from collections.abc import Container
@@ -28,10 +30,13 @@ LONGEST_VIDEO = 2_000  # frames; what is missing of a longer one is rendered by 
 class RenderPlan:
     """The images to render for each command to an environment; None requests everything.
 
-    policy, subgoals: the readers. settings: how often the policy acts, and whether all is rendered (`draw`).
+    policy, subgoals: the readers. settings: how often the policy acts, and whether all is rendered
+    (`draw`).
     """
 
-    def __init__(self, policy: Policy, subgoals: SubgoalPredictor | None, settings: RolloutSettings) -> None:
+    def __init__(
+        self, policy: Policy, subgoals: SubgoalPredictor | None, settings: RolloutSettings
+    ) -> None:
         self._policy, self._robot, self._settings = policy, policy.embodiment, settings
         self._grounded = subgoals is not None and subgoals.kind == "grounded"
         self._sees_video = subgoals is not None and subgoals.sees_video
@@ -55,7 +60,9 @@ class RenderPlan:
         return self._render_request(self._read_of_videos)
 
     def missing(self, frames: Observation) -> RenderRequest | None:
-        """For a second reset, after one that gave these frames; None where it gave all that is needed."""
+        """For a second reset, after one that gave these frames; None where it gave all that is
+        needed.
+        """
         if self._all or self._resampled:
             return None
         video = len(frames["state"]) - 1
@@ -64,8 +71,12 @@ class RenderPlan:
             return None
         return self._render_request(frozenset(needed))
 
-    def of_chunk(self, running: RunningEpisode, count: int, unobserved: int = 0) -> RenderRequest | None:
-        """For the next `count` frames of an episode, after so many further ones that are not observed."""
+    def of_chunk(
+        self, running: RunningEpisode, count: int, unobserved: int = 0
+    ) -> RenderRequest | None:
+        """For the next `count` frames of an episode, after so many further ones that are not
+        observed.
+        """
         if self._all:
             return None
         if self._sees_passing:
@@ -73,10 +84,14 @@ class RenderPlan:
         n_observed = running.episode.n_observed_frames
         stop = n_observed + count if self._robot.action.frames is not None else EVERY.stop
         frames = self._within(running.video_frames, n_observed, stop)
-        return self._render_request(frozenset(frame + running.unobserved + unobserved for frame in frames))
+        return self._render_request(
+            frozenset(frame + running.unobserved + unobserved for frame in frames)
+        )
 
     def _render_request(self, frames: Container[int]) -> RenderRequest:
-        return RenderRequest(dict.fromkeys(self._cameras, frames), self._robot.camera_names, self._grounded)
+        return RenderRequest(
+            dict.fromkeys(self._cameras, frames), self._robot.camera_names, self._grounded
+        )
 
     def _within(self, exec_start: int, first: int, stop: int) -> list[int]:
         reads = self._reads(exec_start)
@@ -86,13 +101,17 @@ class RenderPlan:
 
     @cached_property
     def _read_of_videos(self) -> Container[int]:
-        """Frames that the policy may read of a video, however long it is; none where that may be most of them."""
+        """Frames that the policy may read of a video, however long it is; none where that may be
+        most of them.
+        """
         read = self._read_before(np.arange(LONGEST_VIDEO), LONGEST_VIDEO)
         few = read is not None and len(read) < LONGEST_VIDEO / 2
         return frozenset(read.tolist() if read is not None and few else ())
 
     def _read_before(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
-        """Frames that the policy reads at any of these steps, but for the current one, which is rendered anyway."""
+        """Frames that the policy reads at any of these steps, but for the current one, which is
+        rendered anyway.
+        """
         lists = []
         for step in steps:
             read = frames_read(self._policy, np.array([step]), exec_start)
@@ -103,7 +122,8 @@ class RenderPlan:
 
     def _reads_of(self, exec_start: int) -> np.ndarray | None:
         """Frames that the policy reads of an episode with this video, until its step limit."""
-        # A motion, or an event that holds the robot, takes any number of frames: the policy may act at each.
+        # A motion, or an event that holds the robot, takes any number of frames: the policy may act
+        # at each.
         action, most = self._robot.action, self._settings.max_steps + self._hold_steps + 2
         anywhere = action.frames is None or self._hold_steps
         if anywhere:

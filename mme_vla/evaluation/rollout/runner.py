@@ -1,7 +1,8 @@
-"""Many episodes at once: environments in worker processes, one policy that acts for the waiting ones in one batch.
+"""Many episodes at once: environments in worker processes, one policy that acts for the waiting
+ones in one batch.
 
-Each worker executes its chunk at its own pace. One that has finished is in the policy's next batch. No episode waits
-for a slow one, and a long conditioning video is read in pieces between batches.
+Each worker executes its chunk at its own pace. One that has finished is in the policy's next batch.
+No episode waits for a slow one, and a long conditioning video is read in pieces between batches.
 """
 
 import time
@@ -36,7 +37,8 @@ from mme_vla.subgoal import SubgoalPredictor
 class Waiting:
     """Episodes in the order they begin.
 
-    jobs: all that are left. claims: where other processes run the same ones; each then begins what it could claim.
+    jobs: all that are left. claims: where other processes run the same ones; each then begins what
+    it could claim.
     """
 
     def __init__(self, jobs: Iterable[Job] = (), claims: Claims | None = None) -> None:
@@ -114,7 +116,8 @@ class Rollout:
         facts: what the records say of the policy.
         record: called with every record, as soon as there is one.
         subgoals: predicts the subgoal; None leaves it out of the prompt.
-        subgoal_folder: where every subgoal is written down with its image; None keeps the scores alone.
+        subgoal_folder: where every subgoal is written down with its image; None keeps the scores
+            alone.
     """
 
     policy: Policy
@@ -132,7 +135,9 @@ class Rollout:
     _stillborn: int = 0
 
     def __post_init__(self) -> None:
-        self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(self.settings.max_batch)
+        self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(
+            self.settings.max_batch
+        )
         self._events = read_events(self.settings.event)
         self._render_plan = RenderPlan(self.policy, self.subgoals, self.settings)
 
@@ -142,7 +147,9 @@ class Rollout:
             pass
 
     def rounds(self, jobs: Sequence[Job] | Waiting) -> Iterator[None]:
-        """Run these episodes; yields whenever the policy has done what it could for those that wait."""
+        """Run these episodes; yields whenever the policy has done what it could for those that
+        wait.
+        """
         begun = time.perf_counter()
         self._waiting = jobs if isinstance(jobs, Waiting) else Waiting(jobs)
         for worker in range(self.envs.workers):
@@ -164,8 +171,12 @@ class Rollout:
         piece = settings.encode_chunk * (1 if memory is None else memory.storage.keep_every)
         trace = None
         if self.subgoals is not None:
-            trace = SubgoalTrace(self.subgoals.kind, self.subgoal_folder, f"{job.task}_ep{job.episode}")
-        running = RunningEpisode(self.policy, job, settings.seed, self.subgoals, piece, trace, self._events)
+            trace = SubgoalTrace(
+                self.subgoals.kind, self.subgoal_folder, f"{job.task}_ep{job.episode}"
+            )
+        running = RunningEpisode(
+            self.policy, job, settings.seed, self.subgoals, piece, trace, self._events
+        )
         running.worker = worker
         self._running[worker] = running
         self.envs.start(worker, job, draw=self._render_plan.before_video())
@@ -181,13 +192,14 @@ class Rollout:
         if reply.done:
             if not reply.crashed:
                 running.end(reply.info)
-            # A scene in which an object finds no place finds none again, and says nothing of the simulator.
+            # A scene in which an object finds no place finds none again, and says nothing of the
+            # simulator.
             unbuildable = reply.info.get("exception_type") == "SceneError"
             self._stillborn += not (running.chunks or unbuildable)
             require(
                 self._stillborn < GIVE_UP_AFTER,
-                f"{self._stillborn} environments in a row could not be started, so the run stops; the last one: "
-                f"{reply.info.get('error_message')}",
+                f"{self._stillborn} environments in a row could not be started, so the run stops;"
+                f" the last one: {reply.info.get('error_message')}",
             )
             message = reply.info.get("error_message")
             self._finish(running, str(reply.info.get("status")), message, retry=not unbuildable)
@@ -202,12 +214,17 @@ class Rollout:
         self._scheduler.reading.append(running)
 
     def _draws_again(self, running: RunningEpisode, reply: Reply) -> bool:
-        """Let the episode begin once more if images of its video are needed that it did not draw."""
-        missing, length = self._render_plan.missing(reply.observation), len(reply.observation["state"]) - 1
+        """Let the episode begin once more if images of its video are needed that it
+        did not draw.
+        """
+        missing, length = (
+            self._render_plan.missing(reply.observation),
+            len(reply.observation["state"]) - 1,
+        )
         require(
             running.redrawn in (None, length),
-            f"{reply.job}: its conditioning video had {running.redrawn} frames, and {length} when it was simulated "
-            "again: the environment does not repeat itself. Set draw=all.",
+            f"{reply.job}: its conditioning video had {running.redrawn} frames, and {length} when"
+            " it was simulated again: the environment does not repeat itself. Set draw=all.",
         )
         if missing is None:
             return False
@@ -221,7 +238,9 @@ class Rollout:
             if isinstance(step, Act):
                 self._act(step.batch)
             elif isinstance(step, Prepare):
-                if isinstance(self.policy, PreparesChunks) and self.policy.prepare(step.work.episode):
+                if isinstance(self.policy, PreparesChunks) and self.policy.prepare(
+                    step.work.episode
+                ):
                     self._scheduler.later[step.work] = None
             else:
                 step.work.read()
@@ -236,7 +255,9 @@ class Rollout:
             self._scheduler.acting.append(running)
             return
         draw = self._render_plan.of_chunk(running, event.observed, event.hold - event.observed)
-        self.envs.send(running.worker, {"hold": event.hold, "subgoal": running.episode.subgoal, "draw": draw})
+        self.envs.send(
+            running.worker, {"hold": event.hold, "subgoal": running.episode.subgoal, "draw": draw}
+        )
 
     def _act(self, batch: list[RunningEpisode]) -> None:
         begun = time.perf_counter()
@@ -253,11 +274,16 @@ class Rollout:
             running.add_policy_seconds(share)
             actions = chunk[: self.settings.execute or self.policy.embodiment.action.execute]
             if not np.isfinite(actions).all():
-                self._finish(running, "error", "the policy's actions are not finite numbers", retry=False)
+                self._finish(
+                    running, "error", "the policy's actions are not finite numbers", retry=False
+                )
                 continue
             running.set_actions(actions)
             draw = self._render_plan.of_chunk(running, len(actions))
-            self.envs.send(running.worker, {"actions": actions, "subgoal": running.episode.subgoal, "draw": draw})
+            self.envs.send(
+                running.worker,
+                {"actions": actions, "subgoal": running.episode.subgoal, "draw": draw},
+            )
             self._scheduler.later[running] = None
 
     def _choose(self, batch: list[RunningEpisode]) -> np.ndarray:
@@ -269,7 +295,9 @@ class Rollout:
         source = environment(self.settings.env)
         return source.episode(job.task, job.split, job.episode), source.suite_of(job.task)
 
-    def _finish(self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True) -> None:
+    def _finish(
+        self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True
+    ) -> None:
         """Record an episode and let its worker begin another."""
         job = running.job
         outcome = status if status in ("success", "fail", "timeout") else "error"
@@ -278,12 +306,23 @@ class Rollout:
         spec, suite = self._spec(job)
         robot = self.policy.embodiment
         record = EpisodeRecord(
-            **vars(self.facts), action_space=robot.action.answers or robot.name, task=job.task, episode=job.episode,
-            seed=spec.seed, difficulty=spec.difficulty, scene=running.scene,
-            outcome=outcome, steps=running.steps, seconds=running.seconds, error=error if outcome == "error" else None,
+            **vars(self.facts),
+            action_space=robot.action.answers or robot.name,
+            task=job.task,
+            episode=job.episode,
+            seed=spec.seed,
+            difficulty=spec.difficulty,
+            scene=running.scene,
+            outcome=outcome,
+            steps=running.steps,
+            seconds=running.seconds,
+            error=error if outcome == "error" else None,
             extra={
-                "env": self.settings.env, "goal": running.episode.goal, "chunks": running.chunks,
-                "video_frames": running.video_frames, "actions_sha256": running.actions_sha256,
+                "env": self.settings.env,
+                "goal": running.episode.goal,
+                "chunks": running.chunks,
+                "video_frames": running.video_frames,
+                "actions_sha256": running.actions_sha256,
                 **({"suite": suite} if suite else {}),
                 **({"refused": error} if error and outcome != "error" else {}),
                 **({"video": running.video} if running.video else {}),
@@ -292,7 +331,7 @@ class Rollout:
                 **({"notes": running.episode.written} if running.episode.written else {}),
                 **({EXTRA: running.trace.score.to_dict()} if running.trace else {}),
             },
-        )  # fmt: skip
+        )
         again = outcome == "error" and retry and self._tries[job] <= self.settings.retries
         self.record(record)
         self.progress.episode(record, again)

@@ -18,18 +18,19 @@ class RolloutSettings:
 
     seed: of the policy's noise; it does not reach the environments.
     max_steps: actions until the outcome is `timeout`; by default as many as the split allows.
-    max_actions: actions, whatever frames they take, until the outcome is `timeout`; None: the policy's own limit.
-    only_possible: by choices, offer no option whose every object is out of reach.
-    execute: actions of a chunk that are executed before the policy acts again; None: the embodiment's number.
-    env: name of the environment in the registry.
+    max_actions: actions, whatever frames they take, until the outcome is `timeout`; None: the
+    policy's own limit. only_possible: by choices, offer no option whose every object is out of
+    reach. execute: actions of a chunk that are executed before the policy acts again; None: the
+    embodiment's number. env: name of the environment in the registry.
     workers: environments at a time; None: one a core, at most 16.
-    max_batch: most episodes that act together; 1 makes results independent of timing to the last bit.
-    encode_chunk: frames encoded before other episodes may act.
-    retries: how often an episode whose environment failed is tried again before the run continues without it.
-    timeout_s: seconds after which an environment that does not respond is replaced.
-    draw: `needed`: images that the policy and its subgoals read; `all`: of every frame. Outcomes are the same.
-    subgoal_log: whether every predicted subgoal is logged with its image.
-    event: what happens in every episode (`rollout.events`), such as `pause:100@subtask:2`; None for nothing.
+    max_batch: most episodes that act together; 1 makes results independent of timing to the last
+    bit. encode_chunk: frames encoded before other episodes may act.
+    retries: how often an episode whose environment failed is tried again before the run continues
+    without it. timeout_s: seconds after which an environment that does not respond is replaced.
+    draw: `needed`: images that the policy and its subgoals read; `all`: of every frame. Outcomes
+    are the same. subgoal_log: whether every predicted subgoal is logged with its image.
+    event: what happens in every episode (`rollout.events`), such as `pause:100@subtask:2`; None for
+    nothing.
     """
 
     seed: NonNegativeInt = 42
@@ -60,12 +61,17 @@ class RolloutSettings:
             object.__setattr__(self, "max_steps", source.step_limit(self.split))
         varied = read_variant(self.split) is not None
         if self.env == "official" and (varied or not self.render):
-            raise UserError("env=official has its own scenes and always renders: leave out split=… and render=false.")
+            raise UserError(
+                "env=official has its own scenes and always renders: leave out split=… and"
+                " render=false."
+            )
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read the keys of a configuration that are settings; others are ignored."""
-        provided = {key: value for key, value in config.items() if (key, value) != ("max_steps", None)}
+        provided = {
+            key: value for key, value in config.items() if (key, value) != ("max_steps", None)
+        }
         return read_section(cls, provided, others=True)
 
     def worker_count(self, episodes: int) -> int:

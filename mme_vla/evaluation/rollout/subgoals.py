@@ -1,4 +1,6 @@
-"""Predicted subgoals against the environment's own: whether the text is right, and how far the points are off."""
+"""Predicted subgoals against the environment's own: whether the text is right, and how far the
+points are off.
+"""
 
 import json
 import shutil
@@ -29,9 +31,10 @@ class SubgoalScore:
 
     A subgoal is right when its text without points is; points are compared where the text is right.
 
-    chunks: times the policy acted. judged: of these, how often the environment had a subgoal to compare with.
-    right: how often the text was the environment's. points, distance: points compared, and the sum of their distances
-    in pixels of the front image. asked: questions to a model. problems: unusable replies by kind.
+    chunks: times the policy acted. judged: of these, how often the environment had a subgoal to
+    compare with. right: how often the text was the environment's. points, distance: points
+    compared, and the sum of their distances in pixels of the front image. asked: questions to a
+    model. problems: unusable replies by kind.
     """
 
     chunks: int = 0
@@ -42,10 +45,13 @@ class SubgoalScore:
     asked: int = 0
     problems: Counter[str] = field(default_factory=Counter)
 
-    def add(self, predicted: str | None, meant: str | None, queried: bool = False, problem: str = "") -> None:
+    def add(
+        self, predicted: str | None, meant: str | None, queried: bool = False, problem: str = ""
+    ) -> None:
         """Count one subgoal.
 
-        predicted: the policy's subgoal; None while there is none. meant: the environment's; None where it has none.
+        predicted: the policy's subgoal; None while there is none. meant: the environment's; None
+        where it has none.
         """
         self.chunks += 1
         self.asked += queried
@@ -71,17 +77,26 @@ class SubgoalScore:
 
     @property
     def mean_distance(self) -> float | None:
-        """Mean distance of points in pixels, where the words are right; None without such points."""
+        """Mean distance of points in pixels, where the words are right; None without
+        such points.
+        """
         return self.distance / self.points if self.points else None
 
     def show(self) -> tuple[str, str]:
         """Accuracy and distance with their units, for a terminal."""
         accuracy, distance = self.accuracy, self.mean_distance
-        return "–" if accuracy is None else f"{accuracy:.1f} %", "–" if distance is None else f"{distance:.1f} px"
+        return (
+            "–" if accuracy is None else f"{accuracy:.1f} %",
+            "–" if distance is None else f"{distance:.1f} px",
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for a record."""
-        return {**asdict(self), "distance": round(self.distance, 2), "problems": dict(self.problems)}
+        return {
+            **asdict(self),
+            "distance": round(self.distance, 2),
+            "problems": dict(self.problems),
+        }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
@@ -89,7 +104,9 @@ class SubgoalScore:
         try:
             return cls(**{**values, "problems": Counter(values["problems"])})
         except (TypeError, KeyError) as error:
-            raise UserError(f"extra.{EXTRA} of a record is not a score of subgoals: {error}") from None
+            raise UserError(
+                f"extra.{EXTRA} of a record is not a score of subgoals: {error}"
+            ) from None
 
 
 def score_of(record: EpisodeRecord) -> SubgoalScore | None:
@@ -105,25 +122,45 @@ def total_score(records: Iterable[EpisodeRecord]) -> SubgoalScore | None:
 
 
 def point_distances(predicted: str | None, meant: str) -> list[float] | None:
-    """Distances in pixels between the points of two subgoals, in order; None if their words differ."""
+    """Distances in pixels between the points of two subgoals, in order; None if their
+    words differ.
+    """
     if predicted is None:
         return None
-    (predicted_words, predicted_points), (meant_words, meant_points) = mark_points(predicted), mark_points(meant)
-    if _normalised(predicted_words) != _normalised(meant_words) or len(predicted_points) != len(meant_points):
+    (predicted_words, predicted_points), (meant_words, meant_points) = (
+        mark_points(predicted),
+        mark_points(meant),
+    )
+    if _normalised(predicted_words) != _normalised(meant_words) or len(predicted_points) != len(
+        meant_points
+    ):
         return None
-    return [float(np.hypot(a - c, b - d)) for (a, b), (c, d) in zip(predicted_points, meant_points, strict=True)]
+    return [
+        float(np.hypot(a - c, b - d))
+        for (a, b), (c, d) in zip(predicted_points, meant_points, strict=True)
+    ]
 
 
 def subgoal_tables(results: Results) -> list[Table]:
     """Subgoals of every method that has a predictor, per task, over all its runs."""
-    columns = ["", "episodes", "subgoals", "right words (%)", "distance (pixels)", "asked", "unusable answers"]
+    columns = [
+        "",
+        "episodes",
+        "subgoals",
+        "right words (%)",
+        "distance (pixels)",
+        "asked",
+        "unusable answers",
+    ]
     return task_tables(results, EXTRA, "subgoals beside the environment's own", columns, _row)
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:
     total = total_score(records) or SubgoalScore()
     problems = ", ".join(f"{count} {kind}" for kind, count in sorted(total.problems.items())) or "0"
-    figures = ["–" if value is None else f"{value:.1f}" for value in (total.accuracy, total.mean_distance)]
+    figures = [
+        "–" if value is None else f"{value:.1f}" for value in (total.accuracy, total.mean_distance)
+    ]
     return [name, str(len(records)), str(total.judged), *figures, str(total.asked), problems]
 
 
@@ -137,9 +174,10 @@ SUBGOALS = "subgoals"  # Name of the folder within a run
 class SubgoalTrace:
     """Scores the subgoals of an episode and, given a folder, writes them down as they come.
 
-    `<folder>/<name>.jsonl` has a line for each time the policy acted, `<folder>/<name>/<step>.jpg` the image it acted
-    on. A subgoal that was kept, or came in the background, is older: `asked_step` is the step of its question.
-    What an earlier try of the same episode left there is replaced.
+    `<folder>/<name>.jsonl` has a line for each time the policy acted, `<folder>/<name>/<step>.jpg`
+    the image it acted on. A subgoal that was kept, or came in the background, is older:
+    `asked_step` is the step of its question. What an earlier try of the same episode left there is
+    replaced.
 
     kind: `simple` or `grounded`. folder: None keeps the score alone. name: of the episode.
     """
@@ -157,8 +195,8 @@ class SubgoalTrace:
     def add(self, episode: SubgoalEpisode, subgoal: Subgoal, latency_s: float) -> None:
         """Note the subgoal that the policy acts on now.
 
-        episode: as the predictor knows it, its last frame and report the current ones. latency_s: seconds the policy
-        waited for it.
+        episode: as the predictor knows it, its last frame and report the current ones. latency_s:
+        seconds the policy waited for it.
         """
         # Between two sub-tasks the environment names none, and the last one stays, as in training.
         self._meant = online_subgoal(episode.info, self._kind) or self._meant

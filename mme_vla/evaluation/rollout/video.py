@@ -1,4 +1,6 @@
-"""An episode as a video: all cameras side by side, the conditioning part in a red border, the subgoal below."""
+"""An episode as a video: all cameras side by side, the conditioning part in a red border, the
+subgoal below.
+"""
 
 import re
 from collections import deque
@@ -19,9 +21,11 @@ class EpisodeVideo:
     """Draws and compresses frame by frame, so that no episode is held in memory.
 
     A thread compresses beside the simulation, which waits only when it is `BEHIND` frames ahead.
-    The file gets its name, with the outcome, when the episode is over; until then it is a hidden file beside it.
+    The file gets its name, with the outcome, when the episode is over; until then it is a hidden
+    file beside it.
 
-    path: of the video, from outcome and goal. kept: which outcomes are kept: `all`, `success` or `failure`.
+    path: of the video, from outcome and goal. kept: which outcomes are kept: `all`, `success` or
+    `failure`.
     """
 
     def __init__(self, path: Callable[[str, str], Path], save_on: str = "all") -> None:
@@ -31,18 +35,25 @@ class EpisodeVideo:
         self._thread: ThreadPoolExecutor | None = None
         self._waiting: deque[Future[None]] = deque()
 
-    def add(self, views: Sequence[np.ndarray], caption: str | None = None, demo: bool = False) -> None:
+    def add(
+        self, views: Sequence[np.ndarray], caption: str | None = None, demo: bool = False
+    ) -> None:
         """Append the images [H, W, 3] uint8 that all cameras took at one step."""
         if self._video is None:
             self._video, self._thread = self._open(), ThreadPoolExecutor(1, "film")
         assert self._thread is not None
-        self._waiting.append(self._thread.submit(self._video.add, video_frame(views, caption, demo)))
+        self._waiting.append(
+            self._thread.submit(self._video.add, video_frame(views, caption, demo))
+        )
         while len(self._waiting) > BEHIND:
             self._waiting.popleft().result()
 
     def finish(self, outcome: str, goal: str) -> Path | None:
         """Close the video under its name; None if this outcome is not kept."""
-        if self._video is None or self._save_on not in ("all", "success" if outcome == "success" else "failure"):
+        if self._video is None or self._save_on not in (
+            "all",
+            "success" if outcome == "success" else "failure",
+        ):
             self.discard()
             return None
         self._compressed()

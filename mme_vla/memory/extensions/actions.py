@@ -1,14 +1,16 @@
 """Actions: an LSTM over what the robot itself felt and did; no image is read (CAMP).
 
-After "Remember what you did?" (CAMP, arXiv 2606.21188), whose code is not public: a recurrent memory of the robot's own
-actions is a strong history where scenes look alike. The paper trains it first to reconstruct the past actions (their
-low frequencies, quantised) and then conditions a diffusion policy on its code; a memory here has no loss of its own,
-so this one learns from the action loss alone. That it is an LSTM of two layers, reads states beside actions, also those
-of the conditioning video, every `stride` frames, and says what it knows in `budget` tokens, are choices of ours.
+After "Remember what you did?" (CAMP, arXiv 2606.21188), whose code is not public: a recurrent
+memory of the robot's own actions is a strong history where scenes look alike. The paper trains it
+first to reconstruct the past actions (their low frequencies, quantised) and then conditions a
+diffusion policy on its code; a memory here has no loss of its own, so this one learns from the
+action loss alone. That it is an LSTM of two layers, reads states beside actions, also those of the
+conditioning video, every `stride` frames, and says what it knows in `budget` tokens, are choices of
+ours.
 
-A frame's row is [state | action that led to it, relative to that state | 1], both normalised as the policy's are; where
-no own action led to it (the video, the first frame) the last two are 0. On a robot whose action is a motion of many
-frames they are 0 everywhere: the states say where it went.
+A frame's row is [state | action that led to it, relative to that state | 1], both normalised as the
+policy's are; where no own action led to it (the video, the first frame) the last two are 0. On a
+robot whose action is a motion of many frames they are 0 everywhere: the states say where it went.
 """
 
 import math
@@ -37,11 +39,13 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 class MotionRows(History):
-    """A history as such a memory sees it: its tokens are rows, padded with zeros to the width of a token.
+    """A history as such a memory sees it: its tokens are rows, padded with zeros to the width of a
+    token.
 
     Args:
         source: what is there. read: frames [n] → rows [n, w] float32. width: of a token.
-        memory: its name, for what is said where a row is too long. device: where rows are wanted; None leaves them.
+        memory: its name, for what is said where a row is too long. device: where rows are wanted;
+            None leaves them.
     """
 
     def __init__(
@@ -54,7 +58,13 @@ class MotionRows(History):
     ) -> None:
         super().__init__(source.spec, source.exec_start)
         self.clock_starts = source.clock_starts
-        self._source, self._read, self._width, self._memory, self._device = source, read, width, memory, device
+        self._source, self._read, self._width, self._memory, self._device = (
+            source,
+            read,
+            width,
+            memory,
+            device,
+        )
 
     def __len__(self) -> int:
         return len(self._source)
@@ -63,36 +73,48 @@ class MotionRows(History):
         rows = self._read(indices[:, 0])
         if rows.shape[1] > self._width:
             raise UserError(
-                f"The memory `{self._memory}` reads {rows.shape[1]} numbers a frame of this robot, and what carries "
-                f"them, most often this backbone's vision tokens, is {self._width} wide."
+                f"The memory `{self._memory}` reads {rows.shape[1]} numbers a frame of this robot,"
+                " and what carries them, most often this backbone's vision tokens, is"
+                f" {self._width} wide."
             )
         return nn.functional.pad(rows, (0, self._width - rows.shape[1])).to(self._device)
 
 
 class LSTMLayer(RecurrentLayer):
-    """An LSTM of several layers. State: hidden and cell states, each [b, layers, hidden], 0 at first.
+    """An LSTM of several layers. State: hidden and cell states, each [b, layers, hidden], 0 at
+    first.
 
-    Fresh cells forget at rates of their own, from half of what they hold a frame to a share in `longest` of it, evenly
-    in the logarithm (after Tallec and Ollivier, arXiv 1804.11188): with the usual bias of 1 nothing of a video would be
-    left after a hundred frames, and no loss could tell what there was to keep.
+    Fresh cells forget at rates of their own, from half of what they hold a frame to a share in
+    `longest` of it, evenly in the logarithm (after Tallec and Ollivier, arXiv 1804.11188): with the
+    usual bias of 1 nothing of a video would be left after a hundred frames, and no loss could tell
+    what there was to keep.
     """
 
     def __init__(self, hidden: int, layers: int, budget: int, longest: int) -> None:
         super().__init__()
         self.hidden, self.budget = hidden, budget
-        self.norm = nn.LayerNorm(hidden)  # a fresh encoder's outputs are small: the gates would hardly move
+        self.norm = nn.LayerNorm(
+            hidden
+        )  # a fresh encoder's outputs are small: the gates would hardly move
         inputs = [nn.Linear(hidden, 4 * hidden) for _ in range(layers)]
         self.inputs = nn.ModuleList(inputs)
-        self.recurrent = nn.ModuleList(nn.Linear(hidden, 4 * hidden, bias=False) for _ in range(layers))
+        self.recurrent = nn.ModuleList(
+            nn.Linear(hidden, 4 * hidden, bias=False) for _ in range(layers)
+        )
         self.tokens = nn.Linear(hidden, budget * hidden)
-        # What is the same for every history must not be most of a token: norms above leave its direction alone.
+        # What is the same for every history must not be most of a token: norms above leave its
+        # direction alone.
         nn.init.zeros_(self.tokens.bias)
         with torch.no_grad():
             for gates in inputs:
-                gates.bias[hidden : 2 * hidden] = torch.linspace(0, math.log(max(longest - 1, 2)), hidden)
+                gates.bias[hidden : 2 * hidden] = torch.linspace(
+                    0, math.log(max(longest - 1, 2)), hidden
+                )
 
     def initial(self, batch: int) -> State:
-        zeros = self.tokens.weight.new_zeros(batch, len(self.inputs), self.hidden, dtype=torch.float32)
+        zeros = self.tokens.weight.new_zeros(
+            batch, len(self.inputs), self.hidden, dtype=torch.float32
+        )
         return zeros, zeros
 
     def advance(
@@ -114,7 +136,10 @@ class LSTMLayer(RecurrentLayer):
                     outputs.append(h)
                 normed = torch.stack(outputs, 1)
                 after.append((h, c))
-            return (torch.stack([h for h, _ in after], 1), torch.stack([c for _, c in after], 1)), {}
+            return (
+                torch.stack([h for h, _ in after], 1),
+                torch.stack([c for _, c in after], 1),
+            ), {}
 
     def read(self, state: State) -> tuple[Tensor, Tensor]:
         tokens = linear(self.tokens, state[0][:, -1]).unflatten(-1, (self.budget, self.hidden))
@@ -137,10 +162,12 @@ class ActionMemory(RecurrentMemory, ProprioMemory):
         stride: int = 4,
         **options: Any,
     ) -> None:
-        """See `RecurrentMemory`, whose frames these are; there are no images, so no grid and no pooling.
+        """See `RecurrentMemory`, whose frames these are; there are no images, so no grid and no
+        pooling.
 
         Args:
-            budget: memory tokens. hidden: width of the LSTM; None is a quarter of `d_vision`, at least 64.
+            budget: memory tokens. hidden: width of the LSTM; None is a quarter of `d_vision`, at
+                least 64.
             layers: of the LSTM. max_steps, max_video, stride: which frames it reads.
         """
         check_sizes("memory", budget=budget, layers=layers)
@@ -154,11 +181,16 @@ class ActionMemory(RecurrentMemory, ProprioMemory):
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return np.zeros(0, np.int64)
 
-    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+    def gather_selection(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> HistoryTokens:
         return super().gather_selection(self._motion_rows(history), step, rng)
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
-        return super().encode([self._motion_rows(history, self.output.weight.device) for history in histories], streams)
+        return super().encode(
+            [self._motion_rows(history, self.output.weight.device) for history in histories],
+            streams,
+        )
 
     def prepare(self, history: History, stream: Any) -> bool:
         return super().prepare(self._motion_rows(history, self.output.weight.device), stream)

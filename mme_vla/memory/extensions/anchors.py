@@ -1,7 +1,8 @@
 """Anchors: the first frame and the last ones, the floor that a memory has to exceed.
 
-After the anchors of EventVLA, which keeps frame 0 and two frames of the last second beside its keyframes. There is
-nothing here that decides what to write, so any memory that does is compared with it.
+After the anchors of EventVLA, which keeps frame 0 and two frames of the last second beside its
+keyframes. There is nothing here that decides what to write, so any memory that does is compared
+with it.
 """
 
 from typing import Any
@@ -38,8 +39,8 @@ class Anchors(FrameMemory, PerceptualMemory):
         Args:
             budget: memory tokens; 48 hold the first frame and the last two.
             grid, pooling: a frame is grid×grid tokens.
-            spacing, every: frames between two of the last ones, of which the current frame is one, and how they are
-                counted (`recurrent_frames`).
+            spacing, every: frames between two of the last ones, of which the current frame is one,
+                and how they are counted (`recurrent_frames`).
         """
         check_sizes("memory", spacing=spacing)
         check_every(every, spacing, "spacing")
@@ -49,4 +50,6 @@ class Anchors(FrameMemory, PerceptualMemory):
 
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """Frame 0 and the last ones, ascending."""
-        return np.union1d([0], recurrent_frames(step, 0, self.recent, stride=self.spacing, every=self.every))
+        return np.union1d(
+            [0], recurrent_frames(step, 0, self.recent, stride=self.spacing, every=self.every)
+        )

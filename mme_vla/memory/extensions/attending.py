@@ -1,4 +1,6 @@
-"""A small pre-norm transformer block that memories put together: some tokens read others, then an MLP."""
+"""A small pre-norm transformer block that memories put together: some tokens read others, then an
+MLP.
+"""
 
 from collections.abc import Sequence
 
@@ -19,7 +21,10 @@ MLP = 4
 def heads_of(hidden: int, heads: int | None) -> int:
     """So many heads; None is one for each 64 of `hidden`, at least 2."""
     heads = heads or max(2, hidden // 64)
-    require(heads >= 1 and hidden % heads == 0, f"memory.heads={heads} does not divide memory.hidden={hidden}.")
+    require(
+        heads >= 1 and hidden % heads == 0,
+        f"memory.heads={heads} does not divide memory.hidden={hidden}.",
+    )
     return heads
 
 
@@ -29,12 +34,22 @@ class ReadingBlock(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.head_dim = width // heads
-        self.norm, self.context_norm, self.mlp_norm = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
-        self.q, self.kv, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
+        self.norm, self.context_norm, self.mlp_norm = (
+            nn.LayerNorm(width),
+            nn.LayerNorm(width),
+            nn.LayerNorm(width),
+        )
+        self.q, self.kv, self.out = (
+            nn.Linear(width, width),
+            nn.Linear(width, 2 * width),
+            nn.Linear(width, width),
+        )
         self.up, self.down = nn.Linear(width, MLP * width), nn.Linear(MLP * width, width)
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor) -> Tensor:
-        """Let x [b, q, d] read context [b, k, d] where mask, bool [b, q, k], says so; a row of no one's reads all."""
+        """Let x [b, q, d] read context [b, k, d] where mask, bool [b, q, k], says so; a row of no
+        one's reads all.
+        """
         q = self.q(self.norm(x)).unflatten(-1, (-1, self.head_dim))
         k, v = self.kv(self.context_norm(context)).unflatten(-1, (-1, self.head_dim)).chunk(2, -2)
         q, k, v = (part.transpose(1, 2) for part in (q, k, v))
@@ -47,7 +62,9 @@ class ReadingBlock(nn.Module):
 
 
 def not_later(queries: Tensor, keys: Tensor) -> Tensor:
-    """Which keys belong to a query's frame or an earlier one: frame numbers [b, q] and [b, k] → bool [b, q, k]."""
+    """Which keys belong to a query's frame or an earlier one: frame numbers [b, q] and [b, k] →
+    bool [b, q, k].
+    """
     return keys[:, None, :] <= queries[:, :, None]
 
 
@@ -68,13 +85,17 @@ class FrameMemory(MemoryModule):
     lazy = True  # most frames are never selected
 
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
-        """The frames that are read at `step` of an episode whose execution begins at `exec_start`; int64, ascending."""
+        """The frames that are read at `step` of an episode whose execution begins at `exec_start`;
+        int64, ascending.
+        """
         raise NotImplementedError
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return union_frames([self.selected_frames(int(step), exec_start) for step in steps])
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         return all_patches(self.selected_frames(step, history.exec_start), self.storage.grid)
 
     def padded_length(self, count: int) -> int:

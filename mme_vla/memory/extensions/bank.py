@@ -1,7 +1,9 @@
-"""Memory banks (MemoryVLA): learned tokens of past moments that are written, retrieved, fused and merged.
+"""Memory banks (MemoryVLA): learned tokens of past moments that are written, retrieved, fused and
+merged.
 
-Unlike the memories that choose among stored vision tokens, a bank keeps what the network itself made of a moment, and
-is asked with the tokens of the current one. Its state belongs to an episode: `init_state`, `read`, `update`.
+Unlike the memories that choose among stored vision tokens, a bank keeps what the network itself
+made of a moment, and is asked with the tokens of the current one. Its state belongs to an episode:
+`init_state`, `read`, `update`.
 """
 
 from collections.abc import Sequence
@@ -51,7 +53,8 @@ class Banked(FrameMemory):
             d_vision: width of a vision token. width: of a memory token, given by the integration.
             budget: most memory tokens; grid×grid of them are made.
             grid, pooling: a moment is grid×grid tokens.
-            stride, every, moments, video: which frames are moments (`recurrent_frames`), the current one among them.
+            stride, every, moments, video: which frames are moments (`recurrent_frames`), the
+                current one among them.
             hidden: width of the bank; by default a quarter of `d_vision`, at least 64.
             length, retrieval_layers, time_code, fusion, consolidation: as for `MemoryBank`.
         """
@@ -59,10 +62,12 @@ class Banked(FrameMemory):
         check_sizes("memory", grid=grid, stride=stride, video=video)
         check_every(every, stride)
         require(
-            1 < moments > video, f"memory.moments={moments} must be at least 2, and more than memory.video={video}."
+            1 < moments > video,
+            f"memory.moments={moments} must be at least 2, and more than memory.video={video}.",
         )
         require(
-            budget >= grid**2, f"memory.budget={budget} does not hold the {grid}×{grid} tokens of a frame: {grid**2}."
+            budget >= grid**2,
+            f"memory.budget={budget} does not hold the {grid}×{grid} tokens of a frame: {grid**2}.",
         )
         hidden = default_hidden(d_vision, hidden)
         self.budget, self.moments, self.video = grid**2, moments, video
@@ -85,7 +90,9 @@ class Banked(FrameMemory):
         stored = self.bank.replay(moments[:, :-1], times[:, :-1], valid[:, :-1])
         current = moments[:, -1]
         tokens = self.output(self.bank.fuse(current, self.bank.ask(current, *stored)))
-        return MemoryTokens(tokens, torch.ones(tokens.shape[:2], dtype=torch.bool, device=tokens.device))
+        return MemoryTokens(
+            tokens, torch.ones(tokens.shape[:2], dtype=torch.bool, device=tokens.device)
+        )
 
 
 FUSIONS, CONSOLIDATIONS = ("gate", "add"), ("tome", "fifo")
@@ -97,7 +104,8 @@ GATE_STD = 1e-3  # of a fresh gate, which so begins at about one half
 class BankState:
     """What a bank holds of one episode, in the order of time, without gradients.
 
-    entries: [t, n, d]. times: [t] int64. merged: where the newest entry made two others one; −1 where it did not.
+    entries: [t, n, d]. times: [t] int64. merged: where the newest entry made two others one; −1
+    where it did not.
     """
 
     entries: Tensor
@@ -121,26 +129,40 @@ class TimeCode(nn.Module):
         return self.output(functional.silu(self.input(features)))
 
     def features(self, times: Tensor) -> Tensor:
-        """[cos(t f) | sin(t f)] of times [n], f_j = 10000^(−j/half); of an odd width the last number is 0."""
+        """[cos(t f) | sin(t f)] of times [n], f_j = 10000^(−j/half); of an odd width the last
+        number is 0.
+        """
         half = self.frequencies // 2
         ramp = torch.arange(half, device=times.device, dtype=torch.float32) / max(half, 1)
         angles = times.float()[:, None] * LONGEST**-ramp
-        return functional.pad(torch.cat([angles.cos(), angles.sin()], -1), (0, self.frequencies % 2))
+        return functional.pad(
+            torch.cat([angles.cos(), angles.sin()], -1), (0, self.frequencies % 2)
+        )
 
 
 class RetrievalBlock(nn.Module):
-    """Attention of one head as wide as the tokens, then an MLP; a norm after each. What is read is `read` wide."""
+    """Attention of one head as wide as the tokens, then an MLP; a norm after each. What is read is
+    `read` wide.
+    """
 
     def __init__(self, width: int, read: int | None = None) -> None:
         super().__init__()
-        self.query, self.key, self.value = (nn.Linear(size or width, width) for size in (width, read, read))
+        self.query, self.key, self.value = (
+            nn.Linear(size or width, width) for size in (width, read, read)
+        )
         self.attention_norm, self.mlp_norm = nn.LayerNorm(width), nn.LayerNorm(width)
         self.mlp_in, self.mlp_out = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
 
-    def forward(self, query: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Queries [b, n, d] read keys and values [b, m, read]; mask [b, 1, m] is False on padding."""
+    def forward(
+        self, query: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None
+    ) -> Tensor:
+        """Queries [b, n, d] read keys and values [b, m, read]; mask [b, 1, m] is False
+        on padding.
+        """
         q, k, v = self.query(query), self.key(keys), self.value(values)
-        x = self.attention_norm(query + functional.scaled_dot_product_attention(q, k, v, attn_mask=mask))
+        x = self.attention_norm(
+            query + functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        )
         return self.mlp_norm(x + self.mlp_out(functional.gelu(self.mlp_in(x))))
 
 
@@ -164,7 +186,8 @@ class Retrieval(nn.Module):
             width: d. read: width of an entry, where it is another.
             retrieval_layers: blocks the current tokens read the entries through.
             time_code: whether keys carry their moment's time.
-            fusion: how current and retrieved tokens become one: `gate` (learned, each number its own) or `add` (mean).
+            fusion: how current and retrieved tokens become one: `gate` (learned, each number its
+                own) or `add` (mean).
         """
         super().__init__()
         check_sizes("bank", retrieval_layers=retrieval_layers)
@@ -177,7 +200,13 @@ class Retrieval(nn.Module):
             nn.init.normal_(self.gate.weight, std=GATE_STD)
             nn.init.normal_(self.gate.bias, std=GATE_STD)
 
-    def ask(self, tokens: Tensor, entries: Tensor, times: Tensor | None = None, valid: Tensor | None = None) -> Tensor:
+    def ask(
+        self,
+        tokens: Tensor,
+        entries: Tensor,
+        times: Tensor | None = None,
+        valid: Tensor | None = None,
+    ) -> Tensor:
         """What entries [b, t, n, d] at times [b, t] answer to tokens [b, k, d].
 
         Args:
@@ -187,7 +216,10 @@ class Retrieval(nn.Module):
         keys = entries
         if self.time is not None:
             assert times is not None
-            keys = entries + self.time(times.flatten()).to(tokens).unflatten(0, times.shape)[:, :, None]
+            keys = (
+                entries
+                + self.time(times.flatten()).to(tokens).unflatten(0, times.shape)[:, :, None]
+            )
         empty = mask = None
         if valid is not None:
             empty = ~valid.any(1)
@@ -207,14 +239,18 @@ class Retrieval(nn.Module):
         return share * tokens + (1 - share) * retrieved
 
     def read_memory(self, memory: MemoryTokens, tokens: Tensor) -> Tensor:
-        """Fused tokens [b, k, d], from the current ones and a memory's tokens [b, n, read] in place of entries."""
+        """Fused tokens [b, k, d], from the current ones and a memory's tokens [b, n, read] in place
+        of entries.
+        """
         # Tokens where the mask is False are undefined: a weight of 0 alone would let a nan through.
         entries = memory.tokens.masked_fill(~memory.mask[..., None], 0).to(tokens)
         return self.fuse(tokens, self.ask(tokens, entries[:, :, None], valid=memory.mask))
 
 
 class MemoryBank(Retrieval):
-    """A bank of at most `length` moments, each n tokens of width d: what is written, merged, and so retrieved."""
+    """A bank of at most `length` moments, each n tokens of width d: what is written, merged, and so
+    retrieved.
+    """
 
     def __init__(
         self,
@@ -229,9 +265,10 @@ class MemoryBank(Retrieval):
         """Build an empty bank.
 
         Args:
-            width, retrieval_layers, time_code, fusion: as for `Retrieval`. length: most moments it holds.
-            consolidation: what becomes of a moment too many: `tome` makes the two most alike neighbours one, `fifo`
-                drops the oldest.
+            width, retrieval_layers, time_code, fusion: as for `Retrieval`. length: most moments it
+                holds.
+            consolidation: what becomes of a moment too many: `tome` makes the two most alike
+                neighbours one, `fifo` drops the oldest.
             store_fused: store the fused tokens instead of the current ones.
         """
         check_sizes("bank", length=length)
@@ -246,14 +283,21 @@ class MemoryBank(Retrieval):
         return BankState(weight.new_zeros(0, tokens, self.width), times)
 
     def retrieve(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
-        """What the current tokens [b, n, d] of b episodes retrieve from their banks; an empty bank returns these."""
+        """What the current tokens [b, n, d] of b episodes retrieve from their banks; an empty bank
+        returns these.
+        """
         lengths = [len(state) for state in states]
         longest = max(lengths)
         if not longest:
             return tokens
-        entries = torch.stack([_padded(state.entries, longest) for state in states]).to(tokens)  # b t n d
+        entries = torch.stack([_padded(state.entries, longest) for state in states]).to(
+            tokens
+        )  # b t n d
         times = torch.stack([_padded(state.times, longest) for state in states]).to(tokens.device)
-        valid = torch.arange(longest, device=tokens.device) < torch.tensor(lengths, device=tokens.device)[:, None]
+        valid = (
+            torch.arange(longest, device=tokens.device)
+            < torch.tensor(lengths, device=tokens.device)[:, None]
+        )
         return self.ask(tokens, entries, times, None if min(lengths) == longest else valid)
 
     def read(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
@@ -261,7 +305,9 @@ class MemoryBank(Retrieval):
         return self.fuse(tokens, self.retrieve(states, tokens))
 
     def update(self, state: BankState, tokens: Tensor, fused: Tensor, time: int) -> BankState:
-        """The bank after a moment [n, d] at `time`, of which `fused` was read; no gradient goes in."""
+        """The bank after a moment [n, d] at `time`, of which `fused` was read; no
+        gradient goes in.
+        """
         stored = (fused if self.store_fused else tokens).detach()
         entries = torch.cat([state.entries.to(stored), stored[None]])
         times = torch.cat([state.times, state.times.new_tensor([time])])
@@ -271,15 +317,19 @@ class MemoryBank(Retrieval):
             return BankState(entries[1:], times[1:])
         return _merge(entries, times)
 
-    def replay(self, moments: Tensor, times: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What banks hold after b sequences of moments, written at once: as `update` one by one, with fixed shapes.
+    def replay(
+        self, moments: Tensor, times: Tensor, valid: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What banks hold after b sequences of moments, written at once: as `update` one by one,
+        with fixed shapes.
 
         Args:
-            moments: [b, t, n, d]. times: [b, t] int64. valid: [b, t] bool, False on padding, which goes in front.
+            moments: [b, t, n, d]. times: [b, t] int64. valid: [b, t] bool, False on padding, which
+                goes in front.
 
         Returns:
-            Entries [b, k, n, d] without gradients, times [b, k] and whether there is such an entry [b, k], k ≤ length,
-            the empty places in front.
+            Entries [b, k, n, d] without gradients, times [b, k] and whether there is such an entry
+            [b, k], k ≤ length, the empty places in front.
         """
         entries = moments.detach().clone()  # two that become one are written where the earlier was
 
@@ -287,31 +337,46 @@ class MemoryBank(Retrieval):
             return entries.gather(1, places[..., None, None].expand(-1, -1, *entries.shape[2:]))
 
         def similarity(first: Tensor, second: Tensor) -> Tensor:
-            return functional.cosine_similarity(entries_at(first), entries_at(second), dim=-1).mean(-1)
+            return functional.cosine_similarity(entries_at(first), entries_at(second), dim=-1).mean(
+                -1
+            )
 
         places = torch.arange(self.length, device=times.device)[None]
         indices = places[:, : times.shape[1]].expand(len(times), -1)  # b k: which of the moments
-        alike = similarity(indices[:, :-1], indices[:, 1:])  # of neighbours; merging changes two of them
+        alike = similarity(
+            indices[:, :-1], indices[:, 1:]
+        )  # of neighbours; merging changes two of them
         for step in range(self.length, times.shape[1]):
             indices = torch.cat([indices, torch.full_like(indices[:, :1], step)], 1)
-            # Where the first place is empty it goes; else the oldest does, or two neighbours become one.
+            # Where the first place is empty it goes; else the oldest does, or two neighbours become
+            # one.
             pair = torch.full_like(indices[:, :1], -1)
             if self.consolidation == "tome":
                 alike = torch.cat([alike, similarity(indices[:, -2:-1], indices[:, -1:])], 1)
-                pair = torch.where(valid.gather(1, indices[:, :1]), alike.argmax(1, keepdim=True), pair)
+                pair = torch.where(
+                    valid.gather(1, indices[:, :1]), alike.argmax(1, keepdim=True), pair
+                )
                 both = entries_at(indices.gather(1, torch.cat([pair, pair + 1], 1).clamp(min=0)))
-                one = torch.where((pair < 0)[..., None, None], both[:, :1], both.mean(1, keepdim=True))
+                one = torch.where(
+                    (pair < 0)[..., None, None], both[:, :1], both.mean(1, keepdim=True)
+                )
                 earlier = indices.gather(1, pair.clamp(min=0))[..., None, None].expand_as(one)
                 entries.scatter_(1, earlier, one)
                 alike = alike.gather(1, places[:, :-1] + (places[:, :-1] >= pair).long())
             indices = indices.gather(1, places + (places > pair).long())
             if self.consolidation == "tome" and self.length > 1:
                 left = torch.cat([pair - 1, pair], 1).clamp(0, self.length - 2)
-                alike = alike.scatter(1, left, similarity(indices.gather(1, left), indices.gather(1, left + 1)))
+                alike = alike.scatter(
+                    1, left, similarity(indices.gather(1, left), indices.gather(1, left + 1))
+                )
         return entries_at(indices), times.gather(1, indices), valid.gather(1, indices)
 
     def run(
-        self, tokens: Tensor, times: Tensor, sequences: Sequence[Tensor], states: Sequence[BankState] | None = None
+        self,
+        tokens: Tensor,
+        times: Tensor,
+        sequences: Sequence[Tensor],
+        states: Sequence[BankState] | None = None,
     ) -> tuple[Tensor, list[BankState]]:
         """Take sequences of moments side by side, each in its own bank.
 
@@ -323,7 +388,11 @@ class MemoryBank(Retrieval):
         Returns:
             Fused tokens [m, n, d], and the bank after each sequence.
         """
-        banks = list(states) if states is not None else [self.init_state(tokens.shape[1]) for _ in sequences]
+        banks = (
+            list(states)
+            if states is not None
+            else [self.init_state(tokens.shape[1]) for _ in sequences]
+        )
         when = times.tolist()
         fused: list[Tensor] = []
         places: list[Tensor] = []
@@ -345,7 +414,11 @@ def _merge(entries: Tensor, times: Tensor) -> BankState:
     alike = functional.cosine_similarity(entries[:-1], entries[1:], dim=-1).mean(-1)
     i = int((alike == alike.max()).nonzero()[0])
     one = (entries[i : i + 1] + entries[i + 1 : i + 2]) / 2
-    return BankState(torch.cat([entries[:i], one, entries[i + 2 :]]), torch.cat([times[: i + 1], times[i + 2 :]]), i)
+    return BankState(
+        torch.cat([entries[:i], one, entries[i + 2 :]]),
+        torch.cat([times[: i + 1], times[i + 2 :]]),
+        i,
+    )
 
 
 def _padded(x: Tensor, length: int) -> Tensor:

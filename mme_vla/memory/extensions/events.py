@@ -1,14 +1,19 @@
-"""Events: keyframes by rule, where the gripper acts, the arm comes to rest, or the image changes (KEMO, EventVLA).
+"""Events: keyframes by rule, where the gripper acts, the arm comes to rest, or the image changes
+(KEMO, EventVLA).
 
-After "KEMO" (arXiv 2606.23589), whose code is not public: keyframes where a kinematic event takes place, filtered by
-what is seen. The rules here are ours, and none has a threshold on how fast a robot is or how much an image changes:
+After "KEMO" (arXiv 2606.23589), whose code is not public: keyframes where a kinematic event takes
+place, filtered by what is seen. The rules here are ours, and none has a threshold on how fast a
+robot is or how much an image changes:
 
-- the gripper opens or closes by at least `gripper` of its normalised range between two stored frames
+- the gripper opens or closes by at least `gripper` of its normalised range between two stored
+  frames
 - the speed of the arm has a minimum: it is lower than before, and not higher than after
-- the image's change, as TokenDrop scores it, has a maximum: it is higher than before, and not lower than after
+- the image's change, as TokenDrop scores it, has a maximum: it is higher than before, and not lower
+  than after
 
-An event counts one for each of the first two, and for the last the change as a share of the greatest so far. The
-greatest are kept, with the first frame and the newest. A minimum and a maximum are known one stored frame later.
+An event counts one for each of the first two, and for the last the change as a share of the
+greatest so far. The greatest are kept, with the first frame and the newest. A minimum and a maximum
+are known one stored frame later.
 """
 
 from collections.abc import Callable
@@ -29,7 +34,9 @@ from mme_vla.types import HistoryTokens
 
 @MEMORIES.register("events")
 class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
-    """The first frame, the newest stored one, and at most `budget / grid² − 2` at which something happened."""
+    """The first frame, the newest stored one, and at most `budget / grid² − 2` at which something
+    happened.
+    """
 
     def __init__(
         self,
@@ -50,7 +57,8 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
             grid, pooling: a frame is grid×grid tokens.
             stride: frames 0 and k·stride − 1 are stored and compared.
             gripper: least change of the gripper that is an event; its normalised range is 2.
-            gripper_state: which number of the robot's state is its gripper. The others are the arm's.
+            gripper_state: which number of the robot's state is its gripper. The others are the
+                arm's.
         """
         check_sizes("memory", stride=stride)
         require(gripper > 0, f"memory.gripper={gripper}: must be greater than 0.")
@@ -65,19 +73,24 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
     def frames_scored(self, length: int) -> np.ndarray:
         return self.storage.stored_frames(length)
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         frames = self.storage.stored_frames(step + 1)
         if len(frames) > self.frames:
             frames = frames[self.top_frames(history, frames)]
         return all_patches(frames, self.storage.grid)
 
     def top_frames(self, history: History, frames: np.ndarray) -> np.ndarray:
-        """Which of the stored frames [n] up to now are kept: ascending indices, no more than fit."""
+        """Which of the stored frames [n] up to now are kept: ascending indices, no
+        more than fit.
+        """
         states = history.proprio(frames).numpy().astype(np.float64)
         count, number = states.shape[1], self.gripper_state
         require(
             -count <= number < count,
-            f"memory.gripper_state={number}: the robot's state has {count} numbers. Name the gripper's, from 0.",
+            f"memory.gripper_state={number}: the robot's state has {count} numbers. Name the"
+            " gripper's, from 0.",
         )
         arm, gripper = np.delete(states, self.gripper_state, 1), states[:, self.gripper_state]
         closes = np.abs(np.diff(gripper, prepend=gripper[:1])) >= self.gripper
@@ -91,11 +104,15 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
         best = np.argsort(-value, kind="stable")[: self.frames]
         return np.sort(best[value[best] > 0])
 
-    def condition_on_prompt(self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]) -> HistoryTokens:
+    def condition_on_prompt(
+        self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
+    ) -> HistoryTokens:
         return replace(history, features=condition(history.features))
 
 
 def peaks(values: np.ndarray) -> np.ndarray:
-    """Where values [n] are higher than the one before and not lower than the one after; bool [n], False at the ends."""
+    """Where values [n] are higher than the one before and not lower than the one after; bool [n],
+    False at the ends.
+    """
     inside = (values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])
     return np.pad(inside, 1)

@@ -1,10 +1,12 @@
-"""Gist: the first frames and the last ones whole, and a few learned tokens of every frame between (MemoryWAM).
+"""Gist: the first frames and the last ones whole, and a few learned tokens of every frame between
+(MemoryWAM).
 
-After "Efficient World Action Modeling with Persistent Memory" (arXiv 2606.20562), whose code is not public; what is
-taken from the paper: two whole anchor frames at the task's onset, four whole recent frames, eight gist tokens of every
-frame, which read their own frame and the gists of earlier ones, and older frames that are seen through their gists
-alone. There the gists are keys and values inside a video model; here they are memory tokens. Ours are the number of
-layers, the spacing of frames, and that an episode with more frames than the budget holds keeps evenly spaced ones.
+After "Efficient World Action Modeling with Persistent Memory" (arXiv 2606.20562), whose code is not
+public; what is taken from the paper: two whole anchor frames at the task's onset, four whole recent
+frames, eight gist tokens of every frame, which read their own frame and the gists of earlier ones,
+and older frames that are seen through their gists alone. There the gists are keys and values inside
+a video model; here they are memory tokens. Ours are the number of layers, the spacing of frames,
+and that an episode with more frames than the budget holds keeps evenly spaced ones.
 """
 
 from typing import Any
@@ -15,7 +17,14 @@ from torch import Tensor, nn
 
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import FeatureEncoder
-from mme_vla.memory.extensions.attending import FrameMemory, ReadingBlock, by_frame, heads_of, not_later, rows_at
+from mme_vla.memory.extensions.attending import (
+    FrameMemory,
+    ReadingBlock,
+    by_frame,
+    heads_of,
+    not_later,
+    rows_at,
+)
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import check_every, default_hidden, recurrent_frames
@@ -25,7 +34,9 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 @MEMORIES.register("gist")
 class Gist(FrameMemory):
-    """[anchors, whole | gists of the frames between | recent frames, whole], in the order of time."""
+    """[anchors, whole | gists of the frames between | recent frames, whole], in the
+    order of time.
+    """
 
     pad_left = True
     timed = True
@@ -53,25 +64,36 @@ class Gist(FrameMemory):
         Args:
             d_vision: width of a vision token. width: of a memory token, given by the integration.
             budget: most memory tokens; what whole frames leave of it holds gists.
-            anchors, recent: whole frames at the beginning and at the end. gists: tokens of each frame between.
+            anchors, recent: whole frames at the beginning and at the end. gists: tokens of each
+                frame between.
             grid, pooling: a frame that is read is grid×grid tokens.
-            stride, every: frames between two that are read, and how they are counted (`recurrent_frames`); the first is
-                always read.
-            layers, hidden, heads: of the gists' encoder; its width is by default a quarter of `d_vision`, at least 64.
+            stride, every: frames between two that are read, and how they are counted
+                (`recurrent_frames`); the first is always read.
+            layers, hidden, heads: of the gists' encoder; its width is by default a quarter of
+                `d_vision`, at least 64.
             encoder: `position_dim`, `position_hidden` and `positions` of both `FeatureEncoder`s.
         """
         super().__init__()
-        check_sizes("memory", anchors=anchors, recent=recent, gists=gists, stride=stride, layers=layers)
+        check_sizes(
+            "memory", anchors=anchors, recent=recent, gists=gists, stride=stride, layers=layers
+        )
         check_every(every, stride)
         full_tokens = (anchors + recent) * grid**2
         require(
             budget >= full_tokens + gists,
-            f"memory.budget={budget} does not hold {anchors + recent} whole frames of {grid}×{grid} tokens and the "
-            f"gists of one more: choose at least {full_tokens + gists}, or fewer memory.anchors or memory.recent.",
+            f"memory.budget={budget} does not hold {anchors + recent} whole frames of {grid}×{grid}"
+            f" tokens and the gists of one more: choose at least {full_tokens + gists}, or fewer"
+            " memory.anchors or memory.recent.",
         )
         hidden = default_hidden(d_vision, hidden)
         heads = heads_of(hidden, heads)
-        self.anchors, self.recent, self.gists, self.stride, self.every = anchors, recent, gists, stride, every
+        self.anchors, self.recent, self.gists, self.stride, self.every = (
+            anchors,
+            recent,
+            gists,
+            stride,
+            every,
+        )
         self.between = (budget - full_tokens) // gists
         self.budget = full_tokens + self.between * gists
         self.storage = StorageSpec(grid, pooling)
@@ -94,28 +116,42 @@ class Gist(FrameMemory):
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2
-        places = by_frame(torch.arange(history.mask.shape[1], device=history.mask.device)[None], patches)[0]  # t p
+        places = by_frame(
+            torch.arange(history.mask.shape[1], device=history.mask.device)[None], patches
+        )[0]  # t p
         valid = by_frame(history.mask, patches)[..., 0]  # b t
         first, between, last = self._parts(valid)
         gists = self.output(self.norm(self._gists(history, valid)))
-        full = rows_at(by_frame(history.features, patches), torch.cat([first[0], last[0]], 1)).flatten(1, 2)
-        where = rows_at(by_frame(history.positions, patches), torch.cat([first[0], last[0]], 1)).flatten(1, 2)
+        full = rows_at(
+            by_frame(history.features, patches), torch.cat([first[0], last[0]], 1)
+        ).flatten(1, 2)
+        where = rows_at(
+            by_frame(history.positions, patches), torch.cat([first[0], last[0]], 1)
+        ).flatten(1, 2)
         there = torch.cat([first[1], last[1]], 1).repeat_interleave(patches, 1)
         encoded = self.encoder(full, where, there)
         split = [self.anchors * patches, self.recent * patches]
-        (anchors, recent), (anchor_mask, recent_mask) = encoded.split(split, 1), there.split(split, 1)
+        (anchors, recent), (anchor_mask, recent_mask) = (
+            encoded.split(split, 1),
+            there.split(split, 1),
+        )
         summaries = rows_at(gists.unflatten(1, (-1, self.gists)), between[0]).flatten(1, 2)
         summary_mask = between[1].repeat_interleave(self.gists, 1)
         ages = None
         if history.ages is not None:
             of_frame = history.ages[:, places[:, 0]]
             counts = zip((first, between, last), (patches, self.gists, patches), strict=True)
-            ages = torch.cat([rows_at(of_frame, at).repeat_interleave(n, 1) for (at, _), n in counts], 1)
+            ages = torch.cat(
+                [rows_at(of_frame, at).repeat_interleave(n, 1) for (at, _), n in counts], 1
+            )
         tokens = torch.cat([anchors, summaries.to(anchors.dtype), recent], 1)
-        return MemoryTokens(tokens, torch.cat([anchor_mask, summary_mask, recent_mask], 1), ages=ages)
+        return MemoryTokens(
+            tokens, torch.cat([anchor_mask, summary_mask, recent_mask], 1), ages=ages
+        )
 
     def _parts(self, valid: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Which frames of [b, t], padded in front, fill the places of anchors, gists and recent frames.
+        """Which frames of [b, t], padded in front, fill the places of anchors, gists and recent
+        frames.
 
         Returns:
             For each of the three (frames [b, k], whether there is such a frame [b, k]).
@@ -132,12 +168,16 @@ class Gist(FrameMemory):
         return parts
 
     def _gists(self, history: HistoryTokens, valid: Tensor) -> Tensor:
-        """Gists [b, t·gists, hidden] of all frames: each reads its own frame and the gists up to its own."""
+        """Gists [b, t·gists, hidden] of all frames: each reads its own frame and the gists up to
+        its own.
+        """
         rows, frames = valid.shape
         x = self.reader(history.features, history.positions, history.mask)
         gists = self.questions.to(x.dtype).repeat(frames, 1).expand(rows, -1, -1)
         of_gist = torch.arange(frames, device=x.device).repeat_interleave(self.gists)[None]
-        of_token = torch.arange(frames, device=x.device).repeat_interleave(self.storage.grid**2)[None]
+        of_token = torch.arange(frames, device=x.device).repeat_interleave(self.storage.grid**2)[
+            None
+        ]
         attends = (of_gist[:, :, None] == of_token[:, None, :]) & history.mask[:, None, :]
         earlier = not_later(of_gist, of_gist) & valid.repeat_interleave(self.gists, 1)[:, None, :]
         mask = torch.cat([attends, earlier], 2)

@@ -1,10 +1,12 @@
-"""Keyframes: a write head says at which frames a sub-task begins, and these frames are kept whole (EventVLA).
+"""Keyframes: a write head says at which frames a sub-task begins, and these frames are kept whole
+(EventVLA).
 
-After EventVLA, whose head predicts keyframes from the hidden state of an action chunk, keeps those that are certain
-enough beside a few anchors, and suppresses neighbours. A memory here stands before the language model, so that the head
-reads what a frame looks like and how it differs from the stored frame before it. What it learns from are the sub-tasks
-of the dataset: a stored frame is a keyframe where a sub-task has begun since the stored frame before it. Without
-labels the action loss alone teaches it, through a straight-through sigmoid as in `learned_topk`.
+After EventVLA, whose head predicts keyframes from the hidden state of an action chunk, keeps those
+that are certain enough beside a few anchors, and suppresses neighbours. A memory here stands before
+the language model, so that the head reads what a frame looks like and how it differs from the
+stored frame before it. What it learns from are the sub-tasks of the dataset: a stored frame is a
+keyframe where a sub-task has begun since the stored frame before it. Without labels the action loss
+alone teaches it, through a straight-through sigmoid as in `learned_topk`.
 """
 
 from collections.abc import Sequence
@@ -30,7 +32,9 @@ LOWEST = 1e4  # beyond any score
 
 @MEMORIES.register("keyframes")
 class Keyframes(PerceptualMemory, ReadsLabels):
-    """The first frame, the newest stored one, and `budget / grid² − 2` that the head is most certain of."""
+    """The first frame, the newest stored one, and `budget / grid² − 2` that the head is most
+    certain of.
+    """
 
     reads_labels = (LABEL,)
 
@@ -51,13 +55,16 @@ class Keyframes(PerceptualMemory, ReadsLabels):
 
         Args:
             grid, pooling: a frame is grid×grid tokens.
-            every: frames 0 and k·every − 1 can be kept. pool: most of them that the head reads, evenly spaced.
+            every: frames 0 and k·every − 1 can be kept. pool: most of them that the head reads,
+                evenly spaced.
             hidden: width of the head; None is a quarter of `d_vision`, at least 64.
         """
         check_sizes("memory", every=every, pool=pool)
         frames = budget_frames(budget, grid, at_least=3)
         require(
-            frames <= pool, f"memory.pool={pool}: the frames of memory.budget={budget} are {frames}, so at least that."
+            frames <= pool,
+            f"memory.pool={pool}: the frames of memory.budget={budget} are {frames}, so at least"
+            " that.",
         )
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
         hidden = default_hidden(d_vision, hidden)
@@ -71,7 +78,9 @@ class Keyframes(PerceptualMemory, ReadsLabels):
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return union_frames([self.selected_frames(int(step)) for step in steps])
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         """The candidates: `forward` keeps some of them."""
         return all_patches(self.selected_frames(step), self.storage.grid)
 
@@ -80,7 +89,9 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         valid = by_frame(history.mask, patches)[..., 0]
         scores = self.scores(history.features)
         top_frames = self.top_frames(scores, valid)
-        tokens = (top_frames[..., None] * patches + torch.arange(patches, device=top_frames.device)).flatten(1)
+        tokens = (
+            top_frames[..., None] * patches + torch.arange(patches, device=top_frames.device)
+        ).flatten(1)
         features, positions, mask = (
             rows_at(part, tokens) for part in (history.features, history.positions, history.mask)
         )
@@ -91,21 +102,29 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         ages = None if history.ages is None else rows_at(history.ages, tokens)
         losses = {}
         if LABEL in history.labels:
-            losses["write"] = write_loss(scores, by_frame(history.labels[LABEL], patches)[..., 0], valid)
-        return MemoryTokens(encoded * worth[..., None].to(encoded.dtype), mask, ages=ages, losses=losses)
+            losses["write"] = write_loss(
+                scores, by_frame(history.labels[LABEL], patches)[..., 0], valid
+            )
+        return MemoryTokens(
+            encoded * worth[..., None].to(encoded.dtype), mask, ages=ages, losses=losses
+        )
 
     def scores(self, features: Tensor) -> Tensor:
-        """Logits [b, t] float32: whether a sub-task has begun since the frame before; features [b, t·p, d]."""
+        """Logits [b, t] float32: whether a sub-task has begun since the frame before; features [b,
+        t·p, d].
+        """
         with full_precision(features):
             means = by_frame(features.float(), self.storage.grid**2).mean(2)
             change = torch.diff(means, dim=1, prepend=means[:, :1])
-            return linear(self.write, functional.silu(linear(self.read, torch.cat([means, change], -1))))[..., 0]
+            return linear(
+                self.write, functional.silu(linear(self.read, torch.cat([means, change], -1)))
+            )[..., 0]
 
     def top_frames(self, scores: Tensor, valid: Tensor) -> Tensor:
         """Which frames are kept: int64 [b, frames], ascending, padding last.
 
-        Highest scores first, those lower than a neighbour's after all others. The first frame and the newest in any
-        case.
+        Highest scores first, those lower than a neighbour's after all others. The first frame and
+        the newest in any case.
         """
         ranks = scores.detach().masked_fill(~valid, -2 * LOWEST)
         highest = functional.max_pool1d(ranks[:, None], 3, 1, 1)[:, 0]
@@ -116,12 +135,18 @@ class Keyframes(PerceptualMemory, ReadsLabels):
 
 
 def write_loss(scores: Tensor, subtask: Tensor, valid: Tensor) -> Tensor:
-    """Cross-entropy [b] of logits [b, t], the mean over keyframes and that over other frames counting alike.
+    """Cross-entropy [b] of logits [b, t], the mean over keyframes and that over other frames
+    counting alike.
 
     Args:
         subtask: the number of each frame's sub-task, [b, t]. valid: bool [b, t].
     """
     begins = torch.diff(subtask, dim=1, prepend=subtask[:, :1]).ne(0)
-    losses = functional.binary_cross_entropy_with_logits(scores, begins.to(scores.dtype), reduction="none")
-    sides = [(losses * side).sum(1) / side.sum(1).clamp(min=1) for side in (begins & valid, ~begins & valid)]
+    losses = functional.binary_cross_entropy_with_logits(
+        scores, begins.to(scores.dtype), reduction="none"
+    )
+    sides = [
+        (losses * side).sum(1) / side.sum(1).clamp(min=1)
+        for side in (begins & valid, ~begins & valid)
+    ]
     return (sides[0] + sides[1]) / 2

@@ -1,6 +1,7 @@
 """Present: the current frame's tokens alone, as if they were memory.
 
-A control, not a memory: a policy with it has the parameters and the updates of one that remembers, and no past.
+A control, not a memory: a policy with it has the parameters and the updates of one that remembers,
+and no past.
 """
 
 from collections.abc import Sequence
@@ -37,11 +38,16 @@ class Present(PerceptualMemory):
         """
         check_sizes("memory", grid=grid)
         enough = budget is None or budget >= grid**2
-        require(enough, f"memory.budget={budget} does not hold the {grid}×{grid} tokens of a frame: {grid**2}.")
+        require(
+            enough,
+            f"memory.budget={budget} does not hold the {grid}×{grid} tokens of a frame: {grid**2}.",
+        )
         super().__init__(d_vision, width, grid**2, StorageSpec(grid, pooling), **encoder)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return union_frames([np.asarray(steps, np.int64)])
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         return all_patches(np.array([step]), self.storage.grid)

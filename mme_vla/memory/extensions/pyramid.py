@@ -1,10 +1,12 @@
-"""Pyramid: windows over the past, each with a greater stride than the one after it, and the first frame (RTP).
+"""Pyramid: windows over the past, each with a greater stride than the one after it, and the first
+frame (RTP).
 
-After the temporal pyramid of RTP, whose code is not public: 12 frames one apart, then frames four apart, then eight
-apart, and an anchor at the reset. The token of a frame has its time, not its place among the kept ones: frame numbers
-in the position features, and frames back from now in attention (`integration.memory_position=time`, as in
-`configs/model/pyramid_*`). Our own choices are the strides, and that they count from the episode's first frame. A frame
-that has been dropped then never returns, so the memory could be held in a store of this size.
+After the temporal pyramid of RTP, whose code is not public: 12 frames one apart, then frames four
+apart, then eight apart, and an anchor at the reset. The token of a frame has its time, not its
+place among the kept ones: frame numbers in the position features, and frames back from now in
+attention (`integration.memory_position=time`, as in `configs/model/pyramid_*`). Our own choices are
+the strides, and that they count from the episode's first frame. A frame that has been dropped then
+never returns, so the memory could be held in a store of this size.
 """
 
 from collections.abc import Sequence
@@ -40,14 +42,16 @@ class Pyramid(FrameMemory, PerceptualMemory):
 
         Args:
             grid, pooling: a frame is grid×grid tokens.
-            strides: frames between two of a window, from the newest window to the oldest; each divides the next one.
-                All windows hold equally many frames, the newest ones one more where that does not come out even.
+            strides: frames between two of a window, from the newest window to the oldest; each
+                divides the next one. All windows hold equally many frames, the newest ones one more
+                where that does not come out even.
         """
         strides = list(strides)
         check_sizes("memory", **{f"strides.{i}": stride for i, stride in enumerate(strides)})
         require(
             len(strides) > 0 and all(a < b and b % a == 0 for a, b in pairwise(strides)),
-            f"memory.strides={strides}: each must be a multiple of the one before it, and greater, as in [2, 8, 32].",
+            f"memory.strides={strides}: each must be a multiple of the one before it, and greater,"
+            " as in [2, 8, 32].",
         )
         frames = budget_frames(budget, grid, at_least=len(strides) + 1)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, strides[0]), **encoder)
@@ -55,7 +59,9 @@ class Pyramid(FrameMemory, PerceptualMemory):
         self.sizes = [len(part) for part in np.array_split(np.arange(frames - 1), len(strides))]
 
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
-        """The frames kept at `step`, ascending: frame 0, and k·stride − 1 within the window of each stride."""
+        """The frames kept at `step`, ascending: frame 0, and k·stride − 1 within the window of each
+        stride.
+        """
         windows, newest = [np.zeros(1, np.int64)], step
         for stride, size in zip(self.strides, self.sizes, strict=True):
             oldest = newest - stride * size

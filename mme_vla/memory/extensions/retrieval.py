@@ -1,12 +1,15 @@
-"""Retrieval: the stretches of the past that look most like the current view, found before any frame is sampled.
+"""Retrieval: the stretches of the past that look most like the current view, found before any frame
+is sampled.
 
-After the retrieval step of SoumilRathi/robomme-interference (at 48d62faa, read and not copied): a history is cut where
-the cosine between neighbouring frames falls below a threshold, a chunk is worth its highest cosine with the frame that
-asks, and the best chunk's span is handed to the policy's own sampler. There frames were embedded by SigLIP anew; here a
-frame is the mean of its stored tokens, which are there already, so their threshold of 0.923 does not carry over.
-Choices of ours: a chunk ends with the conditioning video and has at most `longest` frames; the chunk that holds the
-current frame always looks like it, and is therefore not asked but fills what is left over; as many chunks are taken, in
-the order of likeness, as the budget holds; and of the chunk that does not fit whole, evenly spaced frames.
+After the retrieval step of SoumilRathi/robomme-interference (at 48d62faa, read and not copied): a
+history is cut where the cosine between neighbouring frames falls below a threshold, a chunk is
+worth its highest cosine with the frame that asks, and the best chunk's span is handed to the
+policy's own sampler. There frames were embedded by SigLIP anew; here a frame is the mean of its
+stored tokens, which are there already, so their threshold of 0.923 does not carry over. Choices of
+ours: a chunk ends with the conditioning video and has at most `longest` frames; the chunk that
+holds the current frame always looks like it, and is therefore not asked but fills what is left
+over; as many chunks are taken, in the order of likeness, as the budget holds; and of the chunk that
+does not fit whole, evenly spaced frames.
 """
 
 from typing import Any
@@ -24,7 +27,9 @@ from mme_vla.registry import MEMORIES
 
 @MEMORIES.register("retrieval")
 class Retrieval(PerceptualMemory):
-    """budget / grid² frames: of the chunks most like the newest stored frame, and that frame itself."""
+    """budget / grid² frames: of the chunks most like the newest stored frame, and that frame
+    itself.
+    """
 
     def __init__(
         self,
@@ -42,24 +47,35 @@ class Retrieval(PerceptualMemory):
 
         Args:
             grid, pooling: a remembered frame is grid×grid tokens.
-            every: frames 0 and k·every − 1 are stored, compared and remembered; 1: all. The newest of them asks.
-            cut: a new chunk begins where two neighbouring stored frames have a cosine below it. −1 never cuts.
+            every: frames 0 and k·every − 1 are stored, compared and remembered; 1: all. The newest
+                of them asks.
+            cut: a new chunk begins where two neighbouring stored frames have a cosine below it. −1
+                never cuts.
             longest: most stored frames of a chunk.
         """
         frames = budget_frames(budget, grid)
-        require(-1 <= cut <= 1, f"memory.cut={cut} is a cosine: it lies between -1 (never cut) and 1 (cut everywhere).")
+        require(
+            -1 <= cut <= 1,
+            f"memory.cut={cut} is a cosine: it lies between -1 (never cut) and 1 (cut everywhere).",
+        )
         check_sizes("memory", longest=longest)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
         self.frames, self.cut, self.longest = frames, cut, longest
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
         frames = self.storage.stored_frames(step + 1)
         if len(frames) > self.frames:
-            frames = frames[self.alike(self.frame_features(history, frames), frames >= history.exec_start)]
+            frames = frames[
+                self.alike(self.frame_features(history, frames), frames >= history.exec_start)
+            ]
         return all_patches(frames, self.storage.grid)
 
     def frame_features(self, history: History, frames: np.ndarray) -> Tensor:
-        """What stored frames [n] look like: [n, d_vision] of length 1, from their tokens as they are stored."""
+        """What stored frames [n] look like: [n, d_vision] of length 1, from their tokens as they
+        are stored.
+        """
         tokens = history.stored(all_patches(frames, self.storage.grid)).float()
         return torch.nn.functional.normalize(tokens.unflatten(0, (len(frames), -1)).mean(1), dim=-1)
 
@@ -67,7 +83,8 @@ class Retrieval(PerceptualMemory):
         """Which frames are remembered.
 
         Args:
-            features: of the stored frames, [n, d], of length 1. execution: bool [n], False in the video.
+            features: of the stored frames, [n, d], of length 1. execution: bool [n], False in the
+                video.
 
         Returns:
             int64 [`frames`], ascending, the newest last.
@@ -79,14 +96,20 @@ class Retrieval(PerceptualMemory):
         taken, remaining = [np.array([len(features) - 1])], self.frames - 1
         for chunk in [*ranked, chunks[-1][:-1]]:
             if remaining and len(chunk):
-                picked = chunk if len(chunk) <= remaining else chunk[evenly_spaced_frames(len(chunk) - 1, remaining)]
+                picked = (
+                    chunk
+                    if len(chunk) <= remaining
+                    else chunk[evenly_spaced_frames(len(chunk) - 1, remaining)]
+                )
                 taken.append(picked)
                 remaining -= len(picked)
         return np.sort(np.concatenate(taken))
 
 
 def chunks_of(cuts: np.ndarray, execution: np.ndarray, longest: int) -> list[np.ndarray]:
-    """Split n frames where `cuts` [n − 1] says so, where the video ends, and into pieces of at most `longest`."""
+    """Split n frames where `cuts` [n − 1] says so, where the video ends, and into pieces of at most
+    `longest`.
+    """
     ends = cuts | (np.diff(execution.astype(int)) != 0)
     runs = np.split(np.arange(len(execution)), np.flatnonzero(ends) + 1)
     return [run[start : start + longest] for run in runs for start in range(0, len(run), longest)]

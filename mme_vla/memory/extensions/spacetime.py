@@ -1,14 +1,17 @@
-"""Spacetime: past images enter the vision tower itself, and past states are tokens (MEM, LeRobot's option of π0.5).
+"""Spacetime: past images enter the vision tower itself, and past states are tokens (MEM, LeRobot's
+option of π0.5).
 
 After MEM's short-horizon memory (arXiv 2603.03596) as LeRobot's π0.5 has it (`use_visual_memory`,
-`use_proprioceptive_memory`; huggingface/lerobot#4076, read and not copied): six frames a second apart; every fourth
-layer of the tower lets each patch look at the same patch of the frames before it, with the layer's own weights, and
-what the tower made of past frames is dropped above the last such layer. So the prefix is no longer than before, and no
-weight is added. Each frame's state, normalised and padded with zeros, becomes one token through one linear layer.
+`use_proprioceptive_memory`; huggingface/lerobot#4076, read and not copied): six frames a second
+apart; every fourth layer of the tower lets each patch look at the same patch of the frames before
+it, with the layer's own weights, and what the tower made of past frames is dropped above the last
+such layer. So the prefix is no longer than before, and no weight is added. Each frame's state,
+normalised and padded with zeros, becomes one token through one linear layer.
 
-LeRobot takes the state out of the prompt where states are tokens; here prompts hold none unless a format asks for it.
-There the tokens stand between images and words; here the integration says where they go, and
-`integration.mutual=true` of `context` puts them there. Frames of the conditioning video are past frames as any other.
+LeRobot takes the state out of the prompt where states are tokens; here prompts hold none unless a
+format asks for it. There the tokens stand between images and words; here the integration says where
+they go, and `integration.mutual=true` of `context` puts them there. Frames of the conditioning
+video are past frames as any other.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +21,14 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, check_sizes, require
-from mme_vla.memory.base import NEVER, MemoryModule, PastViewMemory, PastViewSpec, ProprioMemory, union_frames
+from mme_vla.memory.base import (
+    NEVER,
+    MemoryModule,
+    PastViewMemory,
+    PastViewSpec,
+    ProprioMemory,
+    union_frames,
+)
 from mme_vla.memory.extensions.actions import MotionRows
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
@@ -27,10 +37,12 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 @MEMORIES.register("spacetime")
 class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
-    """Views of `frames` frames for the tower, and their states as so many tokens; `select` names the frames.
+    """Views of `frames` frames for the tower, and their states as so many tokens; `select` names
+    the frames.
 
-    No cache serves it: it would have to hold the features of every frame of every camera in each layer that attends
-    over time, where others store one pooled grid of one camera. So images are read anew, in training too.
+    No cache serves it: it would have to hold the features of every frame of every camera in each
+    layer that attends over time, where others store one pooled grid of one camera. So images are
+    read anew, in training too.
     """
 
     timed = True
@@ -50,7 +62,8 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
         """Configure the frames, and what is read of them.
 
         Args:
-            d_vision: width of a vision token, to which a state is padded on its way. width: of a memory token.
+            d_vision: width of a vision token, to which a state is padded on its way. width: of a
+                memory token.
             frames: how many, the current one among them. stride: frames between two.
             every: interval of the tower's layers that attend over time, at least the last one.
             views: give the tower past images. states: hand over past states as tokens.
@@ -60,10 +73,15 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
         super().__init__()
         check_sizes("memory", frames=frames, stride=stride, every=every, state_dim=state_dim)
         require(
-            views or states, "memory.views=false and memory.states=false leave nothing to remember: set one of them."
+            views or states,
+            "memory.views=false and memory.states=false leave nothing to remember: set one of"
+            " them.",
         )
         enough = budget is None or not states or budget >= frames
-        require(enough, f"memory.budget={budget}: the states of memory.frames={frames} are as many tokens.")
+        require(
+            enough,
+            f"memory.budget={budget}: the states of memory.frames={frames} are as many tokens.",
+        )
         require(
             not states or state_dim <= d_vision,
             f"memory.state_dim={state_dim}: tokens {d_vision} wide carry the states.",
@@ -83,12 +101,18 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
         read = union_frames([self.past_view_spec.at(int(step)) for step in steps])
         return read[read >= 0]
 
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        frames: np.ndarray = step - self.stride * np.arange(self.frames - 1 if self.budget else -1, -1, -1)
+    def select(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
+        frames: np.ndarray = step - self.stride * np.arange(
+            self.frames - 1 if self.budget else -1, -1, -1
+        )
         frames = frames[frames >= 0]
         return np.stack([frames, np.zeros_like(frames)], 1)
 
-    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+    def gather_selection(
+        self, history: History, step: int, rng: np.random.Generator | None = None
+    ) -> HistoryTokens:
         return super().gather_selection(
             MotionRows(history, self._proprio_rows(history), self.d_vision, "spacetime"), step, rng
         )
@@ -98,13 +122,19 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
             tokens = history.features.new_zeros(*history.mask.shape, self.width)
             return MemoryTokens(tokens, history.mask, ages=history.ages)
         weight, ages = self.states.weight, history.ages
-        tokens = self.states(history.features[..., : self.state_dim].to(weight))  # an episode's states are on the CPU
+        tokens = self.states(
+            history.features[..., : self.state_dim].to(weight)
+        )  # an episode's states are on the CPU
         return MemoryTokens(
-            tokens, history.mask.to(weight.device), ages=None if ages is None else ages.to(weight.device)
+            tokens,
+            history.mask.to(weight.device),
+            ages=None if ages is None else ages.to(weight.device),
         )
 
     def _proprio_rows(self, history: History) -> Callable[[np.ndarray], Tensor]:
-        """Rows that stand for frames [n]: the robot's states, at most as wide as their layer; nothing without them."""
+        """Rows that stand for frames [n]: the robot's states, at most as wide as their layer;
+        nothing without them.
+        """
 
         def rows(frames: np.ndarray) -> Tensor:
             if self.states is None:
@@ -112,7 +142,8 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
             proprio = history.proprio(frames)
             if proprio.shape[1] > self.state_dim:
                 raise UserError(
-                    f"memory.state_dim={self.state_dim}: a state of this robot has {proprio.shape[1]} numbers."
+                    f"memory.state_dim={self.state_dim}: a state of this robot has"
+                    f" {proprio.shape[1]} numbers."
                 )
             return proprio
 

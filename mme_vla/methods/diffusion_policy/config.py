@@ -16,8 +16,9 @@ LARGEST = 2**16
 class DiffusionSizes:
     """The keys of the section `backbone` of Diffusion Policy.
 
-    picture: (height, width) before cropping. widths: of the U-Net's levels. window: frames an observation has.
-    memory_tower, memory_width: what turns remembered frames into tokens, where there is a memory.
+    picture: (height, width) before cropping. widths: of the U-Net's levels. window: frames an
+    observation has. memory_tower, memory_width: what turns remembered frames into tokens, where
+    there is a memory.
     """
 
     horizon: int
@@ -43,36 +44,57 @@ class DiffusionSizes:
         values = dict(section)
         if (name := values.pop("name", None)) != NAME:
             raise UserError(
-                f"backbone.name={brief(name)} is no network of Diffusion Policy: choose backbone=dp, or dp_tiny to try "
-                "things out."
+                f"backbone.name={brief(name)} is no network of Diffusion Policy: choose"
+                " backbone=dp, or dp_tiny to try things out."
             )
         return read_section(cls, values, "backbone")
 
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            numbers = [n for n in (value if isinstance(value, tuple) else [value]) if isinstance(n, int)]
+            numbers = [
+                n for n in (value if isinstance(value, tuple) else [value]) if isinstance(n, int)
+            ]
             if value == () or not all(1 <= n <= LARGEST for n in numbers):
-                where = "processor" if f.name == "window" else "backbone"  # which the backbone follows
-                raise UserError(f"{where}.{f.name}={brief(value)} must be made of whole numbers from 1 to {LARGEST}.")
-        require(0 < self.crop <= 1, f"backbone.crop={brief(self.crop)} must lie above 0 and at most at 1.")
+                where = (
+                    "processor" if f.name == "window" else "backbone"
+                )  # which the backbone follows
+                raise UserError(
+                    f"{where}.{f.name}={brief(value)} must be made of whole numbers from 1 to"
+                    f" {LARGEST}."
+                )
+        require(
+            0 < self.crop <= 1,
+            f"backbone.crop={brief(self.crop)} must lie above 0 and at most at 1.",
+        )
         halved = 2 ** (len(self.widths) - 1)
         require(
             self.horizon % halved == 0,
-            f"embodiment.action.horizon={self.horizon} must be a multiple of {halved}: each of the U-Net's "
-            f"{len(self.widths)} levels (backbone.widths) but the last halves the chunk.",
+            f"embodiment.action.horizon={self.horizon} must be a multiple of {halved}: each of the"
+            f" U-Net's {len(self.widths)} levels (backbone.widths) but the last halves the chunk.",
         )
         require(
             self.window <= self.horizon,
             f"processor.window={self.window} leaves no action of a chunk of {self.horizon}.",
         )
         even = self.step_width % 2 == 0 and self.step_width >= 4
-        require(even, f"backbone.step_width={self.step_width} must be even and at least 4: sines and cosines.")
-        require(self.kernel % 2, f"backbone.kernel={self.kernel} must be odd, so that a chunk keeps its length.")
+        require(
+            even,
+            f"backbone.step_width={self.step_width} must be even and at least 4: sines and"
+            " cosines.",
+        )
+        require(
+            self.kernel % 2,
+            f"backbone.kernel={self.kernel} must be odd, so that a chunk keeps its length.",
+        )
         if bad := [width for width in self.widths if width % self.groups]:
-            raise UserError(f"backbone.widths: {bad[0]} is no multiple of backbone.groups={self.groups}.")
+            raise UserError(
+                f"backbone.widths: {bad[0]} is no multiple of backbone.groups={self.groups}."
+            )
         if self.widths[0] % 8:
-            raise UserError(f"backbone.widths: the first, {self.widths[0]}, must be a multiple of 8.")
+            raise UserError(
+                f"backbone.widths: the first, {self.widths[0]}, must be a multiple of 8."
+            )
 
     @property
     def cropped(self) -> tuple[int, int]:

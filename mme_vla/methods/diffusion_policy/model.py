@@ -1,4 +1,5 @@
-"""The one-dimensional U-Net of Diffusion Policy: it predicts the noise of an action chunk under a condition.
+"""The one-dimensional U-Net of Diffusion Policy: it predicts the noise of an action chunk under a
+condition.
 
 Module names inside are those of the authors' checkpoints.
 """
@@ -33,7 +34,8 @@ def require_diffusers() -> None:
 
 
 def noise_schedule(steps: int) -> Schedule:
-    """A squared-cosine schedule of so many steps that predicts noise and clips its guesses of the chunk to ±1.
+    """A squared-cosine schedule of so many steps that predicts noise and clips its guesses of the
+    chunk to ±1.
 
     It moves its own tables to where it is used: make a new one for each use.
     """
@@ -55,8 +57,12 @@ def add_noise(schedule: Schedule, chunk: Tensor, noise: Tensor, step: Tensor) ->
     return noisy
 
 
-def denoise_once(schedule: Schedule, predicted: Tensor, step: int, x: Tensor, fresh: Tensor | None) -> Tensor:
-    """One step of the way back, from the predicted noise and fresh noise of the same shape, which step 0 needs not."""
+def denoise_once(
+    schedule: Schedule, predicted: Tensor, step: int, x: Tensor, fresh: Tensor | None
+) -> Tensor:
+    """One step of the way back, from the predicted noise and fresh noise of the same shape, which
+    step 0 needs not.
+    """
     steps = torch.full((len(x),), step, device=x.device)
     mean: Tensor = schedule.batch_step_no_noise(predicted, steps, x)
     if step == 0 or fresh is None:
@@ -73,10 +79,14 @@ def sample(
 
     Args:
         predict: (noisy chunks [b, h, a], steps [b]) → their noise. start: [b, h, a].
-        fresh: [b, steps − 1, h, a], what is added after each step but the last. steps: fewer than the schedule's.
+        fresh: [b, steps − 1, h, a], what is added after each step but the last. steps: fewer than
+            the schedule's.
     """
     total = int(schedule.config.num_train_timesteps)
-    require(steps is None or 0 < steps <= total, f"flow_steps={steps}: Diffusion Policy samples in 1 to {total} steps.")
+    require(
+        steps is None or 0 < steps <= total,
+        f"flow_steps={steps}: Diffusion Policy samples in 1 to {total} steps.",
+    )
     schedule.set_timesteps(steps or total)
     x = start
     for i, step in enumerate(schedule.timesteps.tolist()):
@@ -90,7 +100,8 @@ CHANNELS = 512
 
 
 def build_image_encoder() -> nn.Sequential:
-    """ResNet-18 without pooling and classifier, fresh, a group norm of 16 channels a group for each batch norm.
+    """ResNet-18 without pooling and classifier, fresh, a group norm of 16 channels a group for each
+    batch norm.
 
     Images [n, 3, H, W] → [n, 512, ⌈H/32⌉, ⌈W/32⌉].
     """
@@ -115,13 +126,17 @@ def map_size(side: int) -> int:
 def cell_centres(height: int, width: int, device: torch.device | None = None) -> Tensor:
     """(x, y) of each cell of a map in [−1, 1], row by row: [height·width, 2]."""
     y, x = torch.meshgrid(
-        torch.linspace(-1, 1, height, device=device), torch.linspace(-1, 1, width, device=device), indexing="ij"
+        torch.linspace(-1, 1, height, device=device),
+        torch.linspace(-1, 1, width, device=device),
+        indexing="ij",
     )
     return torch.stack([x.flatten(), y.flatten()], dim=-1)
 
 
 class SpatialSoftmax(nn.Module):
-    """Maps [n, c, H, W] → the expected place (x, y) of each of k learned features, [n, k, 2] in [−1, 1]."""
+    """Maps [n, c, H, W] → the expected place (x, y) of each of k learned features, [n, k, 2] in
+    [−1, 1].
+    """
 
     def __init__(self, channels: int, keypoints: int) -> None:
         super().__init__()
@@ -165,11 +180,15 @@ class ConvBlock(nn.Module):
 
 
 class ConditionedUnit(nn.Module):
-    """Two blocks with a shortcut; between them each channel is scaled and shifted by the condition (not 1 + scale)."""
+    """Two blocks with a shortcut; between them each channel is scaled and shifted by the condition
+    (not 1 + scale).
+    """
 
     def __init__(self, channels: int, out: int, condition: int, kernel: int, groups: int) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList([ConvBlock(channels, out, kernel, groups), ConvBlock(out, out, kernel, groups)])
+        self.blocks = nn.ModuleList(
+            [ConvBlock(channels, out, kernel, groups), ConvBlock(out, out, kernel, groups)]
+        )
         self.cond_encoder = nn.Sequential(nn.Mish(), nn.Linear(condition, 2 * out))
         self.residual_conv = nn.Conv1d(channels, out, 1) if channels != out else nn.Identity()
 
@@ -195,13 +214,20 @@ class ConditionalUnet1d(nn.Module):
     """Noisy chunks [b, h, a], diffusion steps [b] and a condition [b, c] → the noise [b, h, a]."""
 
     def __init__(
-        self, action_dim: int, condition: int, step_width: int, widths: Sequence[int], kernel: int, groups: int
+        self,
+        action_dim: int,
+        condition: int,
+        step_width: int,
+        widths: Sequence[int],
+        kernel: int,
+        groups: int,
     ) -> None:
         """Build the network.
 
         Args:
             condition: c. step_width: of the embedded diffusion step.
-            widths: channels of each level, each with half the steps of the one before. kernel, groups: of all blocks.
+            widths: channels of each level, each with half the steps of the one before. kernel,
+                groups: of all blocks.
         """
         super().__init__()
         self.diffusion_step_encoder = nn.Sequential(
@@ -219,19 +245,29 @@ class ConditionalUnet1d(nn.Module):
         levels = list(zip([action_dim, *widths[:-1]], widths, strict=True))
         self.down_modules = nn.ModuleList()
         for number, (before, width) in enumerate(levels):
-            half = Resample(nn.Conv1d(width, width, 3, 2, 1)) if number < len(levels) - 1 else nn.Identity()
+            half = (
+                Resample(nn.Conv1d(width, width, 3, 2, 1))
+                if number < len(levels) - 1
+                else nn.Identity()
+            )
             self.down_modules.append(nn.ModuleList([unit(before, width), unit(width, width), half]))
         self.up_modules = nn.ModuleList()
         for before, width in reversed(levels[1:]):  # the first level's skip is never read
             twice = Resample(nn.ConvTranspose1d(before, before, 4, 2, 1))
-            self.up_modules.append(nn.ModuleList([unit(2 * width, before), unit(before, before), twice]))
+            self.up_modules.append(
+                nn.ModuleList([unit(2 * width, before), unit(before, before), twice])
+            )
         first = widths[0]
-        self.final_conv = nn.Sequential(ConvBlock(first, first, kernel, FINAL_GROUPS), nn.Conv1d(first, action_dim, 1))
+        self.final_conv = nn.Sequential(
+            ConvBlock(first, first, kernel, FINAL_GROUPS), nn.Conv1d(first, action_dim, 1)
+        )
 
     def forward(self, chunk: Tensor, step: Tensor, condition: Tensor) -> Tensor:
         condition = torch.cat([self.diffusion_step_encoder(step), condition], dim=-1)
         x, skips = chunk.mT, []
-        down: Any = self.down_modules  # lists of modules, whose own modules type checkers do not see
+        down: Any = (
+            self.down_modules
+        )  # lists of modules, whose own modules type checkers do not see
         up: Any = self.up_modules
         for first, second, half in down:
             skips.append(second(first(x, condition), condition))
@@ -245,29 +281,40 @@ class ConditionalUnet1d(nn.Module):
 
 
 class DiffusionNetwork(nn.Module):
-    """What learns: one image encoder for all cameras, keypoints, a projection of the words, and the U-Net.
+    """What learns: one image encoder for all cameras, keypoints, a projection of the words, and the
+    U-Net.
 
-    With a memory, a frozen vision tower turns remembered frames into the tokens that memories store.
+    With a memory, a frozen vision tower turns remembered frames into the tokens that memories
+    store.
     """
 
     def __init__(
-        self, sizes: DiffusionSizes, cameras: int, state_width: int, memory_feature: int = 0, tower: bool = False
+        self,
+        sizes: DiffusionSizes,
+        cameras: int,
+        state_width: int,
+        memory_feature: int = 0,
+        tower: bool = False,
     ) -> None:
         """Build it.
 
         Args:
-            memory_feature: numbers that a memory adds to the condition. tower: whether frames are to be remembered.
+            memory_feature: numbers that a memory adds to the condition. tower: whether frames are
+                to be remembered.
         """
         super().__init__()
         self.sizes = sizes
         self.recomputed: Recompute = False
-        # The tower comes first: with one seed it is the same whatever else is built, and so is a cache made by it.
+        # The tower comes first: with one seed it is the same whatever else is built, and so is a
+        # cache made by it.
         if tower:
             self.vision = VisionTower(sizes.memory_tower, sizes.memory_width)
             initialise(self.vision)
         self.image_encoder = build_image_encoder()
         # Keypoints x0, y0, x1, … As trained, a ReLU follows: what lies left or above has a 0 there.
-        self.image_pool = nn.Sequential(SpatialSoftmax(CHANNELS, sizes.keypoints), nn.Flatten(), nn.ReLU())
+        self.image_pool = nn.Sequential(
+            SpatialSoftmax(CHANNELS, sizes.keypoints), nn.Flatten(), nn.ReLU()
+        )
         self.text_proj = nn.Sequential(
             nn.LayerNorm(sizes.text_dim),
             nn.Linear(sizes.text_dim, sizes.text_hidden),
@@ -277,14 +324,23 @@ class DiffusionNetwork(nn.Module):
         step = cameras * 2 * sizes.keypoints + state_width + sizes.text_width
         self.condition_width = sizes.window * step + memory_feature
         self.unet = ConditionalUnet1d(
-            sizes.action_dim, self.condition_width, sizes.step_width, sizes.widths, sizes.kernel, sizes.groups
+            sizes.action_dim,
+            self.condition_width,
+            sizes.step_width,
+            sizes.widths,
+            sizes.kernel,
+            sizes.groups,
         )
 
-    def condition(self, images: Tensor, state: Tensor, text: Tensor, memory: Tensor | None = None) -> Tensor:
-        """The condition [b, c]: for each step keypoints of all cameras, state and words; then the memory's feature.
+    def condition(
+        self, images: Tensor, state: Tensor, text: Tensor, memory: Tensor | None = None
+    ) -> Tensor:
+        """The condition [b, c]: for each step keypoints of all cameras, state and words; then the
+        memory's feature.
 
         Args:
-            images: [b, t, v, 3, h, w] in [−1, 1], cropped. state: [b, t, s] normalised. text: [b, d] of unit length.
+            images: [b, t, v, 3, h, w] in [−1, 1], cropped. state: [b, t, s] normalised. text: [b,
+                d] of unit length.
         """
         flat = images.flatten(0, 2)
         features = run_layer(self.image_encoder, flat, how=self.training and self.recomputed)

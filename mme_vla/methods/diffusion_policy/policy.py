@@ -1,4 +1,6 @@
-"""`DiffusionPolicy`: chunks of absolute joint targets by denoising, as its authors trained it or with a memory."""
+"""`DiffusionPolicy`: chunks of absolute joint targets by denoising, as its authors trained it or
+with a memory.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self
@@ -32,9 +34,11 @@ if TYPE_CHECKING:
 
 @POLICIES.register("diffusion_policy")
 class DiffusionPolicy(NetworkPolicy):
-    """Diffusion Policy (RoboMME's DP-Unet): a U-Net that denoises chunks conditioned on images, state and goal.
+    """Diffusion Policy (RoboMME's DP-Unet): a U-Net that denoises chunks conditioned on images,
+    state and goal.
 
-    Any memory may stand beside it, through an integration that makes one vector of its tokens (`film`).
+    Any memory may stand beside it, through an integration that makes one vector of its tokens
+    (`film`).
     """
 
     processor: DiffusionProcessor | None
@@ -61,8 +65,8 @@ class DiffusionPolicy(NetworkPolicy):
     ) -> None:
         """Put the parts together; `processor`, `config` and `options` as for `NetworkPolicy`.
 
-        While training, `augment` crops at random, one position for the whole batch; else the centre is cropped, as
-        when acting.
+        While training, `augment` crops at random, one position for the whole batch; else the centre
+        is cropped, as when acting.
         """
         super().__init__(processor, config, **options)
         self.backbone, self.memory, self.integration = backbone, memory, integration
@@ -72,13 +76,21 @@ class DiffusionPolicy(NetworkPolicy):
 
     @classmethod
     def from_config(
-        cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
+        cls,
+        config: Mapping[str, Any],
+        processor: "PolicyProcessor | None" = None,
+        *,
+        fresh_backbone: bool = True,
     ) -> Self:
         model.require_diffusers()
         sizes, robot = DiffusionSizes.from_dict(config["backbone"]), embodiment_of(config)
         integration = _pooled(config.get("integration"), sizes)
         if (integration is None) != (not config.get("memory")):
-            mismatch = "a memory without an integration" if integration is None else "an integration without a memory"
+            mismatch = (
+                "a memory without an integration"
+                if integration is None
+                else "an integration without a memory"
+            )
             raise UserError(f"This configuration names {mismatch}; name both, or neither.")
         require(
             robot.action.width == sizes.action_dim,
@@ -86,11 +98,15 @@ class DiffusionPolicy(NetworkPolicy):
             f"{robot.action.width} numbers an action; leave it to the embodiment.",
         )
         feature = 0 if integration is None else integration.feature_width
-        network = DiffusionNetwork(sizes, len(robot.cameras), robot.state.width, feature, integration is not None)
+        network = DiffusionNetwork(
+            sizes, len(robot.cameras), robot.state.width, feature, integration is not None
+        )
         memory: Memory | None = None
         if integration is not None:
             grid = sizes.memory_tower.image_size // sizes.memory_tower.patch_size
-            memory = build_memory(config["memory"], sizes.memory_width, grid, integration.memory_width)
+            memory = build_memory(
+                config["memory"], sizes.memory_width, grid, integration.memory_width
+            )
             check_past(config, memory, frozenset())
         processor = processor_for(DiffusionProcessor, processor, "dp, or dp_tiny to try things out")
         return cls(network, memory, integration, processor, config, **policy_options(cls, config))
@@ -100,40 +116,64 @@ class DiffusionPolicy(NetworkPolicy):
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """The `noise` [n, h, a] that is added and the `step` [n] of the noise level."""
         step = torch.randint(self.sizes.diffusion_steps, (count,), generator=generator)
-        return {"noise": torch.randn(count, self.horizon, self.action_dim, generator=generator), "step": step}
+        return {
+            "noise": torch.randn(count, self.horizon, self.action_dim, generator=generator),
+            "step": step,
+        }
 
     def forward(
-        self, batch: DiffusionBatch, noise: Mapping[str, Tensor] | None = None, corner: tuple[int, int] | None = None
+        self,
+        batch: DiffusionBatch,
+        noise: Mapping[str, Tensor] | None = None,
+        corner: tuple[int, int] | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean squared error of the predicted noise, and metrics to log (detached).
 
         Args:
             batch: with `actions`. noise: as `training_noise` makes them.
-            corner: (top, left) of the crop; by default sampled while training and the centre's else.
+            corner: (top, left) of the crop; by default sampled while training and the centre's
+                else.
         """
         if batch.actions is None:
-            raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
+            raise ValueError(
+                "forward() computes a loss: batch.actions must hold the recorded chunk (it is"
+                " None)."
+            )
         values = noise or self.training_noise(len(batch.actions), torch.default_generator)
         sampled = map_noise(values, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history)
         with self.autocast():
             condition = self.condition(batch, memory, corner)
-            noisy = model.add_noise(self._schedule(), batch.actions, sampled["noise"], sampled["step"])
+            noisy = model.add_noise(
+                self._schedule(), batch.actions, sampled["noise"], sampled["step"]
+            )
             predicted = self.backbone.unet(noisy, sampled["step"], condition)
         losses = (predicted.float() - sampled["noise"]).square().mean(-1)  # b h
         loss = masked_mean(losses, batch.action_mask)
         reported = {} if memory is None else memory.metrics
-        return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
+        return loss, {
+            "loss": loss.detach(),
+            **{f"memory/{name}": value for name, value in reported.items()},
+        }
 
     def condition(
-        self, batch: DiffusionBatch, memory: MemoryTokens | None = None, corner: tuple[int, int] | None = None
+        self,
+        batch: DiffusionBatch,
+        memory: MemoryTokens | None = None,
+        corner: tuple[int, int] | None = None,
     ) -> Tensor:
-        """What the U-Net denoises under, [b, c]: the window's steps, oldest first, then the memory's vector."""
+        """What the U-Net denoises under, [b, c]: the window's steps, oldest first, then the
+        memory's vector.
+        """
         feature = None if self.integration is None else self.integration.feature(memory)
-        return self.backbone.condition(self._cropped_images(batch.images, corner), batch.state, batch.text, feature)
+        return self.backbone.condition(
+            self._cropped_images(batch.images, corner), batch.state, batch.text, feature
+        )
 
     def recompute(self, mode: Recompute) -> None:
-        """Compute the images' features again in the backward pass instead of keeping them, or keep them."""
+        """Compute the images' features again in the backward pass instead of keeping them, or keep
+        them.
+        """
         self.backbone.recomputed = mode
 
     def shard_groups(self) -> Sequence[ShardGroup]:
@@ -145,7 +185,9 @@ class DiffusionPolicy(NetworkPolicy):
 
     def _cropped_images(self, images: Tensor, corner: tuple[int, int] | None) -> Tensor:
         """Images [..., H, W] uint8, all cropped at one place, in [−1, 1]."""
-        margins = [side - size for side, size in zip(images.shape[-2:], self.sizes.cropped, strict=True)]
+        margins = [
+            side - size for side, size in zip(images.shape[-2:], self.sizes.cropped, strict=True)
+        ]
         if corner is None and self.training and self.augment:
             top, left = (int(torch.randint(most + 1, ())) for most in margins)
         else:
@@ -157,7 +199,9 @@ class DiffusionPolicy(NetworkPolicy):
     # Sampling
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
-        """The starting `noise` [h, a], and what is `added` [99, h, a] after each step but the last."""
+        """The starting `noise` [h, a], and what is `added` [99, h, a] after each step
+        but the last.
+        """
         shape, steps = (self.horizon, self.action_dim), self.sizes.diffusion_steps
         noise = torch.randn(shape, generator=generator)
         return {"noise": noise, "added": torch.randn(steps - 1, *shape, generator=generator)}
@@ -173,11 +217,14 @@ class DiffusionPolicy(NetworkPolicy):
         """A normalised chunk [b, h, a], from the first step of the current frame on.
 
         Args:
-            noise: as `sampling_noise` makes them, with a batch axis. steps: of the sampler; 100 as trained by default.
+            noise: as `sampling_noise` makes them, with a batch axis. steps: of the sampler; 100 as
+                trained by default.
             memory: memory tokens encoded beforehand.
         """
         if noise is None:
-            noise = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.state))])
+            noise = stack_noise(
+                [self.sampling_noise(torch.default_generator) for _ in range(len(batch.state))]
+            )
         sampled = map_noise(noise, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history) if memory is None else memory
         with self.autocast():
@@ -187,7 +234,9 @@ class DiffusionPolicy(NetworkPolicy):
                 with self.autocast():
                     return self.backbone.unet(x, step, condition).float()
 
-            return model.sample(self._schedule(), predict, sampled["noise"], sampled["added"], steps)
+            return model.sample(
+                self._schedule(), predict, sampled["noise"], sampled["added"], steps
+            )
 
     # Episodes
 
@@ -195,20 +244,32 @@ class DiffusionPolicy(NetworkPolicy):
         processor = self.require_processor()
         images, states = zip(*(e.window for e in episodes), strict=True)
         text = torch.stack([e.prompt for e in episodes])
-        return DiffusionBatch(torch.stack(images), processor.states(torch.stack(states)), text).to(self.device)
+        return DiffusionBatch(torch.stack(images), processor.states(torch.stack(states)), text).to(
+            self.device
+        )
 
     def predict_chunk(
-        self, batch: DiffusionBatch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: DiffusionBatch,
+        episodes: Sequence[Episode],
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
         """A chunk for what `observation` saw, through the episodes' memories."""
         return self.sample_actions(batch, noise, steps, self.encode_memories(episodes))
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
-        """What the memory reads beside the current frame; with a window of consecutive frames, any may be seen."""
+        """What the memory reads beside the current frame; with a window of consecutive frames, any
+        may be seen.
+        """
         processor = self.require_processor()
         if processor.samples.window > 1 and processor.samples.consecutive:
             return None
-        return np.zeros(0, np.int64) if self.memory is None else self.memory.frames_read(steps, exec_start)
+        return (
+            np.zeros(0, np.int64)
+            if self.memory is None
+            else self.memory.frames_read(steps, exec_start)
+        )
 
     def require_processor(self) -> DiffusionProcessor:
         processor = super().require_processor()
@@ -228,7 +289,9 @@ class DiffusionPolicy(NetworkPolicy):
     @property
     def memory_tower(self) -> MemoryTower:
         self.require_memory()
-        return MemoryTower(self.backbone.vision, self.backbone.pooled_tokens, self.sizes.memory_width)
+        return MemoryTower(
+            self.backbone.vision, self.backbone.pooled_tokens, self.sizes.memory_width
+        )
 
     # Costs
 
@@ -241,7 +304,9 @@ class DiffusionPolicy(NetworkPolicy):
             state=torch.zeros(1, sizes.window, robot.state.width, device=device),
             text=torch.zeros(1, sizes.text_dim, device=device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            history=None if self.memory is None else full_history(self.memory, sizes.memory_width, device),
+            history=None
+            if self.memory is None
+            else full_history(self.memory, sizes.memory_width, device),
         )
 
     def warm_up_vision(self) -> None:
@@ -256,8 +321,8 @@ def _pooled(section: Mapping[str, Any] | None, sizes: DiffusionSizes) -> PooledI
     kind = INTEGRATIONS[section.get("name", "")]
     if not (isinstance(kind, type) and issubclass(kind, PooledIntegration)):
         raise UserError(
-            f"Diffusion Policy has no place for what the integration {section['name']!r} brings: memory reaches it as "
-            "one vector. Choose integration=film."
+            f"Diffusion Policy has no place for what the integration {section['name']!r} brings:"
+            " memory reaches it as one vector. Choose integration=film."
         )
     built: PooledIntegration = INTEGRATIONS.build(section, sizes)
     return built

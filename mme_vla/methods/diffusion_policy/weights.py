@@ -1,4 +1,6 @@
-"""Diffusion Policy's own checkpoints: `.pth` files {model, global_step, ckpt_manager}, `stats.json` beside them."""
+"""Diffusion Policy's own checkpoints: `.pth` files {model, global_step, ckpt_manager}, `stats.json`
+beside them.
+"""
 
 import json
 import re
@@ -21,7 +23,9 @@ from mme_vla.weights.tables import Adapter, Derived, Piece
 
 STATS = "stats.json"
 WEIGHTS = "model.pth"
-_WRAPPED = re.compile(r"^(?:module\.|_orig_mod\.|_checkpoint_wrapped_module\.)+|(?<=\.)_checkpoint_wrapped_module\.")
+_WRAPPED = re.compile(
+    r"^(?:module\.|_orig_mod\.|_checkpoint_wrapped_module\.)+|(?<=\.)_checkpoint_wrapped_module\."
+)
 _UNET, _LOCAL = "policy.", "backbone.unet."
 _GRID = "image_pool.0.pos_grid"
 
@@ -35,7 +39,9 @@ def is_diffusion_policy(names: Iterable[str]) -> bool:
 
 
 def unwrapped(name: str) -> str:
-    """A tensor's name without what data parallelism, compilation and activation checkpointing put before it."""
+    """A tensor's name without what data parallelism, compilation and activation checkpointing put
+    before it.
+    """
     return _WRAPPED.sub("", name)
 
 
@@ -53,8 +59,8 @@ def diffusion_adapter(policy: Policy) -> Adapter:
     """The authors' names of this policy's tensors; a memory and its tower have none."""
     if not isinstance(policy, DiffusionPolicy):
         raise UserError(
-            f"This format holds Diffusion Policy; {policy.config.get('name', 'this')} is a {type(policy).__name__}. "
-            "Set model=diffusion_policy."
+            f"This format holds Diffusion Policy; {policy.config.get('name', 'this')} is a"
+            f" {type(policy).__name__}. Set model=diffusion_policy."
         )
     table = {
         name: [Piece(name.replace(_LOCAL, _UNET).removeprefix("backbone."))]
@@ -66,10 +72,14 @@ def diffusion_adapter(policy: Policy) -> Adapter:
 
 
 def read_diffusion_stats(folder: Path) -> NormStats | None:
-    """The statistics of `stats.json`, where there is one: the authors write `action` where others write `actions`."""
+    """The statistics of `stats.json`, where there is one: the authors write `action` where others
+    write `actions`.
+    """
     if not (folder / STATS).is_file():
         return None
-    data = read_json(checked_file(folder, STATS, "statistics"), "normalisation statistics", limit=2**24)
+    data = read_json(
+        checked_file(folder, STATS, "statistics"), "normalisation statistics", limit=2**24
+    )
     inner = data.get("norm_stats")
     if isinstance(inner, dict) and "action" in inner and "actions" not in inner:
         data = {"norm_stats": {**inner, "actions": inner["action"]}}
@@ -79,7 +89,9 @@ def read_diffusion_stats(folder: Path) -> NormStats | None:
         raise UserError(f"{folder / STATS}: {error}") from None
 
 
-def write_diffusion_policy(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+def write_diffusion_policy(
+    policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None
+) -> None:
     """`model.pth` and `stats.json` as the authors' training writes them."""
     released = diffusion_adapter(policy).export(policy.state_dict())
     model = {name: cast(tensor.detach(), dtype).cpu() for name, tensor in released.items()}

@@ -1,4 +1,6 @@
-"""MemoryVLA's action head: a diffusion transformer over a chunk, conditioned on cognition and perceptual tokens."""
+"""MemoryVLA's action head: a diffusion transformer over a chunk, conditioned on cognition and
+perceptual tokens.
+"""
 
 import math
 from collections.abc import Callable
@@ -25,7 +27,9 @@ class Schedule:
 
     @classmethod
     def cosine(cls, steps: int = STEPS) -> "Schedule":
-        """Nichol and Dhariwal's: β_i = 1 − ā((i+1)/n) / ā(i/n), capped; ā(u) = cos²((u + 0.008)/1.008 · π/2)."""
+        """Nichol and Dhariwal's: β_i = 1 − ā((i+1)/n) / ā(i/n), capped; ā(u) = cos²((u +
+        0.008)/1.008 · π/2).
+        """
         u = np.arange(steps + 1) / steps
         left = np.cos((u + 0.008) / 1.008 * np.pi / 2) ** 2
         betas = np.minimum(1 - left[1:] / left[:-1], LARGEST_BETA)
@@ -36,11 +40,14 @@ class Schedule:
 
     def noised(self, actions: Tensor, noise: Tensor, steps: Tensor) -> Tensor:
         """Chunks [b, h, a] after `steps` [b] of noising: √ā·actions + √(1 − ā)·noise."""
-        left = torch.from_numpy(self.alphas_cumprod).to(actions.device)[steps.to(actions.device)][:, None, None]
+        left = torch.from_numpy(self.alphas_cumprod).to(actions.device)[steps.to(actions.device)][
+            :, None, None
+        ]
         return left.sqrt().to(actions) * actions + (1 - left).sqrt().to(actions) * noise
 
     def ddim_steps(self, count: int) -> np.ndarray:
-        """The steps that DDIM visits, ascending: every k-th from 0, with the smallest k that gives exactly `count`.
+        """The steps that DDIM visits, ascending: every k-th from 0, with the smallest k that gives
+        exactly `count`.
 
         Raises:
             UserError: no k does.
@@ -48,12 +55,14 @@ class Schedule:
         strides = {math.ceil(len(self) / stride): stride for stride in range(len(self), 0, -1)}
         require(
             count in strides,
-            f"flow_steps={count}: MemoryVLA visits every k-th of {len(self)} diffusion steps, so it samples in "
-            f"{', '.join(map(str, sorted(strides)))}.",
+            f"flow_steps={count}: MemoryVLA visits every k-th of {len(self)} diffusion steps, so it"
+            f" samples in {', '.join(map(str, sorted(strides)))}.",
         )
         return np.arange(0, len(self), strides[count])
 
-    def ddim(self, noise: Tensor, count: int, predict: Callable[[Tensor, int], Tensor]) -> list[Tensor]:
+    def ddim(
+        self, noise: Tensor, count: int, predict: Callable[[Tensor, int], Tensor]
+    ) -> list[Tensor]:
         """Go back from noise [b, h, a] in `count` steps without new noise (η = 0).
 
         Args:
@@ -83,7 +92,8 @@ INITS = ("zero", "xavier")
 class DitConfig:
     """DiT-L by default; S is 384 × 6 layers × 4 heads, B 768 × 12 × 12.
 
-    perceptual_init: how the attention to perceptual tokens begins: `zero`, as released (it begins silent), or `xavier`.
+    perceptual_init: how the attention to perceptual tokens begins: `zero`, as released (it begins
+    silent), or `xavier`.
     """
 
     width: int = 1024
@@ -98,14 +108,20 @@ class DitConfig:
 
 
 def step_features(steps: Tensor) -> Tensor:
-    """[cos(t f) | sin(t f)] of diffusion steps [n], f_j = 10000^(−j/half): [n, TIME_FEATURES] float32."""
-    ramp = torch.arange(TIME_FEATURES // 2, device=steps.device, dtype=torch.float32) / (TIME_FEATURES // 2)
+    """[cos(t f) | sin(t f)] of diffusion steps [n], f_j = 10000^(−j/half): [n, TIME_FEATURES]
+    float32.
+    """
+    ramp = torch.arange(TIME_FEATURES // 2, device=steps.device, dtype=torch.float32) / (
+        TIME_FEATURES // 2
+    )
     angles = steps.float()[:, None] * 10_000.0**-ramp
     return torch.cat([angles.cos(), angles.sin()], -1)
 
 
 class DitBlock(nn.Module):
-    """Self-attention over the chunk, attention to the perceptual tokens, an MLP; norms before each."""
+    """Self-attention over the chunk, attention to the perceptual tokens, an MLP; norms
+    before each.
+    """
 
     def __init__(self, width: int, heads: int) -> None:
         from timm.layers import Attention, GELUTanh, Mlp
@@ -127,11 +143,14 @@ class DitBlock(nn.Module):
 class Dit(nn.Module):
     """Predicts the noise in a chunk.
 
-    The time and the cognition token make one token in front of the chunk's. In training the cognition token of some
-    samples gives way to a learned empty one, which guidance uses later; perceptual tokens always stay.
+    The time and the cognition token make one token in front of the chunk's. In training the
+    cognition token of some samples gives way to a learned empty one, which guidance uses later;
+    perceptual tokens always stay.
     """
 
-    def __init__(self, config: DitConfig, action_dim: int, horizon: int, d_cognition: int, d_perceptual: int) -> None:
+    def __init__(
+        self, config: DitConfig, action_dim: int, horizon: int, d_cognition: int, d_perceptual: int
+    ) -> None:
         super().__init__()
         width = config.width
         self.action = nn.Linear(action_dim, width)
@@ -162,7 +181,9 @@ class Dit(nn.Module):
             if perceptual == "zero":
                 nn.init.zeros_(cross.in_proj_weight)
 
-    def tokens(self, x: Tensor, steps: Tensor, cognition: Tensor, drop: Tensor | None = None) -> Tensor:
+    def tokens(
+        self, x: Tensor, steps: Tensor, cognition: Tensor, drop: Tensor | None = None
+    ) -> Tensor:
         """What the first block reads [b, h + 1, d].
 
         Args:
@@ -177,17 +198,28 @@ class Dit(nn.Module):
         return torch.cat([first, self.action(x)], 1) + self.positions
 
     def forward(
-        self, x: Tensor, steps: Tensor, cognition: Tensor, perceptual: Tensor, drop: Tensor | None = None
+        self,
+        x: Tensor,
+        steps: Tensor,
+        cognition: Tensor,
+        perceptual: Tensor,
+        drop: Tensor | None = None,
     ) -> Tensor:
-        """The noise [b, h, a] in x [b, h, a] at `steps` [b]; perceptual tokens [b, p, d_perceptual]."""
+        """The noise [b, h, a] in x [b, h, a] at `steps` [b]; perceptual tokens [b, p,
+        d_perceptual].
+        """
         read = self.perceptual(perceptual)
         tokens = self.tokens(x, steps, cognition, drop)
         for block in self.blocks:
             tokens = block(tokens, read)
         return self.output(self.norm(tokens))[:, 1:]
 
-    def guided(self, x: Tensor, steps: Tensor, cognition: Tensor, perceptual: Tensor, scale: float) -> Tensor:
-        """The noise, pushed away from what it would be without a cognition token; a scale of 1 pushes nothing."""
+    def guided(
+        self, x: Tensor, steps: Tensor, cognition: Tensor, perceptual: Tensor, scale: float
+    ) -> Tensor:
+        """The noise, pushed away from what it would be without a cognition token; a scale of 1
+        pushes nothing.
+        """
         if scale == 1:
             return self(x, steps, cognition, perceptual)
         drop = torch.arange(2, device=x.device).bool().repeat_interleave(len(x))

@@ -1,4 +1,6 @@
-"""An episode of MemoryVLA: what its banks hold, and which moments of the conditioning video enter them."""
+"""An episode of MemoryVLA: what its banks hold, and which moments of the conditioning video enter
+them.
+"""
 
 import copy
 from collections.abc import Sequence
@@ -24,7 +26,9 @@ class Writer(Host, Protocol):
     @property
     def banked(self) -> MemoryVlaCore: ...
 
-    def write(self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]) -> BankStates: ...
+    def write(
+        self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]
+    ) -> BankStates: ...
 
     def store(self, banks: BankStates, cognition: Tensor, features: Tensor) -> BankStates: ...
 
@@ -32,8 +36,9 @@ class Writer(Host, Protocol):
 class MemoryVlaEpisode(Episode):
     """Banks beside the current view.
 
-    Of the video every `VIDEO_STRIDE`-th frame is written; of the execution, each frame at which a chunk was chosen. The
-    latter is written when the next frames arrive, so that choosing twice at one frame gives the same chunk.
+    Of the video every `VIDEO_STRIDE`-th frame is written; of the execution, each frame at which a
+    chunk was chosen. The latter is written when the next frames arrive, so that choosing twice at
+    one frame gives the same chunk.
     """
 
     def __init__(self, policy: Writer, goal: str, seed: int = 0) -> None:
@@ -42,12 +47,16 @@ class MemoryVlaEpisode(Episode):
         self._banks = policy.banked.init_state()
         self._moments: list[np.ndarray] = []
         self.pending: tuple[Tensor, Tensor] | None = None
-        """The moment at which the last chunk was chosen: its cognition token [1, d] and vision features [p, c]."""
+        """The moment at which the last chunk was chosen: its cognition token [1, d] and vision
+        features [p, c].
+        """
         self._due: np.ndarray | None = None
 
     @property
     def banks(self) -> BankStates:
-        """What the banks hold. Moments of the video are read with the goal, so they are written once it is needed."""
+        """What the banks hold. Moments of the video are read with the goal, so they are written
+        once it is needed.
+        """
         if self._moments:
             self._banks = self._writer.write(self._banks, np.stack(self._moments), self.prompt)
             self._moments = []
@@ -58,14 +67,20 @@ class MemoryVlaEpisode(Episode):
         self._banks, self._moments = banks, []
 
     def _take(
-        self, frames: FrameBatch, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None = None
+        self,
+        frames: FrameBatch,
+        demo: np.ndarray,
+        executed: np.ndarray,
+        states: np.ndarray | None = None,
     ) -> None:
         if self.pending is not None:
             self.banks = self._writer.store(self.banks, *self.pending)
             self.pending = None
         moments = []
         for i in range(len(demo)):
-            if self._due is not None and demo[i]:  # a later frame of the video shows that it was not the last one
+            if (
+                self._due is not None and demo[i]
+            ):  # a later frame of the video shows that it was not the last one
                 moments.append(self._due)
             if self._due is not None and (demo[i] or not self._video_over):
                 self._due = None
@@ -84,7 +99,9 @@ class MemoryVlaEpisode(Episode):
         """The entries of both banks, each with its times."""
         named = (("cognition", self.banks.cognition), ("perceptual", self.banks.perceptual))
         return tuple(
-            MemoryEntries(name, tuple(zip(bank.times.tolist(), bank.entries, strict=True)), self.banks.count)
+            MemoryEntries(
+                name, tuple(zip(bank.times.tolist(), bank.entries, strict=True)), self.banks.count
+            )
             for name, bank in named
         )
 
@@ -92,7 +109,9 @@ class MemoryVlaEpisode(Episode):
         twin, banks = copy.copy(self), self.banks
         cognition, perceptual = stores
         twin.banks = replace(
-            banks, cognition=_bank(cognition, banks.cognition), perceptual=_bank(perceptual, banks.perceptual)
+            banks,
+            cognition=_bank(cognition, banks.cognition),
+            perceptual=_bank(perceptual, banks.perceptual),
         )
         return twin
 

@@ -16,7 +16,9 @@ from mme_vla.methods.prismatic import Prismatic
 from mme_vla.types import MemoryTokens
 
 
-def read_moments(vlm: Prismatic, images: Tensor, prompt: Tensor, prompt_mask: Tensor) -> tuple[Tensor, Tensor]:
+def read_moments(
+    vlm: Prismatic, images: Tensor, prompt: Tensor, prompt_mask: Tensor
+) -> tuple[Tensor, Tensor]:
     """Cognition token [n, 1, d] and vision features [n, p, c] of moments.
 
     Args:
@@ -26,7 +28,12 @@ def read_moments(vlm: Prismatic, images: Tensor, prompt: Tensor, prompt_mask: Te
     embedded, patches = vlm.embed(prompt), vlm.projector(features)
     tokens = torch.cat([embedded[:, :1], patches.to(embedded), embedded[:, 1:]], 1)
     attention_mask = torch.cat(
-        [prompt_mask[:, :1], torch.ones_like(patches[..., 0], dtype=torch.bool), prompt_mask[:, 1:]], 1
+        [
+            prompt_mask[:, :1],
+            torch.ones_like(patches[..., 0], dtype=torch.bool),
+            prompt_mask[:, 1:],
+        ],
+        1,
     )
     n = tokens.shape[1]
     causal = torch.ones(n, n, dtype=torch.bool, device=tokens.device).tril()
@@ -64,7 +71,9 @@ class Compression(nn.Module):
 
 @dataclass(frozen=True)
 class BankConfig:
-    """Both banks' options; see `MemoryBank`. A memory in their place is read by as many layers and the same fusion."""
+    """Both banks' options; see `MemoryBank`. A memory in their place is read by as many layers and
+    the same fusion.
+    """
 
     length: int = 16
     retrieval_layers: int = 2
@@ -79,8 +88,8 @@ class MemoryVlaConfig:
     """Sizes of MemoryVLA, and how its head is trained and asked.
 
     perceptual_width, compression_width: of a perceptual token, and of the bottleneck's middle.
-    repeats: copies of a chunk in training, each with its own noise. dropout: how often the cognition token gives way.
-    ddim_steps, guidance: of sampling.
+    repeats: copies of a chunk in training, each with its own noise. dropout: how often the
+    cognition token gives way. ddim_steps, guidance: of sampling.
     """
 
     vision: FusedVisionConfig = field(default_factory=FusedVisionConfig)
@@ -102,7 +111,10 @@ class MemoryVlaConfig:
             if isinstance(value, int):
                 check_sizes("backbone", **{name: value})
         require(0 <= self.dropout < 1, f"backbone.dropout={self.dropout} must lie in [0, 1).")
-        require(self.guidance >= 1, f"backbone.guidance={self.guidance} must be at least 1 (no guidance).")
+        require(
+            self.guidance >= 1,
+            f"backbone.guidance={self.guidance} must be at least 1 (no guidance).",
+        )
 
 
 @dataclass(frozen=True)
@@ -115,9 +127,11 @@ class BankStates:
 
 
 class Core(nn.Module):
-    """From cognition and perceptual tokens to a chunk of actions. A subclass defines the memory they are fused with.
+    """From cognition and perceptual tokens to a chunk of actions. A subclass defines the memory
+    they are fused with.
 
-    Legend: m moments · p patches · widths: c of a vision feature, d of the language model, e of a perceptual token.
+    Legend: m moments · p patches · widths: c of a vision feature, d of the language model, e of a
+    perceptual token.
     """
 
     def __init__(self, config: MemoryVlaConfig, **past: Retrieval) -> None:
@@ -138,11 +152,13 @@ class Core(nn.Module):
         sequences: Sequence[Tensor],
         memory: MemoryTokens | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """What the head reads of each of m moments: cognition and perceptual tokens, fused with the past.
+        """What the head reads of each of m moments: cognition and perceptual tokens, fused with the
+        past.
 
         Args:
             cognition: [m, 1, d]. features: [m, p, c].
-            times: [m]. sequences: places of the moments that share a bank, in the order of time. Banks read these.
+            times: [m]. sequences: places of the moments that share a bank, in the order of time.
+                Banks read these.
             memory: tokens [m, n, e] of each moment's own past, if they replace the banks.
         """
         raise NotImplementedError
@@ -150,19 +166,24 @@ class Core(nn.Module):
     def noise_error(
         self, actions: Tensor, cognition: Tensor, perceptual: Tensor, draws: Mapping[str, Tensor]
     ) -> Tensor:
-        """The head's error [r·m, h] on the chunks [m, h, a] of m moments r times over, each time with its own noise.
+        """The head's error [r·m, h] on the chunks [m, h, a] of m moments r times over, each time
+        with its own noise.
 
         Args:
             draws: `noise` [r·m, h, a], `steps` [r·m], `drop` [r·m] uniform.
         """
         repeats = len(draws["noise"]) // len(actions)
-        cognition, perceptual, actions = (x.repeat(repeats, 1, 1) for x in (cognition, perceptual, actions))
+        cognition, perceptual, actions = (
+            x.repeat(repeats, 1, 1) for x in (cognition, perceptual, actions)
+        )
         noised = self.schedule.noised(actions, draws["noise"], draws["steps"])
         drop = draws["drop"] < self.config.dropout
         predicted = self.head(noised, draws["steps"], cognition, perceptual, drop)
         return (predicted.float() - draws["noise"].float()).square().mean(-1)
 
-    def sample(self, noise: Tensor, cognition: Tensor, perceptual: Tensor, steps: int | None = None) -> Tensor:
+    def sample(
+        self, noise: Tensor, cognition: Tensor, perceptual: Tensor, steps: int | None = None
+    ) -> Tensor:
         """The chunk [b, h, a] that DDIM with guidance makes of noise; nothing is clipped."""
 
         def predict(x: Tensor, step: int) -> Tensor:
@@ -173,7 +194,8 @@ class Core(nn.Module):
 
 
 class RecallingCore(Core):
-    """A memory of the library stands where the banks' entries stood: the same retrieval reads its tokens.
+    """A memory of the library stands where the banks' entries stood: the same retrieval reads its
+    tokens.
 
     Its tokens are as wide as perceptual ones; nothing is written.
     """
@@ -185,7 +207,9 @@ class RecallingCore(Core):
         widths, of_bank = (config.vlm.width, config.perceptual_width), config.bank
         # Without a time code: tokens of a memory carry their own time and place.
         cognition, perceptual = (
-            Retrieval(width, of_bank.retrieval_layers, False, of_bank.fusion, config.perceptual_width)
+            Retrieval(
+                width, of_bank.retrieval_layers, False, of_bank.fusion, config.perceptual_width
+            )
             for width in widths
         )
         super().__init__(config, cognition_retrieval=cognition, perceptual_retrieval=perceptual)
@@ -210,11 +234,15 @@ class MemoryVlaCore(Core):
     cognition_bank: MemoryBank
     perceptual_bank: MemoryBank
 
-    def __init__(self, config: MemoryVlaConfig, cognition_bank: MemoryBank, perceptual_bank: MemoryBank) -> None:
+    def __init__(
+        self, config: MemoryVlaConfig, cognition_bank: MemoryBank, perceptual_bank: MemoryBank
+    ) -> None:
         super().__init__(config, cognition_bank=cognition_bank, perceptual_bank=perceptual_bank)
 
     def init_state(self) -> BankStates:
-        return BankStates(self.cognition_bank.init_state(1), self.perceptual_bank.init_state(self.patches))
+        return BankStates(
+            self.cognition_bank.init_state(1), self.perceptual_bank.init_state(self.patches)
+        )
 
     def through(
         self,
@@ -224,19 +252,29 @@ class MemoryVlaCore(Core):
         sequences: Sequence[Tensor],
         memory: MemoryTokens | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """See `Core.through`; each sequence begins with empty banks, which take its moments one after the other."""
+        """See `Core.through`; each sequence begins with empty banks, which take its moments one
+        after the other.
+        """
         read = self.cognition_bank.run(cognition, times, sequences)[0]
         return read, self.perceptual_bank.run(self.compression(features), times, sequences)[0]
 
-    def read_banks(self, states: Sequence[BankStates], cognition: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        """What the head reads of b episodes' current moments: fused cognition [b, 1, d] and perceptual tokens."""
+    def read_banks(
+        self, states: Sequence[BankStates], cognition: Tensor, features: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What the head reads of b episodes' current moments: fused cognition [b, 1, d] and
+        perceptual tokens.
+        """
         return (
             self.cognition_bank.read([state.cognition for state in states], cognition),
-            self.perceptual_bank.read([state.perceptual for state in states], self.compression(features)),
+            self.perceptual_bank.read(
+                [state.perceptual for state in states], self.compression(features)
+            ),
         )
 
     def store(self, state: BankStates, cognition: Tensor, features: Tensor) -> BankStates:
-        """One episode's banks after the moment [1, d], [p, c]; its time is how many went before it."""
+        """One episode's banks after the moment [1, d], [p, c]; its time is how many
+        went before it.
+        """
         fused, perceptual = self.read_banks([state], cognition[None], features[None])
         tokens = self.compression(features[None])[0]
         return BankStates(

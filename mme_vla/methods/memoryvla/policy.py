@@ -1,4 +1,6 @@
-"""`MemoryVlaPolicy`: a VLM's cognition token and vision features, two banks or any memory, a diffusion head."""
+"""`MemoryVlaPolicy`: a VLM's cognition token and vision features, two banks or any memory, a
+diffusion head.
+"""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -14,7 +16,14 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory, full_history
 from mme_vla.methods.memoryvla.episode import MemoryVlaEpisode, words
-from mme_vla.methods.memoryvla.model import BankStates, Core, MemoryVlaConfig, MemoryVlaCore, build_core, read_moments
+from mme_vla.methods.memoryvla.model import (
+    BankStates,
+    Core,
+    MemoryVlaConfig,
+    MemoryVlaCore,
+    build_core,
+    read_moments,
+)
 from mme_vla.methods.memoryvla.processor import GroupBatch, MemoryVlaProcessor
 from mme_vla.methods.openvla_oft.processor import augment, centre_cut, draw_changes
 from mme_vla.methods.prismatic import IMAGENET, Prismatic
@@ -34,11 +43,13 @@ from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 
 @POLICIES.register("memoryvla")
 class MemoryVlaPolicy(NetworkPolicy):
-    """MemoryVLA: what a moment means (one token of a Llama) and what it looks like (tokens of two towers), each with a
-    bank of past moments that is read, fused and written. A diffusion transformer predicts the chunk.
+    """MemoryVLA: what a moment means (one token of a Llama) and what it looks like (tokens of two
+    towers), each with a bank of past moments that is read, fused and written. A diffusion
+    transformer predicts the chunk.
 
-    Training sees groups of moments of one episode, each group in banks of its own; acting writes moment by moment.
-    A memory of the library may replace the banks: each moment then reads its own history's tokens.
+    Training sees groups of moments of one episode, each group in banks of its own; acting writes
+    moment by moment. A memory of the library may replace the banks: each moment then reads its own
+    history's tokens.
     """
 
     acts_in_bfloat16 = True
@@ -50,11 +61,19 @@ class MemoryVlaPolicy(NetworkPolicy):
             "action": "",
         },
         lora_targets=(
-            "attn.qkv", "attn.proj", "q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj",
+            "attn.qkv",
+            "attn.proj",
+            "q_proj",
+            "k_proj",
+            "v_proj",
+            "o_proj",
+            "gate_proj",
+            "up_proj",
+            "down_proj",
         ),
         full_train=("core",),
         lora_exclude=r"^core\.",
-    )  # fmt: skip
+    )
 
     def __init__(
         self,
@@ -78,21 +97,31 @@ class MemoryVlaPolicy(NetworkPolicy):
 
     @classmethod
     def from_config(
-        cls, config: Mapping[str, Any], processor: PolicyProcessor | None = None, *, fresh_backbone: bool = True
+        cls,
+        config: Mapping[str, Any],
+        processor: PolicyProcessor | None = None,
+        *,
+        fresh_backbone: bool = True,
     ) -> Self:
         section = {key: value for key, value in config["backbone"].items() if key != "name"}
         sizes = read_section(MemoryVlaConfig, section, "backbone")
         embodiment_of(config).check_network(sizes.action_dim, sizes.horizon)
         if config.get("integration"):
             raise UserError(
-                f"MemoryVLA has no place for the integration {config['integration'].get('name')!r}: its own retrieval "
-                "reads a memory, in place of its banks. Set integration=none."
+                f"MemoryVLA has no place for the integration {config['integration'].get('name')!r}:"
+                " its own retrieval reads a memory, in place of its banks. Set integration=none."
             )
-        processor = processor_for(MemoryVlaProcessor, processor, "memoryvla, or memoryvla_tiny to try it")
+        processor = processor_for(
+            MemoryVlaProcessor, processor, "memoryvla, or memoryvla_tiny to try it"
+        )
         require(
-            not (processor is not None and processor.samples.group_size == 1 and not config.get("memory")),
-            "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other; give groups of 2 "
-            "or more, or a memory in place of the banks (memory=framesamp).",
+            not (
+                processor is not None
+                and processor.samples.group_size == 1
+                and not config.get("memory")
+            ),
+            "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other;"
+            " give groups of 2 or more, or a memory in place of the banks (memory=framesamp).",
         )
         with nullcontext() if fresh_backbone else shapes_only():
             vlm = Prismatic(sizes.vision, sizes.vlm, sizes.vocab_size, IMAGENET)
@@ -102,13 +131,17 @@ class MemoryVlaPolicy(NetworkPolicy):
         core = build_core(sizes, recalls=bool(config.get("memory")))
         memory: Memory | None = None
         if config.get("memory"):
-            memory = build_memory(config["memory"], sizes.vision.width, sizes.vision.grid, sizes.perceptual_width)
+            memory = build_memory(
+                config["memory"], sizes.vision.width, sizes.vision.grid, sizes.perceptual_width
+            )
             check_past(config, memory, frozenset())
         return cls(vlm, core, memory, processor, config, **policy_options(cls, config))
 
     # Moments
 
-    def _of_batch(self, batch: GroupBatch, changes: Tensor | None = None) -> tuple[Tensor, Tensor, list[Tensor]]:
+    def _of_batch(
+        self, batch: GroupBatch, changes: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Moments of a batch without its padding, and the places of each group among them.
 
         Args:
@@ -136,10 +169,16 @@ class MemoryVlaPolicy(NetworkPolicy):
     @property
     def group_size(self) -> int:
         """Moments of a training sample: its processor's, else its configuration's."""
-        return self.config["processor"]["group_size"] if self.processor is None else self.processor.samples.group_size
+        return (
+            self.config["processor"]["group_size"]
+            if self.processor is None
+            else self.processor.samples.group_size
+        )
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
-        """Of `count` groups: `noise` [n, r, m, h, a], `steps` and `drop` [n, r, m], for r copies of m moments."""
+        """Of `count` groups: `noise` [n, r, m, h, a], `steps` and `drop` [n, r, m], for r copies of
+        m moments.
+        """
         shape = (count, self.sizes.repeats, self.group_size)
         return {
             "noise": torch.randn(*shape, self.horizon, self.action_dim, generator=generator),
@@ -148,20 +187,28 @@ class MemoryVlaPolicy(NetworkPolicy):
         }
 
     def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
-        """While training with augmentation `changes` [n, m, 6]: what happens to the images of `count` groups."""
+        """While training with augmentation `changes` [n, m, 6]: what happens to the images of
+        `count` groups.
+        """
         if not (self.training and self.augment):
             return {}
         size = self.group_size
         return {"changes": draw_changes(count * size, generator).unflatten(0, (count, size))}
 
-    def forward(self, batch: GroupBatch, noise: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(
+        self, batch: GroupBatch, noise: Mapping[str, Tensor] | None = None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean squared error of the predicted noise over all moments, copies and numbers.
 
         Args:
-            batch: with `actions`. noise: of `training_noise` and `augmentation_params`; fresh ones by default.
+            batch: with `actions`. noise: of `training_noise` and `augmentation_params`; fresh ones
+                by default.
         """
         if batch.actions is None:
-            raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunks (it is None).")
+            raise ValueError(
+                "forward() computes a loss: batch.actions must hold the recorded chunks (it is"
+                " None)."
+            )
         values = dict(noise or self.training_noise(len(batch.images), torch.default_generator))
         if "changes" not in values:
             values |= self.augmentation_params(len(batch.images), torch.default_generator)
@@ -173,17 +220,26 @@ class MemoryVlaPolicy(NetworkPolicy):
 
         sampled = map_noise(values, lambda value: repeat_batch(value.to(self.device)))
         memory = self.encode_memory(batch.histories())
-        cognition, features, groups = self._of_batch(batch, None if changes is None else changes.to(self.device))
+        cognition, features, groups = self._of_batch(
+            batch, None if changes is None else changes.to(self.device)
+        )
         with self.autocast():
-            read, perceptual = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
-            losses = self.core.noise_error(batch.actions[batch.valid], read, perceptual, sampled)  # r·m h
+            read, perceptual = self.core.through(
+                cognition, features, batch.times[batch.valid], groups, memory
+            )
+            losses = self.core.noise_error(
+                batch.actions[batch.valid], read, perceptual, sampled
+            )  # r·m h
         counted = None
         if batch.action_mask is not None:
             of_moments = batch.action_mask[batch.valid]
             counted = of_moments.repeat(len(losses) // len(of_moments), 1)
         loss = masked_mean(losses, counted)
         reported = {} if memory is None else memory.metrics
-        return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
+        return loss, {
+            "loss": loss.detach(),
+            **{f"memory/{name}": value for name, value in reported.items()},
+        }
 
     def recompute(self, mode: Recompute) -> None:
         self.vlm.recompute(mode)
@@ -191,11 +247,17 @@ class MemoryVlaPolicy(NetworkPolicy):
     def shard_groups(self) -> Sequence[ShardGroup]:
         full_modules = (self.vlm.vision, self.vlm.language.model.embed_tokens)
         layers = (*self.vlm.language.model.layers, *self.core.head.blocks)
-        return [*(ShardGroup(module, full=True) for module in full_modules), *map(ShardGroup, layers)]
+        return [
+            *(ShardGroup(module, full=True) for module in full_modules),
+            *map(ShardGroup, layers),
+        ]
 
     def compile(self, **options: Any) -> None:
         """Compile the towers, the language model's layers and the head's blocks, each by itself."""
-        towers, layers = (self.vlm.vision.dino, self.vlm.vision.siglip), self.vlm.language.model.layers
+        towers, layers = (
+            (self.vlm.vision.dino, self.vlm.vision.siglip),
+            self.vlm.language.model.layers,
+        )
         for module in (*towers, *layers, *self.core.head.blocks):
             module.compile(**options)
         if self.memory is not None:
@@ -215,42 +277,68 @@ class MemoryVlaPolicy(NetworkPolicy):
         steps: int | None = None,
         memory: MemoryTokens | None = None,
     ) -> Tensor:
-        """A normalised chunk [g, h, a] for the last moment of every group: through those before it, or its own memory.
+        """A normalised chunk [g, h, a] for the last moment of every group: through those before it,
+        or its own memory.
 
         Args:
             memory: memory tokens of the last moments, encoded beforehand.
         """
         if noise is None:
-            noise = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.images))])
+            noise = stack_noise(
+                [self.sampling_noise(torch.default_generator) for _ in range(len(batch.images))]
+            )
         if self.memory is not None:
             batch = batch.last()
             memory = self.encode_memory(batch.history) if memory is None else memory
         cognition, features, groups = self._of_batch(batch)
         with self.autocast():
-            read, perceptual = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
+            read, perceptual = self.core.through(
+                cognition, features, batch.times[batch.valid], groups, memory
+            )
             last = [int(group[-1]) for group in groups]
-            return self.core.sample(noise["noise"].to(self.device), read[last], perceptual[last], steps)
+            return self.core.sample(
+                noise["noise"].to(self.device), read[last], perceptual[last], steps
+            )
 
     # Episodes
 
     def start_episode(self, goal: str, seed: int = 0) -> Episode:
         """Begin an episode with empty banks, or an empty memory."""
-        return MemoryVlaEpisode(self, goal, seed) if self.memory is None else super().start_episode(goal, seed)
+        return (
+            MemoryVlaEpisode(self, goal, seed)
+            if self.memory is None
+            else super().start_episode(goal, seed)
+        )
 
     def observation(self, episodes: Sequence[Episode]) -> GroupBatch:
-        """The current moments of running episodes, each a group of one; only banks know what number theirs has."""
-        images = self.require_processor().prepare_images(torch.stack([episode.images for episode in episodes]))
+        """The current moments of running episodes, each a group of one; only banks know what number
+        theirs has.
+        """
+        images = self.require_processor().prepare_images(
+            torch.stack([episode.images for episode in episodes])
+        )
         ids, masks = words([episode.prompt for episode in episodes])
         times = torch.tensor(
-            [0 if self.memory is not None else _memoryvla_episode(episode).banks.count for episode in episodes]
+            [
+                0 if self.memory is not None else _memoryvla_episode(episode).banks.count
+                for episode in episodes
+            ]
         )
         valid = torch.ones(len(episodes), 1, dtype=torch.bool)
-        return GroupBatch(images[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(self.device)
+        return GroupBatch(images[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(
+            self.device
+        )
 
     def predict_chunk(
-        self, batch: GroupBatch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: GroupBatch,
+        episodes: Sequence[Episode],
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
-        """A chunk for what `observation` saw, through the episodes' memories, or their banks, which it leaves alone."""
+        """A chunk for what `observation` saw, through the episodes' memories, or their banks, which
+        it leaves alone.
+        """
         if self.memory is not None:
             return self.sample_actions(batch, noise, steps, self.encode_memories(episodes))
         with torch.no_grad():
@@ -265,13 +353,19 @@ class MemoryVlaPolicy(NetworkPolicy):
         return chunk
 
     @torch.no_grad()
-    def write(self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]) -> BankStates:
-        """Banks after further frames [n, H, W, 3] uint8 of the camera that the policy looks through."""
+    def write(
+        self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]
+    ) -> BankStates:
+        """Banks after further frames [n, H, W, 3] uint8 of the camera that the policy looks
+        through.
+        """
         processor = self.require_processor()
         images = processor.resized(frames).to(self.device)
         ids, mask = (part.to(self.device).expand(len(frames), -1) for part in prompt)
         with self.autocast():
-            cognition, features = read_moments(self.vlm, to_unit_range(centre_cut(images)), ids, mask)
+            cognition, features = read_moments(
+                self.vlm, to_unit_range(centre_cut(images)), ids, mask
+            )
             for i in range(len(frames)):
                 banks = self.banked.store(banks, cognition[i], features[i])
         return banks
@@ -299,7 +393,9 @@ class MemoryVlaPolicy(NetworkPolicy):
     def memory_tower(self) -> MemoryTower:
         vlm = self.vlm
         processor = self.processor
-        image_format = processor.memory_image_format if isinstance(processor, MemoryVlaProcessor) else ""
+        image_format = (
+            processor.memory_image_format if isinstance(processor, MemoryVlaProcessor) else ""
+        )
         settings = (image_format, str(vlm.vision.dino_standard))
         return MemoryTower(vlm.vision, vlm.pooled_tokens, self.sizes.vision.width, settings)
 
@@ -320,7 +416,9 @@ class MemoryVlaPolicy(NetworkPolicy):
             times=torch.zeros(1, 1, dtype=torch.int64, device=known),
             valid=torch.ones(1, 1, dtype=torch.bool, device=known),
             actions=torch.zeros(1, 1, self.horizon, self.action_dim, device=device),
-            history=None if self.memory is None else full_history(self.memory, self.sizes.vision.width, device),
+            history=None
+            if self.memory is None
+            else full_history(self.memory, self.sizes.vision.width, device),
         )
 
     def warm_up_vision(self) -> None:

@@ -1,4 +1,6 @@
-"""What stands between raw data and MemoryVLA: one camera, words that end, clipped quantiles, groups of one episode."""
+"""What stands between raw data and MemoryVLA: one camera, words that end, clipped quantiles, groups
+of one episode.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,10 +25,11 @@ from mme_vla.types import HistoryTokens, TensorStruct
 class GroupBatch(TensorStruct):
     """Groups of moments, each of one episode in the order of time, padded behind.
 
-    images: [g, m, 3, s, s] uint8. prompt: [g, m, l] ids; prompt_mask: [g, m, l] bool. times: [g, m] int64.
-    valid: [g, m] bool; False on padding. actions: [g, m, h, a] normalised; None when sampling.
-    action_mask: [g, m, h] bool; None counts all actions.
-    history: a memory's selections [g, m, n, …] of all moments, or [g, n, …] of each group's last one alone; None where
+    images: [g, m, 3, s, s] uint8. prompt: [g, m, l] ids; prompt_mask: [g, m, l] bool. times: [g, m]
+    int64. valid: [g, m] bool; False on padding. actions: [g, m, h, a] normalised; None when
+    sampling. action_mask: [g, m, h] bool; None counts all actions.
+    history: a memory's selections [g, m, n, …] of all moments, or [g, n, …] of each group's last
+    one alone; None where
         banks remember.
     """
 
@@ -60,7 +63,9 @@ GROUP_SIZE = 16
 
 @PROCESSORS.register("memoryvla")
 class MemoryVlaProcessor(OpenVlaProcessor):
-    """As OpenVLA's, but for the prompt's end, the numbers that are commanded as −1 or 1, and groups."""
+    """As OpenVLA's, but for the prompt's end, the numbers that are commanded as −1 or 1, and
+    groups.
+    """
 
     stats_spec = StatsSpec(horizon=1, every=True, extremes=True, exact=True, video=True)
 
@@ -69,21 +74,28 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         """As `OpenVlaProcessor.from_config`, with `group_size` beside the other settings."""
         size = config.get("group_size", GROUP_SIZE)
         check_integer("processor.group_size", size)
-        built = super().from_config({key: value for key, value in config.items() if key != "group_size"})
+        built = super().from_config(
+            {key: value for key, value in config.items() if key != "group_size"}
+        )
         built.samples = SampleSpec(group_size=size, cameras=(built.embodiment.memory_camera,))
         return built
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
-        """As `Processor.from_sections`, at the sizes of the section `backbone`, which is no `Backbone` here."""
+        """As `Processor.from_sections`, at the sizes of the section `backbone`, which is no
+        `Backbone` here.
+        """
         of_network = {key: value for key, value in sections["backbone"].items() if key != "name"}
         sizes = read_section(MemoryVlaConfig, of_network, "backbone")
         options = {"image_size": sizes.vision.image_size, "action_dim": sizes.action_dim}
-        built = cls.from_config({**sections["processor"], **options, "embodiment": embodiment_of(sections).to_dict()})
+        built = cls.from_config(
+            {**sections["processor"], **options, "embodiment": embodiment_of(sections).to_dict()}
+        )
         require(
             built.tokenizer.vocab_size <= sizes.vocab_size,
-            f"The tokenizer {built.tokenizer.spec!r} has {built.tokenizer.vocab_size} entries but "
-            f"backbone.vocab_size={sizes.vocab_size}: choose the processor that goes with the backbone.",
+            f"The tokenizer {built.tokenizer.spec!r} has {built.tokenizer.vocab_size} entries but"
+            f" backbone.vocab_size={sizes.vocab_size}: choose the processor that goes with the"
+            " backbone.",
         )
         return built
 
@@ -97,7 +109,9 @@ class MemoryVlaProcessor(OpenVlaProcessor):
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
         """As `OpenVlaProcessor.actions`; numbers that are commanded as −1 or 1 stay as they are."""
-        raw = self.embodiment.action.to_relative(*(torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state)))
+        raw = self.embodiment.action.to_relative(
+            *(torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state))
+        )
         return self._quantiles().normalize(raw)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
@@ -132,7 +146,9 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         }
 
     def collate(self, items: Sequence[dict[str, Any]]) -> GroupBatch:  # type: ignore[override]
-        """Groups side by side, the shorter ones filled up with their last moment; a single step is a group of one."""
+        """Groups side by side, the shorter ones filled up with their last moment; a single step is
+        a group of one.
+        """
         groups = [item.get("moments", [item]) for item in items]
         times = [torch.as_tensor(item.get("times", item["place"][-1:])) for item in items]
         longest = max(map(len, groups))
@@ -140,12 +156,17 @@ class MemoryVlaProcessor(OpenVlaProcessor):
 
         def stack(name: str) -> Tensor:
             return torch.stack(
-                [torch.stack([group[i][name] for i in at]) for group, at in zip(groups, rows, strict=True)]
+                [
+                    torch.stack([group[i][name] for i in at])
+                    for group, at in zip(groups, rows, strict=True)
+                ]
             )
 
         history = None
         if "history" in groups[0][0]:
-            every = [group[i]["history"] for group, at in zip(groups, rows, strict=True) for i in at]
+            every = [
+                group[i]["history"] for group, at in zip(groups, rows, strict=True) for i in at
+            ]
             history = stack_history(every)._map(lambda x: x.unflatten(0, (len(groups), longest)))
         mask = stack("prompt_mask")
         length = int(mask.sum(-1).max())

@@ -31,11 +31,23 @@ _RULES = tuple(
         (r"compression\.squeeze\.bias", r"per_compr.excite.1.bias", ""),
         (r"compression\.excite\.weight", r"per_compr.excite.3.weight", _CONVOLUTION),
         (r"compression\.excite\.bias", r"per_compr.excite.3.bias", ""),
-        (rf"{_BANK}\.blocks\.(\d+)\.(query|key|value)\.(.*)", r"\1_bank.retrieval_blocks.\2.\3.\4", ""),
-        (rf"{_BANK}\.blocks\.(\d+)\.attention_norm\.(.*)", r"\1_bank.retrieval_blocks.\2.attn_norm.\3", ""),
+        (
+            rf"{_BANK}\.blocks\.(\d+)\.(query|key|value)\.(.*)",
+            r"\1_bank.retrieval_blocks.\2.\3.\4",
+            "",
+        ),
+        (
+            rf"{_BANK}\.blocks\.(\d+)\.attention_norm\.(.*)",
+            r"\1_bank.retrieval_blocks.\2.attn_norm.\3",
+            "",
+        ),
         (rf"{_BANK}\.blocks\.(\d+)\.mlp_in\.(.*)", r"\1_bank.retrieval_blocks.\2.ffn.0.\3", ""),
         (rf"{_BANK}\.blocks\.(\d+)\.mlp_out\.(.*)", r"\1_bank.retrieval_blocks.\2.ffn.2.\3", ""),
-        (rf"{_BANK}\.blocks\.(\d+)\.mlp_norm\.(.*)", r"\1_bank.retrieval_blocks.\2.ffn_norm.\3", ""),
+        (
+            rf"{_BANK}\.blocks\.(\d+)\.mlp_norm\.(.*)",
+            r"\1_bank.retrieval_blocks.\2.ffn_norm.\3",
+            "",
+        ),
         (rf"{_BANK}\.gate\.(.*)", r"\1_bank.gate_fusion_blocks.proj.\2", ""),
         (rf"{_BANK}\.time\.input\.(.*)", r"\1_bank.timestep_encoder.mlp.0.\2", ""),
         (rf"{_BANK}\.time\.output\.(.*)", r"\1_bank.timestep_encoder.mlp.2.\2", ""),
@@ -82,9 +94,14 @@ _DROPPED = "action_model.net.history_embedder."  # CogACT's, which nothing reads
 
 
 def is_memoryvla(names: Iterable[str]) -> bool:
-    """Whether tensors are named as in the authors' checkpoints, or in those of Prismatic that they start from."""
+    """Whether tensors are named as in the authors' checkpoints, or in those of Prismatic that they
+    start from.
+    """
     present = set(names)
-    return "vision_backbone.dino_featurizer.cls_token" in present and "llm_backbone.llm.model.norm.weight" in present
+    return (
+        "vision_backbone.dino_featurizer.cls_token" in present
+        and "llm_backbone.llm.model.norm.weight" in present
+    )
 
 
 def read_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
@@ -96,17 +113,22 @@ def memoryvla_adapter(policy: Policy) -> Adapter:
     """The authors' names of this policy's tensors; what they start from lacks banks and head."""
     if not isinstance(policy, MemoryVlaPolicy):
         raise UserError(
-            f"This format holds MemoryVLA; {policy.config.get('name', 'this')} is a {type(policy).__name__}. "
-            "Set model=memoryvla."
+            f"This format holds MemoryVLA; {policy.config.get('name', 'this')} is a"
+            f" {type(policy).__name__}. Set model=memoryvla."
         )
     names = policy.state_dict()
     return Adapter(
-        memoryvla_table(names), fresh=frozenset(n for n in names if policy.finetune_spec.component_of(n) in _COMPONENTS)
+        memoryvla_table(names),
+        fresh=frozenset(n for n in names if policy.finetune_spec.component_of(n) in _COMPONENTS),
     )
 
 
-def write_memoryvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
-    """`model.pt` as the authors' training writes it; their statistics are of other actions, and none are written."""
+def write_memoryvla(
+    policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None
+) -> None:
+    """`model.pt` as the authors' training writes it; their statistics are of other actions, and
+    none are written.
+    """
     model: dict[str, dict[str, Tensor]] = {}
     for name, tensor in memoryvla_adapter(policy).export(policy.state_dict()).items():
         part, _, suffix = name.partition(".")

@@ -1,4 +1,6 @@
-"""Sizes of a Prismatic VLM (two vision towers, a projector, Llama), and of OpenVLA-OFT around it."""
+"""Sizes of a Prismatic VLM (two vision towers, a projector, Llama), and of OpenVLA-OFT
+around it.
+"""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -9,7 +11,9 @@ from mme_vla.errors import check_multiple, check_sizes, require
 
 @dataclass(frozen=True)
 class TowerConfig:
-    """One vision transformer; its tokens after the block before the last are read, so it has two blocks at least."""
+    """One vision transformer; its tokens after the block before the last are read, so it has two
+    blocks at least.
+    """
 
     width: int
     depth: int
@@ -17,9 +21,14 @@ class TowerConfig:
     num_heads: int
 
     def check(self, section: str) -> None:
-        """Raise an error that names a key of its section, such as `backbone.vision.dino.`, if it has no such tower."""
+        """Raise an error that names a key of its section, such as `backbone.vision.dino.`, if it
+        has no such tower.
+        """
         check_positive(self, section)
-        require(self.depth >= 2, f"{section}depth={self.depth} has no block before its last: at least 2.")
+        require(
+            self.depth >= 2,
+            f"{section}depth={self.depth} has no block before its last: at least 2.",
+        )
         check_multiple(section, "width", self.width, "num_heads", self.num_heads)
 
 
@@ -34,7 +43,9 @@ class FusedVisionConfig:
 
     def __post_init__(self) -> None:
         check_sizes("backbone.vision", image_size=self.image_size, patch_size=self.patch_size)
-        check_multiple("backbone.vision.", "image_size", self.image_size, "patch_size", self.patch_size)
+        check_multiple(
+            "backbone.vision.", "image_size", self.image_size, "patch_size", self.patch_size
+        )
         self.dino.check("backbone.vision.dino.")
         self.siglip.check("backbone.vision.siglip.")
 
@@ -53,8 +64,8 @@ class FusedVisionConfig:
 class LlamaConfig:
     """A Llama without grouped keys.
 
-    norm_eps: OpenVLA's published configuration leaves it at the class's default of 1e-6, although Llama 2 itself has
-    1e-5; OpenVLA-OFT trained and tests with that.
+    norm_eps: OpenVLA's published configuration leaves it at the class's default of 1e-6, although
+    Llama 2 itself has 1e-5; OpenVLA-OFT trained and tests with that.
     """
 
     width: int = 4096
@@ -72,7 +83,8 @@ class LlamaConfig:
 class OpenVlaConfig:
     """OpenVLA-OFT: the VLM, a token of the state, and a head that reads a chunk off zeroed slots.
 
-    state_dim: numbers of the state that the network reads; 0 for none. end_id: the token that closes the sequence.
+    state_dim: numbers of the state that the network reads; 0 for none. end_id: the token that
+    closes the sequence.
     """
 
     everything_sees_everything: ClassVar[bool] = True
@@ -87,9 +99,14 @@ class OpenVlaConfig:
 
     def __post_init__(self) -> None:
         check_sizes(
-            "backbone", **{name: getattr(self, name) for name in ("vocab_size", "end_id", "action_dim", "horizon")}
+            "backbone",
+            **{
+                name: getattr(self, name)
+                for name in ("vocab_size", "end_id", "action_dim", "horizon")
+            },
         )
         require(self.state_dim >= 0, f"backbone.state_dim={self.state_dim} must be at least 0.")
         require(
-            self.end_id < self.vocab_size, f"backbone.end_id={self.end_id} is no token of vocab_size={self.vocab_size}."
+            self.end_id < self.vocab_size,
+            f"backbone.end_id={self.end_id} is no token of vocab_size={self.vocab_size}.",
         )

@@ -40,11 +40,16 @@ class ResidualMLP(nn.Module):
 
 
 class ActionHead(nn.Module):
-    """Hidden states of a step's slots, side by side → that step's action; no activation at the end."""
+    """Hidden states of a step's slots, side by side → that step's action; no
+    activation at the end.
+    """
 
     def __init__(self, width: int, action_dim: int, blocks: int = 2) -> None:
         super().__init__()
-        self.input_norm, self.input = nn.LayerNorm(action_dim * width), nn.Linear(action_dim * width, width)
+        self.input_norm, self.input = (
+            nn.LayerNorm(action_dim * width),
+            nn.Linear(action_dim * width, width),
+        )
         self.blocks = nn.ModuleList(ResidualMLP(width) for _ in range(blocks))
         self.output_norm, self.output = nn.LayerNorm(width), nn.Linear(width, action_dim)
 
@@ -73,9 +78,9 @@ class TokenSequence:
 class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sharded):
     """`<s>`, images, state, memory, words, a slot of zeros for each number of the chunk, `</s>`.
 
-    Nothing is causal and no block is hidden from another, so an integration's visibility table has no effect; memory
-    stands after the state, wherever the integration names it. A slot is answered by the hidden state *before* it, as
-    in predicting the next token (Kim et al., OpenVLA-OFT).
+    Nothing is causal and no block is hidden from another, so an integration's visibility table has
+    no effect; memory stands after the state, wherever the integration names it. A slot is answered
+    by the hidden state *before* it, as in predicting the next token (Kim et al., OpenVLA-OFT).
     """
 
     Config = OpenVlaConfig
@@ -88,7 +93,9 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
     )
     PARTS: ClassVar[Mapping[str, str]] = {"vision": r"vlm\.vision\.", "vlm": r"vlm\.", "action": ""}
 
-    def __init__(self, config: OpenVlaConfig, extra_experts: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, config: OpenVlaConfig, extra_experts: Mapping[str, Any] | None = None
+    ) -> None:
         super().__init__(config, extra_experts)
         self.config = config
         width = config.vlm.width
@@ -115,7 +122,9 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
     # Observation
 
     def encode_images(self, images: Tensor) -> Tensor:
-        """Images [n, 3, s, s] in [−1, 1] → fused tokens [n, grid², d_vision], before the projector."""
+        """Images [n, 3, s, s] in [−1, 1] → fused tokens [n, grid², d_vision], before
+        the projector.
+        """
         return self.vlm.encode_images(images)
 
     def embed(self, batch: Batch) -> list[Block]:
@@ -137,8 +146,18 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
         ]
         if self.state_token is not None:
             if batch.proprio is None:
-                raise ValueError("This backbone reads the state: batch.proprio must hold it, normalised (it is None).")
-            blocks.append(Block("state", self.state_token(batch.proprio), torch.ones_like(token_mask[:, :1]), "vlm"))
+                raise ValueError(
+                    "This backbone reads the state: batch.proprio must hold it, normalised (it is"
+                    " None)."
+                )
+            blocks.append(
+                Block(
+                    "state",
+                    self.state_token(batch.proprio),
+                    torch.ones_like(token_mask[:, :1]),
+                    "vlm",
+                )
+            )
         return [*blocks, Block("prompt", words[:, 1:], batch.prompt_mask[:, 1:], "vlm")]
 
     # The pass
@@ -146,16 +165,27 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
     def sequence(self, blocks: Sequence[Block]) -> TokenSequence:
         """Put the blocks in order and add the slots and `</s>`.
 
-        The words of one sample may be fewer than another's. Slots and `</s>` follow each one's last word by position;
-        attention has no other order, so the padding between does no harm.
+        The words of one sample may be fewer than another's. Slots and `</s>` follow each one's last
+        word by position; attention has no other order, so the padding between does no harm.
         """
-        by_name = {block.name: block for block in blocks if block.name in ("begin", "images", "state", "prompt")}
+        by_name = {
+            block.name: block
+            for block in blocks
+            if block.name in ("begin", "images", "state", "prompt")
+        }
         prompt = by_name.pop("prompt")
-        before = [*by_name.values(), *(block for block in blocks if block.name not in ("prompt", *by_name))]
+        before = [
+            *by_name.values(),
+            *(block for block in blocks if block.name not in ("prompt", *by_name)),
+        ]
         slots = self.horizon * self.action_dim
         zeros = prompt.tokens.new_zeros(len(prompt.tokens), slots, prompt.tokens.shape[-1])
-        end = self.vlm.embed(torch.full_like(prompt.mask[:, :1], self.config.end_id, dtype=torch.long))
-        tokens = torch.cat([*(block.tokens.to(zeros) for block in (*before, prompt)), zeros, end], 1)
+        end = self.vlm.embed(
+            torch.full_like(prompt.mask[:, :1], self.config.end_id, dtype=torch.long)
+        )
+        tokens = torch.cat(
+            [*(block.tokens.to(zeros) for block in (*before, prompt)), zeros, end], 1
+        )
         tail = torch.ones_like(prompt.mask[:, :1]).expand(-1, slots + 1)
         valid = torch.cat([*(block.mask for block in before), prompt.mask, tail], 1)
         start = sum(len(block) for block in before)
@@ -174,7 +204,9 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
         return self.vlm.read(sequence.tokens, mask, sequence.positions, every_layer)
 
     def slots(self, sequence: TokenSequence, hidden: Tensor) -> Tensor:
-        """What the head reads [b, h, a·d]: the hidden states before the slots, a step's side by side."""
+        """What the head reads [b, h, a·d]: the hidden states before the slots, a step's side by
+        side.
+        """
         outputs = hidden.gather(1, sequence.read[..., None].expand(-1, -1, hidden.shape[-1]))
         return outputs.unflatten(1, (self.horizon, self.action_dim)).flatten(2)
 
@@ -190,7 +222,11 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
 
     @torch.no_grad()
     def sample(
-        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: Batch,
+        injection: Injection,
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
         """The chunk [b, h, a], without random numbers."""
         return self.predict_from(injection.blocks)
@@ -204,7 +240,11 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
 
     def compile(self, **options: Any) -> None:
         """Compile the towers and every layer of the language model, each by itself."""
-        for module in (self.vlm.vision.dino, self.vlm.vision.siglip, *self.vlm.language.model.layers):
+        for module in (
+            self.vlm.vision.dino,
+            self.vlm.vision.siglip,
+            *self.vlm.language.model.layers,
+        ):
             module.compile(**options)
 
     def parts(self) -> Mapping[str, str]:

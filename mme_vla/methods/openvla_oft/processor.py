@@ -1,4 +1,6 @@
-"""Images as OpenVLA's family sees them: Lanczos-3 on uint8, a crop of 90 % of the area, four changes of colour."""
+"""Images as OpenVLA's family sees them: Lanczos-3 on uint8, a crop of 90 % of the area, four
+changes of colour.
+"""
 
 import io
 import math
@@ -24,7 +26,8 @@ EPSILON = 1e-8
 class ClippedQuantiles:
     """Maps [q01, q99] to [−1, 1] and clips; a number that never moved becomes 0.
 
-    low, high: the quantiles [d]. scaled: [d] bool; the others pass as they are. still: [d] bool; never moved.
+    low, high: the quantiles [d]. scaled: [d] bool; the others pass as they are. still: [d] bool;
+    never moved.
     """
 
     low: np.ndarray
@@ -40,12 +43,16 @@ class ClippedQuantiles:
         """
         low, high = np.asarray(stats.q01, np.float64), np.asarray(stats.q99, np.float64)
         least, most = getattr(stats, "min", None), getattr(stats, "max", None)
-        ends = (low, high) if least is None or most is None else (np.asarray(least), np.asarray(most))
+        ends = (
+            (low, high) if least is None or most is None else (np.asarray(least), np.asarray(most))
+        )
         every = np.ones(len(low), bool) if scaled is None else np.asarray(scaled, bool)
         return cls(low, high, every, ends[0] == ends[1])
 
     def normalize(self, x: Tensor) -> Tensor:
-        """Scale x [..., d]: clip(2 (x − q01) / (q99 − q01 + ε) − 1, ±1), and 0 where nothing ever moved."""
+        """Scale x [..., d]: clip(2 (x − q01) / (q99 − q01 + ε) − 1, ±1), and 0 where nothing ever
+        moved.
+        """
         low, span, scaled, still = self._on(x)
         y = (2 * (x - low) / span - 1).clamp(-1, 1)
         return torch.where(scaled, torch.where(still, torch.zeros_like(y), y), x)
@@ -58,11 +65,17 @@ class ClippedQuantiles:
     def _on(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         require(
             x.is_floating_point() and x.shape[-1] == len(self.low),
-            f"Statistics of {len(self.low)} numbers do not fit values {x.dtype} of shape {list(x.shape)}.",
+            f"Statistics of {len(self.low)} numbers do not fit values {x.dtype} of shape"
+            f" {list(x.shape)}.",
         )
         still = self.still if len(self.still) else np.zeros(len(self.low), bool)
         scaled, motionless = (torch.from_numpy(flag).to(x.device) for flag in (self.scaled, still))
-        return x.new_tensor(self.low), x.new_tensor(self.high - self.low + EPSILON), scaled, motionless
+        return (
+            x.new_tensor(self.low),
+            x.new_tensor(self.high - self.low + EPSILON),
+            scaled,
+            motionless,
+        )
 
 
 SIDE = math.sqrt(0.9)  # of the crop, as a fraction of the image's
@@ -90,7 +103,9 @@ def lanczos(frames: np.ndarray, size: int) -> np.ndarray:
 
 
 def _weights(length: int, size: int) -> np.ndarray:
-    """What each of `size` places takes of each of `length` ones: [size, length] float32, rows add up to 1."""
+    """What each of `size` places takes of each of `length` ones: [size, length] float32, rows add
+    up to 1.
+    """
     scale = length / size
     widened = max(scale, 1.0)
     centres = (np.arange(size) + 0.5) * scale
@@ -112,7 +127,8 @@ def jpeg_round_trip(frames: np.ndarray) -> np.ndarray:
 
 
 def crop(pixels: Tensor, top: Tensor, left: Tensor) -> Tensor:
-    """Cut a square of 90 % of the area and resize it back, bilinear, corner on corner, without antialiasing.
+    """Cut a square of 90 % of the area and resize it back, bilinear, corner on corner, without
+    antialiasing.
 
     Args:
         pixels: [n, 3, s, s]. top, left: [n] fractions of the image, in [0, 1 − √0.9].
@@ -143,14 +159,18 @@ def _lines(pixels: Tensor, places: Tensor, axis: int) -> Tensor:
 
 
 def centre_crop(images: Tensor) -> Tensor:
-    """What test time shows of images [..., 3, s, s] uint8: the middle 90 % of the area, resized back; uint8."""
+    """What test time shows of images [..., 3, s, s] uint8: the middle 90 % of the area, resized
+    back; uint8.
+    """
     flat = images.flatten(0, -4)
     middle = torch.full((len(flat),), (1 - SIDE) / 2, device=images.device, dtype=torch.float64)
     return quantised(crop(flat.float() / 255, middle, middle).clamp(0, 1)).view(images.shape)
 
 
 def centre_cut(images: Tensor) -> Tensor:
-    """As `centre_crop`, but of whole pixels and resized back with Lanczos-3: how MemoryVLA shows images."""
+    """As `centre_crop`, but of whole pixels and resized back with Lanczos-3: how MemoryVLA shows
+    images.
+    """
     if images.is_meta:  # shapes alone: there is nothing to resize
         return images
     size = images.shape[-1]
@@ -165,8 +185,12 @@ def quantised(pixels: Tensor) -> Tensor:
     return (pixels * 255.5).floor().clamp(0, 255).to(torch.uint8)
 
 
-def draw_changes(count: int, generator: torch.Generator | None = None, device: torch.device | None = None) -> Tensor:
-    """Draws of `count` images [n, 6], made on the CPU: top, left, brightness, contrast, saturation, hue."""
+def draw_changes(
+    count: int, generator: torch.Generator | None = None, device: torch.device | None = None
+) -> Tensor:
+    """Draws of `count` images [n, 6], made on the CPU: top, left, brightness, contrast, saturation,
+    hue.
+    """
     u = torch.rand(count, 6, generator=generator)
     low = torch.tensor([0, 0, -BRIGHTNESS, CONTRAST[0], SATURATION[0], -HUE])
     high = torch.tensor([1 - SIDE, 1 - SIDE, BRIGHTNESS, CONTRAST[1], SATURATION[1], HUE])
@@ -213,23 +237,29 @@ def shift_hue(pixels: Tensor, by: Tensor) -> Tensor:
 
 @PROCESSORS.register("openvla")
 class OpenVlaProcessor(Processor):
-    """Lanczos-3 images, Llama's words, clipped quantiles of raw numbers, and the state for the network."""
+    """Lanczos-3 images, Llama's words, clipped quantiles of raw numbers, and the state for the
+    network.
+    """
 
     stats_spec = StatsSpec(horizon=1, every=True, extremes=True, exact=True)
     samples = SampleSpec(full_chunks_only=True)
     jpeg: bool = False
-    """Write every image as JPEG and read it again before it is resized, as the original's data were."""
+    """Write every image as JPEG and read it again before it is resized, as the original's data
+    were.
+    """
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """As `Processor.from_config`, with `jpeg` beside the other settings."""
         jpeg = config.get("jpeg", False)
         require(isinstance(jpeg, bool), f"processor.jpeg must be true or false, not {brief(jpeg)}.")
-        built = super().from_config({key: value for key, value in config.items() if key not in ("name", "jpeg")})
+        built = super().from_config(
+            {key: value for key, value in config.items() if key not in ("name", "jpeg")}
+        )
         require(
             built.embodiment.action.width == built.action_dim,
-            f"backbone.action_dim={built.action_dim}: this network's actions are as wide as the robot's, "
-            f"{built.embodiment.action.width}.",
+            f"backbone.action_dim={built.action_dim}: this network's actions are as wide as the"
+            f" robot's, {built.embodiment.action.width}.",
         )
         built.jpeg = jpeg
         return built
@@ -237,10 +267,14 @@ class OpenVlaProcessor(Processor):
     # Images
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """As `Processor.images`, resized with Lanczos-3; a crop or an augmentation is the policy's."""
+        """As `Processor.images`, resized with Lanczos-3; a crop or an augmentation is
+        the policy's.
+        """
         return super().images([self._resized(as_uint8_frames(view)) for view in views])
 
-    def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
+    def memory_images(
+        self, frames: np.ndarray | Tensor, device: torch.device | str | None = None
+    ) -> Tensor:
         """As `Processor.memory_images`, resized with Lanczos-3; neither cropped nor augmented."""
         array = frames.cpu().numpy() if isinstance(frames, Tensor) else frames
         resized = torch.from_numpy(np.require(self._resized(array), requirements=["C", "W"]))
@@ -257,7 +291,9 @@ class OpenVlaProcessor(Processor):
     # Words
 
     def prompt(self, *args: Any, **named: Any) -> tuple[Tensor, Tensor]:
-        """As `Processor.prompt`, closed by the piece `▁`, whose state predicts the first number of the chunk."""
+        """As `Processor.prompt`, closed by the piece `▁`, whose state predicts the first number of
+        the chunk.
+        """
         ids, mask = super().prompt(*args, **named)
         place = min(int(mask.sum()), len(ids) - 1)
         ids[place], mask[place] = self.tokenizer.piece("▁"), True
@@ -272,7 +308,9 @@ class OpenVlaProcessor(Processor):
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
         """As `Processor.actions`, clipped."""
-        raw = self.embodiment.action.to_relative(*(torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state)))
+        raw = self.embodiment.action.to_relative(
+            *(torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state))
+        )
         return ClippedQuantiles.of(self.require_stats().actions).normalize(raw)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
@@ -286,7 +324,9 @@ class OpenVlaProcessor(Processor):
         return super().item(sample) | {"proprio": self.proprio(sample.states[-1])}
 
     def collate(self, items: Sequence[dict[str, Any]]) -> Batch:
-        return replace(super().collate(items), proprio=torch.stack([item["proprio"] for item in items]))
+        return replace(
+            super().collate(items), proprio=torch.stack([item["proprio"] for item in items])
+        )
 
     def to_config(self) -> dict[str, Any]:
         return {"name": "openvla", **super().to_config(), "jpeg": self.jpeg}

@@ -17,9 +17,10 @@ Size = Annotated[int, Range(1, 2**16)]
 class EncoderSizes:
     """SAM2's image encoder (Hiera and its neck); Hiera-B+ by default.
 
-    width, heads: of the first stage; both double from stage to stage. blocks, windows: number of blocks and side of the
-    attention windows, of each stage. global_blocks: blocks, counted through all stages, that attend to the whole image.
-    background: side of the table of positions. neck: width of its output maps. lora: rank of the adapters.
+    width, heads: of the first stage; both double from stage to stage. blocks, windows: number of
+    blocks and side of the attention windows, of each stage. global_blocks: blocks, counted through
+    all stages, that attend to the whole image. background: side of the table of positions. neck:
+    width of its output maps. lora: rank of the adapters.
     """
 
     width: Size = 112
@@ -34,10 +35,14 @@ class EncoderSizes:
     def __post_init__(self) -> None:
         for name in ("blocks", "windows"):
             require(
-                len(getattr(self, name)) == LEVELS, f"backbone.encoder.{name} must have {LEVELS} numbers, one a stage."
+                len(getattr(self, name)) == LEVELS,
+                f"backbone.encoder.{name} must have {LEVELS} numbers, one a stage.",
             )
         if any(place >= sum(self.blocks) for place in self.global_blocks):
-            raise UserError(f"backbone.encoder.global_blocks={list(self.global_blocks)}: there are {sum(self.blocks)}.")
+            raise UserError(
+                f"backbone.encoder.global_blocks={list(self.global_blocks)}: there are"
+                f" {sum(self.blocks)}."
+            )
 
     @property
     def widths(self) -> list[int]:
@@ -49,12 +54,13 @@ class EncoderSizes:
 class SAM2ActSizes:
     """The network: both looks have the same sizes.
 
-    grid, patch: patches of a virtual image, and their side in pixels; an image has grid · patch of them.
-    width, heads, depth: of the multi-view transformer. language, words: width and number of the goal's tokens.
-    sam, pictures, state: what of a token's width the encoder's map, the image and the robot's state take.
-    state_dim: numbers of the robot's state. rotation_bins: of a whole turn. head: first width of the heads.
-    memory: width of a remembered place; memory_layers, memory_feedforward: of the attention over memories.
-    mask_stages: halvings between a heatmap's image and the grid. remembered: most keyframes that are read.
+    grid, patch: patches of a virtual image, and their side in pixels; an image has grid · patch of
+    them. width, heads, depth: of the multi-view transformer. language, words: width and number of
+    the goal's tokens. sam, pictures, state: what of a token's width the encoder's map, the image
+    and the robot's state take. state_dim: numbers of the robot's state. rotation_bins: of a whole
+    turn. head: first width of the heads. memory: width of a remembered place; memory_layers,
+    memory_feedforward: of the attention over memories. mask_stages: halvings between a heatmap's
+    image and the grid. remembered: most keyframes that are read.
     """
 
     encoder: EncoderSizes = field(default_factory=EncoderSizes)
@@ -80,14 +86,23 @@ class SAM2ActSizes:
     @classmethod
     def from_dict(cls, section: Mapping[str, Any]) -> Self:
         """Read the section `backbone` of a configuration, but for its `name`."""
-        return read_section(cls, {key: value for key, value in section.items() if key != "name"}, "backbone")
+        return read_section(
+            cls, {key: value for key, value in section.items() if key != "name"}, "backbone"
+        )
 
     def __post_init__(self) -> None:
         check_multiple("backbone.", "width", self.width, "backbone.heads", self.heads)
-        check_multiple("backbone.", "depth", self.depth, "pairs", 2)  # half of the layers see one view alone
+        check_multiple(
+            "backbone.", "depth", self.depth, "pairs", 2
+        )  # half of the layers see one view alone
         check_multiple("backbone.", "memory", self.memory, "quarters", 4)
-        check_multiple("backbone.", "sam + backbone.pictures + backbone.state", self.token, "quarters", 4)
-        require(360 % self.rotation_bins == 0, f"backbone.rotation_bins={self.rotation_bins} must divide 360 degrees.")
+        check_multiple(
+            "backbone.", "sam + backbone.pictures + backbone.state", self.token, "quarters", 4
+        )
+        require(
+            360 % self.rotation_bins == 0,
+            f"backbone.rotation_bins={self.rotation_bins} must divide 360 degrees.",
+        )
 
     @property
     def side(self) -> int:

@@ -22,7 +22,8 @@ from mme_vla.policy.episode import Episode, Host
 class SceneInputs:
     """What an episode shows the network at one keyframe.
 
-    points: [n, 3], metres. colours: [n, 3] in [0, 1]. state: [p]: gripper open, two fingers, time. language: [l, w].
+    points: [n, 3], metres. colours: [n, 3] in [0, 1]. state: [p]: gripper open, two fingers, time.
+    language: [l, w].
     """
 
     points: Tensor
@@ -31,39 +32,60 @@ class SceneInputs:
     language: Tensor
 
     def to(self, device: torch.device) -> "SceneInputs":
-        return SceneInputs(*(x.to(device) for x in (self.points, self.colours, self.state, self.language)))
+        return SceneInputs(
+            *(x.to(device) for x in (self.points, self.colours, self.state, self.language))
+        )
 
 
 @torch.no_grad()
 def decide(
-    network: SAM2ActNetwork, scene: SceneInputs, remembered: BankState, cube: Cube, finder: PointFinder
+    network: SAM2ActNetwork,
+    scene: SceneInputs,
+    remembered: BankState,
+    cube: Cube,
+    finder: PointFinder,
 ) -> tuple[Tensor, BankState]:
     """The next waypoint of one episode, and what it remembers after this keyframe.
 
     Returns:
-        The benchmark's waypoint [7]: position in metres, extrinsic roll-pitch-yaw in radians, gripper −1 (closed) or 1.
-        Whether the way there may touch things, which the network tells too, the benchmark's planner does not ask.
+        The benchmark's waypoint [7]: position in metres, extrinsic roll-pitch-yaw in radians,
+        gripper −1 (closed) or 1. Whether the way there may touch things, which the network tells
+        too, the benchmark's planner does not ask.
     """
-    points, colours, state, language = (x[None] for x in (scene.points, scene.colours, scene.state, scene.language))
+    points, colours, state, language = (
+        x[None] for x in (scene.points, scene.colours, scene.state, scene.language)
+    )
     side, zoom = network.sizes.side, ZOOM
     views = network.encode_views(cloud_images(points, colours, cube, side), state, language)
     logits, remembered = network.coarse_step(views, remembered)
     first = finder.find(logits)
-    closer = network.encode_views(zoomed_images(points, colours, cube, first, zoom, side), state, language)
+    closer = network.encode_views(
+        zoomed_images(points, colours, cube, first, zoom, side), state, language
+    )
     logits, tokens = network.fine_step(closer)
     point = finder.find(logits)
     outputs = network.heads(tokens, point)
     bins = torch.stack([outputs[axis].argmax(-1) for axis in "xyz"], -1)
     angles = torch.deg2rad(angles_of_bins(bins, network.sizes.rotation_bins)).float()
     grip = 2.0 * outputs["gripper"].argmax(-1, keepdim=True) - 1
-    return torch.cat([cube.back(zoom_back(point, first, zoom)), angles, grip], -1)[0].float(), remembered
+    return torch.cat([cube.back(zoom_back(point, first, zoom)), angles, grip], -1)[
+        0
+    ].float(), remembered
 
 
 @torch.no_grad()
-def watch(network: SAM2ActNetwork, scene: SceneInputs, remembered: BankState, cube: Cube) -> BankState:
-    """What an episode remembers after a frame at which nothing is decided, such as one of the conditioning video."""
-    points, colours, state, language = (x[None] for x in (scene.points, scene.colours, scene.state, scene.language))
-    views = network.encode_views(cloud_images(points, colours, cube, network.sizes.side), state, language)
+def watch(
+    network: SAM2ActNetwork, scene: SceneInputs, remembered: BankState, cube: Cube
+) -> BankState:
+    """What an episode remembers after a frame at which nothing is decided, such as one of the
+    conditioning video.
+    """
+    points, colours, state, language = (
+        x[None] for x in (scene.points, scene.colours, scene.state, scene.language)
+    )
+    views = network.encode_views(
+        cloud_images(points, colours, cube, network.sizes.side), state, language
+    )
     return network.coarse_step(views, remembered)[1]
 
 
@@ -81,8 +103,9 @@ class Watcher(Host, Protocol):
 class KeyframeEpisode(Episode):
     """Goal, bank and current shots of one episode.
 
-    A keyframe is a frame at which a waypoint is predicted: the last one of those that arrive together. Of the
-    conditioning video some frames, evenly spread, are taken into the bank once the first execution frame is there.
+    A keyframe is a frame at which a waypoint is predicted: the last one of those that arrive
+    together. Of the conditioning video some frames, evenly spread, are taken into the bank once the
+    first execution frame is there.
     """
 
     _policy: Watcher
@@ -105,18 +128,23 @@ class KeyframeEpisode(Episode):
         actions: np.ndarray | None = None,
         rendered: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        """Take frames in order, with what the cameras read beside their images; see `Episode.observe`.
+        """Take frames in order, with what the cameras read beside their images; see
+        `Episode.observe`.
 
         Args:
-            frames: of every camera also `<name>_depth` [t, H, W, 1] in millimetres and `<name>_camera_extrinsic`
-                [t, 3, 4], from the world to the camera.
+            frames: of every camera also `<name>_depth` [t, H, W, 1] in millimetres and
+                `<name>_camera_extrinsic` [t, 3, 4], from the world to the camera.
             rendered: the same frames for every camera; depth and poses are given for these alone.
         """
         self._check_readings(frames)
         require(
             not (
                 rendered is not None
-                and any(not np.array_equal(rendered[n], places) for places in rendered.values() for n in rendered)
+                and any(
+                    not np.array_equal(rendered[n], places)
+                    for places in rendered.values()
+                    for n in rendered
+                )
             ),
             "This policy sees through all of its cameras at once: draw the same frames of each.",
         )
@@ -125,24 +153,37 @@ class KeyframeEpisode(Episode):
         places = range(len(demo)) if rendered is None else next(iter(rendered.values())).tolist()
         processor = self._policy.require_processor()
         fingers = np.asarray(states, np.float32)[:, -1]
-        self._video += [(processor.shots(frames, i), float(fingers[at])) for i, at in enumerate(places) if demo[at]]
+        self._video += [
+            (processor.shots(frames, i), float(fingers[at]))
+            for i, at in enumerate(places)
+            if demo[at]
+        ]
         if len(demo) and not demo[-1]:
             self._store_video()
             if self._after is not None:
                 self.remembered, self._after = self._after, None
                 self.waypoints += 1
             current_rendered = len(places) > 0 and places[-1] == len(demo) - 1
-            self._now = (processor.shots(frames, len(places) - 1), float(fingers[-1])) if current_rendered else None
+            self._now = (
+                (processor.shots(frames, len(places) - 1), float(fingers[-1]))
+                if current_rendered
+                else None
+            )
 
     def scene_inputs(self) -> SceneInputs:
         """What the network is shown now."""
         if self._now is None:
-            raise UserError("The episode has seen no execution frame yet: call observe() with the current one first.")
+            raise UserError(
+                "The episode has seen no execution frame yet: call observe() with the current one"
+                " first."
+            )
         shots, finger = self._now
         return self._scene_inputs(shots, finger, self.waypoints)
 
     def decided(self, remembered: BankState) -> None:
-        """Note what is remembered once the frame that was decided at lies behind: when the next ones are observed."""
+        """Note what is remembered once the frame that was decided at lies behind: when the next
+        ones are observed.
+        """
         self._after = remembered
 
     @property
@@ -172,15 +213,21 @@ class KeyframeEpisode(Episode):
     def _store_video(self) -> None:
         most = self._policy.require_processor().video_frames
         count = min(len(self._video), most)
-        for place, index in enumerate(np.linspace(0, len(self._video) - 1, count).round().astype(int)):
+        for place, index in enumerate(
+            np.linspace(0, len(self._video) - 1, count).round().astype(int)
+        ):
             shots, finger = self._video[index]
-            self.remembered = self._policy.watch(self._scene_inputs(shots, finger, place), self.remembered)
+            self.remembered = self._policy.watch(
+                self._scene_inputs(shots, finger, place), self.remembered
+            )
         self._video = []
 
     def _scene_inputs(self, shots: list[Shot], finger: float, place: int) -> SceneInputs:
         processor = self._policy.require_processor()
         points, colours = processor.cloud(shots)
-        return SceneInputs(points, colours, processor.state(finger, place), processor.prompt(self.goal))
+        return SceneInputs(
+            points, colours, processor.state(finger, place), processor.prompt(self.goal)
+        )
 
     def _check_readings(self, frames: Mapping[str, np.ndarray]) -> None:
         for camera in self._robot.cameras:
@@ -190,10 +237,13 @@ class KeyframeEpisode(Episode):
             depth, pose = camera.readings
             for name, shape in ((depth, (*images.shape[:3], 1)), (pose, (len(images), 3, 4))):
                 require(
-                    name in frames, f"observe() needs {name!r} beside the camera {camera.name!r}; got {sorted(frames)}."
+                    name in frames,
+                    f"observe() needs {name!r} beside the camera {camera.name!r}; got"
+                    f" {sorted(frames)}.",
                 )
                 readings = np.asarray(frames[name])
                 require(
                     readings.shape in (shape, shape[:3]) and readings.dtype.kind in "fiu",
-                    f"{name} must be {list(shape)} numbers; got {readings.dtype} {list(readings.shape)}.",
+                    f"{name} must be {list(shape)} numbers; got {readings.dtype}"
+                    f" {list(readings.shape)}.",
                 )

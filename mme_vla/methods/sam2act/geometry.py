@@ -1,4 +1,6 @@
-"""Between a point of the cube and the three heatmaps that tell it: targets, loss, reading, and the best point."""
+"""Between a point of the cube and the three heatmaps that tell it: targets, loss, reading, and the
+best point.
+"""
 
 from dataclasses import dataclass
 from typing import Self
@@ -17,7 +19,8 @@ def unproject(depth: np.ndarray, intrinsic: np.ndarray, extrinsic: np.ndarray) -
     A pixel stands at its whole-numbered column and row, not at its centre, as in the released code.
 
     Args:
-        depth: [h, w], metres along the camera's axis. intrinsic: [3, 3]. extrinsic: world to camera, [3, 4] or [4, 4].
+        depth: [h, w], metres along the camera's axis. intrinsic: [3, 3]. extrinsic: world to
+            camera, [3, 4] or [4, 4].
     """
     depth, intrinsic, extrinsic = (np.asarray(x, np.float64) for x in (depth, intrinsic, extrinsic))
     rows, columns = np.indices(depth.shape, dtype=np.float64)
@@ -83,11 +86,17 @@ def shift_and_rotate(points: Tensor, centre: Tensor, shift: Tensor, angle: Tenso
 
 VIEWS = 3
 """top · front · right, everywhere in this order."""
-_ABOVE, _AHEAD, _BESIDE = 1.0, 1.0, 0.5  # where the eyes stand; the third one stands closer, as released
+_ABOVE, _AHEAD, _BESIDE = (
+    1.0,
+    1.0,
+    0.5,
+)  # where the eyes stand; the third one stands closer, as released
 
 
 def project(points: Tensor, side: int) -> Tensor:
-    """Columns and rows [..., 3 views, 2] of points [..., 3], in pixels of images of `side` and not rounded."""
+    """Columns and rows [..., 3 views, 2] of points [..., 3], in pixels of images of `side` and not
+    rounded.
+    """
     x, y, z = points.unbind(-1)
     half = side / 2
     columns = torch.stack([x, y, -x], -1)
@@ -96,13 +105,17 @@ def project(points: Tensor, side: int) -> Tensor:
 
 
 def depths(points: Tensor) -> Tensor:
-    """How far points [..., 3] are from each camera along its axis, [..., 3 views]; negative behind it."""
+    """How far points [..., 3] are from each camera along its axis, [..., 3 views]; negative behind
+    it.
+    """
     x, y, z = points.unbind(-1)
     return torch.stack([_ABOVE - z, _AHEAD - x, _BESIDE - y], -1)
 
 
 def constant_channels(side: int, device: torch.device | None = None) -> Tensor:
-    """Constant channels of each image, [3 views, 3, side, side]: its number from −1 to 1, and every row and column."""
+    """Constant channels of each image, [3 views, 3, side, side]: its number from −1 to 1, and every
+    row and column.
+    """
     line = torch.linspace(-1, 1, side, device=device)
     number = torch.linspace(-1, 1, VIEWS, device=device)[:, None, None].expand(VIEWS, side, side)
     rows, columns = line[:, None].expand(side, side), line[None].expand(side, side)
@@ -114,13 +127,15 @@ _LOCK = 1.0
 
 
 def angles_of(quaternions: Tensor) -> Tensor:
-    """Extrinsic x-y-z angles [..., 3] in degrees, in (−180, 180], of quaternions [..., 4] (x, y, z, w).
+    """Extrinsic x-y-z angles [..., 3] in degrees, in (−180, 180], of quaternions [..., 4] (x, y, z,
+    w).
 
     Where y is within a degree of ±90 it counts as ±90, and all of the rest is the turn about x.
     """
     x, y, z, w = torch.nn.functional.normalize(quaternions.double(), dim=-1).unbind(-1)
-    # With half angles a, b, c: (cos b + sin b)·(cos, sin)(a − c) and (cos b − sin b)·(cos, sin)(a + c). Unlike the
-    # textbook's tangents neither of them is ill-conditioned at the pole that the other fails at.
+    # With half angles a, b, c: (cos b + sin b)·(cos, sin)(a − c) and (cos b − sin b)·(cos, sin)(a +
+    # c). Unlike the textbook's tangents neither of them is ill-conditioned at the pole that the
+    # other fails at.
     difference, added = torch.atan2(x - z, w + y), torch.atan2(x + z, w - y)
     plus, minus = torch.hypot(x - z, w + y), torch.hypot(x + z, w - y)
     tilt = torch.rad2deg(2 * torch.atan2(plus - minus, plus + minus))
@@ -128,7 +143,9 @@ def angles_of(quaternions: Tensor) -> Tensor:
     roll = torch.where(up, 2 * difference, torch.where(down, 2 * added, difference + added))
     yaw = torch.where(up | down, 0.0, added - difference)
     tilt = torch.where(up, 90.0, torch.where(down, -90.0, tilt))
-    return torch.stack([_wrap_angle(torch.rad2deg(roll)), tilt, _wrap_angle(torch.rad2deg(yaw))], -1)
+    return torch.stack(
+        [_wrap_angle(torch.rad2deg(roll)), tilt, _wrap_angle(torch.rad2deg(yaw))], -1
+    )
 
 
 def quaternions_of(angles: Tensor) -> Tensor:
@@ -141,7 +158,9 @@ def quaternions_of(angles: Tensor) -> Tensor:
 
 
 def to_bins(quaternions: Tensor, count: int) -> Tensor:
-    """The bins [..., 3] int64 of quaternions [..., 4] (x, y, z, w), where a turn has `count` of them."""
+    """The bins [..., 3] int64 of quaternions [..., 4] (x, y, z, w), where a turn has `count` of
+    them.
+    """
     width = 360 / count
     return ((angles_of(quaternions) + 180) / width).round().to(torch.int64) % count
 
@@ -157,11 +176,14 @@ def _wrap_angle(degrees: Tensor) -> Tensor:
 
 SIGMA = 1.5
 """Width of a target's peak in pixels, as released."""
-_CUT = 4.5  # a target is zero where its Gaussian's exponent is below −4.5, three widths from the peak
+_CUT = (
+    4.5  # a target is zero where its Gaussian's exponent is below −4.5, three widths from the peak
+)
 
 
 def targets(pixels: Tensor, side: int, sigma: float = SIGMA) -> Tensor:
-    """Heatmaps [n, side, side] that sum to 1, with a peak at each of the pixels [n, 2] (column, row).
+    """Heatmaps [n, side, side] that sum to 1, with a peak at each of the pixels [n, 2] (column,
+    row).
 
     With a `sigma` below 0 all of a target is in the one pixel that is nearest.
     """
@@ -202,7 +224,8 @@ def corners(pixels: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
         pixels: [..., 2] (column, row), not rounded.
 
     Returns:
-        int64 [..., 4] numbers of pixels, row by row, and weights [..., 4] that sum to 1, or to 0 outside the image.
+        int64 [..., 4] numbers of pixels, row by row, and weights [..., 4] that sum to 1, or to 0
+        outside the image.
     """
     low, high = pixels.floor(), pixels.ceil()
     columns = torch.stack([low[..., 0], low[..., 0], high[..., 0], high[..., 0]], -1)
@@ -229,9 +252,9 @@ def read_maps(maps: Tensor, pixels: Tensor) -> Tensor:
 class PointFinder:
     """Finds the point of the cube that three heatmaps agree on, among the centres of side³ cells.
 
-    The cells' places in the views never change: a column and a row of a view depend on one coordinate each, so that
-    reading a map at all of them is resampling it along its two axes. What is kept is a number and a weight for
-    each pair of coordinates.
+    The cells' places in the views never change: a column and a row of a view depend on one
+    coordinate each, so that reading a map at all of them is resampling it along its two axes. What
+    is kept is a number and a weight for each pair of coordinates.
     """
 
     def __init__(self, side: int, device: torch.device | None = None) -> None:
@@ -241,13 +264,18 @@ class PointFinder:
         zero = torch.zeros_like(first)
         # top is seen by (x, y), front by (y, z), right by (x, z)
         axes = [(first, second, zero), (zero, first, second), (first, zero, second)]
-        pixels = torch.stack([project(torch.stack(xyz, -1), side)[..., view, :] for view, xyz in enumerate(axes)])
+        pixels = torch.stack(
+            [project(torch.stack(xyz, -1), side)[..., view, :] for view, xyz in enumerate(axes)]
+        )
         self._numbers, self._weights = corners(pixels, side, side)
 
     def scores(self, heatmaps: Tensor) -> Tensor:
         """The views' mean at every cell, [side, side, side] by x, y, z, of maps [3, side, side]."""
         flat = heatmaps.flatten(1)
-        read = [(flat[view][self._numbers[view]] * self._weights[view]).sum(-1) for view in range(len(flat))]
+        read = [
+            (flat[view][self._numbers[view]] * self._weights[view]).sum(-1)
+            for view in range(len(flat))
+        ]
         top, front, right = read
         return (top[:, :, None] + front[None] + right[:, None, :]) / len(read)
 
@@ -255,7 +283,9 @@ class PointFinder:
         """The best points [b, 3] of logits [b, 3, 1, side, side]; the first of equal ones."""
         maps = logits[:, :, 0].flatten(2).softmax(-1).view_as(logits[:, :, 0])
         best = torch.stack([self.scores(maps_of_one).argmax() for maps_of_one in maps])
-        cells = torch.stack([best // self.side**2, best // self.side % self.side, best % self.side], -1)
+        cells = torch.stack(
+            [best // self.side**2, best // self.side % self.side, best % self.side], -1
+        )
         return self.line[cells]
 
 
@@ -278,7 +308,9 @@ def z_buffer(points: Tensor, features: Tensor, side: int) -> tuple[Tensor, Tenso
     count, free = len(points), torch.iinfo(torch.int64).max
     pixels = project(points, side).permute(1, 0, 2)  # v n 2
     columns, rows = pixels.unbind(-1)
-    inside = (columns >= 0) & (columns < side) & (rows >= 0) & (rows < side) & points.isfinite().all(-1)
+    inside = (
+        (columns >= 0) & (columns < side) & (rows >= 0) & (rows < side) & points.isfinite().all(-1)
+    )
     millimetres = (depths(points).T * _MILLIMETRES).clamp(min=0).to(torch.int64)
     view = torch.arange(VIEWS, device=points.device)[:, None]
     places = (view * side + rows.to(torch.int64)) * side + columns.to(torch.int64)
@@ -297,8 +329,9 @@ def z_buffer(points: Tensor, features: Tensor, side: int) -> tuple[Tensor, Tenso
 def splat(images: Tensor, depth: Tensor, radius: float = RADIUS) -> tuple[Tensor, Tensor]:
     """Let near points cover the pixels around them.
 
-    Each pixel takes over its neighbour of least depth within the radius, if that is nearer than its own or it is empty.
-    Neighbours of depth exactly 0 do not spread; among equal ones the last in order counts, columns before rows.
+    Each pixel takes over its neighbour of least depth within the radius, if that is nearer than its
+    own or it is empty. Neighbours of depth exactly 0 do not spread; among equal ones the last in
+    order counts, columns before rows.
 
     Args:
         images: [v, side, side, c]. depth: [v, side, side]. radius: in the cube's coordinates.
@@ -347,7 +380,8 @@ def render(points: Tensor, features: Tensor, side: int, radius: float = RADIUS) 
 def virtual_images(points: Tensor, colours: Tensor, side: int) -> Tensor:
     """What the network sees of a cloud: [3 views, 10, side, side].
 
-    Channels: place / the cloud's largest coordinate (3), colour (3), centred depth, then `constant_channels` (3).
+    Channels: place / the cloud's largest coordinate (3), colour (3), centred depth, then
+    `constant_channels` (3).
 
     Args:
         points: [n, 3] in the cube's coordinates; at least one. colours: [n, 3] in [0, 1].
@@ -361,7 +395,13 @@ def _shifted(image: Tensor, across: int, down: int, fill: float) -> Tensor:
     """[v, s, s] whose pixel (row, column) is the given one's (row + down, column + across)."""
     side = image.shape[-1]
     shifted = torch.full_like(image, fill)
-    rows, columns = slice(max(-down, 0), side - max(down, 0)), slice(max(-across, 0), side - max(across, 0))
-    there_rows, there_columns = slice(max(down, 0), side + min(down, 0)), slice(max(across, 0), side + min(across, 0))
+    rows, columns = (
+        slice(max(-down, 0), side - max(down, 0)),
+        slice(max(-across, 0), side - max(across, 0)),
+    )
+    there_rows, there_columns = (
+        slice(max(down, 0), side + min(down, 0)),
+        slice(max(across, 0), side + min(across, 0)),
+    )
     shifted[:, rows, columns] = image[:, there_rows, there_columns]
     return shifted

@@ -1,4 +1,6 @@
-"""The multi-view transformer: three virtual images, the goal and the robot's state → a token for every patch."""
+"""The multi-view transformer: three virtual images, the goal and the robot's state → a token for
+every patch.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -24,9 +26,15 @@ class ConvexUp(nn.Module):
         super().__init__()
         inner = 2 * wide
         self.net_out = nn.Sequential(
-            _around(wide, inner), nn.ReLU(), _around(inner, inner), nn.ReLU(), _around(inner, narrow)
+            _around(wide, inner),
+            nn.ReLU(),
+            _around(inner, inner),
+            nn.ReLU(),
+            _around(inner, narrow),
         )
-        self.net_mask = nn.Sequential(_around(wide, inner), nn.ReLU(), nn.Conv2d(inner, _NEIGHBOURS * self.RATIO**2, 1))
+        self.net_mask = nn.Sequential(
+            _around(wide, inner), nn.ReLU(), nn.Conv2d(inner, _NEIGHBOURS * self.RATIO**2, 1)
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """Upsample."""
@@ -34,9 +42,13 @@ class ConvexUp(nn.Module):
         batch, channels, height, width = coarse.shape
         mask = _MASK_SCALE * self.net_mask(x)
         weights = mask.view(batch, 1, _NEIGHBOURS, self.RATIO, self.RATIO, height, width).softmax(2)
-        around = nn.functional.unfold(coarse, 3, padding=1).view(batch, channels, _NEIGHBOURS, 1, 1, height, width)
+        around = nn.functional.unfold(coarse, 3, padding=1).view(
+            batch, channels, _NEIGHBOURS, 1, 1, height, width
+        )
         fine = (weights * around).sum(2)  # b c ratio ratio h w
-        return fine.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels, self.RATIO * height, self.RATIO * width)
+        return fine.permute(0, 1, 4, 2, 5, 3).reshape(
+            batch, channels, self.RATIO * height, self.RATIO * width
+        )
 
 
 class ChannelNorm(nn.LayerNorm):
@@ -65,8 +77,9 @@ _WIDER = 4  # feed-forward layers, inside
 class EncodedViews:
     """The network's encoding of one view of the scene.
 
-    images: [b, 3, 10, s, s] of `virtual_images`. maps: of the image encoder for all views, finest first:
-    [b·3, token/4, 4g, 4g], [b·3, token/2, 2g, 2g], [b·3, neck, g, g]. state: [b, p]. language: [b, l, w].
+    images: [b, 3, 10, s, s] of `virtual_images`. maps: of the image encoder for all views, finest
+    first: [b·3, token/4, 4g, 4g], [b·3, token/2, 2g, 2g], [b·3, neck, g, g]. state: [b, p].
+    language: [b, l, w].
     """
 
     images: Tensor
@@ -88,7 +101,8 @@ class Attention(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[b, n, d] → [b, n, d]."""
         queries, keys, values = (
-            part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in (self.to_q(x), *self.to_kv(x).chunk(2, -1))
+            part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+            for part in (self.to_q(x), *self.to_kv(x).chunk(2, -1))
         )
         drop = _DROPOUT if self.training else 0.0
         mixed = nn.functional.scaled_dot_product_attention(queries, keys, values, dropout_p=drop)
@@ -139,17 +153,23 @@ class Normed(nn.Module):
 
 
 class MultiViewTransformer(nn.Module):
-    """From a look to the tokens of all patches: first each view by itself, then all views and the goal together."""
+    """From a look to the tokens of all patches: first each view by itself, then all views and the
+    goal together.
+    """
 
     def __init__(self, sizes: SAM2ActSizes) -> None:
         super().__init__()
         self.sizes = sizes
         self.positions = nn.Parameter(torch.randn(1, VIEWS * sizes.grid**2, sizes.token))
         self.state = Normed(nn.Linear(sizes.state_dim, sizes.state), sizes.state)
-        self.patches = Normed(nn.Conv2d(10, sizes.pictures, sizes.patch, sizes.patch), sizes.pictures)
+        self.patches = Normed(
+            nn.Conv2d(10, sizes.pictures, sizes.patch, sizes.patch), sizes.pictures
+        )
         self.language = Normed(nn.Linear(sizes.language, sizes.token), sizes.token)
         self.sam = nn.Conv2d(sizes.encoder.neck, sizes.sam, 1)
-        self.unused_sam = nn.Conv2d(sizes.encoder.neck, sizes.sam, 1)  # in every released checkpoint; nothing reads it
+        self.unused_sam = nn.Conv2d(
+            sizes.encoder.neck, sizes.sam, 1
+        )  # in every released checkpoint; nothing reads it
         self.wide = nn.Linear(sizes.token, sizes.width)
         self.narrow = nn.Linear(sizes.width, sizes.token)
         self.layers = nn.ModuleList(Layer(sizes.width, sizes.heads) for _ in range(sizes.depth))
@@ -161,7 +181,11 @@ class MultiViewTransformer(nn.Module):
         batch, grid = len(inputs.images), self.sizes.grid
         patches = self.patches(inputs.images.flatten(0, 1))  # (b v) c g g
         sam = nn.functional.leaky_relu(self.sam(inputs.maps[2]), SLOPE)
-        state = self.state(inputs.state)[:, None, :, None, None].expand(batch, VIEWS, -1, grid, grid).flatten(0, 1)
+        state = (
+            self.state(inputs.state)[:, None, :, None, None]
+            .expand(batch, VIEWS, -1, grid, grid)
+            .flatten(0, 1)
+        )
         tokens = torch.cat([sam, patches, state], 1).flatten(2).transpose(1, 2)
         tokens = tokens.reshape(batch, VIEWS * grid**2, -1) + self.positions
         words = inputs.language.shape[1]
@@ -225,7 +249,9 @@ class Heads(nn.Module):
         self.rates = code_rates(2 * len(self.rates)).to(self.norm.weight.device)
 
     def features(self, tokens: Tensor, waypoints: Tensor) -> Tensor:
-        """What the heads read [b, f] of tokens [b·3, token, g, g] at waypoints [b, 3] of the closer look's cube."""
+        """What the heads read [b, f] of tokens [b·3, token, g, g] at waypoints [b, 3] of the closer
+        look's cube.
+        """
         batch, (token, grid) = len(waypoints), tokens.shape[1:3]
         by_view = tokens.view(batch, VIEWS, token, grid, grid)
         pooled = by_view.amax((-2, -1)).transpose(1, 2).flatten(1)  # channel by channel
@@ -234,7 +260,8 @@ class Heads(nn.Module):
         return torch.cat([pooled, there], -1)
 
     def forward(self, features: Tensor, rotation: Tensor | None = None) -> dict[str, Tensor]:
-        """Logits `gripper` [b, 2], `collision` [b, 2], and of each rotation bin `x`, `y`, `z` [b, bins].
+        """Logits `gripper` [b, 2], `collision` [b, 2], and of each rotation bin `x`, `y`, `z` [b,
+        bins].
 
         The bin about y is conditioned on the one about x, the one about z on both.
 
@@ -247,7 +274,13 @@ class Heads(nn.Module):
         conditioned = normed + self.code(x.argmax(-1) if rotation is None else rotation[:, 0])
         y = self.y(conditioned)
         conditioned = conditioned + self.code(y.argmax(-1) if rotation is None else rotation[:, 1])
-        return {"gripper": gripper, "collision": collision, "x": x, "y": y, "z": self.z(conditioned)}
+        return {
+            "gripper": gripper,
+            "collision": collision,
+            "x": x,
+            "y": y,
+            "z": self.z(conditioned),
+        }
 
     def code(self, bins: Tensor) -> Tensor:
         """Sines and cosines [b, f] of bins [b]."""
@@ -267,7 +300,11 @@ class Branch(nn.Module):
 
 def _mlp(width: int, inner: int, out: int) -> nn.Sequential:
     return nn.Sequential(
-        nn.Linear(width, inner), nn.ReLU(), nn.Linear(inner, inner // 2), nn.ReLU(), nn.Linear(inner // 2, out)
+        nn.Linear(width, inner),
+        nn.ReLU(),
+        nn.Linear(inner, inner // 2),
+        nn.ReLU(),
+        nn.Linear(inner // 2, out),
     )
 
 
@@ -281,7 +318,9 @@ COLOURS = slice(3, 6)
 
 
 class SAM2ActNetwork(nn.Module):
-    """Encoder, bank and both branches. What an episode remembers goes in and comes out; nothing of it stays here."""
+    """Encoder, bank and both branches. What an episode remembers goes in and comes out; nothing of
+    it stays here.
+    """
 
     def __init__(self, sizes: SAM2ActSizes) -> None:
         super().__init__()
@@ -304,8 +343,12 @@ class SAM2ActNetwork(nn.Module):
         self.coarse.transformer.recomputed = self.fine.transformer.recomputed = mode
 
     def encode_views(self, images: Tensor, state: Tensor, language: Tensor) -> EncodedViews:
-        """What a branch reads: virtual images [b, 3, 10, s, s], the state [b, p], the goal's tokens [b, l, w]."""
-        return EncodedViews(images, self.encoder(images[:, :, COLOURS].flatten(0, 1)), state, language)
+        """What a branch reads: virtual images [b, 3, 10, s, s], the state [b, p], the goal's tokens
+        [b, l, w].
+        """
+        return EncodedViews(
+            images, self.encoder(images[:, :, COLOURS].flatten(0, 1)), state, language
+        )
 
     def coarse_step(self, views: EncodedViews, remembered: BankState) -> tuple[Tensor, BankState]:
         """Heatmap logits [b, 3, 1, s, s] of the coarse views, and what is remembered after it."""
@@ -319,7 +362,8 @@ class SAM2ActNetwork(nn.Module):
         return logits.unflatten(0, (-1, VIEWS))
 
     def coarse_sequences(self, views: EncodedViews, length: int) -> Tensor:
-        """Heatmap logits [b, 3, 1, s, s] of sequences of keyframes, each with a bank of its own that begins empty.
+        """Heatmap logits [b, 3, 1, s, s] of sequences of keyframes, each with a bank of its own
+        that begins empty.
 
         Gradients flow through everything that is remembered.
 
@@ -335,7 +379,9 @@ class SAM2ActNetwork(nn.Module):
             now = rows[:, step].flatten()
             maps = (views.maps[0][now], views.maps[1][now], views.maps[2][now])
             here = replace(views, maps=maps)
-            logits, remembered = self._store_and_decode(here, tokens[now], positions[now], remembered)
+            logits, remembered = self._store_and_decode(
+                here, tokens[now], positions[now], remembered
+            )
             decoded.append(logits)
         return torch.stack(decoded, 1).flatten(0, 1)
 
@@ -347,12 +393,16 @@ class SAM2ActNetwork(nn.Module):
         return logits.unflatten(0, (-1, VIEWS)), self.memory.update(remembered, tokens, logits)
 
     def fine_step(self, views: EncodedViews) -> tuple[Tensor, Tensor]:
-        """Heatmap logits [b, 3, 1, s, s] of the closer views, and its tokens [b·3, token, g, g] for the heads."""
+        """Heatmap logits [b, 3, 1, s, s] of the closer views, and its tokens [b·3, token, g, g] for
+        the heads.
+        """
         tokens = self.fine.transformer(views)
         logits: Tensor = self.fine.decoder(tokens, *views.maps[:2])
         return logits.unflatten(0, (-1, VIEWS)), tokens
 
-    def heads(self, tokens: Tensor, waypoints: Tensor, rotation: Tensor | None = None) -> dict[str, Tensor]:
+    def heads(
+        self, tokens: Tensor, waypoints: Tensor, rotation: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """What to do at waypoints [b, 3] of the closer look's cube: see `Heads.forward`."""
         heads = self.fine.heads
         assert heads is not None

@@ -13,9 +13,22 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import check_choice, require
 from mme_vla.methods.sam2act.config import SAM2ActSizes
 from mme_vla.methods.sam2act.episode import KeyframeEpisode, SceneInputs, decide, watch
-from mme_vla.methods.sam2act.geometry import ZOOM, Cube, PointFinder, heatmap_loss, shift_and_rotate, to_bins
+from mme_vla.methods.sam2act.geometry import (
+    ZOOM,
+    Cube,
+    PointFinder,
+    heatmap_loss,
+    shift_and_rotate,
+    to_bins,
+)
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
-from mme_vla.methods.sam2act.processor import NAME, KeyframeBatch, SAM2ActProcessor, cloud_images, zoomed_images
+from mme_vla.methods.sam2act.processor import (
+    NAME,
+    KeyframeBatch,
+    SAM2ActProcessor,
+    cloud_images,
+    zoomed_images,
+)
 from mme_vla.methods.sam2act.sam2 import BankState
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.network import NetworkPolicy, processor_for
@@ -37,7 +50,9 @@ _BIN_OFFSETS = (-2, 2)  # how far off the bins given to the heads; the upper end
 
 
 def augmentation_draws(count: int, keyframes: int, generator: torch.Generator) -> Noise:
-    """Random numbers of `count` samples: shifts and turns in [−1, 1], and the offsets of the given bins."""
+    """Random numbers of `count` samples: shifts and turns in [−1, 1], and the offsets of the given
+    bins.
+    """
     return {
         "shift": 2 * torch.rand(count, keyframes, 3, generator=generator) - 1,
         "turn": 2 * torch.rand(count, keyframes, generator=generator) - 1,
@@ -47,7 +62,9 @@ def augmentation_draws(count: int, keyframes: int, generator: torch.Generator) -
 
 @dataclass(frozen=True)
 class Scenes:
-    """A batch after augmentation, b·k keyframes one after the other; the points are in the world."""
+    """A batch after augmentation, b·k keyframes one after the other; the points are in
+    the world.
+    """
 
     points: Tensor
     colours: Tensor
@@ -61,16 +78,23 @@ class Scenes:
 
 @torch.no_grad()
 def augmented(
-    batch: KeyframeBatch, language: Tensor, noise: Mapping[str, Tensor] | None, cube: Cube, bins: int
+    batch: KeyframeBatch,
+    language: Tensor,
+    noise: Mapping[str, Tensor] | None,
+    cube: Cube,
+    bins: int,
 ) -> Scenes:
     """Shift each keyframe's cloud and turn it about its target, and the target's rotation with it.
 
     Args:
-        language: [b, l, w] tokens of the goals. noise: as `augmentation_draws` makes them; None changes nothing.
+        language: [b, l, w] tokens of the goals. noise: as `augmentation_draws` makes them; None
+            changes nothing.
         bins: of a whole turn.
     """
     keyframes = batch.points.shape[1]
-    points, target, rotation = (x.flatten(0, 1) for x in (batch.points, batch.target, batch.rotation))
+    points, target, rotation = (
+        x.flatten(0, 1) for x in (batch.points, batch.target, batch.rotation)
+    )
     if noise is not None:
         low, high = target.new_tensor(cube.low), target.new_tensor(cube.high)
         shift = noise["shift"].flatten(0, 1).to(target) * SHIFT * (high - low)
@@ -90,7 +114,9 @@ def augmented(
     )
 
 
-def first_loss(network: SAM2ActNetwork, scenes: Scenes, cube: Cube, offsets: Tensor | None = None) -> dict[str, Tensor]:
+def first_loss(
+    network: SAM2ActNetwork, scenes: Scenes, cube: Cube, offsets: Tensor | None = None
+) -> dict[str, Tensor]:
     """The losses of the first stage, each of weight 1; single keyframes, no memory.
 
     The closer look stands at the true waypoint, and the heads read there.
@@ -105,12 +131,17 @@ def first_loss(network: SAM2ActNetwork, scenes: Scenes, cube: Cube, offsets: Ten
     fine, tokens = network.fine_step(network.encode_views(near, scenes.state, scenes.language))
     here = torch.zeros_like(centre)  # the waypoint, in the closer look's cube
     maps = torch.cat([heatmap_loss(coarse, centre), heatmap_loss(fine, here)], 1)
-    noisy_bins = scenes.bins if offsets is None else (scenes.bins + offsets) % network.sizes.rotation_bins
+    noisy_bins = (
+        scenes.bins if offsets is None else (scenes.bins + offsets) % network.sizes.rotation_bins
+    )
     outputs = network.heads(tokens, here, noisy_bins)
     entropy = nn.functional.cross_entropy
     return {
         "heatmap": maps.mean(),
-        **{f"rotation_{axis}": entropy(outputs[axis], scenes.bins[:, i]) for i, axis in enumerate("xyz")},
+        **{
+            f"rotation_{axis}": entropy(outputs[axis], scenes.bins[:, i])
+            for i, axis in enumerate("xyz")
+        },
         "gripper": entropy(outputs["gripper"], scenes.gripper),
         "collision": entropy(outputs["collision"], scenes.collision),
     }
@@ -120,7 +151,9 @@ def _turned(rotation: Tensor, angle: Tensor) -> Tensor:
     """Quaternions [n, 4] (x, y, z, w) after a further turn about the vertical."""
     x, y, z, w = rotation.unbind(-1)
     sin, cos = (angle / 2).sin(), (angle / 2).cos()
-    return torch.stack([cos * x - sin * y, cos * y + sin * x, cos * z + sin * w, cos * w - sin * z], -1)
+    return torch.stack(
+        [cos * x - sin * y, cos * y + sin * x, cos * z + sin * w, cos * w - sin * z], -1
+    )
 
 
 STAGES = {
@@ -136,7 +169,9 @@ WIDTH = 7
 
 @POLICIES.register(NAME)
 class SAM2ActPolicy(NetworkPolicy):
-    """SAM2Act+ (RoboMME's fine-tuned model): one waypoint at a time, which the benchmark's planner moves to."""
+    """SAM2Act+ (RoboMME's fine-tuned model): one waypoint at a time, which the benchmark's planner
+    moves to.
+    """
 
     processor: SAM2ActProcessor | None
     memory = None  # its memory stands inside the network, between transformer and decoder
@@ -165,13 +200,20 @@ class SAM2ActPolicy(NetworkPolicy):
 
     @classmethod
     def from_config(
-        cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
+        cls,
+        config: Mapping[str, Any],
+        processor: "PolicyProcessor | None" = None,
+        *,
+        fresh_backbone: bool = True,
     ) -> Self:
         sizes, robot = SAM2ActSizes.from_dict(config["backbone"]), embodiment_of(config)
         require(
-            robot.action.width == WIDTH and robot.action.frames is None and robot.action.horizon == 1,
-            f"SAM2Act+ predicts one planned motion of {WIDTH} numbers; the robot {robot.name!r} is asked for "
-            f"chunks of {robot.action.horizon} × {robot.action.width}. Set embodiment=robomme_keyframes.",
+            robot.action.width == WIDTH
+            and robot.action.frames is None
+            and robot.action.horizon == 1,
+            f"SAM2Act+ predicts one planned motion of {WIDTH} numbers; the robot {robot.name!r} is"
+            f" asked for chunks of {robot.action.horizon} × {robot.action.width}. Set"
+            " embodiment=robomme_keyframes.",
         )
         require(
             not config.get("memory") and not config.get("integration"),
@@ -193,7 +235,11 @@ class SAM2ActPolicy(NetworkPolicy):
     @property
     def cube(self) -> Cube:
         """The workspace of the processor, else of the configuration."""
-        return Cube.of(self.config["processor"]["bounds"]) if self.processor is None else self.processor.cube
+        return (
+            Cube.of(self.config["processor"]["bounds"])
+            if self.processor is None
+            else self.processor.cube
+        )
 
     # Training
 
@@ -205,7 +251,11 @@ class SAM2ActPolicy(NetworkPolicy):
         self, batch: KeyframeBatch, noise: Mapping[str, Tensor] | None = None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The stage's loss, and its parts to log (detached)."""
-        values = self.training_noise(len(batch.points), torch.default_generator) if noise is None else noise
+        values = (
+            self.training_noise(len(batch.points), torch.default_generator)
+            if noise is None
+            else noise
+        )
         sampled = map_noise(values, lambda value: value.to(self.device))
         cube, sizes = self.cube, self.backbone.sizes
         augmentation = sampled if self.training and self.augment else None
@@ -221,23 +271,33 @@ class SAM2ActPolicy(NetworkPolicy):
                 logits = self.backbone.coarse_sequences(views, batch.points.shape[1])
                 parts = {"heatmap": heatmap_loss(logits, scenes.target).mean()}
         loss = torch.stack(list(parts.values())).sum()
-        return loss, {"loss": loss.detach(), **{name: part.detach() for name, part in parts.items()}}
+        return loss, {
+            "loss": loss.detach(),
+            **{name: part.detach() for name, part in parts.items()},
+        }
 
     def recompute(self, mode: Recompute) -> None:
         self.backbone.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
         stages = (self.backbone.coarse, self.backbone.fine)
-        layers = [ShardGroup(layer) for stage in stages for layer in stacked_layers(stage.transformer)]
+        layers = [
+            ShardGroup(layer) for stage in stages for layer in stacked_layers(stage.transformer)
+        ]
         return [ShardGroup(self.backbone.encoder, full=True), *layers]
 
     # Sampling
 
     @torch.no_grad()
     def sample_actions(
-        self, batch: KeyframeBatch, noise: Mapping[str, Tensor] | None = None, steps: int | None = None
+        self,
+        batch: KeyframeBatch,
+        noise: Mapping[str, Tensor] | None = None,
+        steps: int | None = None,
     ) -> Tensor:
-        """The waypoint [b, 1, 7] after the last keyframe of each sequence; those before it are remembered."""
+        """The waypoint [b, 1, 7] after the last keyframe of each sequence; those before it are
+        remembered.
+        """
         waypoints = []
         for i in range(len(batch.points)):
             state = BankState()
@@ -268,7 +328,9 @@ class SAM2ActPolicy(NetworkPolicy):
         return KeyframeEpisode(self, goal, seed)
 
     def observation(self, episodes: "Sequence[Episode]") -> list[SceneInputs]:
-        return [episode.scene_inputs() for episode in episodes if isinstance(episode, KeyframeEpisode)]
+        return [
+            episode.scene_inputs() for episode in episodes if isinstance(episode, KeyframeEpisode)
+        ]
 
     def predict_chunk(
         self,
@@ -277,7 +339,9 @@ class SAM2ActPolicy(NetworkPolicy):
         noise: Mapping[str, Tensor],
         steps: int | None = None,
     ) -> Tensor:
-        """The next waypoints [n, 1, 7]; what is remembered of these keyframes counts from the next frames on."""
+        """The next waypoints [n, 1, 7]; what is remembered of these keyframes counts from the next
+        frames on.
+        """
         waypoints = []
         for scene, episode in zip(batch, episodes, strict=True):
             assert isinstance(episode, KeyframeEpisode)

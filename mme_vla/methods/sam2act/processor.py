@@ -12,7 +12,13 @@ from torch import Tensor, nn
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, check_integer, require
-from mme_vla.methods.goal_encoders import HASHED, ClipEncoder, GoalEncoder, GoalProcessor, direction_of
+from mme_vla.methods.goal_encoders import (
+    HASHED,
+    ClipEncoder,
+    GoalEncoder,
+    GoalProcessor,
+    direction_of,
+)
 from mme_vla.methods.sam2act.geometry import (
     EMPTY,
     VIEWS,
@@ -34,7 +40,8 @@ class KeyframeBatch(TensorStruct):
 
     points: [b, k, n, 3], metres in the world, bounds not applied yet. colours: [b, k, n, 3] uint8.
     state: [b, k, p]. language: [b, l, w] the goal's tokens.
-    target: [b, k, 3], metres. rotation: [b, k, 4], quaternions (x, y, z, w). gripper, collision: [b, k] int64.
+    target: [b, k, 3], metres. rotation: [b, k, 4], quaternions (x, y, z, w). gripper, collision:
+    [b, k] int64.
     """
 
     points: Tensor
@@ -56,7 +63,8 @@ CHANNELS = 10
 class Shot:
     """One camera at one moment.
 
-    colours: [h, w, 3] uint8. depth: [h, w], millimetres. intrinsic: [3, 3]. extrinsic: world to camera, [3, 4].
+    colours: [h, w, 3] uint8. depth: [h, w], millimetres. intrinsic: [3, 3]. extrinsic: world to
+    camera, [3, 4].
     """
 
     colours: np.ndarray
@@ -65,9 +73,11 @@ class Shot:
     extrinsic: np.ndarray
 
     def shrunk(self, side: int) -> "Shot":
-        """The same at another size: colours averaged over areas, depths interpolated, as the authors do.
+        """The same at another size: colours averaged over areas, depths interpolated, as the
+        authors do.
 
-        Depths across an edge become points in the air between the two surfaces; the released weights know them.
+        Depths across an edge become points in the air between the two surfaces; the released
+        weights know them.
         """
         height, width = self.depth.shape
         if (height, width) == (side, side):
@@ -83,12 +93,16 @@ class Shot:
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """World points [h·w, 3] float32 in metres, and their colours [h·w, 3] uint8."""
-        world = unproject(np.asarray(self.depth, np.float64) / MILLIMETRES, self.intrinsic, self.extrinsic)
+        world = unproject(
+            np.asarray(self.depth, np.float64) / MILLIMETRES, self.intrinsic, self.extrinsic
+        )
         return world.reshape(-1, 3).astype(np.float32), self.colours.reshape(-1, 3)
 
 
 def cloud_of(shots: Sequence[Shot], side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points [n, 3] float32 and colours [n, 3] uint8 of several cameras at `side` × `side` pixels each."""
+    """Points [n, 3] float32 and colours [n, 3] uint8 of several cameras at `side` × `side` pixels
+    each.
+    """
     points, colours = zip(*(shot.shrunk(side).points() for shot in shots), strict=True)
     return np.concatenate(points), np.concatenate(colours)
 
@@ -97,14 +111,19 @@ def cloud_images(points: Tensor, colours: Tensor, cube: Cube, side: int) -> Tens
     """What the coarse look sees of clouds in the world: [b, 3, 10, side, side].
 
     Args:
-        points: [b, n, 3] in metres; those outside of the cube are left out. colours: [b, n, 3] in [0, 1].
+        points: [b, n, 3] in metres; those outside of the cube are left out. colours: [b, n, 3] in
+            [0, 1].
     """
     inside = cube.inside(points)
     return _render_images(cube.place(points), colours, inside, side)
 
 
-def zoomed_images(points: Tensor, colours: Tensor, cube: Cube, centre: Tensor, zoom: float, side: int) -> Tensor:
-    """What the closer look sees: the same points, `zoom` times larger around centres [b, 3] in the cube."""
+def zoomed_images(
+    points: Tensor, colours: Tensor, cube: Cube, centre: Tensor, zoom: float, side: int
+) -> Tensor:
+    """What the closer look sees: the same points, `zoom` times larger around centres [b, 3] in the
+    cube.
+    """
     inside = cube.inside(points)
     return _render_images(zoom * (cube.place(points) - centre[:, None]), colours, inside, side)
 
@@ -123,7 +142,9 @@ def _render_images(points: Tensor, colours: Tensor, inside: Tensor, side: int) -
 
 
 class HashedTokens(GoalEncoder):
-    """One fixed random vector [words, width] a word, zeros behind the last: equal words, equal vectors."""
+    """One fixed random vector [words, width] a word, zeros behind the last: equal words, equal
+    vectors.
+    """
 
     def __init__(self, width: int, words: int) -> None:
         super().__init__(width)
@@ -139,7 +160,8 @@ class HashedTokens(GoalEncoder):
 class ClipTokens(ClipEncoder):
     """All states [words, width] of the text tower after its last norm.
 
-    The released model reads OpenAI's RN50 text tower (width 512), which no repository of the hub holds in this form.
+    The released model reads OpenAI's RN50 text tower (width 512), which no repository of the hub
+    holds in this form.
     """
 
     method, tower = "SAM2Act+", "CLIPTextModel"
@@ -152,7 +174,13 @@ class ClipTokens(ClipEncoder):
     @torch.no_grad()
     def encode(self, text: str) -> Tensor:
         tokenizer, tower = self.parts
-        read = tokenizer([text], padding="max_length", truncation=True, max_length=self.words, return_tensors="pt")
+        read = tokenizer(
+            [text],
+            padding="max_length",
+            truncation=True,
+            max_length=self.words,
+            return_tensors="pt",
+        )
         # The released code fills with zeros, where transformers repeats the end-of-text token.
         ids = read["input_ids"] * read["attention_mask"]
         states: Tensor = tower(input_ids=ids).last_hidden_state
@@ -182,7 +210,9 @@ class Recorded(Protocol):
 
 @PROCESSORS.register(NAME)
 class SAM2ActProcessor(GoalProcessor):
-    """Nothing here is normalised: points are metres, and the network's output is a waypoint in the world."""
+    """Nothing here is normalised: points are metres, and the network's output is a waypoint in the
+    world.
+    """
 
     name = NAME
     samples = SampleSpec(kind="keyframes")
@@ -206,10 +236,12 @@ class SAM2ActProcessor(GoalProcessor):
         """Put it together.
 
         Args:
-            text: `hashed`, or the folder of a CLIP. language, words: width and number of its tokens.
+            text: `hashed`, or the folder of a CLIP. language, words: width and number of its
+                tokens.
             side: pixels that images are brought to before they become points.
             bounds: of the scene in metres, lowest corner first; what is outside is not seen.
-            trained_waypoints, waypoints: keyframes that the clock counts to, in training and when acting.
+            trained_waypoints, waypoints: keyframes that the clock counts to, in training and when
+                acting.
             video_frames: frames of the conditioning video that are encoded, evenly spaced.
             field_of_view: of all cameras, in degrees; the benchmark's have 90.
         """
@@ -218,27 +250,41 @@ class SAM2ActProcessor(GoalProcessor):
         for name, value in sizes.items():
             check_integer(f"processor.{name}", value, LARGEST)
         numbers = list(bounds)
-        finite = len(numbers) == 6 and all(isinstance(n, int | float) and np.isfinite(n) for n in numbers)
-        require(
-            finite and not any(low >= high for low, high in zip(numbers[:3], numbers[3:], strict=True)),
-            f"processor.bounds={brief(numbers)} must be x, y, z of the lowest corner, then the highest.",
+        finite = len(numbers) == 6 and all(
+            isinstance(n, int | float) and np.isfinite(n) for n in numbers
         )
         require(
-            not isinstance(field_of_view, bool) and isinstance(field_of_view, int | float) and 0 < field_of_view < 180,
+            finite
+            and not any(low >= high for low, high in zip(numbers[:3], numbers[3:], strict=True)),
+            f"processor.bounds={brief(numbers)} must be x, y, z of the lowest corner, then the"
+            " highest.",
+        )
+        require(
+            not isinstance(field_of_view, bool)
+            and isinstance(field_of_view, int | float)
+            and 0 < field_of_view < 180,
             f"processor.field_of_view={brief(field_of_view)} must lie between 0 and 180 degrees.",
         )
         require(
-            isinstance(text, str) and text, f"processor.text={brief(text)} must be hashed, or the folder of a CLIP."
+            isinstance(text, str) and text,
+            f"processor.text={brief(text)} must be hashed, or the folder of a CLIP.",
         )
         if blind := [camera.name for camera in embodiment.cameras if not camera.depth]:
             raise UserError(
-                f"SAM2Act+ needs depth of every camera; the robot {embodiment.name!r} gives none of {', '.join(blind)} "
-                "(embodiment.cameras.<name>.depth). Set embodiment=robomme_keyframes."
+                f"SAM2Act+ needs depth of every camera; the robot {embodiment.name!r} gives none of"
+                f" {', '.join(blind)} (embodiment.cameras.<name>.depth). Set"
+                " embodiment=robomme_keyframes."
             )
         self.embodiment, self.text_name = embodiment, text
-        self.text = HashedTokens(language, words) if text == HASHED else ClipTokens(language, words, text)
+        self.text = (
+            HashedTokens(language, words) if text == HASHED else ClipTokens(language, words, text)
+        )
         self.side, self.cube = side, Cube.of(numbers)
-        self.trained_waypoints, self.waypoints, self.video_frames = trained_waypoints, waypoints, video_frames
+        self.trained_waypoints, self.waypoints, self.video_frames = (
+            trained_waypoints,
+            waypoints,
+            video_frames,
+        )
         self.field_of_view = float(field_of_view)
         self.stats = stats
 
@@ -260,15 +306,19 @@ class SAM2ActProcessor(GoalProcessor):
     # Observations
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Images of all cameras as they are, [v, 3, H, W] uint8, or [n, v, 3, H, W]; points are made of shots."""
+        """Images of all cameras as they are, [v, 3, H, W] uint8, or [n, v, 3, H, W]; points are
+        made of shots.
+        """
         stacked = np.stack([np.asarray(view) for view in views], axis=-4)
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(stacked, -1, -3)))
 
     def shots(self, views: Mapping[str, np.ndarray], index: int) -> list[Shot]:
-        """The cameras' shots of one of the frames that an environment delivers, at the size that points are made of.
+        """The cameras' shots of one of the frames that an environment delivers, at the size that
+        points are made of.
 
         Args:
-            views: of every camera its images [t, H, W, 3], depths [t, H, W, 1] in millimetres and poses [t, 3, 4].
+            views: of every camera its images [t, H, W, 3], depths [t, H, W, 1] in millimetres and
+                poses [t, 3, 4].
         """
         shots = []
         for camera in self.embodiment.cameras:
@@ -278,22 +328,30 @@ class SAM2ActProcessor(GoalProcessor):
             focal = width / 2 / math.tan(math.radians(self.field_of_view) / 2)
             intrinsic = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
             deep = np.asarray(views[depth][index]).reshape(height, width)
-            shots.append(Shot(colours, deep, intrinsic, np.asarray(views[pose][index])).shrunk(self.side))
+            shots.append(
+                Shot(colours, deep, intrinsic, np.asarray(views[pose][index])).shrunk(self.side)
+            )
         return shots
 
     def cloud(self, shots: Sequence[Shot]) -> tuple[Tensor, Tensor]:
         """Points [n, 3] in metres, and their colours [n, 3] in [0, 1]."""
         points, colours = cloud_of(shots, self.side)
-        return torch.from_numpy(points), torch.from_numpy(np.ascontiguousarray(colours)).float() / 255
+        return torch.from_numpy(points), torch.from_numpy(
+            np.ascontiguousarray(colours)
+        ).float() / 255
 
     def clock(self, place: int, waypoints: int) -> float:
-        """Time from 1 down to −1, of the `place`-th of `waypoints` keyframes; it stays at −1 past the last."""
+        """Time from 1 down to −1, of the `place`-th of `waypoints` keyframes; it stays at −1 past
+        the last.
+        """
         return 2 * (1 - min(place / max(waypoints - 1, 1), 1)) - 1
 
     def state(self, finger: float, place: int) -> Tensor:
         """The robot's state for the network [4] when acting: open, both fingers (alike), time."""
         opened = float(finger > FINGER_COUNTS_OPEN)
-        return torch.tensor([opened, finger, finger, self.clock(place, self.waypoints)], dtype=torch.float32)
+        return torch.tensor(
+            [opened, finger, finger, self.clock(place, self.waypoints)], dtype=torch.float32
+        )
 
     def commanded_state(self, opened: bool, place: int) -> Tensor:
         """The same in training, where fingers are synthetic from the command, as released."""
@@ -316,7 +374,10 @@ class SAM2ActProcessor(GoalProcessor):
     def item(self, sample: Recorded) -> dict[str, Any]:
         clouds = [cloud_of(shots, self.side) for shots in sample.shots]
         targets = np.asarray(sample.targets, np.float32)
-        states = [self.commanded_state(bool(o), int(p)) for o, p in zip(sample.open, sample.places, strict=True)]
+        states = [
+            self.commanded_state(bool(o), int(p))
+            for o, p in zip(sample.open, sample.places, strict=True)
+        ]
         rotation = quaternions_of(torch.rad2deg(torch.from_numpy(targets[:, 3:6]).double()))
         return {
             "points": torch.from_numpy(np.stack([points for points, _ in clouds])),
@@ -332,7 +393,9 @@ class SAM2ActProcessor(GoalProcessor):
 
     def collate(self, items: Sequence[dict[str, Any]]) -> KeyframeBatch:
         names = KeyframeBatch.__dataclass_fields__
-        return KeyframeBatch(**{name: torch.stack([item[name] for item in items]) for name in names})
+        return KeyframeBatch(
+            **{name: torch.stack([item[name] for item in items]) for name in names}
+        )
 
     # Folders
 

@@ -16,19 +16,30 @@ _REDUCTION = 16
 
 
 class LoraProjection(nn.Module):
-    """A fused projection to queries, keys and values, with low-rank changes of the queries and the values.
+    """A fused projection to queries, keys and values, with low-rank changes of the queries and the
+    values.
 
-    Each change reaches as many numbers as the input has: the first ones and the last ones of the output. In the blocks
-    that double the width that is half of the queries and half of the values, as released.
+    Each change reaches as many numbers as the input has: the first ones and the last ones of the
+    output. In the blocks that double the width that is half of the queries and half of the values,
+    as released.
     """
 
     def __init__(self, qkv: nn.Linear, rank: int) -> None:
         super().__init__()
         width = qkv.in_features
         self.qkv = qkv
-        self.linear_a_q, self.linear_b_q = nn.Linear(width, rank, bias=False), nn.Linear(rank, width, bias=False)
-        self.linear_a_v, self.linear_b_v = nn.Linear(width, rank, bias=False), nn.Linear(rank, width, bias=False)
-        for first, second in ((self.linear_a_q, self.linear_b_q), (self.linear_a_v, self.linear_b_v)):
+        self.linear_a_q, self.linear_b_q = (
+            nn.Linear(width, rank, bias=False),
+            nn.Linear(rank, width, bias=False),
+        )
+        self.linear_a_v, self.linear_b_v = (
+            nn.Linear(width, rank, bias=False),
+            nn.Linear(rank, width, bias=False),
+        )
+        for first, second in (
+            (self.linear_a_q, self.linear_b_q),
+            (self.linear_a_v, self.linear_b_v),
+        ):
             nn.init.kaiming_uniform_(first.weight, a=math.sqrt(5))
             nn.init.zeros_(second.weight)
 
@@ -54,9 +65,11 @@ class ImageEncoder(nn.Module):
         self.middle = nn.Conv2d(sizes.encoder.neck, sizes.token // 2, 1)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Maps [n, token/4, 4g, 4g], [n, token/2, 2g, 2g], [n, neck, g, g] of colours [n, 3, s, s] in [0, 1].
+        """Maps [n, token/4, 4g, 4g], [n, token/2, 2g, 2g], [n, neck, g, g] of colours [n, 3, s, s]
+        in [0, 1].
 
-        Colours go in as they are: the released code neither subtracts a mean nor divides by a deviation.
+        Colours go in as they are: the released code neither subtracts a mean nor divides by a
+        deviation.
         """
         size = (self.side, self.side)
         scaled = nn.functional.interpolate(images, size, mode="bilinear", align_corners=True)
@@ -151,12 +164,16 @@ class MemoryEncoder(nn.Module):
 
 
 def sine_positions(side: int, width: int, device: torch.device | None = None) -> Tensor:
-    """Positions [width, side, side] of a grid: the first half of the numbers by row, the second by column."""
+    """Positions [width, side, side] of a grid: the first half of the numbers by row, the second by
+    column.
+    """
     half = width // 2
     line = torch.arange(1, side + 1, device=device).float() / (side + 1e-6) * (2 * math.pi)
     rates = 10_000 ** (-2 * (torch.arange(half, device=device) // 2).float() / half)
     angles = line[:, None] * rates
-    codes = torch.stack([angles[:, 0::2].sin(), angles[:, 1::2].cos()], -1).flatten(1).T  # half side
+    codes = (
+        torch.stack([angles[:, 0::2].sin(), angles[:, 1::2].cos()], -1).flatten(1).T
+    )  # half side
     rows, columns = codes[:, :, None].expand(-1, -1, side), codes[:, None].expand(-1, side, -1)
     return torch.cat([rows, columns])
 
@@ -197,7 +214,10 @@ class MemoryLayer(nn.Module):
     def __init__(self, width: int, memory: int, inner: int) -> None:
         super().__init__()
         self.self_norm, self.self_attention = nn.LayerNorm(width), RotaryAttention(width, width)
-        self.memory_norm, self.memory_attention = nn.LayerNorm(width), RotaryAttention(width, memory)
+        self.memory_norm, self.memory_attention = (
+            nn.LayerNorm(width),
+            RotaryAttention(width, memory),
+        )
         self.feed_norm = nn.LayerNorm(width)
         self.into, self.back = nn.Linear(width, inner), nn.Linear(inner, width)
 
@@ -205,7 +225,9 @@ class MemoryLayer(nn.Module):
         """[b, n, d] with memories and their positions [b, t·n, m]."""
         normed = self.self_norm(x)
         x = x + self._drop(self.self_attention(normed, normed, normed, angles))
-        x = x + self._drop(self.memory_attention(self.memory_norm(x), memory + places, memory, angles))
+        x = x + self._drop(
+            self.memory_attention(self.memory_norm(x), memory + places, memory, angles)
+        )
         return x + self._drop(self.back(self._drop(self.into(self.feed_norm(x)).relu())))
 
     def _drop(self, x: Tensor) -> Tensor:
@@ -224,7 +246,8 @@ class MemoryAttention(nn.Module):
         """Enriched tokens [b, n, d].
 
         Args:
-            x, positions: [b, n, d]; n is a square's area. memory, places: [b, t·n, m], moment by moment.
+            x, positions: [b, n, d]; n is a square's area. memory, places: [b, t·n, m], moment by
+                moment.
         """
         angles = grid_angles(round(x.shape[1] ** 0.5), x.shape[-1], x.device)
         x = x + _POSITION_SCALE * positions
@@ -235,7 +258,9 @@ class MemoryAttention(nn.Module):
 
 
 def grid_angles(side: int, width: int, device: torch.device | None = None) -> Tensor:
-    """Angles [side², width/2] of the places of a grid, row by row: the first half by column, the second by row."""
+    """Angles [side², width/2] of the places of a grid, row by row: the first half by column, the
+    second by row.
+    """
     rates = _BASE ** (-torch.arange(0, width, 4, device=device)[: width // 4].float() / width)
     line = torch.arange(side, device=device).float()
     rows, columns = line.repeat_interleave(side), line.repeat(side)
@@ -254,7 +279,9 @@ _SHARPNESS, _SHIFT = 20.0, 10.0  # a heatmap's logits become a mask of −10 to 
 
 @dataclass(frozen=True)
 class BankState:
-    """What an episode remembers: maps [n, g², m] of its latest keyframes, n views, the oldest first."""
+    """What an episode remembers: maps [n, g², m] of its latest keyframes, n views, the oldest
+    first.
+    """
 
     maps: tuple[Tensor, ...] = ()
 
@@ -265,17 +292,28 @@ class BankState:
 class KeyframeBank(nn.Module):
     """Reads and writes the states; keeps none itself.
 
-    Views are in the batch axis n and do not attend to each other: n is 3 for one episode, 3·b for b in step.
+    Views are in the batch axis n and do not attend to each other: n is 3 for one episode, 3·b for b
+    in step.
     """
 
     def __init__(
-        self, *, grid: int, token: int, memory: int, layers: int, feedforward: int, mask_stages: int, remembered: int
+        self,
+        *,
+        grid: int,
+        token: int,
+        memory: int,
+        layers: int,
+        feedforward: int,
+        mask_stages: int,
+        remembered: int,
     ) -> None:
         """Build encoder and attention.
 
         Args:
-            grid: side of a view's grid of tokens. token: their width. memory: width of what is kept of each.
-            layers, feedforward: of the attention. mask_stages: halvings from a heatmap's image to the grid.
+            grid: side of a view's grid of tokens. token: their width. memory: width of what is kept
+                of each.
+            layers, feedforward: of the attention. mask_stages: halvings from a heatmap's image to
+                the grid.
             remembered: most keyframes that are read.
         """
         super().__init__()
@@ -311,7 +349,9 @@ class KeyframeBank(nn.Module):
         """
         side = self.grid * 2**self.mask_stages
         mask = nn.functional.interpolate(logits.float(), (side, side), mode="bilinear")
-        encoded = self.encoder(tokens, mask.sigmoid() * _SHARPNESS - _SHIFT).flatten(2).transpose(1, 2)
+        encoded = (
+            self.encoder(tokens, mask.sigmoid() * _SHARPNESS - _SHIFT).flatten(2).transpose(1, 2)
+        )
         return BankState((*state.maps, encoded)[-self.remembered :])
 
     def positions(self) -> Tensor:
@@ -320,10 +360,12 @@ class KeyframeBank(nn.Module):
 
 
 def released_positions(table: Tensor, batch: int) -> Tensor:
-    """The positions [b·3, g², d] under which tokens read the bank, of the transformer's table [1, 3·g², d].
+    """The positions [b·3, g², d] under which tokens read the bank, of the transformer's table [1,
+    3·g², d].
 
-    The released code reshapes where it should have transposed, batch and all: place p of view i of sample s gets row
-    (3·b·p + 3·s + i) of the table repeated b times. Weights trained so need the same.
+    The released code reshapes where it should have transposed, batch and all: place p of view i of
+    sample s gets row (3·b·p + 3·s + i) of the table repeated b times. Weights trained so need the
+    same.
     """
     rows, width = table.shape[1:]
     places = rows // 3

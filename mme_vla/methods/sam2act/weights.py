@@ -84,9 +84,14 @@ IMAGE_PREFIX = "sam2."
 
 
 def released_name(target: str, mask_stages: int) -> str:
-    """The released code's name of one of the network's tensors; masks are halved `mask_stages` times."""
+    """The released code's name of one of the network's tensors; masks are halved `mask_stages`
+    times.
+    """
     name = target
-    for pattern, replacement in [(r"memory\.encoder\.mask\.out\.", _mask(3 * mask_stages)), *_PLACES]:
+    for pattern, replacement in [
+        (r"memory\.encoder\.mask\.out\.", _mask(3 * mask_stages)),
+        *_PLACES,
+    ]:
         name, count = re.subn(f"^{pattern}", replacement, name, count=1)
         if count:
             break
@@ -105,7 +110,12 @@ def released_names(targets: Iterable[str], mask_stages: int) -> NameTable:
 
 def released_copies(names: Iterable[str]) -> dict[str, str]:
     """Copy → original: the branches' own copies of every tensor of SAM2's."""
-    return {f"{branch}.{name}": name for name in names if name.startswith(IMAGE_PREFIX) for branch in BRANCHES}
+    return {
+        f"{branch}.{name}": name
+        for name in names
+        if name.startswith(IMAGE_PREFIX)
+        for branch in BRANCHES
+    }
 
 
 def released_unread(width: int = 256) -> list[Unread]:
@@ -130,7 +140,9 @@ def _unread_shapes(width: int) -> Mapping[str, tuple[int, ...]]:
     prompt = "sam_prompt_encoder"
     shapes |= {f"{prompt}.pe_layer.positional_encoding_gaussian_matrix": (2, half)}
     shapes |= {f"{prompt}.point_embeddings.{i}.weight": (1, width) for i in range(4)}
-    shapes |= {f"{prompt}.{name}.weight": (1, width) for name in ("not_a_point_embed", "no_mask_embed")}
+    shapes |= {
+        f"{prompt}.{name}.weight": (1, width) for name in ("not_a_point_embed", "no_mask_embed")
+    }
     for step, (out, into, side) in {0: (4, 1, 2), 3: (16, 4, 2), 6: (width, 16, 1)}.items():
         shapes |= _layer(f"{prompt}.mask_downscaling.{step}", out, into, side, side)
     for step, channels in {1: 4, 4: 16}.items():
@@ -154,7 +166,9 @@ def _unread_shapes(width: int) -> Mapping[str, tuple[int, ...]]:
         shapes |= {f"{name}.weight": (into, out, 2, 2), f"{name}.bias": (out,)}
     shapes |= _norm(f"{decoder}.output_upscaling.1", small)
     for token in range(tokens):
-        shapes |= _layers(f"{decoder}.output_hypernetworks_mlps.{token}.layers", [width, width, width, eighth])
+        shapes |= _layers(
+            f"{decoder}.output_hypernetworks_mlps.{token}.layers", [width, width, width, eighth]
+        )
     shapes |= _layers(f"{decoder}.iou_prediction_head.layers", [width, width, width, tokens])
     return shapes | _layers(f"{decoder}.pred_obj_score_head.layers", [width, width, width, 1])
 
@@ -208,19 +222,26 @@ def sam2act_adapter(policy: Policy) -> Adapter:
     """The authors' names of this policy's tensors."""
     if not isinstance(policy, SAM2ActPolicy):
         raise UserError(
-            f"This format holds SAM2Act+; {policy.config.get('name', 'this')} is a {type(policy).__name__}. "
-            "Set model=sam2act_plus."
+            f"This format holds SAM2Act+; {policy.config.get('name', 'this')} is a"
+            f" {type(policy).__name__}. Set model=sam2act_plus."
         )
     sizes = policy.backbone.sizes
     table = released_names(policy.backbone.state_dict(), sizes.mask_stages)
     unread = released_unread(sizes.encoder.neck)
-    originals = [piece.path for pieces in table.values() for piece in pieces] + [gap.path for gap in unread]
+    originals = [piece.path for pieces in table.values() for piece in pieces] + [
+        gap.path for gap in unread
+    ]
     rates = Derived(RATES, lambda: code_rates(sizes.feature)[None])  # of the rotation bins' codes
     return Adapter(prefixed("backbone", table), unread, released_copies(originals), [rates])
 
 
-def write_sam2act(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+def write_sam2act(
+    policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None
+) -> None:
     """`model_plus_last.pth` as the authors' training writes it, but for the optimizer's state."""
     released = sam2act_adapter(policy).export(policy.state_dict())
     model = {name: cast(tensor.detach(), dtype).cpu() for name, tensor in released.items()}
-    torch.save({"epoch": 0, "model_state": model, "optimizer_state": {}, "lr_sched_state": {}}, folder / WEIGHTS)
+    torch.save(
+        {"epoch": 0, "model_state": model, "optimizer_state": {}, "lr_sched_state": {}},
+        folder / WEIGHTS,
+    )

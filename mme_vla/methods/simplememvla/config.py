@@ -1,11 +1,20 @@
-"""Sizes of SimpleMemVLA's network: `configs/backbone/simplememvla*.yaml`, where each is explained."""
+"""Sizes of SimpleMemVLA's network: `configs/backbone/simplememvla*.yaml`, where each
+is explained.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any, Self
 
-from mme_vla.config.sections import NonNegative, NonNegativeInt, Positive, PositiveInt, Range, read_section
+from mme_vla.config.sections import (
+    NonNegative,
+    NonNegativeInt,
+    Positive,
+    PositiveInt,
+    Range,
+    read_section,
+)
 from mme_vla.errors import UserError, brief, missing_extra
 
 NAME = "simplememvla"
@@ -17,8 +26,8 @@ LARGEST = 2**24
 class HeadSizes:
     """The action head: a transformer over condition tokens, one state token and the chunk.
 
-    rope_section: shares of (time, row, column) in the rotary angles, scaled to `rope_factor` of half a head's width.
-    time_alpha: flow times are Beta(time_alpha, 1), 1 = noise.
+    rope_section: shares of (time, row, column) in the rotary angles, scaled to `rope_factor` of
+    half a head's width. time_alpha: flow times are Beta(time_alpha, 1), 1 = noise.
     """
 
     width: PositiveInt = 2048
@@ -34,9 +43,15 @@ class HeadSizes:
 
     def __post_init__(self) -> None:
         if self.width % self.heads:
-            raise UserError(f"backbone.head.width={self.width} must be a multiple of backbone.head.heads={self.heads}.")
+            raise UserError(
+                f"backbone.head.width={self.width} must be a multiple of"
+                f" backbone.head.heads={self.heads}."
+            )
         if not sum(self.rope_section):
-            raise UserError("backbone.head.rope_section=[0, 0, 0] leaves no rotary angle: give a share to an axis.")
+            raise UserError(
+                "backbone.head.rope_section=[0, 0, 0] leaves no rotary angle: give a share to an"
+                " axis."
+            )
 
 
 @dataclass(frozen=True)
@@ -44,8 +59,9 @@ class SimpleMemVlaSizes:
     """The keys of the section `backbone`.
 
     vlm: a `Qwen3_5Config` of transformers, in its own keys (`text_config`, `vision_config`).
-    image_size: side of the images, in pixels, that costs are counted at and that a memory's frames are resized to.
-    state_dim: numbers of the state token; 0 for none. memory_width: of a memory's tokens before their projection.
+    image_size: side of the images, in pixels, that costs are counted at and that a memory's frames
+    are resized to. state_dim: numbers of the state token; 0 for none. memory_width: of a memory's
+    tokens before their projection.
     """
 
     vlm: Mapping[str, Any]
@@ -64,14 +80,16 @@ class SimpleMemVlaSizes:
         values = dict(section)
         if (name := values.pop("name", None)) != NAME:
             raise UserError(
-                f"backbone.name={brief(name)} is no network of SimpleMemVLA: choose backbone=simplememvla, or "
-                "simplememvla_tiny to try things out."
+                f"backbone.name={brief(name)} is no network of SimpleMemVLA: choose"
+                " backbone=simplememvla, or simplememvla_tiny to try things out."
             )
         return read_section(cls, values, "backbone")
 
     def __post_init__(self) -> None:
         if self.image_size % self.factor:
-            raise UserError(f"backbone.image_size={self.image_size} must be a multiple of {self.factor} pixels.")
+            raise UserError(
+                f"backbone.image_size={self.image_size} must be a multiple of {self.factor} pixels."
+            )
 
     @cached_property
     def qwen(self) -> Any:
@@ -85,13 +103,19 @@ class SimpleMemVlaSizes:
             config: Any = Qwen3_5Config(**self.vlm)
             config.tie_word_embeddings = config.text_config.tie_word_embeddings = True
             vision, text = config.vision_config, config.text_config
-            fits = vision.out_hidden_size == text.hidden_size and not vision.hidden_size % vision.num_heads
+            fits = (
+                vision.out_hidden_size == text.hidden_size
+                and not vision.hidden_size % vision.num_heads
+            )
         except Exception as error:  # transformers raises its own kinds
-            raise UserError(f"backbone.vlm is no Qwen3_5Config: {brief(str(error), 300, quote=False)}") from None
+            raise UserError(
+                f"backbone.vlm is no Qwen3_5Config: {brief(str(error), 300, quote=False)}"
+            ) from None
         if not fits:
             raise UserError(
-                f"backbone.vlm: vision_config.out_hidden_size={vision.out_hidden_size} must be text_config.hidden_size="
-                f"{text.hidden_size}, and vision_config.num_heads must divide its hidden_size."
+                f"backbone.vlm: vision_config.out_hidden_size={vision.out_hidden_size} must be"
+                f" text_config.hidden_size={text.hidden_size}, and vision_config.num_heads must"
+                " divide its hidden_size."
             )
         return config
 

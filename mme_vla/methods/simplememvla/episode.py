@@ -1,7 +1,9 @@
-"""An episode of SimpleMemVLA: the frames its video may show, their tokens, and the next prompt's beginning.
+"""An episode of SimpleMemVLA: the frames its video may show, their tokens, and the next prompt's
+beginning.
 
-The timestamps of a window keep their places while its images move on, so the language model reads a new window whole.
-What does not depend on the newest frames is read between two decisions (`advance`), which changes no action.
+The timestamps of a window keep their places while its images move on, so the language model reads a
+new window whole. What does not depend on the newest frames is read between two decisions
+(`advance`), which changes no action.
 """
 
 from collections.abc import Sequence
@@ -52,7 +54,8 @@ class Ahead:
 class VideoMemory:
     """What an episode keeps of its video, as far back as a window reaches.
 
-    frames: index → [3, H, W] uint8. patches: the tokens [m, D] of temporal patches. ahead: see `Ahead`.
+    frames: index → [3, H, W] uint8. patches: the tokens [m, D] of temporal patches. ahead: see
+    `Ahead`.
     """
 
     frames: dict[int, Tensor] = field(default_factory=dict)
@@ -79,7 +82,11 @@ class VideoEpisode(Episode):
         """The sub-task that the policy generated for its last chunk."""
 
     def _take(
-        self, frames: FrameBatch, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None = None
+        self,
+        frames: FrameBatch,
+        demo: np.ndarray,
+        executed: np.ndarray,
+        states: np.ndarray | None = None,
     ) -> None:
         start, processor = self.n_observed_frames, self._policy.require_processor()
         oldest = start + len(demo) - 1 - (processor.window.span if processor.shows_video else 0)
@@ -93,7 +100,9 @@ class VideoEpisode(Episode):
     def step(self) -> int:
         """The current frame."""
         if not self.n_observed_frames:
-            raise UserError("No frame was observed yet: call observe() with the current frame before act().")
+            raise UserError(
+                "No frame was observed yet: call observe() with the current frame before act()."
+            )
         return self.n_observed_frames - 1
 
     def pairs(self, step: int) -> list[Pair]:
@@ -106,8 +115,8 @@ class VideoEpisode(Episode):
         missing = sorted({frame for pair in pairs for frame in pair} - set(self.video.frames))
         if missing:
             raise UserError(
-                f"The video shows the frames {missing[:5]}, which were not rendered or not observed: observe() those "
-                "that frames_read() names."
+                f"The video shows the frames {missing[:5]}, which were not rendered or not"
+                " observed: observe() those that frames_read() names."
             )
         frames = torch.stack([self.video.frames[frame] for pair in pairs for frame in pair])
         return self._policy.require_processor().video(frames)
@@ -121,7 +130,9 @@ class VideoEpisode(Episode):
         return torch.stack([self.video.patches[pair] for pair in pairs])
 
     def plan(self, step: int, tokens: Tokens, model: VideoLanguageModel) -> bool:
-        """Begin to read the prompt at a later step; return whether its beginning was observed, and rendered."""
+        """Begin to read the prompt at a later step; return whether its beginning was observed, and
+        rendered.
+        """
         pairs = self.pairs(step)
         rendered = all(frame in self.video.frames for pair in pairs[:-1] for frame in pair)
         if not tokens.prefix or not rendered:
@@ -142,7 +153,8 @@ class VideoEpisode(Episode):
         end = int(torch.nonzero(kinds)[last * features.shape[1] - 1]) + 1
         place, device = slice(ahead.length, end), features.device
         ids, positions = (
-            torch.from_numpy(x[..., place].copy()).to(device)[None] for x in (tokens.ids, tokens.positions)
+            torch.from_numpy(x[..., place].copy()).to(device)[None]
+            for x in (tokens.ids, tokens.positions)
         )
         embedded = model.embed(ids, (kinds[place][None].to(device), features.flatten(0, 1)))
         model.hidden(embedded, positions, ahead.cache)

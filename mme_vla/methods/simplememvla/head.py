@@ -1,7 +1,8 @@
-"""The action head of SimpleMemVLA: a flow-matching transformer that reads the hidden states of the sub-task's words.
+"""The action head of SimpleMemVLA: a flow-matching transformer that reads the hidden states of the
+sub-task's words.
 
-Shapes: b batch · S words of a response · h actions of a chunk · d width of the head · D width of the language model ·
-n = S + 1 + h tokens of the head.
+Shapes: b batch · S words of a response · h actions of a chunk · d width of the head · D width of
+the language model · n = S + 1 + h tokens of the head.
 """
 
 import math
@@ -35,7 +36,9 @@ class Condition(TensorStruct):
 
 
 def scaled_section(section: tuple[int, ...], half: int) -> list[int]:
-    """Shares of the axes in `half` angles: rounded down, the remainder to the largest fractions, first ones first."""
+    """Shares of the axes in `half` angles: rounded down, the remainder to the largest fractions,
+    first ones first.
+    """
     total = sum(section)
     exact = [half * share / total for share in section]
     counts = [math.floor(value) for value in exact]
@@ -67,7 +70,9 @@ class Rotary(nn.Module):
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """Rotate the first numbers of each head [b, heads, n, k] by angles [b, n, r]; the others stay."""
+    """Rotate the first numbers of each head [b, heads, n, k] by angles [b, n, r]; the
+    others stay.
+    """
     width = cos.shape[-1]
     rotary, remaining = x[..., :width], x[..., width:]
     first, second = rotary.chunk(2, -1)
@@ -90,7 +95,9 @@ class Attention(nn.Module):
         q, k = rotate(q, *rope), rotate(k, *rope)
         dropout = self.dropout if self.training else 0.0
         with fused_kernels(q):
-            read = functional.scaled_dot_product_attention(q, k, v.to(q), mask[:, None, None], dropout)
+            read = functional.scaled_dot_product_attention(
+                q, k, v.to(q), mask[:, None, None], dropout
+            )
         return self.out_proj(read.transpose(1, 2).flatten(2))
 
 
@@ -109,7 +116,11 @@ class HeadBlock(nn.Module):
         self.attn = Attention(sizes)
         dropout = sizes.dropout
         self.mlp = nn.Sequential(
-            nn.Linear(width, inner), nn.GELU("tanh"), nn.Dropout(dropout), nn.Linear(inner, width), nn.Dropout(dropout)
+            nn.Linear(width, inner),
+            nn.GELU("tanh"),
+            nn.Dropout(dropout),
+            nn.Linear(inner, width),
+            nn.Dropout(dropout),
         )
         self.adaLN = nn.Sequential(nn.SiLU(), nn.Linear(width, 6 * width))
 
@@ -125,14 +136,18 @@ class TimeEmbedding(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.mlp = nn.Sequential(nn.Linear(2 * TIME_FREQUENCIES, width), nn.SiLU(), nn.Linear(width, width))
+        self.mlp = nn.Sequential(
+            nn.Linear(2 * TIME_FREQUENCIES, width), nn.SiLU(), nn.Linear(width, width)
+        )
 
     def forward(self, time: Tensor) -> Tensor:
         index = torch.arange(TIME_FREQUENCIES, device=time.device, dtype=torch.float32)
         frequencies = torch.exp(-math.log(10_000) * index / (TIME_FREQUENCIES - 1))
         angles = time.float()[:, None] * frequencies
         first: Any = self.mlp[0]
-        embedded: Tensor = self.mlp(torch.cat([angles.cos(), angles.sin()], -1).to(first.weight.dtype))
+        embedded: Tensor = self.mlp(
+            torch.cat([angles.cos(), angles.sin()], -1).to(first.weight.dtype)
+        )
         return embedded
 
 
@@ -157,14 +172,18 @@ class ActionHead(nn.Module):
         condition_dim: D. state_dim: numbers of the state; 0 for no state token.
     """
 
-    def __init__(self, sizes: HeadSizes, condition_dim: int, action_dim: int, horizon: int, state_dim: int) -> None:
+    def __init__(
+        self, sizes: HeadSizes, condition_dim: int, action_dim: int, horizon: int, state_dim: int
+    ) -> None:
         super().__init__()
         width = sizes.width
         self.sizes, self.horizon, self.action_dim = sizes, horizon, action_dim
         self.condition_proj = nn.Linear(condition_dim, width)
         self.condition_token_proj = nn.Linear(condition_dim, width)
         self.state_proj = nn.Linear(state_dim, width) if state_dim else None
-        self.action_proj = nn.Sequential(nn.Linear(action_dim, width), nn.SiLU(), nn.Linear(width, width))
+        self.action_proj = nn.Sequential(
+            nn.Linear(action_dim, width), nn.SiLU(), nn.Linear(width, width)
+        )
         self.time_embed = TimeEmbedding(width)
         self.condition_type = nn.Parameter(torch.empty(1, 1, width))
         if state_dim:
@@ -184,9 +203,14 @@ class ActionHead(nn.Module):
             elif ".adaLN." in name or name.startswith("final_layer.linear."):
                 nn.init.zeros_(parameter)
 
-    def tokens(self, condition: Condition, state: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def tokens(
+        self, condition: Condition, state: Tensor | None, x: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Tokens [b, n, d], positions [b, 3, n] and mask [b, n] for noisy chunks x [b, h, a]."""
-        words = functional.normalize(self.condition_proj(condition.hidden), dim=-1) + self.condition_type
+        words = (
+            functional.normalize(self.condition_proj(condition.hidden), dim=-1)
+            + self.condition_type
+        )
         if condition.tokens is not None:
             words = words + self.condition_token_proj(condition.tokens)
         end = condition.positions.masked_fill(~condition.mask[:, None], 0).amax((1, 2))
@@ -197,19 +221,27 @@ class ActionHead(nn.Module):
             positions.append((end + 1)[:, None, None].expand(-1, 3, 1))
             count = 1
         steps = torch.arange(x.shape[1], device=x.device)
-        actions = self.action_proj(x.to(words.dtype)) + self.action_type + self.action_pos[:, : x.shape[1]]
+        actions = (
+            self.action_proj(x.to(words.dtype))
+            + self.action_type
+            + self.action_pos[:, : x.shape[1]]
+        )
         positions.append((end[:, None] + 1 + count + steps)[:, None].expand(-1, 3, -1))
         masks.append(torch.ones(x.shape[:2], dtype=torch.bool, device=x.device))
         return torch.cat([*parts, actions], 1), torch.cat(positions, 2), torch.cat(masks, 1)
 
     def _state_mask(self, state: Tensor) -> Tensor:
-        """Whether each state [b, s] is read, [b, 1]: all of them unless trained with `state_dropout`."""
+        """Whether each state [b, s] is read, [b, 1]: all of them unless trained with
+        `state_dropout`.
+        """
         share = self.sizes.state_dropout if self.training else 0.0
         if not share:
             return torch.ones(len(state), 1, dtype=torch.bool, device=state.device)
         return torch.rand(len(state), 1, device=state.device) >= share
 
-    def forward(self, x: Tensor, time: Tensor, condition: Condition, state: Tensor | None) -> Tensor:
+    def forward(
+        self, x: Tensor, time: Tensor, condition: Condition, state: Tensor | None
+    ) -> Tensor:
         """The velocity [b, h, a] at noisy chunks x [b, h, a] and flow times [b], 1 = noise.
 
         Args:
@@ -222,7 +254,9 @@ class ActionHead(nn.Module):
         velocity: Tensor = self.final_layer(tokens[:, -x.shape[1] :], embedded)
         return velocity
 
-    def sample(self, noise: Tensor, condition: Condition, state: Tensor | None, steps: int) -> Tensor:
+    def sample(
+        self, noise: Tensor, condition: Condition, state: Tensor | None, steps: int
+    ) -> Tensor:
         """Integrate from noise [b, h, a] to chunks in Euler steps."""
         x = noise.float()
         for i in range(steps):
@@ -231,19 +265,28 @@ class ActionHead(nn.Module):
         return x
 
     def loss(
-        self, actions: Tensor, condition: Condition, state: Tensor | None, noise: Tensor, time: Tensor,
+        self,
+        actions: Tensor,
+        condition: Condition,
+        state: Tensor | None,
+        noise: Tensor,
+        time: Tensor,
         mask: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
-        """The flow-matching loss of chunks [b, h, a]; arguments as for `forward` and `channel_loss`."""
+    ) -> Tensor:
+        """The flow-matching loss of chunks [b, h, a]; arguments as for `forward` and
+        `channel_loss`.
+        """
         x, target = interpolate(actions.float(), noise, time)
         return channel_loss(self(x, time, condition, state), target, mask)
 
 
 def channel_loss(velocity: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Squared error averaged over a channel's counted steps, over the channels that have one, and over samples.
+    """Squared error averaged over a channel's counted steps, over the channels that have one, and
+    over samples.
 
     Args:
-        velocity, target: [b, h, a]. mask: bool [b, h] or [b, h, a], False on steps that do not count.
+        velocity, target: [b, h, a]. mask: bool [b, h] or [b, h, a], False on steps that do not
+            count.
     """
     errors = (velocity.float() - target.float()).square()
     if mask is None:

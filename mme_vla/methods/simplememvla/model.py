@@ -1,6 +1,8 @@
-"""The vision-language model of SimpleMemVLA: transformers' Qwen3.5, its hidden states, and the words it generates.
+"""The vision-language model of SimpleMemVLA: transformers' Qwen3.5, its hidden states, and the
+words it generates.
 
-Shapes: b batch · L tokens · D width · k temporal patches (pairs of frames) · m merged tokens of one.
+Shapes: b batch · L tokens · D width · k temporal patches (pairs of frames) · m merged tokens of
+one.
 """
 
 from collections.abc import Sequence
@@ -32,14 +34,22 @@ class ContinuedDeltaNet(Qwen3_5GatedDeltaNet):
     """
 
     def forward(
-        self, hidden_states: Tensor, cache_params: Any = None, attention_mask: Tensor | None = None, **options: Any
+        self,
+        hidden_states: Tensor,
+        cache_params: Any = None,
+        attention_mask: Tensor | None = None,
+        **options: Any,
     ) -> Tensor:
         """Tokens [b, n, D] → [b, n, D]; the cache is updated."""
         fresh = cache_params is None or not cache_params.has_previous_state(self.layer_idx)
         if fresh or hidden_states.shape[1] == 1:
             read: Tensor = super().forward(hidden_states, cache_params, attention_mask, **options)
             return read
-        count, kernel, layer = hidden_states.shape[1], self.conv_kernel_size, cache_params.layers[self.layer_idx]
+        count, kernel, layer = (
+            hidden_states.shape[1],
+            self.conv_kernel_size,
+            cache_params.layers[self.layer_idx],
+        )
         state = layer.recurrent_states
         new = self.in_proj_qkv(hidden_states).transpose(1, 2)
         columns = torch.cat([layer.conv_states.to(new), new], -1)
@@ -52,10 +62,15 @@ class ContinuedDeltaNet(Qwen3_5GatedDeltaNet):
             q, k = (x.repeat_interleave(repeats, 2) for x in (q, k))
         decay = functional.softplus(self.in_proj_a(hidden_states).float() + self.dt_bias)
         read, state = self.chunk_gated_delta_rule(
-            q, k, v.unflatten(-1, (-1, self.head_v_dim)), g=-self.A_log.float().exp() * decay,
-            beta=self.in_proj_b(hidden_states).sigmoid(), initial_state=state, output_final_state=True,
+            q,
+            k,
+            v.unflatten(-1, (-1, self.head_v_dim)),
+            g=-self.A_log.float().exp() * decay,
+            beta=self.in_proj_b(hidden_states).sigmoid(),
+            initial_state=state,
+            output_final_state=True,
             use_qk_l2norm_in_kernel=True,
-        )  # fmt: skip
+        )
         cache_params.update_recurrent_state(state, self.layer_idx)
         gate = self.in_proj_z(hidden_states).reshape(-1, self.head_v_dim)
         normed = self.norm(read.reshape(-1, self.head_v_dim), gate)
@@ -64,7 +79,9 @@ class ContinuedDeltaNet(Qwen3_5GatedDeltaNet):
 
 
 class AttentionCache(DynamicCache):
-    """The cache of a language model without delta nets: transformers requests their state of any."""
+    """The cache of a language model without delta nets: transformers requests their
+    state of any.
+    """
 
     def has_previous_state(self, layer_idx: int | None = None) -> bool:
         """False: there is none."""
@@ -79,21 +96,27 @@ class WordIds(NamedTuple):
 
 
 class Prefill(NamedTuple):
-    """A prompt's beginning as the language model keeps it: attention keys and values, and delta-net states."""
+    """A prompt's beginning as the language model keeps it: attention keys and values, and delta-net
+    states.
+    """
 
     cache: Any
     length: int
 
 
 class VideoLanguageModel(nn.Module):
-    """Qwen3.5 with a language head tied to its embedding. Tensors have the names of the published checkpoint."""
+    """Qwen3.5 with a language head tied to its embedding. Tensors have the names of the published
+    checkpoint.
+    """
 
     def __init__(self, config: "Qwen3_5Config") -> None:
         super().__init__()
         self.model = Qwen3_5Model(config)
         for layer in self.model.language_model.layers:
             if hasattr(layer, "linear_attn"):
-                layer.linear_attn.__class__ = ContinuedDeltaNet  # the same weights, with another forward
+                layer.linear_attn.__class__ = (
+                    ContinuedDeltaNet  # the same weights, with another forward
+                )
         self.reset_buffers()
 
     def reset_buffers(self) -> None:
@@ -110,7 +133,9 @@ class VideoLanguageModel(nn.Module):
         return self.model.language_model.embed_tokens
 
     def recompute(self, mode: Recompute) -> None:
-        """Compute layers again in the backward pass instead of keeping their activations, or keep them."""
+        """Compute layers again in the backward pass instead of keeping their activations, or keep
+        them.
+        """
         if mode:
             self.model.gradient_checkpointing_enable(checkpoint_options(mode))
         else:
@@ -121,27 +146,35 @@ class VideoLanguageModel(nn.Module):
         vision = self.model.visual.config
         rows = pixel_rows(pairs, vision.patch_size, vision.spatial_merge_size)
         height, width = (side // vision.patch_size for side in pairs.shape[-2:])
-        grid = torch.tensor([[len(pairs), height, width]])  # on the CPU: transformers reads it as numbers
-        tokens = self.model.visual(rows.to(self.embedding.weight.dtype), grid_thw=grid).pooler_output
+        grid = torch.tensor(
+            [[len(pairs), height, width]]
+        )  # on the CPU: transformers reads it as numbers
+        tokens = self.model.visual(
+            rows.to(self.embedding.weight.dtype), grid_thw=grid
+        ).pooler_output
         return tokens.reshape(len(pairs), -1, tokens.shape[-1])
 
     def embed(self, ids: Tensor, *replaced: tuple[Tensor, Tensor]) -> Tensor:
         """Embeddings [b, L, D] of tokens [b, L], some replaced.
 
         Args:
-            replaced: pairs of a mask [b, L] and of the tokens [n, D] that take its places, in order.
+            replaced: pairs of a mask [b, L] and of the tokens [n, D] that take its places, in
+                order.
         """
         embedded: Tensor = self.embedding(ids)
         for mask, tokens in replaced:
             embedded = embedded.masked_scatter(mask[..., None], tokens.to(embedded))
         return embedded
 
-    def hidden(self, embedded: Tensor, positions: Tensor, cache: Any = None, mask: Tensor | None = None) -> Tensor:
+    def hidden(
+        self, embedded: Tensor, positions: Tensor, cache: Any = None, mask: Tensor | None = None
+    ) -> Tensor:
         """Hidden states [b, L, D] after the final norm.
 
         Args:
             embedded: [b, L, D]. positions: [b, 3, L]. cache: of `new_cache`, continued in place.
-            mask: [b, L of everything so far], False on padding at the left. Padding at the right needs none.
+            mask: [b, L of everything so far], False on padding at the left. Padding at the right
+                needs none.
         """
         output = self.model.language_model(
             inputs_embeds=embedded, position_ids=positions.transpose(0, 1), past_key_values=cache,
@@ -163,25 +196,35 @@ class VideoLanguageModel(nn.Module):
     # Words
 
     def generate(
-        self, embedded: Tensor, positions: Tensor, ends: WordIds, limit: int, mask: Tensor | None = None,
-        prefill: Prefill | None = None, words: Sequence[Sequence[int]] | None = None,
-    ) -> tuple[list[list[int]], Condition]:  # fmt: skip
+        self,
+        embedded: Tensor,
+        positions: Tensor,
+        ends: WordIds,
+        limit: int,
+        mask: Tensor | None = None,
+        prefill: Prefill | None = None,
+        words: Sequence[Sequence[int]] | None = None,
+    ) -> tuple[list[list[int]], Condition]:
         """Generate the sub-tasks of prompts, greedily, and return their words' hidden states.
 
         Args:
             embedded: [b, n, D] of the prompts, padded on the left, without what `prefill` holds.
-            positions: [b, 3, n]. mask: [b, n], False on padding. limit: most words of a response before its end.
+            positions: [b, 3, n]. mask: [b, n], False on padding. limit: most words of a response
+                before its end.
             prefill: the beginning of one prompt; its cache is continued.
             words: ids to take instead, without `<|im_end|>`.
 
         Returns:
-            The ids of each response up to `<|im_end|>`, and the condition, which includes the line break behind it.
+            The ids of each response up to `<|im_end|>`, and the condition, which includes the line
+            break behind it.
         """
         cache = self.new_cache() if prefill is None else prefill.cache
         last = self.hidden(embedded, positions, cache, mask)[:, -1]
         place = positions[:, :, -1].amax(1)
         responses: list[list[int]] = [[] for _ in range(len(embedded))]
-        tails: list[list[int]] = [[] for _ in responses]  # what follows the words: the end and the line break
+        tails: list[list[int]] = [
+            [] for _ in responses
+        ]  # what follows the words: the end and the line break
         hidden: list[Tensor] = []
         tokens: list[Tensor] = []
         while any(len(tail) < 2 for tail in tails):
@@ -190,7 +233,9 @@ class VideoLanguageModel(nn.Module):
                 likeliest = logits.argmax(-1).tolist()
             else:
                 step = len(hidden)
-                likeliest = [word_ids[step] if step < len(word_ids) else ends.end for word_ids in words]
+                likeliest = [
+                    word_ids[step] if step < len(word_ids) else ends.end for word_ids in words
+                ]
             inputs = []
             for response, tail, word in zip(responses, tails, likeliest, strict=True):
                 if tail or word == ends.end or len(response) == limit:
@@ -206,27 +251,35 @@ class VideoLanguageModel(nn.Module):
             last = self.hidden(token, place[:, None, None].expand(-1, 3, 1), cache, mask)[:, -1]
             hidden.append(last)
             tokens.append(token[:, 0])
-        lengths = torch.tensor([len(response) + 2 for response in responses], device=embedded.device)
+        lengths = torch.tensor(
+            [len(response) + 2 for response in responses], device=embedded.device
+        )
         count = len(hidden)
         steps = torch.arange(count, device=embedded.device)
         first = place - count + 1
         where = (first[:, None] + steps)[:, None].expand(-1, 3, -1)
-        condition = Condition(torch.stack(hidden, 1), torch.stack(tokens, 1), where, steps < lengths[:, None])
+        condition = Condition(
+            torch.stack(hidden, 1), torch.stack(tokens, 1), where, steps < lengths[:, None]
+        )
         return [[*response, ends.end] for response in responses], condition
 
 
 def words_loss(
     model: VideoLanguageModel, hidden: Tensor, ids: Tensor, spans: Sequence[tuple[int, int]]
 ) -> tuple[Tensor, Tensor]:
-    """The cross entropy of responses, averaged over all their tokens, and the share of tokens that are the likeliest.
+    """The cross entropy of responses, averaged over all their tokens, and the share of tokens that
+    are the likeliest.
 
     Args:
-        hidden: [b, L, D]. ids: [b, L]. spans: first token of each response, and the one behind its last.
+        hidden: [b, L, D]. ids: [b, L]. spans: first token of each response, and the one behind its
+            last.
     """
     rows = [(i, place) for i, (start, end) in enumerate(spans) for place in range(start, end)]
     row, place = torch.tensor(rows, device=hidden.device).T
     logits, targets = model.logits(hidden[row, place - 1]), ids[row, place]
-    return functional.cross_entropy(logits, targets), (logits.detach().argmax(-1) == targets).float().mean()
+    return functional.cross_entropy(logits, targets), (
+        logits.detach().argmax(-1) == targets
+    ).float().mean()
 
 
 def response_condition(

@@ -1,4 +1,6 @@
-"""`SimpleMemVlaPolicy`: a video-language model generates the sub-task; its words' hidden states condition a flow."""
+"""`SimpleMemVlaPolicy`: a video-language model generates the sub-task; its words' hidden states
+condition a flow.
+"""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -19,9 +21,23 @@ from mme_vla.memory.base import MemoryModule, full_history
 from mme_vla.methods.simplememvla.config import SimpleMemVlaSizes
 from mme_vla.methods.simplememvla.episode import VideoEpisode
 from mme_vla.methods.simplememvla.head import ActionHead, Condition
-from mme_vla.methods.simplememvla.model import Prefill, VideoLanguageModel, WordIds, response_condition, words_loss
+from mme_vla.methods.simplememvla.model import (
+    Prefill,
+    VideoLanguageModel,
+    WordIds,
+    response_condition,
+    words_loss,
+)
 from mme_vla.methods.simplememvla.processor import PromptSettings, SimpleMemVlaProcessor, VideoBatch
-from mme_vla.methods.simplememvla.prompt import IMAGE, MEMORY, TEXT, VIDEO, CameraTokens, Tokens, rope_positions
+from mme_vla.methods.simplememvla.prompt import (
+    IMAGE,
+    MEMORY,
+    TEXT,
+    VIDEO,
+    CameraTokens,
+    Tokens,
+    rope_positions,
+)
 from mme_vla.methods.simplememvla.video import TEMPORAL, Window, augment, augmentation_draw
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
@@ -35,14 +51,18 @@ from mme_vla.speed.sharding import ShardGroup
 from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 
 _STAMP_TOKENS, _REQUEST_TOKENS, _RESPONSE_TOKENS = 9, 105, 12
-"""Text tokens of a timestamp, of a prompt's remaining text and of a response, where costs are counted."""
+"""Text tokens of a timestamp, of a prompt's remaining text and of a response, where costs are
+counted.
+"""
 
 
 @POLICIES.register("simplememvla")
 class SimpleMemVlaPolicy(NetworkPolicy):
-    """SimpleMemVLA: no memory module but a time-stamped video in the prompt, sub-task words, and a flow head on them.
+    """SimpleMemVLA: no memory module but a time-stamped video in the prompt, sub-task words, and a
+    flow head on them.
 
-    A memory of the library may replace the video: its tokens, projected, stand where the video's would.
+    A memory of the library may replace the video: its tokens, projected, stand where the video's
+    would.
     """
 
     acts_in_bfloat16 = True
@@ -54,12 +74,20 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             "action": "",
         },
         lora_targets=(
-            "q_proj", "k_proj", "v_proj", "o_proj", "in_proj_qkv", "in_proj_z", "linear_attn.out_proj", "gate_proj",
-            "up_proj", "down_proj",
+            "q_proj",
+            "k_proj",
+            "v_proj",
+            "o_proj",
+            "in_proj_qkv",
+            "in_proj_z",
+            "linear_attn.out_proj",
+            "gate_proj",
+            "up_proj",
+            "down_proj",
         ),
         full_train=("action_head",),
         lora_exclude=r"^action_head\.",
-    )  # fmt: skip
+    )
 
     def __init__(
         self,
@@ -86,36 +114,55 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         self.action_head = ActionHead(sizes.head, *head)
         self.memory, self.sizes = memory, sizes
         self.memory_proj = None if memory is None else nn.Linear(sizes.memory_width, sizes.width)
-        self.horizon, self.action_dim, self.sample_steps = sizes.horizon, sizes.action_dim, EULER_STEPS
+        self.horizon, self.action_dim, self.sample_steps = (
+            sizes.horizon,
+            sizes.action_dim,
+            EULER_STEPS,
+        )
 
     @classmethod
     def from_config(
-        cls, config: Mapping[str, Any], processor: PolicyProcessor | None = None, *, fresh_backbone: bool = True
+        cls,
+        config: Mapping[str, Any],
+        processor: PolicyProcessor | None = None,
+        *,
+        fresh_backbone: bool = True,
     ) -> Self:
         sizes, robot = SimpleMemVlaSizes.from_dict(config["backbone"]), embodiment_of(config)
         robot.check_network(sizes.action_dim, sizes.horizon)
         if sizes.state_dim not in (0, robot.state.width):
-            raise UserError(f"backbone.state_dim={sizes.state_dim} must be {robot.state.width}, or 0 for no state.")
+            raise UserError(
+                f"backbone.state_dim={sizes.state_dim} must be {robot.state.width}, or 0 for no"
+                " state."
+            )
         if config.get("integration"):
             raise UserError(
-                f"SimpleMemVLA has no place for the integration {config['integration'].get('name')!r}: a memory's "
-                "tokens stand in the prompt, in place of the video. Set integration=none."
+                "SimpleMemVLA has no place for the integration"
+                f" {config['integration'].get('name')!r}: a memory's tokens stand in the prompt, in"
+                " place of the video. Set integration=none."
             )
         if processor is not None and not isinstance(processor, SimpleMemVlaProcessor):
-            raise UserError("SimpleMemVLA needs its own processor: set processor=simplememvla, or simplememvla_tiny.")
+            raise UserError(
+                "SimpleMemVLA needs its own processor: set processor=simplememvla, or"
+                " simplememvla_tiny."
+            )
         memory: MemoryModule | None = None
         if config.get("memory"):
             grid = sizes.image_size // sizes.factor
             memory = build_memory(config["memory"], sizes.width, grid, sizes.memory_width)
             check_past(config, memory, frozenset())
             if not memory.budget:
-                raise UserError(f"The memory {config['memory']['name']!r} has no tokens with these settings.")
+                raise UserError(
+                    f"The memory {config['memory']['name']!r} has no tokens with these settings."
+                )
         options = policy_options(cls, config)
         return cls(sizes, memory, processor, config, fresh_backbone=fresh_backbone, **options)
 
     # The network
 
-    def embed(self, batch: VideoBatch, memory: MemoryTokens | None = None, changes: Tensor | None = None) -> Tensor:
+    def embed(
+        self, batch: VideoBatch, memory: MemoryTokens | None = None, changes: Tensor | None = None
+    ) -> Tensor:
         """Embeddings [b, L, D] of prompts, with images and memory tokens in them.
 
         Args:
@@ -125,7 +172,11 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         if changes is not None:
             video, images = _augmented(video, images, batch.patches, changes)
         pairs = images.flatten(0, 1)[:, None].expand(-1, TEMPORAL, -1, -1, -1)
-        replaced = [(batch.kinds == IMAGE, self.backbone.encode_patches(pairs).flatten(0, 1))] if len(pairs) else []
+        replaced = (
+            [(batch.kinds == IMAGE, self.backbone.encode_patches(pairs).flatten(0, 1))]
+            if len(pairs)
+            else []
+        )
         features = batch.features
         if features is None and video is not None and len(video):
             features = self.backbone.encode_patches(video)
@@ -136,9 +187,13 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         return self.backbone.embed(batch.ids, *replaced)
 
     def _projected(self, memory: MemoryTokens) -> Tensor:
-        """Memory tokens [b, n, D] for the language model; empty ones are zero before the projection."""
+        """Memory tokens [b, n, D] for the language model; empty ones are zero before the
+        projection.
+        """
         assert self.memory_proj is not None
-        tokens: Tensor = self.memory_proj(torch.where(memory.mask[..., None], memory.tokens.float(), 0.0))
+        tokens: Tensor = self.memory_proj(
+            torch.where(memory.mask[..., None], memory.tokens.float(), 0.0)
+        )
         return tokens
 
     # Training
@@ -150,17 +205,29 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         return {"noise": noise, "time": uniform ** (1 / self.sizes.head.time_alpha)}
 
     def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
-        """While training with augmentation `changes` [n, 7]: uniform numbers for the images of `count` samples."""
-        return {"changes": torch.rand(count, 7, generator=generator)} if self.training and self.augment else {}
+        """While training with augmentation `changes` [n, 7]: uniform numbers for the images of
+        `count` samples.
+        """
+        return (
+            {"changes": torch.rand(count, 7, generator=generator)}
+            if self.training and self.augment
+            else {}
+        )
 
-    def forward(self, batch: VideoBatch, noise: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(
+        self, batch: VideoBatch, noise: Mapping[str, Tensor] | None = None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """The flow's loss and the cross entropy of the sub-task's words, weighted and added.
 
         Args:
-            batch: with responses and `actions`. noise: of `training_noise` and `augmentation_params`.
+            batch: with responses and `actions`. noise: of `training_noise` and
+                `augmentation_params`.
         """
         if batch.actions is None:
-            raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
+            raise ValueError(
+                "forward() computes a loss: batch.actions must hold the recorded chunk (it is"
+                " None)."
+            )
         values = dict(noise or self.training_noise(len(batch.ids), torch.default_generator))
         if "changes" not in values:
             values |= self.augmentation_params(len(batch.ids), torch.default_generator)
@@ -173,11 +240,25 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             words, right = words_loss(self.backbone, hidden, batch.ids, batch.spans)
             condition = response_condition(hidden, embedded, batch.positions, batch.spans)
             action = self.action_head.loss(
-                batch.actions, condition, self._state(batch), values["noise"], values["time"], batch.action_mask
+                batch.actions,
+                condition,
+                self._state(batch),
+                values["noise"],
+                values["time"],
+                batch.action_mask,
             )
         loss = self.sizes.action_weight * action + self.sizes.words_weight * words
-        reported = {} if memory is None else {f"memory/{name}": value for name, value in memory.metrics.items()}
-        metrics = {"loss": loss.detach(), "action": action.detach(), "words": words.detach(), "words_right": right}
+        reported = (
+            {}
+            if memory is None
+            else {f"memory/{name}": value for name, value in memory.metrics.items()}
+        )
+        metrics = {
+            "loss": loss.detach(),
+            "action": action.detach(),
+            "words": words.detach(),
+            "words_right": right,
+        }
         return loss, metrics | reported
 
     def _state(self, batch: VideoBatch) -> Tensor | None:
@@ -187,12 +268,15 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         self.backbone.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        """The vision tower, every layer of the language model, and every block of the head, gathered in float32.
+        """The vision tower, every layer of the language model, and every block of the head,
+        gathered in float32.
 
         Decay rates of delta nets are not rounded.
         """
         tower, layers = self.backbone.model.visual, self.backbone.model.language_model.layers
-        return [ShardGroup(module, full=True) for module in (tower, *layers, *self.action_head.blocks)]
+        return [
+            ShardGroup(module, full=True) for module in (tower, *layers, *self.action_head.blocks)
+        ]
 
     # Sampling
 
@@ -208,23 +292,32 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         steps: int | None = None,
         memory: MemoryTokens | None = None,
     ) -> Tensor:
-        """A normalised chunk [b, h, a] under words that the policy generates; responses in the batch are not read.
+        """A normalised chunk [b, h, a] under words that the policy generates; responses in the
+        batch are not read.
 
         Args:
             memory: memory tokens encoded beforehand.
         """
         if noise is None:
-            noise = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.ids))])
+            noise = stack_noise(
+                [self.sampling_noise(torch.default_generator) for _ in range(len(batch.ids))]
+            )
         memory = self.encode_memory(batch.history) if memory is None else memory
         _, condition = self.generate(batch, memory)
         return self._sample(batch, condition, noise, steps)
 
     def _sample(
-        self, batch: VideoBatch, condition: Condition, noise: Mapping[str, Tensor], steps: int | None
+        self,
+        batch: VideoBatch,
+        condition: Condition,
+        noise: Mapping[str, Tensor],
+        steps: int | None,
     ) -> Tensor:
         with self.autocast():
             start = noise["noise"].to(self.device)
-            return self.action_head.sample(start, condition, self._state(batch), steps or self.sample_steps)
+            return self.action_head.sample(
+                start, condition, self._state(batch), steps or self.sample_steps
+            )
 
     @torch.no_grad()
     def generate(
@@ -238,9 +331,13 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         with self.autocast():
             embedded = self.embed(batch, memory)
             longest, start = max(batch.prompts), 0 if prefill is None else prefill.length
-            rows = [functional.pad(e[:n], (0, 0, longest - n, 0)) for e, n in zip(embedded, batch.prompts, strict=True)]
+            rows = [
+                functional.pad(e[:n], (0, 0, longest - n, 0))
+                for e, n in zip(embedded, batch.prompts, strict=True)
+            ]
             places = [
-                functional.pad(p[:, :n], (longest - n, 0)) for p, n in zip(batch.positions, batch.prompts, strict=True)
+                functional.pad(p[:, :n], (longest - n, 0))
+                for p, n in zip(batch.positions, batch.prompts, strict=True)
             ]
             mask = None
             if min(batch.prompts) < longest:
@@ -248,7 +345,13 @@ class SimpleMemVlaPolicy(NetworkPolicy):
                 mask = torch.arange(longest, device=embedded.device) >= (longest - lengths)[:, None]
             ids, limit = self._word_settings(batch)
             return self.backbone.generate(
-                torch.stack(rows)[:, start:], torch.stack(places)[..., start:], ids, limit, mask, prefill, batch.words
+                torch.stack(rows)[:, start:],
+                torch.stack(places)[..., start:],
+                ids,
+                limit,
+                mask,
+                prefill,
+                batch.words,
             )
 
     def _word_settings(self, batch: VideoBatch) -> tuple[WordIds, int]:
@@ -265,7 +368,9 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         return VideoEpisode(self, goal, seed)
 
     def observation(self, episodes: Sequence[Episode]) -> VideoBatch:
-        """The prompts and current images of running episodes, without the tokens of their videos."""
+        """The prompts and current images of running episodes, without the tokens of
+        their videos.
+        """
         processor, robot = self.require_processor(), self.embodiment
         others = [i for i, name in enumerate(robot.camera_names) if name != robot.memory_camera]
         tokens = [self._tokens(_video_episode(episode)) for episode in episodes]
@@ -283,12 +388,20 @@ class SimpleMemVlaPolicy(NetworkPolicy):
 
     @torch.no_grad()
     def predict_chunk(
-        self, batch: VideoBatch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
+        self,
+        batch: VideoBatch,
+        episodes: Sequence[Episode],
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
     ) -> Tensor:
-        """A chunk for each episode; prompts that were read ahead are continued one by one, the others in one batch."""
+        """A chunk for each episode; prompts that were read ahead are continued one by one, the
+        others in one batch.
+        """
         running = [_video_episode(episode) for episode in episodes]
         with self.autocast():
-            features = [episode.encode(self.backbone, episode.pairs(episode.step)) for episode in running]
+            features = [
+                episode.encode(self.backbone, episode.pairs(episode.step)) for episode in running
+            ]
         memory = self.encode_memories(episodes)
         prefills = [episode.take_prefill(self._tokens(episode)) for episode in running]
         alone = [[i] for i, prefill in enumerate(prefills) if prefill is not None]
@@ -309,7 +422,9 @@ class SimpleMemVlaPolicy(NetworkPolicy):
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
-        """Read some of the prompt at the next decision, or what the memory reads; return whether more remains."""
+        """Read some of the prompt at the next decision, or what the memory reads; return whether
+        more remains.
+        """
         processor = self.require_processor()
         if not processor.shows_video:
             return super().prepare(episode)
@@ -345,14 +460,19 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         return {
             "factor": (processor.factor, sizes.factor),
             "image_side": (processor.image_side, sizes.image_size),
-            "memory_tokens": (processor.memory_tokens, 0 if self.memory is None else self.memory.budget),
+            "memory_tokens": (
+                processor.memory_tokens,
+                0 if self.memory is None else self.memory.budget,
+            ),
             "horizon": (processor.embodiment.action.horizon, sizes.horizon),
         }
 
     @property
     def memory_tower(self) -> MemoryTower:
         self.require_memory()
-        return MemoryTower(self.backbone.model.visual, self._pooled_tokens, self.sizes.width, ("one image",))
+        return MemoryTower(
+            self.backbone.model.visual, self._pooled_tokens, self.sizes.width, ("one image",)
+        )
 
     def _pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
         pairs = images[:, None].expand(-1, TEMPORAL, -1, -1, -1)
@@ -361,7 +481,9 @@ class SimpleMemVlaPolicy(NetworkPolicy):
     # Costs
 
     def full_batch(self, device: torch.device | str = "cpu") -> VideoBatch:
-        """A batch of one without content: a full video, or a full memory, and a response of a usual length."""
+        """A batch of one without content: a full video, or a full memory, and a response of a usual
+        length.
+        """
         sizes, robot, section = self.sizes, self.embodiment, dict(self.config["processor"])
         settings = PromptSettings(**{key: value for key, value in section.items() if key != "name"})
         window = Window(settings.seconds, settings.fps, settings.native_fps)
@@ -371,7 +493,15 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         stamped = [*[TEXT] * _STAMP_TOKENS, *[VIDEO] * (grid[0] * grid[1])]
         image = [TEXT, *[IMAGE] * (grid[0] * grid[1])] * (len(robot.cameras) - 1)
         memory = [MEMORY] * (0 if self.memory is None else self.memory.budget)
-        kinds = np.array([TEXT, *memory, *stamped * patches, *image, *[TEXT] * (_REQUEST_TOKENS + _RESPONSE_TOKENS)])
+        kinds = np.array(
+            [
+                TEXT,
+                *memory,
+                *stamped * patches,
+                *image,
+                *[TEXT] * (_REQUEST_TOKENS + _RESPONSE_TOKENS),
+            ]
+        )
         cameras = [
             CameraTokens("front", grid, [0.0] * patches),
             *[CameraTokens("wrist", grid)] * (len(robot.cameras) - 1),
@@ -385,7 +515,9 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             lengths=(length,),
             patches=(patches,),
             state=torch.zeros(1, robot.state.width, device=device),
-            images=torch.zeros(1, len(robot.cameras) - 1, 3, side, side, dtype=torch.uint8, device=device),
+            images=torch.zeros(
+                1, len(robot.cameras) - 1, 3, side, side, dtype=torch.uint8, device=device
+            ),
             video=torch.zeros(patches, TEMPORAL, 3, side, side, dtype=torch.uint8, device=device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
             history=None if self.memory is None else full_history(self.memory, sizes.width, device),
@@ -405,7 +537,9 @@ def _augmented(
     draws = [augmentation_draw(row) for row in changes.tolist()]
     if video is not None:
         parts = zip(video.split(list(patches)), draws, strict=True)
-        video = torch.cat([augment(part.flatten(0, 1), draw).unflatten(0, (-1, TEMPORAL)) for part, draw in parts])
+        video = torch.cat(
+            [augment(part.flatten(0, 1), draw).unflatten(0, (-1, TEMPORAL)) for part, draw in parts]
+        )
     return video, torch.stack([augment(row, draw) for row, draw in zip(images, draws, strict=True)])
 
 

@@ -1,6 +1,8 @@
-"""What stands between raw data and SimpleMemVLA: a time-stamped video, a prompt with its response, mean and deviation.
+"""What stands between raw data and SimpleMemVLA: a time-stamped video, a prompt with its response,
+mean and deviation.
 
-Shapes: b batch · L tokens · P temporal patches of a sample · K of a batch · c cameras without a past.
+Shapes: b batch · L tokens · P temporal patches of a sample · K of a batch · c cameras without a
+past.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +33,13 @@ from mme_vla.methods.simplememvla.prompt import (
     encode,
     instruction,
 )
-from mme_vla.methods.simplememvla.video import TEMPORAL, Window, channels_first, fitting_size, resized
+from mme_vla.methods.simplememvla.video import (
+    TEMPORAL,
+    Window,
+    channels_first,
+    fitting_size,
+    resized,
+)
 from mme_vla.processing.base import (
     CONFIG_FILE,
     STATS_FILE,
@@ -80,11 +88,12 @@ class VideoBatch(TensorStruct):
     """Prompts with the images that are in them.
 
     ids: [b, L] padded on the right. kinds: [b, L] int8 (`prompt.TEXT`, …). positions: [b, 3, L].
-    prompts, lengths: tokens of each row's prompt, and with its response. patches: temporal patches of each row.
-    video: [K, 2, 3, H, W] uint8, the temporal patches of all rows one after the other; None where `features` are given.
-    features: [K, m, D], their tokens. images: [b, c, 3, H, W] uint8, of the cameras without a past.
-    state: [b, s] normalised. actions: [b, h, a] normalised. action_mask: [b, h] bool. history: of a memory.
-    words: ids that each row takes instead of generated ones, up to `<|im_end|>`; None to generate them.
+    prompts, lengths: tokens of each row's prompt, and with its response. patches: temporal patches
+    of each row. video: [K, 2, 3, H, W] uint8, the temporal patches of all rows one after the other;
+    None where `features` are given. features: [K, m, D], their tokens. images: [b, c, 3, H, W]
+    uint8, of the cameras without a past. state: [b, s] normalised. actions: [b, h, a] normalised.
+    action_mask: [b, h] bool. history: of a memory. words: ids that each row takes instead of
+    generated ones, up to `<|im_end|>`; None to generate them.
     """
 
     ids: Tensor
@@ -109,9 +118,13 @@ class VideoBatch(TensorStruct):
 
     def rows(self, index: Tensor | slice) -> Self:
         """Rows of the batch, with the temporal patches that belong to them."""
-        indices = np.arange(len(self.ids))[index if isinstance(index, slice) else index.cpu().numpy()].tolist()
+        indices = np.arange(len(self.ids))[
+            index if isinstance(index, slice) else index.cpu().numpy()
+        ].tolist()
         starts = np.cumsum([0, *self.patches])
-        places = torch.tensor([p for i in indices for p in range(starts[i], starts[i + 1])], dtype=torch.int64)
+        places = torch.tensor(
+            [p for i in indices for p in range(starts[i], starts[i + 1])], dtype=torch.int64
+        )
         changed: dict[str, Any] = {
             name: None if (x := getattr(self, name)) is None else x[places.to(x.device)]
             for name in ("video", "features")
@@ -128,7 +141,8 @@ class SimpleMemVlaProcessor(PolicyProcessor):
     """Shows the past of the memory camera as a video, and the current image of every other camera.
 
     Args:
-        sizes: pixels of a side that become a merged token (`factor`), and tokens of a memory in the video's place.
+        sizes: pixels of a side that become a merged token (`factor`), and tokens of a memory in the
+            video's place.
     """
 
     stats_spec = StatsSpec(horizon=1, every=True, exact=True, video=True)
@@ -146,22 +160,29 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         """Put the parts together.
 
         Args:
-            factor: pixels of a side that become one token. memory_tokens: of a memory that takes the video's place.
-            image_side: of the images that a memory stores. tokenizer: in place of the one that the settings name.
+            factor: pixels of a side that become one token. memory_tokens: of a memory that takes
+                the video's place.
+            image_side: of the images that a memory stores. tokenizer: in place of the one that the
+                settings name.
         """
         self.settings, self.embodiment = settings, embodiment
         self.factor, self.memory_tokens, self.image_side = factor, memory_tokens, image_side
         if settings.goal_case is not None:
             check_choice("processor.goal_case", settings.goal_case, GOAL_CASES)
         if settings.side is not None and settings.side % factor:
-            raise UserError(f"processor.side={settings.side} must be a multiple of {factor} pixels.")
+            raise UserError(
+                f"processor.side={settings.side} must be a multiple of {factor} pixels."
+            )
         if settings.seconds * settings.fps > 4096:
-            raise UserError(f"processor.seconds={settings.seconds:g} at fps={settings.fps:g}: at most 4096 frames.")
+            raise UserError(
+                f"processor.seconds={settings.seconds:g} at fps={settings.fps:g}: at most 4096"
+                " frames."
+            )
         if embodiment.fps is not None and embodiment.fps != settings.native_fps:
             raise UserError(
-                f"processor.native_fps={settings.native_fps:g}: the robot {embodiment.name!r} has {embodiment.fps:g} "
-                "frames per second, so the video would be shown at another speed than its timestamps say. Set it to "
-                "embodiment.fps."
+                f"processor.native_fps={settings.native_fps:g}: the robot {embodiment.name!r} has"
+                f" {embodiment.fps:g} frames per second, so the video would be shown at another"
+                " speed than its timestamps say. Set it to embodiment.fps."
             )
         self.window = Window(settings.seconds, settings.fps, settings.native_fps, settings.variable)
         self.tokenizer = tokenizer or WordTokenizer.load(settings.tokenizer)
@@ -181,8 +202,9 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         rows = sizes.qwen.text_config.vocab_size
         if built.tokenizer.vocab_size > rows:
             raise UserError(
-                f"The tokenizer {built.tokenizer.spec!r} has {built.tokenizer.vocab_size} entries but "
-                f"backbone.vlm.text_config.vocab_size={rows}: choose the processor that goes with the backbone."
+                f"The tokenizer {built.tokenizer.spec!r} has {built.tokenizer.vocab_size} entries"
+                f" but backbone.vlm.text_config.vocab_size={rows}: choose the processor that goes"
+                " with the backbone."
             )
         return built
 
@@ -194,20 +216,28 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         return self.settings.video and not self.memory_tokens
 
     def frames(self, step: int) -> np.ndarray:
-        """Frames of the memory camera that are shown at a step, an even number, the current one last: int64 [n]."""
+        """Frames of the memory camera that are shown at a step, an even number, the current one
+        last: int64 [n].
+        """
         return self.window.frames(step) if self.shows_video else np.full(TEMPORAL, step)
 
     def video(self, frames: Tensor) -> Tensor:
         """Frames [n, 3, H, W] uint8 as temporal patches [n/2, 2, 3, h, w]."""
-        return resized(frames, self._size(frames, len(frames), self.settings.video_pixels)).unflatten(0, (-1, TEMPORAL))
+        return resized(
+            frames, self._size(frames, len(frames), self.settings.video_pixels)
+        ).unflatten(0, (-1, TEMPORAL))
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Current images of all cameras, [H, W, 3] or [n, H, W, 3] each, as [v, 3, h, w] or [n, v, 3, h, w] uint8."""
+        """Current images of all cameras, [H, W, 3] or [n, H, W, 3] each, as [v, 3, h, w] or [n, v,
+        3, h, w] uint8.
+        """
         tensors = [channels_first(as_uint8_frames(view)) for view in views]
         bounds = self.settings.image_pixels
         return torch.stack([resized(view, self._size(view, 1, bounds)) for view in tensors], -4)
 
-    def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
+    def memory_images(
+        self, frames: np.ndarray | Tensor, device: torch.device | str | None = None
+    ) -> Tensor:
         """Frames [n, H, W, 3] uint8 that a memory stores, as [n, 3, s, s] uint8."""
         images = channels_first(np.asarray(frames)).to(device)
         return resized(images, (self.image_side, self.image_side))
@@ -222,7 +252,9 @@ class SimpleMemVlaProcessor(PolicyProcessor):
 
     @property
     def prompt_spec(self) -> PromptSpec:
-        return PromptSpec(self.tokenizer.spec, "simplememvla", fingerprint=self.tokenizer.fingerprint)
+        return PromptSpec(
+            self.tokenizer.spec, "simplememvla", fingerprint=self.tokenizer.fingerprint
+        )
 
     def prompt(
         self,
@@ -248,7 +280,8 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         """A prompt that shows so many temporal patches.
 
         Args:
-            request: of `prompt`. size, image_size: (h, w) of the video's frames and of current images.
+            request: of `prompt`. size, image_size: (h, w) of the video's frames and of current
+                images.
             response: the sub-task that is learned.
         """
         cameras = []
@@ -270,7 +303,9 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         return _standardise(states, self.require_stats().state)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
-        raw = self.embodiment.action.to_relative(*(torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state)))
+        raw = self.embodiment.action.to_relative(
+            *(torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state))
+        )
         return _standardise(raw, self.require_stats().actions)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
@@ -284,19 +319,26 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         """One step: its prompt with the sub-task as the response, images, state and chunk."""
         if sample.subgoal is None:
             raise UserError(
-                "SimpleMemVLA learns to generate the current sub-task: set subgoal_text.kind to simple_subgoal or "
-                "grounded_subgoal."
+                "SimpleMemVLA learns to generate the current sub-task: set subgoal_text.kind to"
+                " simple_subgoal or grounded_subgoal."
             )
         robot, state = self.embodiment, torch.from_numpy(sample.states[-1])
         video = self.video(channels_first(sample.views[robot.memory_camera]))
-        views = [sample.views[name][-1] for name in robot.camera_names if name != robot.memory_camera]
-        images = self.images(views) if views else torch.zeros(0, *video.shape[2:], dtype=torch.uint8)
+        views = [
+            sample.views[name][-1] for name in robot.camera_names if name != robot.memory_camera
+        ]
+        images = (
+            self.images(views) if views else torch.zeros(0, *video.shape[2:], dtype=torch.uint8)
+        )
         response = clean_response(sample.subgoal)
-        tokens = self.tokens(self.prompt(sample.goal), len(video), _side(video), _side(images), response)
+        tokens = self.tokens(
+            self.prompt(sample.goal), len(video), _side(video), _side(images), response
+        )
         if len(tokens.ids) > self.settings.max_tokens:
             raise UserError(
-                f"A sample has {len(tokens.ids):,} tokens, more than processor.max_tokens="
-                f"{self.settings.max_tokens:,}: raise it, or show a shorter video (processor.seconds, processor.fps)."
+                f"A sample has {len(tokens.ids):,} tokens, more than"
+                f" processor.max_tokens={self.settings.max_tokens:,}: raise it, or show a shorter"
+                " video (processor.seconds, processor.fps)."
             )
         return {
             "tokens": tokens,
@@ -311,17 +353,23 @@ class SimpleMemVlaProcessor(PolicyProcessor):
             return torch.stack([item[name] for item in items]) if name in items[0] else None
 
         states = torch.stack([item["state"] for item in items])
-        batch = self.batch([item["tokens"] for item in items], [item["images"] for item in items], states)
+        batch = self.batch(
+            [item["tokens"] for item in items], [item["images"] for item in items], states
+        )
         return replace(
             batch,
             video=_joined([item["video"] for item in items]),
             patches=tuple(len(item["video"]) for item in items),
             actions=stack("actions"),
             action_mask=stack("action_mask"),
-            history=stack_history([item["history"] for item in items]) if "history" in items[0] else None,
+            history=stack_history([item["history"] for item in items])
+            if "history" in items[0]
+            else None,
         )
 
-    def batch(self, tokens: Sequence[Tokens], images: Sequence[Tensor], states: Tensor) -> VideoBatch:
+    def batch(
+        self, tokens: Sequence[Tokens], images: Sequence[Tensor], states: Tensor
+    ) -> VideoBatch:
         """Prompts, current images and states as a batch, without video."""
         longest = max(len(one.ids) for one in tokens)
 
@@ -347,7 +395,10 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         shipped = self.tokenizer.spec == BYTES
         return {
             "name": NAME,
-            **{name: list(value) if isinstance(value, tuple) else value for name, value in values.items()},
+            **{
+                name: list(value) if isinstance(value, tuple) else value
+                for name, value in values.items()
+            },
             "tokenizer": BYTES if shipped else TOKENIZER_FILE,
             "tokenizer_fingerprint": self.tokenizer.fingerprint,
             "factor": self.factor,
@@ -375,20 +426,26 @@ class SimpleMemVlaProcessor(PolicyProcessor):
             robot, stats = Embodiment.from_dict(values.pop("embodiment")), values.pop("stats")
             fingerprint = values.pop("tokenizer_fingerprint")
         except KeyError as error:
-            raise UserError(f"{folder / CONFIG_FILE} lacks {error}: it is damaged, or of another version.") from None
+            raise UserError(
+                f"{folder / CONFIG_FILE} lacks {error}: it is damaged, or of another version."
+            ) from None
         if (
             any(isinstance(value, bool) or not isinstance(value, int) for value in sizes.values())
             or sizes["factor"] < 1
         ):
-            raise UserError(f"{folder / CONFIG_FILE}: factor, memory_tokens and image_side must be whole numbers.")
+            raise UserError(
+                f"{folder / CONFIG_FILE}: factor, memory_tokens and image_side must be whole"
+                " numbers."
+            )
         if tokenizer is None:
             named = values.get("tokenizer")
             tokenizer = BYTES if named == BYTES else saved_file(folder, named, "tokenizer")
         words = WordTokenizer.load(tokenizer)
         if words.fingerprint != fingerprint:
             raise UserError(
-                f"The tokenizer {words.spec!r} has fingerprint {words.fingerprint}, but {brief(fingerprint)} was used "
-                "in training: its ids would mean other words. Give the file that was used."
+                f"The tokenizer {words.spec!r} has fingerprint {words.fingerprint}, but"
+                f" {brief(fingerprint)} was used in training: its ids would mean other words. Give"
+                " the file that was used."
             )
         settings = read_section(PromptSettings, values, f"{folder / CONFIG_FILE}: processor")
         built = None if stats is None else NormStats.load(saved_file(folder, stats, "statistics"))
@@ -403,8 +460,8 @@ def _joined(parts: Sequence[Tensor]) -> Tensor:
     sizes = {_side(part) for part in parts}
     if len(sizes) > 1:
         raise UserError(
-            f"The images of one batch have the sizes {sorted(sizes)}: videos of different lengths were shrunk "
-            "differently. Set processor.side."
+            f"The images of one batch have the sizes {sorted(sizes)}: videos of different lengths"
+            " were shrunk differently. Set processor.side."
         )
     return torch.cat(list(parts))
 

@@ -1,4 +1,5 @@
-"""The prompt of SimpleMemVLA, token for token: a user's turn with time-stamped video, and the sub-task as its response.
+"""The prompt of SimpleMemVLA, token for token: a user's turn with time-stamped video, and the
+sub-task as its response.
 
 Shapes: L tokens.
 """
@@ -23,12 +24,26 @@ QWEN = f"{HUB}Qwen/Qwen3.5-4B/tokenizer.json"
 _WORDS_SIZE = 1000
 _LARGEST_FILE = 64 * 2**20  # bytes; Qwen's has 20 MiB
 SPECIAL = (
-    "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>",
-    "<|video_pad|>", "<think>", "</think>",
-)  # fmt: skip
+    "<|endoftext|>",
+    "<|im_start|>",
+    "<|im_end|>",
+    "<|vision_start|>",
+    "<|vision_end|>",
+    "<|image_pad|>",
+    "<|video_pad|>",
+    "<think>",
+    "</think>",
+)
 TEXT, IMAGE, VIDEO, MEMORY = range(4)
-"""Kinds of tokens: what their embeddings are replaced by. Memory tokens count positions like text."""
-_LABELS = {"front": "Front camera", "base": "Front camera", "wrist": "Wrist camera", "hand": "Wrist camera"}
+"""Kinds of tokens: what their embeddings are replaced by. Memory tokens count
+positions like text.
+"""
+_LABELS = {
+    "front": "Front camera",
+    "base": "Front camera",
+    "wrist": "Wrist camera",
+    "hand": "Wrist camera",
+}
 
 
 class WordTokenizer:
@@ -47,13 +62,15 @@ class WordTokenizer:
             self._tokenizer: Tokenizer = Tokenizer.from_str(content)
         except Exception as error:  # the package raises bare exceptions
             reason = brief(str(error), 200, quote=False)
-            raise UserError(f"processor.tokenizer={brief(spec, 300)} is no tokenizer.json: {reason}") from None
+            raise UserError(
+                f"processor.tokenizer={brief(spec, 300)} is no tokenizer.json: {reason}"
+            ) from None
         self.content, self.spec = content, spec
         self.fingerprint = hashlib.sha256(content.encode()).hexdigest()[:16]
         if lacking := [token for token in SPECIAL if self._tokenizer.token_to_id(token) is None]:
             raise UserError(
-                f"The tokenizer {brief(spec, 300)} lacks {', '.join(lacking)}, which SimpleMemVLA's prompts need. Give "
-                "Qwen3.5's tokenizer.json (processor.tokenizer)."
+                f"The tokenizer {brief(spec, 300)} lacks {', '.join(lacking)}, which SimpleMemVLA's"
+                " prompts need. Give Qwen3.5's tokenizer.json (processor.tokenizer)."
             )
 
     @classmethod
@@ -61,8 +78,9 @@ class WordTokenizer:
         """Load a tokenizer.
 
         Args:
-            spec: `bytes` (one token a byte, no file), `words` (a small vocabulary of RoboMME's language, no file), the
-                path of a tokenizer.json or of a folder with one, or `hf://owner/repository/tokenizer.json`.
+            spec: `bytes` (one token a byte, no file), `words` (a small vocabulary of RoboMME's
+                language, no file), the path of a tokenizer.json or of a folder with one, or
+                `hf://owner/repository/tokenizer.json`.
         """
         spec = str(spec)
         if spec in (BYTES, WORDS):
@@ -71,15 +89,21 @@ class WordTokenizer:
         path = path / "tokenizer.json" if path.is_dir() else path
         if not path.is_file():
             raise UserError(
-                f"No tokenizer at {brief(spec, 300)}. Set processor.tokenizer to the path of Qwen3.5's tokenizer.json, "
-                f"to {QWEN}, or to {BYTES!r} or {WORDS!r} to try things out."
+                f"No tokenizer at {brief(spec, 300)}. Set processor.tokenizer to the path of"
+                f" Qwen3.5's tokenizer.json, to {QWEN}, or to {BYTES!r} or {WORDS!r} to try things"
+                " out."
             )
         if path.stat().st_size > _LARGEST_FILE:
-            raise UserError(f"{path} has {path.stat().st_size:,} bytes; a tokenizer has at most {_LARGEST_FILE:,}.")
+            raise UserError(
+                f"{path} has {path.stat().st_size:,} bytes; a tokenizer has at most"
+                f" {_LARGEST_FILE:,}."
+            )
         try:
             return cls(path.read_text(encoding="utf-8"), spec)
         except UnicodeDecodeError:
-            raise UserError(f"{path} is damaged or no tokenizer.json: it is not UTF-8 text.") from None
+            raise UserError(
+                f"{path} is damaged or no tokenizer.json: it is not UTF-8 text."
+            ) from None
 
     @property
     def vocab_size(self) -> int:
@@ -101,7 +125,9 @@ class WordTokenizer:
 
 @lru_cache(maxsize=2)
 def _small_tokenizer(spec: str) -> str:
-    """A tokenizer.json without any file: of one token a byte and two line breaks, or trained on RoboMME's language."""
+    """A tokenizer.json without any file: of one token a byte and two line breaks, or trained on
+    RoboMME's language.
+    """
     try:
         from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers, trainers
     except ImportError:
@@ -111,11 +137,20 @@ def _small_tokenizer(spec: str) -> str:
         learned.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
         learned.decoder = decoders.ByteLevel()
         alphabet = pre_tokenizers.ByteLevel.alphabet()
-        corpus = files("mme_vla").joinpath("assets/tokenizer_corpus.txt").read_text(encoding="utf-8").splitlines()
+        corpus = (
+            files("mme_vla")
+            .joinpath("assets/tokenizer_corpus.txt")
+            .read_text(encoding="utf-8")
+            .splitlines()
+        )
         request = instruction("", Robot("Panda single-arm robot", 20, 30), 1, 1)
         stamps = [timestamp(place / 4) for place in range(400)]
-        trainer = trainers.BpeTrainer(vocab_size=_WORDS_SIZE, initial_alphabet=alphabet, show_progress=False)
-        learned.train_from_iterator([*corpus, *[request] * 200, *stamps, *["Front camera:\n\n"] * 200], trainer)
+        trainer = trainers.BpeTrainer(
+            vocab_size=_WORDS_SIZE, initial_alphabet=alphabet, show_progress=False
+        )
+        learned.train_from_iterator(
+            [*corpus, *[request] * 200, *stamps, *["Front camera:\n\n"] * 200], trainer
+        )
         learned.add_special_tokens([AddedToken(token, normalized=False) for token in SPECIAL])
         trained: str = learned.to_str()
         return trained
@@ -141,8 +176,9 @@ def _download(spec: str) -> Path:
     except (HfHubHTTPError, LocalEntryNotFoundError, OSError, ValueError) as error:
         reason = str(error).strip().splitlines()
         raise UserError(
-            f"The tokenizer {brief(spec, 300)} could not be fetched ({reason[0] if reason else 'no reply'}). Connect "
-            "once so that it is kept, or set processor.tokenizer to the path of a tokenizer.json."
+            f"The tokenizer {brief(spec, 300)} could not be fetched"
+            f" ({reason[0] if reason else 'no reply'}). Connect once so that it is kept, or set"
+            " processor.tokenizer to the path of a tokenizer.json."
         ) from None
 
 
@@ -160,7 +196,8 @@ class CameraTokens:
     """The tokens of one camera in a prompt.
 
     grid: rows and columns of merged tokens of an image or temporal patch.
-    times: of each temporal patch in seconds; None for one image. memory: memory tokens before the first patch.
+    times: of each temporal patch in seconds; None for one image. memory: memory tokens before the
+    first patch.
     """
 
     name: str
@@ -177,7 +214,9 @@ class CameraTokens:
             inside = "<|image_pad|>" * count
         else:
             patch = f"<|vision_start|>{'<|video_pad|>' * count}<|vision_end|>"
-            inside = "<|video_pad|>" * self.memory + "".join(timestamp(time) + patch for time in self.times)
+            inside = "<|video_pad|>" * self.memory + "".join(
+                timestamp(time) + patch for time in self.times
+            )
         return f"{label}:<|vision_start|>{inside}<|vision_end|>"
 
 
@@ -187,12 +226,16 @@ def instruction(goal: str, robot: Robot, videos: int, images: int) -> str:
     if videos == 1 and not images:
         history = "the recent history video (frames tagged with timestamps)"
     else:
-        history = f"the recent history video from {'one camera' if videos == 1 else f'{videos} cameras'} {stamped}"
+        history = (
+            f"the recent history video from {'one camera' if videos == 1 else f'{videos} cameras'}"
+            f" {stamped}"
+        )
     current = "" if not images else f", plus the current image from {_more(images)}"
     return (
-        f"The robot is a {robot.words}. The control frequency is {robot.hz:g} Hz. The next {robot.horizon} control "
-        f"actions are predicted from the current sub-task. You are given {history}{current}. The overall task is: "
-        f"{clean_goal(goal)}. Identify the current sub-task."
+        f"The robot is a {robot.words}. The control frequency is {robot.hz:g} Hz. The next"
+        f" {robot.horizon} control actions are predicted from the current sub-task. You are given"
+        f" {history}{current}. The overall task is: {clean_goal(goal)}. Identify the current"
+        " sub-task."
     )
 
 
@@ -214,8 +257,9 @@ def clean_response(subtask: str) -> str:
 class Tokens:
     """A prompt, and the response where there is one.
 
-    ids: [L] int64. kinds: [L] int8, `TEXT`, `IMAGE`, `VIDEO` or `MEMORY`. positions: [3, L] int64, time, row, column.
-    prompt: tokens before the response. prefix: tokens up to the last one of the temporal patch before the last of the
+    ids: [L] int64. kinds: [L] int8, `TEXT`, `IMAGE`, `VIDEO` or `MEMORY`. positions: [3, L] int64,
+    time, row, column. prompt: tokens before the response. prefix: tokens up to the last one of the
+    temporal patch before the last of the
         first video; 0 where a prompt does not begin with two patches.
     """
 
@@ -227,15 +271,20 @@ class Tokens:
 
 
 def encode(
-    tokenizer: WordTokenizer, cameras: Sequence[CameraTokens], request: str, response: str | None = None
+    tokenizer: WordTokenizer,
+    cameras: Sequence[CameraTokens],
+    request: str,
+    response: str | None = None,
 ) -> Tokens:
     """A prompt as tokens, and behind it the response that is learned.
 
-    The prompt is encoded by itself, so it is the same in training and where a response is generated. With the
-    published tokenizer this makes no difference, since it separates line breaks from words.
+    The prompt is encoded by itself, so it is the same in training and where a response is
+    generated. With the published tokenizer this makes no difference, since it separates line breaks
+    from words.
 
     Args:
-        cameras: in the order in which they are shown. request: of `instruction`. response: of `clean_response`.
+        cameras: in the order in which they are shown. request: of `instruction`. response: of
+            `clean_response`.
     """
     views = "".join(camera.expanded for camera in cameras)
     prompt = tokenizer.encode(
@@ -254,12 +303,16 @@ def encode(
             used += camera.memory + len(camera.times) * camera.grid[0] * camera.grid[1]
     prefix, first = 0, cameras[0]
     if first.times is not None and len(first.times) > 1:
-        prefix = int(video[first.memory + (len(first.times) - 1) * first.grid[0] * first.grid[1] - 1]) + 1
+        prefix = (
+            int(video[first.memory + (len(first.times) - 1) * first.grid[0] * first.grid[1] - 1])
+            + 1
+        )
     return Tokens(ids, kinds, rope_positions(kinds, cameras), len(prompt), prefix)
 
 
 def rope_positions(kinds: np.ndarray, cameras: Sequence[CameraTokens]) -> np.ndarray:
-    """Rotary positions [3, L] (time, row, column): text counts up, an image or temporal patch takes one place in time.
+    """Rotary positions [3, L] (time, row, column): text counts up, an image or temporal patch takes
+    one place in time.
 
     What follows an image begins after its longer side.
     """

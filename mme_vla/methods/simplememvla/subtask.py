@@ -1,8 +1,9 @@
-"""The other half of SimpleMemVLA without its video: π0.5 that generates the current sub-task, and acts on its words.
+"""The other half of SimpleMemVLA without its video: π0.5 that generates the current sub-task, and
+acts on its words.
 
-A small decoder reads the embeddings of current images and prompt and generates the sub-task. The hidden states of its
-words are memory tokens for the action expert, through any integration. The parts are of this library, not of the
-authors.
+A small decoder reads the embeddings of current images and prompt and generates the sub-task. The
+hidden states of its words are memory tokens for the action expert, through any integration. The
+parts are of this library, not of the authors.
 
 Shapes: b batch · n tokens of images and prompt · S words · d width of memory tokens.
 """
@@ -34,7 +35,8 @@ _COUNTED_WORDS = 12
 class SubtaskBatch(Batch):
     """A batch with the sub-tasks that are learned.
 
-    words: [b, S] ids, the last one ends a text. words_mask: [b, S] bool. forced: ids [b, S] in place of generated ones.
+    words: [b, S] ids, the last one ends a text. words_mask: [b, S] bool. forced: ids [b, S] in
+    place of generated ones.
     """
 
     words: Tensor | None = None
@@ -52,8 +54,14 @@ class SubtaskProcessor(Processor):
 
     def item(self, sample: Sample) -> dict[str, Any]:
         if sample.subgoal is None:
-            raise UserError("This policy learns to generate the sub-task: set subgoal_text.kind to simple_subgoal.")
-        words = [*self.tokenizer.encode(clean_response(sample.subgoal), bos=False), self.tokenizer.end]
+            raise UserError(
+                "This policy learns to generate the sub-task: set subgoal_text.kind to"
+                " simple_subgoal."
+            )
+        words = [
+            *self.tokenizer.encode(clean_response(sample.subgoal), bos=False),
+            self.tokenizer.end,
+        ]
         return {**super().item(sample), "words": torch.tensor(words)}
 
     def collate(self, items: Sequence[dict[str, Any]]) -> SubtaskBatch:
@@ -75,17 +83,27 @@ class SubtaskDecoder(nn.Module):
     """
 
     def __init__(
-        self, context_width: int, width: int, vocab_size: int, depth: int = 2, heads: int = 4, longest: int = 24
+        self,
+        context_width: int,
+        width: int,
+        vocab_size: int,
+        depth: int = 2,
+        heads: int = 4,
+        longest: int = 24,
     ) -> None:
         super().__init__()
         if width % heads:
-            raise UserError(f"policy.subtask_heads={heads} must divide the width of memory tokens, {width}.")
+            raise UserError(
+                f"policy.subtask_heads={heads} must divide the width of memory tokens, {width}."
+            )
         self.longest = longest
         self.context = nn.Linear(context_width, width)
         self.words = nn.Embedding(vocab_size, width)
         self.begin = nn.Parameter(torch.randn(1, 1, width) * width**-0.5)
         self.places = nn.Parameter(torch.randn(1, longest + 2, width) * 0.02)
-        layer = nn.TransformerDecoderLayer(width, heads, 4 * width, 0.0, "gelu", batch_first=True, norm_first=True)
+        layer = nn.TransformerDecoderLayer(
+            width, heads, 4 * width, 0.0, "gelu", batch_first=True, norm_first=True
+        )
         self.layers = nn.TransformerDecoder(layer, depth, nn.LayerNorm(width))
         nn.init.normal_(self.words.weight, std=width**-0.5)
 
@@ -97,9 +115,15 @@ class SubtaskDecoder(nn.Module):
         """
         words = torch.cat([self.begin.expand(len(ids), -1, -1), self.words(ids)], 1)
         words = words + self.places[:, : words.shape[1]]
-        causal = torch.ones(words.shape[1], words.shape[1], dtype=torch.bool, device=ids.device).triu(1)
+        causal = torch.ones(
+            words.shape[1], words.shape[1], dtype=torch.bool, device=ids.device
+        ).triu(1)
         states: Tensor = self.layers(
-            words, self.context(context), tgt_mask=causal, memory_key_padding_mask=~mask, tgt_is_causal=True
+            words,
+            self.context(context),
+            tgt_mask=causal,
+            memory_key_padding_mask=~mask,
+            tgt_is_causal=True,
         )
         return states
 
@@ -124,7 +148,9 @@ class SubtaskDecoder(nn.Module):
 
 @POLICIES.register("subtask")
 class SubtaskPolicy(MMEPolicy):
-    """A backbone and an integration that reads the words which the policy generates, in a memory's place."""
+    """A backbone and an integration that reads the words which the policy generates, in a memory's
+    place.
+    """
 
     def __init__(
         self, *parts: Any, subtask_depth: int = 2, subtask_heads: int = 4, subtask_words: int = 24,
@@ -138,23 +164,36 @@ class SubtaskPolicy(MMEPolicy):
         """
         super().__init__(*parts, **options)
         section, width = self.config["backbone"], self.integration.memory_width
-        sizes = (section["vlm"]["width"], width, section["vocab_size"], subtask_depth, subtask_heads, subtask_words)
+        sizes = (
+            section["vlm"]["width"],
+            width,
+            section["vocab_size"],
+            subtask_depth,
+            subtask_heads,
+            subtask_words,
+        )
         self.subtask, self.subtask_weight = SubtaskDecoder(*sizes), subtask_weight
 
     @staticmethod
     def _check_parts(
-        config: Mapping[str, Any], integration: Integration, memory: MemoryModule | None, supports: Set[str]
+        config: Mapping[str, Any],
+        integration: Integration,
+        memory: MemoryModule | None,
+        supports: Set[str],
     ) -> None:
         if memory is not None or not integration.memory_width:
             raise UserError(
-                "policy.name=subtask: the words of the sub-task are in a memory's place. Set memory=none, and an "
-                "integration that reads them (integration=modulator, context or expert)."
+                "policy.name=subtask: the words of the sub-task are in a memory's place. Set"
+                " memory=none, and an integration that reads them (integration=modulator, context"
+                " or expert)."
             )
 
     def _context(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Embeddings [b, n, d] of current images and prompt, and their mask [b, n]."""
         blocks = self.backbone.embed(self.prepare_images(batch))
-        return torch.cat([block.tokens for block in blocks], 1), torch.cat([block.mask for block in blocks], 1)
+        return torch.cat([block.tokens for block in blocks], 1), torch.cat(
+            [block.mask for block in blocks], 1
+        )
 
     def forward(  # type: ignore[override]  # returns metrics too, as all policies do
         self, batch: Batch, *args: Any, **options: Any
@@ -164,7 +203,9 @@ class SubtaskPolicy(MMEPolicy):
         Each word's counts as much as its sample (`Batch.weight`).
         """
         if not isinstance(batch, SubtaskBatch) or batch.words is None or batch.words_mask is None:
-            raise ValueError("forward() computes a loss: the batch must hold the words of its sub-tasks.")
+            raise ValueError(
+                "forward() computes a loss: the batch must hold the words of its sub-tasks."
+            )
         if batch.words.shape[1] > self.subtask.longest + 1:
             raise UserError(
                 f"A sub-task has {batch.words.shape[1] - 1} words, more than policy.subtask_words="
@@ -174,12 +215,21 @@ class SubtaskPolicy(MMEPolicy):
             hidden = self.subtask.hidden(*self._context(batch), batch.words)
             logits = self.subtask.logits(hidden[:, :-1])
         mask = batch.words_mask
-        losses = functional.cross_entropy(logits.transpose(1, 2), batch.words, reduction="none") * mask
-        words = (losses if batch.weight is None else losses * batch.weight[:, None]).sum() / mask.sum()
+        losses = (
+            functional.cross_entropy(logits.transpose(1, 2), batch.words, reduction="none") * mask
+        )
+        words = (
+            losses if batch.weight is None else losses * batch.weight[:, None]
+        ).sum() / mask.sum()
         memory = MemoryTokens(hidden[:, 1:], mask)
         action, metrics = super().forward(batch, *args, **{**options, "memory": memory})
         loss = action + self.subtask_weight * words
-        return loss, {**metrics, "loss": loss.detach(), "action": action.detach(), "words": words.detach()}
+        return loss, {
+            **metrics,
+            "loss": loss.detach(),
+            "action": action.detach(),
+            "words": words.detach(),
+        }
 
     @torch.no_grad()
     def sample_actions(self, batch: Batch, *args: Any, **options: Any) -> Tensor:
@@ -215,4 +265,6 @@ class SubtaskPolicy(MMEPolicy):
     def full_batch(self, device: torch.device | str = "cpu") -> SubtaskBatch:
         words = torch.zeros(1, _COUNTED_WORDS, dtype=torch.int64, device=device)
         full = vars(super().full_batch(device))
-        return SubtaskBatch(**full, words=words, words_mask=torch.ones_like(words, dtype=torch.bool), forced=words)
+        return SubtaskBatch(
+            **full, words=words, words_mask=torch.ones_like(words, dtype=torch.bool), forced=words
+        )

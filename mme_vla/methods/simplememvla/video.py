@@ -1,4 +1,5 @@
-"""The video of SimpleMemVLA: which frames it shows, when they were, at which size, and as which rows of pixels.
+"""The video of SimpleMemVLA: which frames it shows, when they were, at which size, and as which
+rows of pixels.
 
 Shapes: n frames · H, W pixels · p side of a patch · m merged patches a side.
 """
@@ -31,7 +32,8 @@ class Window:
     """The frames that a video shows at a step.
 
     seconds, fps: length and rate of the video. native_fps: rate of the camera.
-    variable: show only frames that exist, at least two; else a full window, the first frame repeated before the start.
+    variable: show only frames that exist, at least two; else a full window, the first frame
+    repeated before the start.
     """
 
     seconds: float
@@ -63,7 +65,9 @@ class Window:
         return max(TEMPORAL, available + available % 2)
 
     def frames(self, step: int) -> np.ndarray:
-        """The frames shown at a step, counted from the episode's first one, video included: int64 [n], ascending."""
+        """The frames shown at a step, counted from the episode's first one, video included: int64
+        [n], ascending.
+        """
         count = self.frame_count(step // self.stride + 1)
         return np.maximum(step - self.stride * np.arange(count - 1, -1, -1), 0)
 
@@ -78,8 +82,11 @@ def timestamp(seconds: float) -> str:
     return f"<{seconds:.1f} seconds>"
 
 
-def fitting_size(height: int, width: int, frames: int, factor: int, bounds: tuple[int, int]) -> tuple[int, int]:
-    """The size that images of H×W are resized to: sides are multiples of `factor`, pixels lie within `bounds`.
+def fitting_size(
+    height: int, width: int, frames: int, factor: int, bounds: tuple[int, int]
+) -> tuple[int, int]:
+    """The size that images of H×W are resized to: sides are multiples of `factor`, pixels lie
+    within `bounds`.
 
     Args:
         frames: of a video, all of which count, or 1 for an image. bounds: least and most pixels.
@@ -91,7 +98,9 @@ def fitting_size(height: int, width: int, frames: int, factor: int, bounds: tupl
     padded = frames + frames % TEMPORAL if frames > 1 else 1
     if padded * math.prod(sides) > high:
         scale = math.sqrt(frames * height * width / high)
-        sides = [max(factor, math.floor(side / scale / factor) * factor) for side in (height, width)]
+        sides = [
+            max(factor, math.floor(side / scale / factor) * factor) for side in (height, width)
+        ]
     elif padded * math.prod(sides) < low:
         scale = math.sqrt(low / (frames * height * width))
         sides = [math.ceil(side * scale / factor) * factor for side in (height, width)]
@@ -119,7 +128,8 @@ def pixel_rows(frames: Tensor, patch: int, merge: int) -> Tensor:
         frames: [n, 2, 3, H, W] uint8, the two frames of each temporal patch.
 
     Returns:
-        float32 [n · H/p · W/p, 3 · 2 · p · p] in [−1, 1], the patches of one merged token side by side.
+        float32 [n · H/p · W/p, 3 · 2 · p · p] in [−1, 1], the patches of one merged token side by
+        side.
     """
     pixels = (frames.float() / 255 - 0.5) / 0.5
     axes = {"p": patch, "q": patch, "a": merge, "b": merge}

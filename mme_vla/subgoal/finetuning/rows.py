@@ -1,4 +1,6 @@
-"""Training rows of the subgoal predictors, in the layout of ms-swift: messages, images, videos, objects."""
+"""Training rows of the subgoal predictors, in the layout of ms-swift: messages, images, videos,
+objects.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -29,7 +31,11 @@ from mme_vla.subgoal.text import (
 from mme_vla.utils import Sums, inside, is_text, read_lines
 
 Row = dict[str, Any]
-SETS = {"simple": ("qwenvl", "simple"), "grounded": ("qwenvl", "grounded"), "memer": ("memer", "grounded")}
+SETS = {
+    "simple": ("qwenvl", "simple"),
+    "grounded": ("qwenvl", "grounded"),
+    "memer": ("memer", "grounded"),
+}
 SETS |= {"memer_simple": ("memer", "simple")}
 """A set's name → (folder of its images, kind of subgoal). The paper trains the first three."""
 
@@ -38,12 +44,12 @@ SETS |= {"memer_simple": ("memer", "simple")}
 class RowOptions:
     """How rows are made.
 
-    noise: lowest and highest integer added to every coordinate, sampled for each row; None adds none.
-    repeat_changes: repeat rows at changes of subgoal (as the released code does for figures).
+    noise: lowest and highest integer added to every coordinate, sampled for each row; None adds
+    none. repeat_changes: repeat rows at changes of subgoal (as the released code does for figures).
     short_segments: a row for segments shorter than the stride too (not as released).
-    second_keyframe: find a second keyframe in one window (as released it is missed, and all that follow with it).
-    substring_match: give ButtonUnmask the extra keyframes of ButtonUnmaskSwap, as released.
-    seed: of the noise.
+    second_keyframe: find a second keyframe in one window (as released it is missed, and all that
+    follow with it). substring_match: give ButtonUnmask the extra keyframes of ButtonUnmaskSwap, as
+    released. seed: of the noise.
     """
 
     noise: tuple[int, int] | None = (-2, 1)
@@ -55,12 +61,16 @@ class RowOptions:
 
     def __post_init__(self) -> None:
         if self.noise is not None and self.noise[0] > self.noise[1]:
-            raise UserError(f"noise={list(self.noise)} must be [lowest, highest] in whole pixels, or null.")
+            raise UserError(
+                f"noise={list(self.noise)} must be [lowest, highest] in whole pixels, or null."
+            )
 
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """The rows of one episode in one set, and the images they refer to: frames by file name, and the video's name."""
+    """The rows of one episode in one set, and the images they refer to: frames by file name, and
+    the video's name.
+    """
 
     rows: list[Row]
     images: dict[str, int]
@@ -94,7 +104,10 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
             ]
         }
         if kind == "grounded":
-            row["objects"] = {"ref": [], "bbox": [_perturbed(point, options.noise, rng) for point in points]}
+            row["objects"] = {
+                "ref": [],
+                "bbox": [_perturbed(point, options.noise, rng) for point in points],
+            }
         row["images"] = names
         if video:
             row["videos"] = [video]
@@ -121,7 +134,9 @@ def _memer(kind: str, labels: Labels, options: RowOptions) -> Iterator[Draft]:
     targets = keyframes(labels, options.substring_match)
     for window in windows(labels, targets, one_a_window=not options.second_keyframe):
         subtask, points = mark_points(labels.texts(kind)[window.frames[-1]])
-        user = memer_user(labels.goal, len(window.past), len(window.frames), video=labels.exec_start > 0)
+        user = memer_user(
+            labels.goal, len(window.past), len(window.frames), video=labels.exec_start > 0
+        )
         texts = (MEMER_SYSTEM, user, memer_reply(subtask, window.positions))
         yield texts, points, [*window.past, *window.frames]
 
@@ -142,7 +157,10 @@ _TIME = 12  # tokens of a video frame's time stamp, at most
 def read_rows(file: str | Path) -> list[Row]:
     """Read a JSON-lines file."""
     path = Path(file)
-    require(path.is_file(), f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}")
+    require(
+        path.is_file(),
+        f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}",
+    )
     Sums(path.parent, remedy="Build the training data again").check(path.name)
     rows = read_lines(path, _checked, "rows of training data", limit=_LIMIT)
     require(rows, f"{path} holds no row.")
@@ -172,7 +190,9 @@ def _fault(row: Row) -> str:
     objects = row.get("objects", {})
     points = objects.get("bbox", []) if isinstance(objects, dict) else None
     if not isinstance(points, list) or not all(
-        isinstance(point, list) and len(point) == 2 and all(type(n) is int and 0 <= n < 2**20 for n in point)
+        isinstance(point, list)
+        and len(point) == 2
+        and all(type(n) is int and 0 <= n < 2**20 for n in point)
         for point in points
     ):
         return f"objects is {brief(objects)}, where bbox should be a list of [row, column]"
@@ -227,11 +247,15 @@ class RowDataset(torch.utils.data.Dataset[Question]):
 
 
 class Collator:
-    """Questions with answers → a batch with labels: the answer and its end count, all else is `IGNORED`."""
+    """Questions with answers → a batch with labels: the answer and its end count, all else is
+    `IGNORED`.
+    """
 
     def __init__(self, vlm: VLM) -> None:
         self.vlm = vlm
-        self.start = vlm.processor.tokenizer.encode("<|im_start|>assistant\n", add_special_tokens=False)
+        self.start = vlm.processor.tokenizer.encode(
+            "<|im_start|>assistant\n", add_special_tokens=False
+        )
         self.end = vlm.processor.tokenizer.eos_token_id
 
     def __call__(self, questions: Sequence[Question]) -> dict[str, Any]:
@@ -253,8 +277,8 @@ class Collator:
 def hf_dataset(file: str | Path) -> Any:
     """A file of rows as a Hugging Face dataset in trl's conversational form.
 
-    Columns: `messages` (role, and content as a list of parts with `type` and `text`), `images` (images, decoded when
-    asked for) and `videos` (absolute paths).
+    Columns: `messages` (role, and content as a list of parts with `type` and `text`), `images`
+    (images, decoded when asked for) and `videos` (absolute paths).
     """
     from datasets import Dataset, Features, Image, List, Value
 
@@ -264,10 +288,16 @@ def hf_dataset(file: str | Path) -> Any:
         system, user, target = texts_of(row)
         messages = Question(system, user, target=target).messages()
         for message in messages:
-            message["content"] = [{"type": p["type"], "text": p.get("text")} for p in message["content"]]
+            message["content"] = [
+                {"type": p["type"], "text": p.get("text")} for p in message["content"]
+            ]
         columns["messages"].append(messages)
-        columns["images"].append([str(inside(folder, name, "picture")) for name in row.get("images", [])])
-        columns["videos"].append([str(inside(folder, name, "video")) for name in row.get("videos", [])])
+        columns["images"].append(
+            [str(inside(folder, name, "picture")) for name in row.get("images", [])]
+        )
+        columns["videos"].append(
+            [str(inside(folder, name, "video")) for name in row.get("videos", [])]
+        )
     part = {"type": Value("string"), "text": Value("string")}
     features = Features(
         messages=List({"role": Value("string"), "content": List(part)}),
@@ -282,4 +312,9 @@ def _longest(row: Row, tokenizer: Any, image: int) -> int:
     words = sum(len(tokenizer.encode(text, add_special_tokens=False)) for text in texts_of(row))
     pairs = VIDEO_FRAMES // 2
     video = pairs * (VIDEO_TOKENS + _TIME + 2)
-    return words + _MARKS + len(row.get("images", [])) * (image + 2) + len(row.get("videos", [])) * video
+    return (
+        words
+        + _MARKS
+        + len(row.get("images", [])) * (image + 2)
+        + len(row.get("videos", [])) * video
+    )

@@ -1,8 +1,10 @@
 """Fine-tuning a Qwen3-VL subgoal predictor with LoRA, as in the paper.
 
-`mme-vla subgoal-train rows=<folder>/grounded.jsonl` (several GPUs: `torchrun --nproc-per-node 4 -m …`)
+`mme-vla subgoal-train rows=<folder>/grounded.jsonl` (several GPUs:
+`torchrun --nproc-per-node 4 -m …`)
 
-The adapter ends up in `<output>/adapter`: `subgoal=qwenvl subgoal.adapter=<output>/adapter` predicts with it.
+The adapter ends up in `<output>/adapter`: `subgoal=qwenvl subgoal.adapter=<output>/adapter`
+predicts with it.
 """
 
 import json
@@ -49,7 +51,9 @@ _ARGUMENTS = {
 
 
 def write_arguments(folder: Path, name: str) -> Path:
-    """Write `swift_<name>.json` beside the rows; run it from that folder: their paths are relative to it."""
+    """Write `swift_<name>.json` beside the rows; run it from that folder: their paths are relative
+    to it.
+    """
     path = folder / f"swift_{name}.json"
     arguments = {**_ARGUMENTS, "dataset": [f"{name}.jsonl"], "output_dir": f"swift_{name}"}
     path.write_text(json.dumps(arguments, indent=1) + "\n")
@@ -57,14 +61,25 @@ def write_arguments(folder: Path, name: str) -> Path:
 
 
 def command(name: str) -> str:
-    return " ".join([*(f"{key}={value}" for key, value in ENVIRONMENT.items()), "swift sft", f"swift_{name}.json"])
+    return " ".join(
+        [
+            *(f"{key}={value}" for key, value in ENVIRONMENT.items()),
+            "swift sft",
+            f"swift_{name}.json",
+        ]
+    )
 
 
 # All linear layers of the language model; the vision tower and the merger stay as they are.
 TARGETS = r".*language_model.*\.(q_proj|k_proj|v_proj|o_proj|gate_proj|up_proj|down_proj)"
 ADAPTER = "adapter"
 ZERO2 = {
-    "zero_optimization": {"stage": 2, "overlap_comm": True, "contiguous_gradients": True, "reduce_scatter": True},
+    "zero_optimization": {
+        "stage": 2,
+        "overlap_comm": True,
+        "contiguous_gradients": True,
+        "reduce_scatter": True,
+    },
     "bf16": {"enabled": "auto"},
     "gradient_clipping": "auto",
     "gradient_accumulation_steps": "auto",
@@ -78,23 +93,30 @@ def accumulation(batch: int, per_device: int, processes: int) -> int:
     together = per_device * processes
     require(
         not (batch % together),
-        f"batch={batch} is no multiple of per_device_batch={per_device} times {processes} processes; "
-        f"choose numbers that divide.",
+        f"batch={batch} is no multiple of per_device_batch={per_device} times {processes}"
+        " processes; choose numbers that divide.",
     )
     return batch // together
 
 
 def find_checkpoint(output: Path, resume: str | None) -> str | None:
     """Where to continue from: a checkpoint's path, or None to start."""
-    checkpoints = sorted(output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1]))
+    checkpoints = sorted(
+        output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1])
+    )
     if resume is None:
         if checkpoints or (output / ADAPTER).exists():
-            raise UserError(f"{output} holds a run: continue with resume=auto, or choose another output.")
+            raise UserError(
+                f"{output} holds a run: continue with resume=auto, or choose another output."
+            )
         return None
     if resume == "auto":
         return str(checkpoints[-1]) if checkpoints else None
     if not Path(resume).is_dir():
-        raise UserError(f"resume={resume!r}: there is no such checkpoint folder; auto takes the newest of the run.")
+        raise UserError(
+            f"resume={resume!r}: there is no such checkpoint folder; auto takes the newest of the"
+            " run."
+        )
     return resume
 
 
@@ -122,14 +144,23 @@ def fine_tune(cfg: "DictConfig") -> Path:
     vlm.model.config.use_cache = False
     rows = RowDataset(cfg.rows, processor.tokenizer, cfg.max_length)
     if rows.left_out:
-        print(f"{rows.left_out} rows are longer than max_length={cfg.max_length} tokens and are left out.")
+        print(
+            f"{rows.left_out} rows are longer than max_length={cfg.max_length} tokens and are left"
+            " out."
+        )
     trainer = Trainer(
-        model=vlm.model, args=_arguments(cfg, output, device), train_dataset=rows, data_collator=Collator(vlm)
+        model=vlm.model,
+        args=_arguments(cfg, output, device),
+        train_dataset=rows,
+        data_collator=Collator(vlm),
     )
     trainer.train(resume_from_checkpoint=checkpoint)
     if trainer.is_world_process_zero():
         vlm.model.save_pretrained(output / ADAPTER)
-        print(f"{output / ADAPTER}: subgoal=qwenvl subgoal.adapter={output / ADAPTER} predicts with it.")
+        print(
+            f"{output / ADAPTER}: subgoal=qwenvl subgoal.adapter={output / ADAPTER} predicts"
+            " with it."
+        )
     return output / ADAPTER
 
 

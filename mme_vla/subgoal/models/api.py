@@ -1,4 +1,6 @@
-"""Questions to a model behind an API: retries, rate limit, time limit, cache of replies, cost. No secret is logged."""
+"""Questions to a model behind an API: retries, rate limit, time limit, cache of replies, cost. No
+secret is logged.
+"""
 
 import hashlib
 import json
@@ -73,7 +75,9 @@ CONNECTIONS: dict[str, type[Connection]] = {"gemini": GoogleConnection, "openai"
 _PASSING = (408, 429, 500, 502, 503, 504)  # HTTP: worth another try
 _FATAL = (401, 403, 404)  # the key or the model's name is wrong: no question will ever be answered
 _LONGEST_PAUSE = 60.0  # seconds
-_SECRET = 8  # characters; what is shorter protects nothing, such as the key `none`, and may be a word of an answer
+# characters; what is shorter protects nothing, such as the key `none`, and may be a word of an
+# answer
+_SECRET = 8
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,8 @@ class ApiFailure(Exception):  # noqa: N818  (an outcome that is expected and cou
 class Api:
     """Asks one model. Safe to use from several threads.
 
-    client: what the connection asks, such as google-genai's; None makes one: at once, but with a cache and no key when
+    client: what the connection asks, such as google-genai's; None makes one: at once, but with a
+    cache and no key when
         the first question comes that the cache does not hold.
     clock, sleep: of the rate limit and the pauses.
     provider: a key of `CONNECTIONS`.
@@ -138,11 +143,15 @@ class Api:
         reply = self._tried(system, messages)
         if known is not None:
             known.parent.mkdir(parents=True, exist_ok=True)
-            draft = known.with_suffix(f".{uuid.uuid4().hex}.partial")  # other processes may share the folder
+            draft = known.with_suffix(
+                f".{uuid.uuid4().hex}.partial"
+            )  # other processes may share the folder
             draft.write_text(json.dumps(with_checksum(vars(reply))))
             try:
                 draft.replace(known)
-            except OSError as error:  # a folder in its place: the answer counts, it is only not kept
+            except (
+                OSError
+            ) as error:  # a folder in its place: the answer counts, it is only not kept
                 draft.unlink(missing_ok=True)
                 log.warning("%s cannot be written: %s", known, error.strerror)
         return reply
@@ -151,7 +160,11 @@ class Api:
         try:
             connection = self._connected()
         except UserError as error:
-            hint = "" if self.settings.cache is None else f" (The cache {self.settings.cache} lacks this answer.)"
+            hint = (
+                ""
+                if self.settings.cache is None
+                else f" (The cache {self.settings.cache} lacks this answer.)"
+            )
             raise UserError(f"{error}{hint}") from None
         pause = self.settings.backoff
         failure = ApiFailure("failed", "never asked")
@@ -170,7 +183,9 @@ class Api:
                     break
             except Exception as error:  # whatever the network and the client come up with
                 reason = self._redacted(f"{type(error).__name__}: {error}")
-                if _code(error) in _FATAL or (_code(error) == 400 and "api key" in str(error).lower()):
+                if _code(error) in _FATAL or (
+                    _code(error) == 400 and "api key" in str(error).lower()
+                ):
                     raise UserError(
                         f"{self.settings.model} cannot be asked: {reason}. Check the key in "
                         f"${self.settings.key_variable} and the model's name."
@@ -209,13 +224,18 @@ class Api:
     def _cache_file(self, system: str, messages: Sequence[Message]) -> Path | None:
         if self.settings.cache is None:
             return None
-        digest = hashlib.sha256(json.dumps([*CONNECTIONS[self.provider].cached_as(self.settings), system]).encode())
+        digest = hashlib.sha256(
+            json.dumps([*CONNECTIONS[self.provider].cached_as(self.settings), system]).encode()
+        )
         for role, parts in messages:
             digest.update(f"\n{role}".encode())
             for item in parts:
                 part = item.pixels if isinstance(item, MediaPart) else item
-                # The images themselves, not their encoding, which may differ between versions of the encoder.
-                raw = part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes()
+                # The images themselves, not their encoding, which may differ between versions of
+                # the encoder.
+                raw = (
+                    part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes()
+                )
                 digest.update(f"\n{getattr(part, 'shape', 'text')} {len(raw)} ".encode() + raw)
         name = digest.hexdigest()
         return Path(self.settings.cache) / name[:2] / f"{name}.json"
@@ -235,7 +255,9 @@ def _read_reply(path: Path) -> Reply | None:
     try:
         stored = verified(read_json(path, "an answer that was kept"), str(path))
         counts: list[Any] = [stored.get("input_tokens"), stored.get("output_tokens")]
-        if not isinstance(stored.get("text"), str) or not all(type(n) is int and 0 <= n < 2**40 for n in counts):
+        if not isinstance(stored.get("text"), str) or not all(
+            type(n) is int and 0 <= n < 2**40 for n in counts
+        ):
             raise UserError(f"{path} lacks a text and two numbers of tokens")
         return Reply(stored["text"], *counts)
     except UserError as error:
@@ -247,19 +269,34 @@ def _is_passing(error: Exception) -> bool:
     if _code(error):
         return _code(error) in _PASSING
     # httpx's errors derive from no built-in one; their names tell.
-    return isinstance(error, OSError) or any(word in type(error).__name__ for word in ("Timeout", "Connect", "Network"))
+    return isinstance(error, OSError) or any(
+        word in type(error).__name__ for word in ("Timeout", "Connect", "Network")
+    )
 
 
 def _code(error: Exception) -> int:
-    codes = (getattr(error, name, 0) for name in ("status_code", "code"))  # as openai has it, as google-genai has it
+    codes = (
+        getattr(error, name, 0) for name in ("status_code", "code")
+    )  # as openai has it, as google-genai has it
     return next((code for code in codes if isinstance(code, int) and code), 0)
 
 
-def make_api(provider: str, settings: Mapping[str, Any], where: str, usage: Usage, client: Any = None) -> Api:
+def make_api(
+    provider: str, settings: Mapping[str, Any], where: str, usage: Usage, client: Any = None
+) -> Api:
     """An `Api` out of plain settings.
 
     Args:
-        provider: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
+        provider: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in,
+            for messages.
     """
-    require(provider in CONNECTIONS, f"{where}.api={provider!r}. {did_you_mean(str(provider), CONNECTIONS)}")
-    return Api(read_section(CONNECTIONS[provider].settings_type, settings, where), usage, client, provider=provider)
+    require(
+        provider in CONNECTIONS,
+        f"{where}.api={provider!r}. {did_you_mean(str(provider), CONNECTIONS)}",
+    )
+    return Api(
+        read_section(CONNECTIONS[provider].settings_type, settings, where),
+        usage,
+        client,
+        provider=provider,
+    )

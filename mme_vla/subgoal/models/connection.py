@@ -1,4 +1,6 @@
-"""Clients of models behind an API: google-genai, and OpenAI's chat completions, which vLLM and Ollama serve too."""
+"""Clients of models behind an API: google-genai, and OpenAI's chat completions, which vLLM and
+Ollama serve too.
+"""
 
 import base64
 import os
@@ -16,19 +18,21 @@ from mme_vla.subgoal.clips import ENCODING, sample_video
 from mme_vla.utils.media import png_bytes, video_bytes
 
 Message = tuple[str, list[Any]]
-"""Role (`user` or `model`); parts: texts, images [H, W, 3], videos [t, H, W, 3], bare or as `MediaPart`."""
+"""Role (`user` or `model`); parts: texts, images [H, W, 3], videos [t, H, W, 3], bare or as
+`MediaPart`.
+"""
 
 
 @dataclass(frozen=True)
 class Settings:
     """How an API is used; the defaults are those of Gemini.
 
-    model: its name. key_variable: environment variable that holds the key; None where none is needed.
-    temperature: 0 for the likeliest answer; None for models that take none.
+    model: its name. key_variable: environment variable that holds the key; None where none is
+    needed. temperature: 0 for the likeliest answer; None for models that take none.
     timeout: seconds before an answer is given up.
-    retries: further tries after a passing error. backoff: seconds before the first of them, doubled each time.
-    requests_per_minute: rate limit; None for none. cache: folder of replies; None keeps none.
-    input_price, output_price: US dollars for a million tokens.
+    retries: further tries after a passing error. backoff: seconds before the first of them, doubled
+    each time. requests_per_minute: rate limit; None for none. cache: folder of replies; None keeps
+    none. input_price, output_price: US dollars for a million tokens.
     """
 
     model: str = "gemini-2.5-pro"
@@ -54,7 +58,9 @@ class Settings:
 
 @dataclass
 class MediaPart:
-    """An image [H, W, 3] or video [t, H, W, 3] of a conversation, encoded once however many questions show it."""
+    """An image [H, W, 3] or video [t, H, W, 3] of a conversation, encoded once however many
+    questions show it.
+    """
 
     pixels: np.ndarray
     _encoded: dict[str, Any] = field(default_factory=dict)
@@ -68,7 +74,9 @@ class MediaPart:
 
 @dataclass(frozen=True)
 class RawReply:
-    """What an API answered. refusal: why the model would not answer, empty if it did. Thoughts count as output."""
+    """What an API answered. refusal: why the model would not answer, empty if it did. Thoughts
+    count as output.
+    """
 
     text: str
     input_tokens: int
@@ -90,7 +98,9 @@ class Connection:
         raise NotImplementedError
 
     def ask(self, system: str, messages: Sequence[Message]) -> RawReply:
-        """Ask the last turn of a conversation, once; whatever goes wrong is raised as the client raises it."""
+        """Ask the last turn of a conversation, once; whatever goes wrong is raised as the client
+        raises it.
+        """
         raise NotImplementedError
 
     @staticmethod
@@ -116,7 +126,9 @@ class GoogleConnection(Connection):
     def ask(self, system: str, messages: Sequence[Message]) -> RawReply:
         response = self._client.models.generate_content(
             model=self._settings.model,
-            contents=[{"role": role, "parts": [_part(part) for part in parts]} for role, parts in messages],
+            contents=[
+                {"role": role, "parts": [_part(part) for part in parts]} for role, parts in messages
+            ],
             config={"system_instruction": system, "temperature": self._settings.temperature},
         )
         used = getattr(response, "usage_metadata", None)
@@ -126,12 +138,16 @@ class GoogleConnection(Connection):
 
 
 def _google_client(settings: Settings) -> Any:
-    require(settings.key, f"Gemini needs a key in the environment variable {settings.key_variable}.")
+    require(
+        settings.key, f"Gemini needs a key in the environment variable {settings.key_variable}."
+    )
     try:
         from google import genai
     except ImportError:
         raise missing_extra("Gemini", "gemini") from None
-    return genai.Client(api_key=settings.key, http_options={"timeout": int(settings.timeout * 1000)})
+    return genai.Client(
+        api_key=settings.key, http_options={"timeout": int(settings.timeout * 1000)}
+    )
 
 
 def _part(part: Any) -> Mapping[str, Any]:
@@ -141,7 +157,9 @@ def _part(part: Any) -> Mapping[str, Any]:
     def inline(pixels: np.ndarray) -> Mapping[str, Any]:
         is_image = pixels.ndim == 3
         data = png_bytes(pixels) if is_image else video_bytes(pixels, **ENCODING)
-        return {"inline_data": {"mime_type": "image/png" if is_image else "video/mp4", "data": data}}
+        return {
+            "inline_data": {"mime_type": "image/png" if is_image else "video/mp4", "data": data}
+        }
 
     return (part if isinstance(part, MediaPart) else MediaPart(part)).once("google", inline)
 
@@ -165,7 +183,8 @@ class OpenAISettings(Settings):
     """As `Settings`, for OpenAI's chat completions.
 
     base_url: of the endpoint, such as http://127.0.0.1:8000/v1; None for OpenAI's own.
-    video_frames: images sent in place of a video, which these endpoints do not take; even, 2 or more.
+    video_frames: images sent in place of a video, which these endpoints do not take; even, 2 or
+    more.
     """
 
     model: str = "gpt-5-mini"
@@ -183,7 +202,10 @@ class OpenAISettings(Settings):
         )
         if self.base_url is not None and _scheme(self.base_url) not in ("http", "https"):
             visible = self.base_url.rpartition("@")[2]  # without a password
-            raise UserError(f"base_url={visible!r} must be an address such as http://127.0.0.1:8000/v1, or null.")
+            raise UserError(
+                f"base_url={visible!r} must be an address such as http://127.0.0.1:8000/v1, or"
+                " null."
+            )
 
     @property
     def login(self) -> str:
@@ -195,7 +217,9 @@ class OpenAISettings(Settings):
 
     @property
     def secrets(self) -> list[str]:
-        """See `Settings`; the password of an address is one too, and its base64, as which it is sent."""
+        """See `Settings`; the password of an address is one too, and its base64, as which it is
+        sent.
+        """
         login = self.login
         return [*super().secrets, *filter(None, (login, _base64(login), login.partition(":")[2]))]
 
@@ -214,7 +238,10 @@ class OpenAIConnection(Connection):
     def ask(self, system: str, conversation: Sequence[Message]) -> RawReply:
         messages: list[dict[str, Any]] = [{"role": "system", "content": system}]
         messages += [
-            {"role": "assistant" if role == "model" else role, "content": self._content(role, parts)}
+            {
+                "role": "assistant" if role == "model" else role,
+                "content": self._content(role, parts),
+            }
             for role, parts in conversation
         ]
         temperature = self._settings.temperature
@@ -248,15 +275,17 @@ class OpenAIConnection(Connection):
 
     @staticmethod
     def cached_as(settings: OpenAISettings) -> list[Any]:
-        """See `Connection`; where the endpoint is does not count, as another machine may have it elsewhere."""
+        """See `Connection`; where the endpoint is does not count, as another machine may have it
+        elsewhere.
+        """
         return [settings.model, settings.temperature, "openai", settings.video_frames]
 
 
 def _openai_client(settings: OpenAISettings) -> Any:
     require(
         settings.key_variable is None or settings.key,
-        f"{settings.model} needs a key in the environment variable {settings.key_variable}; an endpoint that asks "
-        "for none has key_variable=null.",
+        f"{settings.model} needs a key in the environment variable {settings.key_variable}; an"
+        " endpoint that asks for none has key_variable=null.",
     )
     try:
         import openai
@@ -269,7 +298,9 @@ def _openai_client(settings: OpenAISettings) -> Any:
     return openai.OpenAI(
         api_key=settings.key or "none",
         base_url=address.geturl() or None,
-        default_headers={"Authorization": f"Basic {_base64(settings.login)}"} if settings.login else None,
+        default_headers={"Authorization": f"Basic {_base64(settings.login)}"}
+        if settings.login
+        else None,
         timeout=settings.timeout,
         max_retries=0,
     )

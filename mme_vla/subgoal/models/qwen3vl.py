@@ -1,4 +1,6 @@
-"""Qwen3-VL through transformers: questions with images and videos in, completions out, in batches."""
+"""Qwen3-VL through transformers: questions with images and videos in, completions out,
+in batches.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -40,11 +42,15 @@ class Question:
     def messages(self) -> list[dict[str, Any]]:
         """The conversation in the form of chat templates."""
         kinds = {IMAGE: {"type": "image"}, VIDEO: {"type": "video"}}
-        parts = [kinds.get(piece, {"type": "text", "text": piece}) for piece in split_media(self.user)]
+        parts = [
+            kinds.get(piece, {"type": "text", "text": piece}) for piece in split_media(self.user)
+        ]
         messages = [{"role": "system", "content": [{"type": "text", "text": self.system}]}]
         messages.append({"role": "user", "content": parts})
         if self.target is not None:
-            messages.append({"role": "assistant", "content": [{"type": "text", "text": self.target}]})
+            messages.append(
+                {"role": "assistant", "content": [{"type": "text", "text": self.target}]}
+            )
         return messages
 
 
@@ -96,13 +102,17 @@ class VLM:
             try:
                 model = PeftModel.from_pretrained(model, adapter).merge_and_unload()
             except (OSError, ValueError) as error:
-                raise UserError(f"subgoal.adapter={adapter!r} is no LoRA adapter of {name!r}: {error}") from None
+                raise UserError(
+                    f"subgoal.adapter={adapter!r} is no LoRA adapter of {name!r}: {error}"
+                ) from None
         return cls(model.to(place).eval(), processor, batch_size)
 
     def encode(self, questions: Sequence[Question], side: str = "left") -> Any:
         """Token ids, masks and pixels of a batch, padded on `side`."""
         texts = [
-            self.processor.apply_chat_template(q.messages(), tokenize=False, add_generation_prompt=q.target is None)
+            self.processor.apply_chat_template(
+                q.messages(), tokenize=False, add_generation_prompt=q.target is None
+            )
             for q in questions
         ]
         images = [image for q in questions for image in q.images]
@@ -120,20 +130,30 @@ class VLM:
                 for video in videos
             ]
             options["do_sample_frames"] = False
-        return self.processor(text=texts, padding=True, padding_side=side, return_tensors="pt", **options)
+        return self.processor(
+            text=texts, padding=True, padding_side=side, return_tensors="pt", **options
+        )
 
     @torch.inference_mode()
-    def generate(self, questions: Sequence[Question], max_new_tokens: int = 128) -> list[Completion]:
+    def generate(
+        self, questions: Sequence[Question], max_new_tokens: int = 128
+    ) -> list[Completion]:
         """Answer greedily. What is asked together does not change an answer beyond rounding."""
         completions: list[Completion] = []
         for start in range(0, len(questions), self.batch_size):
             batch = self.encode(questions[start : start + self.batch_size]).to(self.model.device)
             sequences = self.model.generate(
-                **batch, max_new_tokens=max_new_tokens, do_sample=False, temperature=None, top_p=None, top_k=None
+                **batch,
+                max_new_tokens=max_new_tokens,
+                do_sample=False,
+                temperature=None,
+                top_p=None,
+                top_k=None,
             )
             read = batch["attention_mask"].sum(1).tolist()
             completions += [
-                self._reply(ids, n) for ids, n in zip(sequences[:, batch["input_ids"].shape[1] :], read, strict=True)
+                self._reply(ids, n)
+                for ids, n in zip(sequences[:, batch["input_ids"].shape[1] :], read, strict=True)
             ]
         return completions
 
@@ -142,7 +162,9 @@ class VLM:
         ends = {tokenizer.eos_token_id, tokenizer.pad_token_id}
         tokens = [token for token in ids.tolist() if token not in ends]
         # The marks of points are special tokens and must stay.
-        return Completion(tokenizer.decode(tokens, skip_special_tokens=False).strip(), read, len(tokens))
+        return Completion(
+            tokenizer.decode(tokens, skip_special_tokens=False).strip(), read, len(tokens)
+        )
 
 
 def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
@@ -157,18 +179,33 @@ def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
     check_transformers_folder(name)
     try:
         processor = AutoProcessor.from_pretrained(name)
-        return Qwen3VLForConditionalGeneration.from_pretrained(name, dtype=getattr(torch, dtype)), processor
+        return Qwen3VLForConditionalGeneration.from_pretrained(
+            name, dtype=getattr(torch, dtype)
+        ), processor
     except (OSError, ValueError) as error:
         place = "that folder" if Path(name).exists() else "the hub"
-        raise UserError(f"No Qwen3-VL model {name!r} in {place}: {str(error).splitlines()[0]}") from None
+        raise UserError(
+            f"No Qwen3-VL model {name!r} in {place}: {str(error).splitlines()[0]}"
+        ) from None
 
 
 def _check_batch(size: int) -> None:
-    require(isinstance(size, int) and size >= 1, f"batch_size={size!r} must be a whole number, 1 or more.")
+    require(
+        isinstance(size, int) and size >= 1,
+        f"batch_size={size!r} must be a whole number, 1 or more.",
+    )
 
 
 def limit_images(processor: Any) -> None:
-    """Hold images and videos to the released limits; nothing of 256×256 pixels is resized by them."""
+    """Hold images and videos to the released limits; nothing of 256×256 pixels is
+    resized by them.
+    """
     area = TOKEN_SIDE**2
-    processor.image_processor.size = {"shortest_edge": 4 * area, "longest_edge": IMAGE_TOKENS * area}
-    processor.video_processor.size = {"shortest_edge": 4 * area, "longest_edge": VIDEO_FRAMES * VIDEO_TOKENS * area}
+    processor.image_processor.size = {
+        "shortest_edge": 4 * area,
+        "longest_edge": IMAGE_TOKENS * area,
+    }
+    processor.video_processor.size = {
+        "shortest_edge": 4 * area,
+        "longest_edge": VIDEO_FRAMES * VIDEO_TOKENS * area,
+    }

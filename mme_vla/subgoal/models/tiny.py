@@ -1,7 +1,7 @@
 """A Qwen3-VL of toy size with random weights and its processor, made without any download.
 
-It says nothing sensible, but it is the real architecture: tests and first runs go through the whole path with it
-(`subgoal.model=tiny`).
+It says nothing sensible, but it is the real architecture: tests and first runs go through the whole
+path with it (`subgoal.model=tiny`).
 """
 
 from pathlib import Path
@@ -9,9 +9,18 @@ from typing import Any
 
 CORPUS = Path(__file__).resolve().parents[2] / "assets" / "tokenizer_corpus.txt"
 SPECIAL = (
-    "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|object_ref_start|>", "<|object_ref_end|>", "<|box_start|>",
-    "<|box_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>",
-)  # fmt: skip
+    "<|endoftext|>",
+    "<|im_start|>",
+    "<|im_end|>",
+    "<|object_ref_start|>",
+    "<|object_ref_end|>",
+    "<|box_start|>",
+    "<|box_end|>",
+    "<|vision_start|>",
+    "<|vision_end|>",
+    "<|image_pad|>",
+    "<|video_pad|>",
+)
 
 # The conversation format of Qwen3-VL, without tools.
 CHAT_TEMPLATE = """{%- for message in messages %}{{ '<|im_start|>' + message.role + '\\n' }}
@@ -19,25 +28,34 @@ CHAT_TEMPLATE = """{%- for message in messages %}{{ '<|im_start|>' + message.rol
 {%- if part.type == 'image' %}{{ '<|vision_start|><|image_pad|><|vision_end|>' }}
 {%- elif part.type == 'video' %}{{ '<|vision_start|><|video_pad|><|vision_end|>' }}
 {%- else %}{{ part.text }}{%- endif %}{%- endfor %}{%- endif %}{{ '<|im_end|>\\n' }}{%- endfor %}
-{%- if add_generation_prompt %}{{ '<|im_start|>assistant\\n' }}{%- endif %}"""
+{%- if add_generation_prompt %}{{ '<|im_start|>assistant\\n' }}{%- endif %}"""  # noqa: E501
 
 
 def tiny_processor() -> Any:
     """A `Qwen3VLProcessor` with a tokenizer trained on RoboMME's language on the spot."""
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
-    from transformers import PreTrainedTokenizerFast, Qwen2VLImageProcessor, Qwen3VLProcessor, Qwen3VLVideoProcessor
+    from transformers import (
+        PreTrainedTokenizerFast,
+        Qwen2VLImageProcessor,
+        Qwen3VLProcessor,
+        Qwen3VLVideoProcessor,
+    )
 
     raw = Tokenizer(models.BPE())
     raw.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     raw.decoder = decoders.ByteLevel()
     alphabet = pre_tokenizers.ByteLevel.alphabet()
-    trainer = trainers.BpeTrainer(vocab_size=800, special_tokens=list(SPECIAL), initial_alphabet=alphabet)
+    trainer = trainers.BpeTrainer(
+        vocab_size=800, special_tokens=list(SPECIAL), initial_alphabet=alphabet
+    )
     raw.train([str(CORPUS)], trainer)
     tokenizer = PreTrainedTokenizerFast(
         tokenizer_object=raw,
         eos_token="<|im_end|>",
         pad_token="<|endoftext|>",
-        additional_special_tokens=[token for token in SPECIAL if token not in ("<|im_end|>", "<|endoftext|>")],
+        additional_special_tokens=[
+            token for token in SPECIAL if token not in ("<|im_end|>", "<|endoftext|>")
+        ],
     )
     vision: dict[str, Any] = {"patch_size": 16, "temporal_patch_size": 2, "merge_size": 2}
     vision |= {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}
@@ -65,7 +83,9 @@ def tiny_config(processor: Any) -> Any:
             "num_key_value_heads": 2,
             "head_dim": 16,
             "max_position_embeddings": 8192,
-            "initializer_range": 0.15,  # the head is tied to the embeddings, and large enough to prefer one token
+            "initializer_range": (
+                0.15
+            ),  # the head is tied to the embeddings, and large enough to prefer one token
             "rope_parameters": {
                 "rope_type": "default",
                 "rope_theta": 5e6,

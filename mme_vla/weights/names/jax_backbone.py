@@ -1,4 +1,6 @@
-"""The released (JAX) names of the backbone's tensors. VLM leaves have no suffix, the action expert's end in `_1`."""
+"""The released (JAX) names of the backbone's tensors. VLM leaves have no suffix, the action
+expert's end in `_1`.
+"""
 
 from mme_vla.backbone.config import BackboneConfig
 from mme_vla.backbone.gemma import ExpertLayer
@@ -10,7 +12,9 @@ SUFFIX = {"vlm": "", "action": "_1", "memory": "_mem"}
 
 
 def released_names(backbone: Pi05Backbone) -> NameTable:
-    """The backbone's table, a released memory expert included; names are relative to the backbone."""
+    """The backbone's table, a released memory expert included; names are relative to
+    the backbone.
+    """
     table: NameTable = {"embedding.weight": [Piece("PaliGemma/llm/embedder/input_embedding")]}
     table |= prefixed("vision.vit", _vision(backbone.config))
     for i, block in enumerate(backbone.transformer.layers):
@@ -27,7 +31,9 @@ def released_names(backbone: Pi05Backbone) -> NameTable:
 
 
 def released_unread(backbone: Pi05Backbone) -> list[Unread]:
-    """What the released trees hold and no action reads: final norms, and the last layer but for its keys and values."""
+    """What the released trees hold and no action reads: final norms, and the last layer but for its
+    keys and values.
+    """
     config, experts = backbone.config, backbone.transformer.experts
     gaps = []
     for name, expert in experts.items():
@@ -62,10 +68,17 @@ def _expert_layer(config: BackboneConfig, layer: ExpertLayer, suffix: str, i: in
     if layer.keys_only:
         return table | {"kv.weight": [kv]}
     q = Piece(f"{LAYERS}/attn/q_einsum{suffix}/w", "n d h -> (n h) d", _attention_axes(config), i)
-    out = Piece(f"{LAYERS}/attn/attn_vec_einsum{suffix}/w", "n h d -> d (n h)", _attention_axes(config), i)
+    out = Piece(
+        f"{LAYERS}/attn/attn_vec_einsum{suffix}/w", "n h d -> d (n h)", _attention_axes(config), i
+    )
     gate_up = Piece(f"{LAYERS}/mlp{suffix}/gating_einsum", "two d f -> (two f) d", {"two": 2}, i)
     down = Piece(f"{LAYERS}/mlp{suffix}/linear", "f d -> d f", {}, i)
-    table |= {"qkv.weight": [q, kv], "out.weight": [out], "mlp.gate_up.weight": [gate_up], "mlp.down.weight": [down]}
+    table |= {
+        "qkv.weight": [q, kv],
+        "out.weight": [out],
+        "mlp.gate_up.weight": [gate_up],
+        "mlp.down.weight": [down],
+    }
     return table | norm("mlp_norm", "pre_ffw_norm")
 
 
@@ -84,7 +97,9 @@ def _vision(config: BackboneConfig) -> NameTable:
         attention = f"{block}/MultiHeadDotProductAttention_0"
         qkv = [f"{attention}/{name}" for name in ("query", "key", "value")]
         names: NameTable = {
-            "attn.qkv.weight": [Piece(f"{path}/kernel", "d n h -> (n h) d", axes, i) for path in qkv],
+            "attn.qkv.weight": [
+                Piece(f"{path}/kernel", "d n h -> (n h) d", axes, i) for path in qkv
+            ],
             "attn.qkv.bias": [Piece(f"{path}/bias", "n h -> (n h)", axes, i) for path in qkv],
             "attn.proj.weight": [Piece(f"{attention}/out/kernel", "n h d -> d (n h)", axes, i)],
             "attn.proj.bias": [Piece(f"{attention}/out/bias", layer=i)],

@@ -1,4 +1,6 @@
-"""The released (JAX) names of the integrations' own tensors. A memory expert's stand in the backbone's table."""
+"""The released (JAX) names of the integrations' own tensors. A memory expert's stand in the
+backbone's table.
+"""
 
 from mme_vla.integration.base import Integration
 from mme_vla.integration.modulator import Modulator, ModulatorLayer

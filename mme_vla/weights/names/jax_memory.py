@@ -63,7 +63,8 @@ def layer_names(layer: nn.Module, root: str = LAYER) -> NameTable:
 
     def kernels(names: dict[str, str]) -> NameTable:
         return {
-            f"{target}.weight": [Piece(f"{root}/{source}/kernel", "i o -> o i")] for target, source in names.items()
+            f"{target}.weight": [Piece(f"{root}/{source}/kernel", "i o -> o i")]
+            for target, source in names.items()
         }
 
     if isinstance(layer, TTTLayer):
@@ -80,7 +81,12 @@ def layer_names(layer: nn.Module, root: str = LAYER) -> NameTable:
     axes = {"k": layer.kv_heads, "h": layer.head_dim}
     return (
         kernels({"q": "q_proj", "out": "to_out"})
-        | {"kv.weight": [Piece(f"{root}/{name}/kernel", "i (k h) -> (k h) i", axes) for name in ("k_proj", "v_proj")]}
+        | {
+            "kv.weight": [
+                Piece(f"{root}/{name}/kernel", "i (k h) -> (k h) i", axes)
+                for name in ("k_proj", "v_proj")
+            ]
+        }
         | {"slots": [Piece(f"{root}/memory_state")]}
         | norm("pre_norm", "pre_norm")
         | norm("post_norm", "post_norm")

@@ -1,7 +1,8 @@
 """The names that PyTorch ports of π0.5 (LeRobot's, openpi's) give the backbone's tensors.
 
-They follow transformers' modules as of 4.52, without LeRobot's leading `model.`. Matrices lie as ours do; ours join
-q, k and v, and gate and up, which here are apart. An expert that integrates memory has no names in these formats.
+They follow transformers' modules as of 4.52, without LeRobot's leading `model.`. Matrices lie as
+ours do; ours join q, k and v, and gate and up, which here are apart. An expert that integrates
+memory has no names in these formats.
 """
 
 from mme_vla.backbone.config import BackboneConfig, VisionConfig
@@ -29,7 +30,9 @@ TIED = {HEAD: EMBEDDING}
 
 
 def torch_names(backbone: Pi05Backbone) -> NameTable:
-    """The table of vision tower, VLM, action expert and heads; names of ours are relative to the backbone."""
+    """The table of vision tower, VLM, action expert and heads; names of ours are relative to the
+    backbone.
+    """
     table: NameTable = {"embedding.weight": [Piece(EMBEDDING)]}
     table |= prefixed("vision.vit", _vision(backbone.config.vision))
     for i, block in enumerate(backbone.transformer.layers):
@@ -44,7 +47,9 @@ def torch_names(backbone: Pi05Backbone) -> NameTable:
 
 
 def torch_unread(backbone: Pi05Backbone) -> list[Unread]:
-    """What these formats hold and no action reads: the VLM's last layer but keys and values, its norm, a head."""
+    """What these formats hold and no action reads: the VLM's last layer but keys and values, its
+    norm, a head.
+    """
     config = backbone.config
     d, f, q = config.vlm.width, config.vlm.mlp_dim, config.num_heads * config.head_dim
     last = f"{EXPERTS['vlm']}.layers.{config.depth - 1}"
@@ -66,7 +71,11 @@ def _affine(path: str) -> NameTable:
 
 def _expert_layer(config: BackboneConfig, layer: ExpertLayer, root: str) -> NameTable:
     def rows(name: str, heads: int) -> Piece:
-        return Piece(f"{root}.self_attn.{name}.weight", "(n h) d -> (n h) d", {"n": heads, "h": config.head_dim})
+        return Piece(
+            f"{root}.self_attn.{name}.weight",
+            "(n h) d -> (n h) d",
+            {"n": heads, "h": config.head_dim},
+        )
 
     def norm(target: str, module: object, source: str) -> NameTable:
         if isinstance(module, AdaRMSNorm):
@@ -90,14 +99,20 @@ def _expert_layer(config: BackboneConfig, layer: ExpertLayer, root: str) -> Name
 
 
 def _vision(config: VisionConfig) -> NameTable:
-    table: NameTable = {"pos_embed": [Piece(f"{VISION}.embeddings.position_embedding.weight", "n d -> 1 n d")]}
+    table: NameTable = {
+        "pos_embed": [Piece(f"{VISION}.embeddings.position_embedding.weight", "n d -> 1 n d")]
+    }
     table |= prefixed("patch_embed.proj", _affine(f"{VISION}.embeddings.patch_embedding"))
-    table |= prefixed("norm", _affine(f"{VISION}.post_layernorm")) | prefixed("head", _affine(PROJECTOR))
+    table |= prefixed("norm", _affine(f"{VISION}.post_layernorm")) | prefixed(
+        "head", _affine(PROJECTOR)
+    )
     for i in range(config.depth):
         root = f"{VISION}.encoder.layers.{i}"
         qkv = [f"{root}.self_attn.{name}_proj" for name in ("q", "k", "v")]
         names: NameTable = {
-            "attn.qkv.weight": [Piece(f"{path}.weight", "e d -> e d", {"e": config.width}) for path in qkv],
+            "attn.qkv.weight": [
+                Piece(f"{path}.weight", "e d -> e d", {"e": config.width}) for path in qkv
+            ],
             "attn.qkv.bias": [Piece(f"{path}.bias", "e -> e", {"e": config.width}) for path in qkv],
         } | prefixed("attn.proj", _affine(f"{root}.self_attn.out_proj"))
         for n in (1, 2):

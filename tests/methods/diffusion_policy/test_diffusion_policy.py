@@ -51,7 +51,8 @@ def test_weights_go_to_the_authors_format_and_back(policy: DiffusionPolicy, tmp_
     convert(tmp_path / "theirs", tmp_path / "back", ["backbone=dp_tiny"])
     back = Policy.from_pretrained(tmp_path / "back")
     assert torch.equal(
-        back.state_dict()["backbone.unet.final_conv.1.weight"], saved["model"]["policy.final_conv.1.weight"]
+        back.state_dict()["backbone.unet.final_conv.1.weight"],
+        saved["model"]["policy.final_conv.1.weight"],
     )
     loaded, original = (each.require_processor().require_stats() for each in (back, policy))
     np.testing.assert_array_equal(loaded.actions.max, original.actions.max)
@@ -79,24 +80,36 @@ def check_window(policy: DiffusionPolicy, source: EpisodeSource, item: dict[str,
 
 
 def test_the_window_holds_consecutive_frames_or_those_it_was_requested_at() -> None:
-    policy, images, states = ready("diffusion_policy_obs2"), views(9), np.linspace(0, 1, 9, dtype=np.float32)
+    policy, images, states = (
+        ready("diffusion_policy_obs2"),
+        views(9),
+        np.linspace(0, 1, 9, dtype=np.float32),
+    )
     states = np.repeat(states[:, None], 8, 1)
     processor = policy.require_processor()
     batches = {}
     for consecutive in (True, False):
         processor.samples = replace(processor.samples, consecutive=consecutive)
         episode = policy.start_episode("push the button")
-        episode.observe({name: of[:3] for name, of in images.items()}, states[:3], np.array([True, True, False]))
+        episode.observe(
+            {name: of[:3] for name, of in images.items()}, states[:3], np.array([True, True, False])
+        )
         first = episode.window[1]
-        assert torch.equal(first[0], first[1]), "the video is no part of it: the first frame means those before"
+        assert torch.equal(first[0], first[1]), (
+            "the video is no part of it: the first frame means those before"
+        )
         in_pieces = policy.start_episode("push the button")
         for frame, demo in enumerate((True, True, False)):
-            in_pieces.observe({name: of[frame : frame + 1] for name, of in images.items()}, states[[frame]], demo)
+            in_pieces.observe(
+                {name: of[frame : frame + 1] for name, of in images.items()}, states[[frame]], demo
+            )
         assert torch.equal(in_pieces.window[1], first), "however it is observed"
         episode.observe({name: of[3:] for name, of in images.items()}, states[3:])
         batches[consecutive] = episode.window[1][:, 0].tolist()
     assert batches == {True: [states[7, 0], states[8, 0]], False: [states[2, 0], states[8, 0]]}
-    assert policy.act(episode).shape == (policy.horizon - 1, 8), "a chunk begins a frame before the current one"
+    assert policy.act(episode).shape == (policy.horizon - 1, 8), (
+        "a chunk begins a frame before the current one"
+    )
 
 
 def test_batching_changes_no_episode(policy: DiffusionPolicy) -> None:
@@ -114,8 +127,16 @@ def test_batching_changes_no_episode(policy: DiffusionPolicy) -> None:
     assert not np.allclose(alone[0], alone[1], atol=1e-3)
 
 
-def test_a_batch_is_cropped_at_one_place_and_the_centre_when_acting(policy: DiffusionPolicy) -> None:
-    ramp = torch.arange(72 * 72).reshape(72, 72).remainder(251).to(torch.uint8).expand(2, 1, 2, 3, 72, 72)
+def test_a_batch_is_cropped_at_one_place_and_the_centre_when_acting(
+    policy: DiffusionPolicy,
+) -> None:
+    ramp = (
+        torch.arange(72 * 72)
+        .reshape(72, 72)
+        .remainder(251)
+        .to(torch.uint8)
+        .expand(2, 1, 2, 3, 72, 72)
+    )
     centre = policy._cropped_images(ramp, None)
     assert torch.equal(centre, policy._cropped_images(ramp, (4, 4)))
     policy.train()
@@ -129,7 +150,9 @@ def test_a_batch_is_cropped_at_one_place_and_the_centre_when_acting(policy: Diff
 
 
 @pytest.mark.parametrize("module", ["diffusers", "torchvision.models"])
-def test_a_missing_package_is_named_with_its_extra(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_named_with_its_extra(
+    module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(UserError, match="extra `baselines`"):
         build_policy("diffusion_policy")

@@ -1,4 +1,6 @@
-"""`diffusion_policy` with a memory: every memory joins the condition through `film`, and changes actions."""
+"""`diffusion_policy` with a memory: every memory joins the condition through `film`, and changes
+actions.
+"""
 
 import time
 from pathlib import Path
@@ -18,7 +20,16 @@ from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.testing.small import unit_stats
 from mme_vla.types import HistoryTokens
 
-SMALL = {"memory_tower": {"image_size": 32, "patch_size": 2, "width": 16, "depth": 1, "mlp_dim": 16, "num_heads": 2}}
+SMALL = {
+    "memory_tower": {
+        "image_size": 32,
+        "patch_size": 2,
+        "width": 16,
+        "depth": 1,
+        "mlp_dim": 16,
+        "num_heads": 2,
+    }
+}
 
 
 def with_memory(memory: str, **overrides: Any) -> DiffusionPolicy:
@@ -37,7 +48,9 @@ def policy() -> DiffusionPolicy:
 def history(policy: DiffusionPolicy, seed: int) -> HistoryTokens:
     full = full_history(policy.require_memory(), policy.sizes.memory_width)
     generator = torch.Generator().manual_seed(seed)
-    return HistoryTokens(torch.randn(full.features.shape, generator=generator), full.positions, full.mask)
+    return HistoryTokens(
+        torch.randn(full.features.shape, generator=generator), full.positions, full.mask
+    )
 
 
 @pytest.mark.parametrize("memory", ["tokendrop", "ttt"])
@@ -46,7 +59,10 @@ def test_any_memory_joins_the_condition(memory: str) -> None:
     batch = policy.full_batch()
     baseline = build_policy("diffusion_policy", backbone=SMALL)
     with torch.no_grad():
-        widths = [each.backbone.unet.mid_modules[0].cond_encoder[1].in_features for each in (policy, baseline)]
+        widths = [
+            each.backbone.unet.mid_modules[0].cond_encoder[1].in_features
+            for each in (policy, baseline)
+        ]
         assert widths[0] == widths[1] + policy.integration.feature_width
         assert policy.condition(batch, policy.encode_memory(batch.history)).shape == (
             1,
@@ -57,7 +73,10 @@ def test_any_memory_joins_the_condition(memory: str) -> None:
 
 def test_what_is_stored_changes_the_reply_and_learns(policy: DiffusionPolicy) -> None:
     batch = policy.full_batch()
-    draws = {name: value[None] for name, value in policy.sampling_noise(torch.Generator().manual_seed(0)).items()}
+    draws = {
+        name: value[None]
+        for name, value in policy.sampling_noise(torch.Generator().manual_seed(0)).items()
+    }
     chunks = []
     for seed in (0, 1, 1):
         batch.history = history(policy, seed)
@@ -66,7 +85,11 @@ def test_what_is_stored_changes_the_reply_and_learns(policy: DiffusionPolicy) ->
     assert not torch.allclose(chunks[0], chunks[1])
     policy.zero_grad()
     policy(batch)[0].backward()
-    learnt = [p for name, p in policy.named_parameters() if policy.finetune_spec.component_of(name) == "memory"]
+    learnt = [
+        p
+        for name, p in policy.named_parameters()
+        if policy.finetune_spec.component_of(name) == "memory"
+    ]
     assert learnt and all(p.grad is not None and p.grad.abs().sum() > 0 for p in learnt)
     policy.zero_grad()
 
@@ -85,11 +108,25 @@ def test_padding_of_a_short_memory_counts_for_nothing(policy: DiffusionPolicy) -
 
 def test_it_trains_on_cached_tokens(tmp_path: Path) -> None:
     tower = [f"backbone.memory_tower.{key}={value}" for key, value in SMALL["memory_tower"].items()]
-    cfg = compose("train", [
-        "model=diffusion_policy", "memory=framesamp", "integration=film", "memory.budget=64", "memory.every=8", *tower,
-        "logger=none", "train.steps=2", "train.batch_size=2", "train.workers=0", "train.device=cpu",
-        "train.val_samples=0", "train.open_loop_chunks=0", f"data.cache.root={tmp_path / 'caches'}",
-    ])  # fmt: skip
+    cfg = compose(
+        "train",
+        [
+            "model=diffusion_policy",
+            "memory=framesamp",
+            "integration=film",
+            "memory.budget=64",
+            "memory.every=8",
+            *tower,
+            "logger=none",
+            "train.steps=2",
+            "train.batch_size=2",
+            "train.workers=0",
+            "train.device=cpu",
+            "train.val_samples=0",
+            "train.open_loop_chunks=0",
+            f"data.cache.root={tmp_path / 'caches'}",
+        ],
+    )
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     checkpoint = train(cfg, config, tmp_path / "run", begun=time.perf_counter())
     again = Policy.from_pretrained(checkpoint)

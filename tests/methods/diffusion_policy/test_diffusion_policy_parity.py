@@ -1,4 +1,6 @@
-"""`diffusion_policy` computes what its authors' code computes: golden cases of their modules, losses and samples."""
+"""`diffusion_policy` computes what its authors' code computes: golden cases of their modules,
+losses and samples.
+"""
 
 import json
 import re
@@ -16,12 +18,23 @@ pytest.importorskip("diffusers")
 
 from mme_vla.embodiment.robomme import ROBOMME_JOINT
 from mme_vla.methods.diffusion_policy import model
-from mme_vla.methods.diffusion_policy.model import ConditionedUnit, SpatialSoftmax, StepSinusoid, cell_centres
+from mme_vla.methods.diffusion_policy.model import (
+    ConditionedUnit,
+    SpatialSoftmax,
+    StepSinusoid,
+    cell_centres,
+)
 from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.methods.diffusion_policy.processor import DiffusionBatch, text_features
 from mme_vla.methods.diffusion_policy.weights import diffusion_adapter
 from mme_vla.policy.build import build_policy
-from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats, normalize, unnormalize
+from mme_vla.processing.normalise import (
+    NormStats,
+    QuantileStats,
+    RunningStats,
+    normalize,
+    unnormalize,
+)
 from mme_vla.training.optim import EMA, clip_gradients, make_optimizer, scheduled_rate
 from mme_vla.training.settings import TrainSettings
 
@@ -42,9 +55,13 @@ def close(actual: Tensor, expected: Tensor, tolerance: float = SINGLE) -> None:
 
 
 def built(about: dict[str, Any]) -> DiffusionPolicy:
-    """The policy of a golden case, its sizes from the case's description and its weights by rule."""
+    """The policy of a golden case, its sizes from the case's description and its
+    weights by rule.
+    """
     options = about["config"]
-    shape, (state,), (action,) = (options["shape_meta"][name]["shape"] for name in ("image", "state", "action"))
+    shape, (state,), (action,) = (
+        options["shape_meta"][name]["shape"] for name in ("image", "state", "action")
+    )
     policy = build_policy(
         "diffusion_policy",
         backbone={
@@ -73,7 +90,10 @@ def built(about: dict[str, Any]) -> DiffusionPolicy:
         processor={"window": options["obs_horizon"]},
     )
     assert isinstance(policy, DiffusionPolicy)
-    weights = {name: rule_weight(name, tuple(of), about["weight_seed"]) for name, of in about["parameters"].items()}
+    weights = {
+        name: rule_weight(name, tuple(of), about["weight_seed"])
+        for name, of in about["parameters"].items()
+    }
     adapter = diffusion_adapter(policy)
     policy.load_state_dict(adapter.translate(weights, policy.state_dict(), "the golden case"))
     return policy
@@ -139,7 +159,9 @@ def test_what_lies_between_in_every_golden_model(golden: Any) -> None:
             handle.remove()
         for name, actual in captured.items():
             expected = arrays[f"out/{name}"]
-            if name == "text_feature" and len(actual) < len(expected):  # they repeat it for every step of the window
+            if name == "text_feature" and len(actual) < len(
+                expected
+            ):  # they repeat it for every step of the window
                 actual = actual.repeat_interleave(len(expected) // len(actual), 0)
             close(actual, expected.reshape(actual.shape) if name == "text_feature" else expected)
 
@@ -149,7 +171,9 @@ def test_the_gradient_of_every_parameter(golden: Any) -> None:
         policy.zero_grad()
         draws = {"noise": arrays["in/noise"], "step": torch.tensor(about["timesteps"])}
         policy(batch_of(arrays, policy), draws, tuple(about["crop_top_left"]))[0].backward()
-        names = {target: pieces[0].path for target, pieces in diffusion_adapter(policy).table.items()}
+        names = {
+            target: pieces[0].path for target, pieces in diffusion_adapter(policy).table.items()
+        }
         largest, ratios = max(about["grad_l2"].values()), []
         for target, parameter in policy.named_parameters():
             expected = about["grad_l2"][names[target]]
@@ -161,7 +185,10 @@ def test_the_gradient_of_every_parameter(golden: Any) -> None:
 def test_a_sample_and_what_is_executed_of_it(golden: Any) -> None:
     for policy, arrays, _ in golden.values():
         batch = batch_of(arrays, policy)
-        draws = {"noise": arrays["in/sample_noise"], "added": arrays["in/step_noise"].transpose(0, 1)}
+        draws = {
+            "noise": arrays["in/sample_noise"],
+            "added": arrays["in/step_noise"].transpose(0, 1),
+        }
         chunk = policy.sample_actions(batch, draws)
         close(chunk, arrays["out/sampled_chunk"], SAMPLES)
         executed = chunk[:, policy.n_past_steps :][:, : policy.embodiment.action.execute]
@@ -203,11 +230,17 @@ def test_the_schedule_and_single_steps_of_it(folder: Path) -> None:
 def test_a_conditioning_unit_with_and_without_a_shortcut(folder: Path) -> None:
     arrays, _ = case(folder, "units")
     for kind in sorted({name.split("/")[0] for name in arrays if name.startswith("film")}):
-        weights = {n.removeprefix(f"{kind}/param/"): x for n, x in arrays.items() if n.startswith(f"{kind}/param/")}
+        weights = {
+            n.removeprefix(f"{kind}/param/"): x
+            for n, x in arrays.items()
+            if n.startswith(f"{kind}/param/")
+        }
         out, channels, kernel = weights["blocks.0.block.0.weight"].shape
         condition, x = arrays.get(f"{kind}/cond", arrays["film/cond"]), arrays[f"{kind}/x"]
         errors = []
-        for groups in (g for g in range(1, out + 1) if out % g == 0):  # the case does not say how many
+        for groups in (
+            g for g in range(1, out + 1) if out % g == 0
+        ):  # the case does not say how many
             unit = ConditionedUnit(channels, out, condition.shape[1], kernel, groups)
             unit.load_state_dict(weights)
             errors.append(float((unit(x, condition) - arrays[f"{kind}/y"]).abs().max().detach()))
@@ -221,7 +254,11 @@ def test_keypoints_and_the_embedded_step(folder: Path) -> None:
     pool.load_state_dict({"nets.weight": weight, "nets.bias": arrays["spatial_softmax/bias"]})
     with torch.no_grad():
         close(pool(arrays["spatial_softmax/x"]), arrays["spatial_softmax/y"])
-    close(cell_centres(*arrays["spatial_softmax/x"].shape[-2:]), arrays["spatial_softmax/pos_grid"], 1e-6)
+    close(
+        cell_centres(*arrays["spatial_softmax/x"].shape[-2:]),
+        arrays["spatial_softmax/pos_grid"],
+        1e-6,
+    )
     close(StepSinusoid(arrays["sinusoid/y"].shape[1])(arrays["sinusoid/t"]), arrays["sinusoid/y"])
 
 
@@ -229,7 +266,9 @@ def statistics_of(arrays: dict[str, Tensor], kind: str) -> QuantileStats:
     values = {name: arrays[f"stats/{kind}/{name}"].tolist() for name in ("min", "max")}
     fields = {name: arrays.get(f"stats/{kind}/{name}") for name in ("mean", "std", "q01", "q99")}
     lists = {name: values["min"] if x is None else x.tolist() for name, x in fields.items()}
-    return QuantileStats.from_dict({**lists, "q99": values["max"] if fields["q99"] is None else lists["q99"], **values})
+    return QuantileStats.from_dict(
+        {**lists, "q99": values["max"] if fields["q99"] is None else lists["q99"], **values}
+    )
 
 
 def test_statistics_and_normalisation_by_extremes(folder: Path) -> None:
@@ -240,22 +279,36 @@ def test_statistics_and_normalisation_by_extremes(folder: Path) -> None:
     statistics = running.result(extremes=True)
     expected = statistics_of(arrays, "state")
     for name in ("min", "max", "mean", "std", "q01", "q99"):
-        close(torch.from_numpy(getattr(statistics, name)), torch.from_numpy(getattr(expected, name)))
+        close(
+            torch.from_numpy(getattr(statistics, name)), torch.from_numpy(getattr(expected, name))
+        )
     for kind in ("state", "action"):
         stats = statistics_of(arrays, kind)
-        close(normalize(arrays[f"minmax/{kind}"].float(), stats, "extremes"), arrays[f"minmax/{kind}_n"].float())
-    back = unnormalize(arrays["minmax/action_n"].float(), statistics_of(arrays, "action"), "extremes")
+        close(
+            normalize(arrays[f"minmax/{kind}"].float(), stats, "extremes"),
+            arrays[f"minmax/{kind}_n"].float(),
+        )
+    back = unnormalize(
+        arrays["minmax/action_n"].float(), statistics_of(arrays, "action"), "extremes"
+    )
     close(back, arrays["minmax/action_back"].float())
 
 
 def test_the_text_feature_of_a_small_clip(folder: Path) -> None:
     transformers = pytest.importorskip("transformers")
     arrays, about = case(folder, "clip_text")
-    tower = transformers.CLIPTextModelWithProjection(transformers.CLIPTextConfig(**about["text_config"])).eval()
-    weights = {name.removeprefix("param/"): x for name, x in arrays.items() if name.startswith("param/")}
+    tower = transformers.CLIPTextModelWithProjection(
+        transformers.CLIPTextConfig(**about["text_config"])
+    ).eval()
+    weights = {
+        name.removeprefix("param/"): x for name, x in arrays.items() if name.startswith("param/")
+    }
     missing, unexpected = tower.load_state_dict(weights, strict=False)
     assert not [name for name in missing if "position_ids" not in name] and not unexpected
-    close(text_features(tower, arrays["in/input_ids"], arrays["in/attention_mask"]), arrays["out/text_emb"])
+    close(
+        text_features(tower, arrays["in/input_ids"], arrays["in/attention_mask"]),
+        arrays["out/text_emb"],
+    )
 
 
 def test_updates_with_their_optimizer_schedule_and_averages(folder: Path, golden: Any) -> None:
@@ -263,13 +316,22 @@ def test_updates_with_their_optimizer_schedule_and_averages(folder: Path, golden
     largest = max(golden, key=lambda name: golden[name][2]["config"]["obs_horizon"])
     policy = built({**golden[largest][2], "weight_seed": about["weight_seed"]})
     corner = tuple(about.get("crop_top_left", golden[largest][2]["crop_top_left"]))
-    recipe = {"lr": 1e-4, "betas": (0.95, 0.999), "eps": 1e-8, "weight_decay": 1e-6, "decay_min_dim": 2}
+    recipe = {
+        "lr": 1e-4,
+        "betas": (0.95, 0.999),
+        "eps": 1e-8,
+        "weight_decay": 1e-6,
+        "decay_min_dim": 2,
+    }
     settings = TrainSettings(
         steps=10, batch_size=1, warmup=about["warmup"], warmup_from_zero=True, schedule="cosine",
         schedule_steps=about["schedule_steps"], **recipe,
     )  # fmt: skip
     parameters = dict(policy.named_parameters())
-    optimizer, ema = make_optimizer(parameters.values(), settings), EMA(parameters, 0.9999, warmup=True)
+    optimizer, ema = (
+        make_optimizer(parameters.values(), settings),
+        EMA(parameters, 0.9999, warmup=True),
+    )
     targets = {pieces[0].path: name for name, pieces in diffusion_adapter(policy).table.items()}
     for step, update in enumerate(about["updates"]):
         rate = scheduled_rate(step, settings)
@@ -281,7 +343,9 @@ def test_updates_with_their_optimizer_schedule_and_averages(folder: Path, golden
         loss, _ = policy(batch_of(arrays, policy), draws, corner)
         loss.backward()
         norm = clip_gradients([p.grad for p in parameters.values() if p.grad is not None], 1.0)
-        assert loss.item() == pytest.approx(update["loss"], rel=5e-4)  # after updates by such gradients
+        assert loss.item() == pytest.approx(
+            update["loss"], rel=5e-4
+        )  # after updates by such gradients
         assert float(norm) == pytest.approx(update["grad_norm"], rel=GRADIENTS)
         optimizer.step()
         optimizer.zero_grad()
@@ -300,14 +364,20 @@ def test_the_rates_of_the_released_schedule(folder: Path) -> None:
         steps=200_000, batch_size=1, lr=1e-4, warmup=500, warmup_from_zero=True, schedule="cosine",
         schedule_steps=1_000_000,
     )  # fmt: skip
-    for step, rate in zip(about["lr_default_schedule_steps"], about["lr_default_schedule"], strict=True):
+    for step, rate in zip(
+        about["lr_default_schedule_steps"], about["lr_default_schedule"], strict=True
+    ):
         assert scheduled_rate(step, settings) == pytest.approx(rate, rel=1e-6, abs=1e-15)
 
 
 def test_a_served_episode(folder: Path, golden: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     arrays, about = case(folder, "serving")
-    fitting = [of for of in golden.values() if of[2]["config"]["obs_horizon"] == about["obs_horizon"]]
-    policy = built({**fitting[0][2], **{key: about[key] for key in ("weight_seed",) if key in about}})
+    fitting = [
+        of for of in golden.values() if of[2]["config"]["obs_horizon"] == about["obs_horizon"]
+    ]
+    policy = built(
+        {**fitting[0][2], **{key: about[key] for key in ("weight_seed",) if key in about}}
+    )
     processor = policy.require_processor()
     processor.stats = NormStats(statistics_of(arrays, "state"), statistics_of(arrays, "action"))
     processor.samples = replace(processor.samples, consecutive=False)  # as that server does
@@ -321,11 +391,17 @@ def test_a_served_episode(folder: Path, golden: Any, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(policy, "condition", watched)
     calls = sorted({name.split("/")[0] for name in arrays if name.startswith("call")})
-    begins = {0, *(int(number) + 1 for number in re.findall(r"\d+", about["note"]))}  # "reset after call 1"
+    begins = {
+        0,
+        *(int(number) + 1 for number in re.findall(r"\d+", about["note"])),
+    }  # "reset after call 1"
     for number, call in enumerate(calls):
         if number in begins:
             episode = policy.start_episode("the goal")
-        draws = {"noise": arrays[f"{call}/sample_noise"][0], "added": arrays[f"{call}/step_noise"][:, 0]}
+        draws = {
+            "noise": arrays[f"{call}/sample_noise"][0],
+            "added": arrays[f"{call}/step_noise"][:, 0],
+        }
         monkeypatch.setattr(episode, "draw", lambda draws=draws: draws)
         views = {name: arrays[f"{call}/{name}"].numpy() for name in ROBOMME_JOINT.camera_names}
         episode.set_view(views, arrays[f"{call}/state"].float().numpy())

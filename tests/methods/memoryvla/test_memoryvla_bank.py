@@ -46,7 +46,8 @@ def test_what_is_stored_carries_no_gradient_and_what_is_read_does() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"fusion": "gat"}, {"consolidation": "lifo"}, {"length": 0}, {"retrieval_layers": 0}]
+    "options",
+    [{"fusion": "gat"}, {"consolidation": "lifo"}, {"length": 0}, {"retrieval_layers": 0}],
 )
 def test_a_bank_that_cannot_be_is_refused(options: dict[str, object]) -> None:
     with pytest.raises(UserError, match=f"bank.{next(iter(options))}"):
@@ -54,7 +55,9 @@ def test_a_bank_that_cannot_be_is_refused(options: dict[str, object]) -> None:
 
 
 def test_a_number_of_ddim_steps_that_no_stride_gives_is_refused() -> None:
-    with pytest.raises(UserError, match=r"flow_steps=51: .* of 100 diffusion steps, so it samples in 1, 2, 3"):
+    with pytest.raises(
+        UserError, match=r"flow_steps=51: .* of 100 diffusion steps, so it samples in 1, 2, 3"
+    ):
         Schedule.cosine(100).ddim_steps(51)
 
 
@@ -63,9 +66,13 @@ def test_a_fresh_head_does_not_hear_the_perceptual_tokens_until_it_is_reported_t
     x, per = torch.randn(2, 5, 4), torch.randn(2, 6, 10)
     for how, reads_tokens in (("zero", False), ("xavier", True)):
         torch.manual_seed(0)
-        head = Dit(DitConfig(16, 2, 2, how), action_dim=4, horizon=5, d_cognition=8, d_perceptual=10)
+        head = Dit(
+            DitConfig(16, 2, 2, how), action_dim=4, horizon=5, d_cognition=8, d_perceptual=10
+        )
         torch.nn.init.normal_(head.output.weight)
-        read = [head(x, torch.tensor([1, 2]), torch.ones(2, 1, 8), tokens) for tokens in (per, per + 1)]
+        read = [
+            head(x, torch.tensor([1, 2]), torch.ones(2, 1, 8), tokens) for tokens in (per, per + 1)
+        ]
         assert torch.equal(*read) is not reads_tokens
 
 
@@ -76,11 +83,14 @@ def test_full_size_parameters_are_the_originals_to_the_number() -> None:
         width = config.vlm.width
         core = MemoryVlaCore(config, MemoryBank(width), MemoryBank(config.perceptual_width))
     parts = {
-        "vision": (vlm.vision, 730_911_680), "projector": (vlm.projector, 71_385_600),
-        "language": (vlm.language, 6_738_939_904), "compression": (core.compression, 1_278_496),
-        "cognition": (core.cognition_bank, 423_735_296), "perceptual": (core.perceptual_bank, 1_661_696),
+        "vision": (vlm.vision, 730_911_680),
+        "projector": (vlm.projector, 71_385_600),
+        "language": (vlm.language, 6_738_939_904),
+        "compression": (core.compression, 1_278_496),
+        "cognition": (core.cognition_bank, 423_735_296),
+        "perceptual": (core.perceptual_bank, 1_661_696),
         "head": (core.head, 408_829_959),
-    }  # fmt: skip
+    }
     for name, (module, count) in parts.items():
         assert sum(p.numel() for p in module.parameters()) == count, name
     names = [*(f"vlm.{name}" for name in vlm.state_dict()), *core.state_dict()]

@@ -1,4 +1,6 @@
-"""MemoryVLA with a memory of the library in place of its banks: it learns, acts, is served and probed as any policy."""
+"""MemoryVLA with a memory of the library in place of its banks: it learns, acts, is served and
+probed as any policy.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +37,9 @@ def policy() -> MemoryVlaPolicy:
 def histories(policy: MemoryVlaPolicy, count: int, seed: int = 0) -> HistoryTokens:
     """Full selections of so many moments, each with features of its own."""
     full = full_history(policy.require_memory(), policy.sizes.vision.width)
-    features = torch.randn(count, *full.features.shape[1:], generator=torch.Generator().manual_seed(seed))
+    features = torch.randn(
+        count, *full.features.shape[1:], generator=torch.Generator().manual_seed(seed)
+    )
     return replace(full.rows(torch.zeros(count, dtype=torch.int64)), features=features)
 
 
@@ -44,10 +48,15 @@ def draws(policy: MemoryVlaPolicy, groups: int = 1) -> dict[str, torch.Tensor]:
 
 
 def noise(policy: MemoryVlaPolicy) -> dict[str, torch.Tensor]:
-    return {name: value[None] for name, value in policy.sampling_noise(torch.Generator().manual_seed(0)).items()}
+    return {
+        name: value[None]
+        for name, value in policy.sampling_noise(torch.Generator().manual_seed(0)).items()
+    }
 
 
-@pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "ttt", "rmt", *BEYOND_MEMORIES, "bank"])
+@pytest.mark.parametrize(
+    "memory", ["framesamp", "tokendrop", "ttt", "rmt", *BEYOND_MEMORIES, "bank"]
+)
 def test_any_memory_stands_where_the_banks_stood(memory: str) -> None:
     policy = recalling(memory)
     assert policy.config["name"] == f"memoryvla_{memory}"
@@ -63,15 +72,24 @@ def test_any_memory_stands_where_the_banks_stood(memory: str) -> None:
     assert torch.equal(first, again) and not torch.equal(first, other)
 
 
-def test_the_loss_depends_on_what_is_remembered_and_teaches_the_memory(policy: MemoryVlaPolicy) -> None:
+def test_the_loss_depends_on_what_is_remembered_and_teaches_the_memory(
+    policy: MemoryVlaPolicy,
+) -> None:
     batch = policy.full_batch()
-    losses = [policy(replace(batch, history=histories(policy, 1, seed)), draws(policy))[0] for seed in (0, 0, 1)]
+    losses = [
+        policy(replace(batch, history=histories(policy, 1, seed)), draws(policy))[0]
+        for seed in (0, 0, 1)
+    ]
     assert torch.equal(losses[0], losses[1]) and not torch.equal(losses[0], losses[2])
     policy.zero_grad()
     losses[0].backward()
     component = policy.finetune_spec.component_of
-    still = [n for n, p in policy.named_parameters() if component(n) == "memory" and not p.grad.any()]  # type: ignore[union-attr]
-    assert all(name.endswith("key.bias") for name in still), still  # a bias of all keys alike changes no weight
+    still = [
+        n for n, p in policy.named_parameters() if component(n) == "memory" and not p.grad.any()
+    ]  # type: ignore[union-attr]
+    assert all(name.endswith("key.bias") for name in still), (
+        still
+    )  # a bias of all keys alike changes no weight
     policy.zero_grad()
     with pytest.raises(ValueError, match="has a memory"):
         policy(replace(batch, history=None))
@@ -84,8 +102,13 @@ def test_what_padding_holds_changes_nothing_and_an_empty_memory_answers_with_the
     tokens = policy.encode_memory(histories(policy, 1))
     assert tokens is not None
     tokens.mask[:, 16:] = False
-    filled = replace(tokens, tokens=tokens.tokens.masked_fill(~tokens.mask[..., None], float("nan")))
-    chunks = [policy.sample_actions(policy.full_batch(), noise(policy), 2, memory) for memory in (tokens, filled)]
+    filled = replace(
+        tokens, tokens=tokens.tokens.masked_fill(~tokens.mask[..., None], float("nan"))
+    )
+    chunks = [
+        policy.sample_actions(policy.full_batch(), noise(policy), 2, memory)
+        for memory in (tokens, filled)
+    ]
     assert torch.equal(*chunks) and chunks[0].isfinite().all()
     now = torch.randn(1, 5, policy.sizes.perceptual_width)
     assert isinstance(policy.core, RecallingCore)
@@ -109,25 +132,39 @@ def test_moments_of_a_group_do_not_read_each_other(policy: MemoryVlaPolicy) -> N
         }
         for i in range(3)
     ]  # fmt: skip
-    group = processor.collate([{"moments": items, "times": np.arange(3) * 8, "place": (0, 0, 16)}, items[0]])
+    group = processor.collate(
+        [{"moments": items, "times": np.arange(3) * 8, "place": (0, 0, 16)}, items[0]]
+    )
     singles = processor.collate(items)
-    assert group.history is not None and group.history.features.ndim == 4 and group.valid.sum(1).tolist() == [3, 1]
+    assert (
+        group.history is not None
+        and group.history.features.ndim == 4
+        and group.valid.sum(1).tolist() == [3, 1]
+    )
     assert singles.times.tolist() == [[0], [8], [16]]
     draws_ = draws(policy, 2)
     alone = {
-        name: torch.cat([value[:1, :, :3].transpose(0, 2).flatten(1, 2), value[1:, :, 0].flatten(0, 0)])[:, :, None]
+        name: torch.cat(
+            [value[:1, :, :3].transpose(0, 2).flatten(1, 2), value[1:, :, 0].flatten(0, 0)]
+        )[:, :, None]
         for name, value in draws_.items()
     }
     together = policy(group, draws_)[0]
     apart = policy(processor.collate([*items, items[0]]), alone)[0]
     torch.testing.assert_close(together, apart)
     chunk = policy.sample_actions(group.rows(slice(0, 1)), noise(policy), 2)
-    torch.testing.assert_close(chunk, policy.sample_actions(processor.collate(items[2:]), noise(policy), 2))
+    torch.testing.assert_close(
+        chunk, policy.sample_actions(processor.collate(items[2:]), noise(policy), 2)
+    )
 
 
 def test_each_frame_of_a_group_has_the_history_of_its_step(tmp_path: Path) -> None:
-    policy = recalling("actions", processor={"group_size": 3})  # it keeps next to no frames: a cache at once
-    data = OmegaConf.to_container(compose("train", [f"data.cache.root={tmp_path}"]).data, resolve=True)
+    policy = recalling(
+        "actions", processor={"group_size": 3}
+    )  # it keeps next to no frames: a cache at once
+    data = OmegaConf.to_container(
+        compose("train", [f"data.cache.root={tmp_path}"]).data, resolve=True
+    )
     samples = prepare_data(policy, data, 42, say=str).train  # type: ignore[arg-type]
     for item in (samples[0], samples.observation(40)):
         for moment, time in zip(item["moments"], item["times"].tolist(), strict=True):
@@ -143,9 +180,13 @@ def test_an_episode_stores_as_a_sample_does_and_saves_nothing(policy: MemoryVlaP
     episode.noise_state = start
     np.testing.assert_array_equal(policy.act(episode, 2), chunk)
     episode.noise_state = start
-    batch = replace(policy.observation([episode]), history=stack_history([episode.gather_selection()]))
+    batch = replace(
+        policy.observation([episode]), history=stack_history([episode.gather_selection()])
+    )
     draws_ = {name: value[None] for name, value in episode.draw().items()}
-    expected = policy.require_processor().absolute_actions(policy.sample_actions(batch, draws_, 2), torch.zeros(1, 8))
+    expected = policy.require_processor().absolute_actions(
+        policy.sample_actions(batch, draws_, 2), torch.zeros(1, 8)
+    )
     np.testing.assert_allclose(chunk, expected[0], atol=1e-5)
     other = policy.start_episode("press the button", seed=4)
     other.observe({"front": moving_frames(12, seed=9), "wrist": front}, still)
@@ -155,7 +196,9 @@ def test_an_episode_stores_as_a_sample_does_and_saves_nothing(policy: MemoryVlaP
 
 
 def test_what_cannot_stand_there_is_refused_in_words() -> None:
-    with pytest.raises(UserError, match="the tower of the backbone 'memoryvla' sees one image at a time"):
+    with pytest.raises(
+        UserError, match="the tower of the backbone 'memoryvla' sees one image at a time"
+    ):
         build_policy("memoryvla", memory="spacetime")
     with pytest.raises(UserError, match="no place for the integration 'context'"):
         build_policy("memoryvla", memory="framesamp", integration="context")
@@ -165,21 +208,34 @@ def test_what_cannot_stand_there_is_refused_in_words() -> None:
         check_frozen(recalling(), freeze_vision=False)
 
 
-@pytest.mark.parametrize(("model", "words"), [("memoryvla", {}), ("memoryvla", {"memory": "ttt"}), ("openvla_oft", {})])
-def test_what_a_checkpoint_to_start_from_lacks_is_rendered(model: str, words: dict[str, Any]) -> None:
-    """Training does not draw what `init_from` will replace: openvla-7b has neither heads nor banks."""
+@pytest.mark.parametrize(
+    ("model", "words"), [("memoryvla", {}), ("memoryvla", {"memory": "ttt"}), ("openvla_oft", {})]
+)
+def test_what_a_checkpoint_to_start_from_lacks_is_rendered(
+    model: str, words: dict[str, Any]
+) -> None:
+    """Training does not draw what `init_from` will replace: openvla-7b has neither
+    heads nor banks.
+    """
     torch.use_deterministic_algorithms(True)  # uninitialised memory is nan then
     try:
-        policy = build_from_config(compose("policy", policy_words(model, words)), fresh_backbone=False)
+        policy = build_from_config(
+            compose("policy", policy_words(model, words)), fresh_backbone=False
+        )
     finally:
         torch.use_deterministic_algorithms(False)
     component = policy.finetune_spec.component_of
-    waiting = {component(name) for name, value in policy.state_dict().items() if value.isnan().any()}
+    waiting = {
+        component(name) for name, value in policy.state_dict().items() if value.isnan().any()
+    }
     assert waiting == {"vision", "vlm"}
 
 
 def test_it_starts_from_a_policy_with_banks_whose_banks_stay_behind(tmp_path: Path) -> None:
-    banked, policy = build_policy("memoryvla", seed=1), build_policy("memoryvla", seed=2, memory="framesamp")
+    banked, policy = (
+        build_policy("memoryvla", seed=1),
+        build_policy("memoryvla", seed=2, memory="framesamp"),
+    )
     assert isinstance(banked.core, MemoryVlaCore)  # type: ignore[union-attr]
     banked.save_pretrained(tmp_path / "ours")
     (tmp_path / "theirs").mkdir()

@@ -1,4 +1,6 @@
-"""MemoryVLA: the original's modules, banks, head, training loss and acting, at the golden network's size."""
+"""MemoryVLA: the original's modules, banks, head, training loss and acting, at the golden network's
+size.
+"""
 
 import json
 from pathlib import Path
@@ -15,7 +17,10 @@ from mme_vla.memory.extensions.bank import BankState, MemoryBank
 from mme_vla.methods.memoryvla.action_head import Schedule
 from mme_vla.methods.memoryvla.model import MemoryVlaCore, cognition_token
 
-TOLERANCE, LONG = 1e-4, 1e-3  # of the largest entry: single modules; gradients, ten steps of sampling, acting
+TOLERANCE, LONG = (
+    1e-4,
+    1e-3,
+)  # of the largest entry: single modules; gradients, ten steps of sampling, acting
 ROLES = ["cog", "per"]
 
 
@@ -57,10 +62,14 @@ def test_memoryvla_modules(folder: Path, network: MemoryVlaCore) -> None:
         near(one.time(golden[f"{role}/time/in"]), golden[f"{role}/time/out"])
         block = [golden[f"{role}/block/{name}"] for name in ("query", "key", "value")]
         near(one.blocks[0](*block), golden[f"{role}/block/out"])
-        near(one.fuse(golden[f"{role}/gate/a"], golden[f"{role}/gate/b"]), golden[f"{role}/gate/out"])
+        near(
+            one.fuse(golden[f"{role}/gate/a"], golden[f"{role}/gate/b"]), golden[f"{role}/gate/out"]
+        )
 
 
-def stepwise(one: MemoryBank, tokens: Tensor, times: Tensor, ids: Tensor) -> list[tuple[Tensor, Tensor, BankState]]:
+def stepwise(
+    one: MemoryBank, tokens: Tensor, times: Tensor, ids: Tensor
+) -> list[tuple[Tensor, Tensor, BankState]]:
     """Each moment's retrieved and fused tokens and the bank of its episode after it."""
     states: dict[int, BankState] = {}
     out = []
@@ -75,7 +84,9 @@ def stepwise(one: MemoryBank, tokens: Tensor, times: Tensor, ids: Tensor) -> lis
 
 @pytest.mark.parametrize("role", ROLES)
 @torch.no_grad()
-def test_memoryvla_banks_of_every_kind(folder: Path, meta: dict[str, Any], weights: Any, role: str) -> None:
+def test_memoryvla_banks_of_every_kind(
+    folder: Path, meta: dict[str, Any], weights: Any, role: str
+) -> None:
     golden = arrays(folder, "bank")
     for name, options in meta["cases"].items():
         if not name.startswith("bank/"):
@@ -94,7 +105,9 @@ def compare_banks(golden: dict[str, Tensor], kind: str, states: list[BankState])
     stored = golden[f"{kind}/bank_times"]
     for i, state in enumerate(states):
         assert len(state) == int(golden[f"{kind}/count"][i])
-        if int(stored[i].min()) >= -1:  # −2: the original keeps no time there, and its record no merges
+        if (
+            int(stored[i].min()) >= -1
+        ):  # −2: the original keeps no time there, and its record no merges
             assert state.merged == int(golden[f"{kind}/merged_at"][i])
             assert state.times.tolist() == stored[i][: len(state)].tolist()
         if f"{kind}/bank_feats" in golden:
@@ -122,13 +135,19 @@ def test_memoryvla_groups_of_a_batch_and_their_gradients(
     golden, kind = arrays(folder, "bank"), f"{role}/{case}"
     one = bank(meta["sizes"], role, weights)
     tokens = golden[f"{kind}/tokens"].clone().requires_grad_()
-    fused, _ = one.run(tokens, golden[f"{kind}/times"], torch.arange(len(tokens)).split(meta["sizes"]["group_size"]))
+    fused, _ = one.run(
+        tokens,
+        golden[f"{kind}/times"],
+        torch.arange(len(tokens)).split(meta["sizes"]["group_size"]),
+    )
     near(fused, golden[f"{kind}/fused"])
     (fused * golden[f"{kind}/cotangent"]).sum().backward()
     assert tokens.grad is not None
     near(tokens.grad, golden[f"{kind}/grad_tokens"], LONG)
     word = {"cog": "cognition_bank", "per": "perceptual_bank"}[role]
-    gradients_ = {golden_name(f"{word}.{n}").split(".", 1)[1]: p.grad for n, p in one.named_parameters()}
+    gradients_ = {
+        golden_name(f"{word}.{n}").split(".", 1)[1]: p.grad for n, p in one.named_parameters()
+    }
     stored = [name for name in golden if name.startswith(f"{kind}/grad/")]
     assert stored
     for name in stored:
@@ -139,15 +158,21 @@ def test_memoryvla_groups_of_a_batch_and_their_gradients(
 
 @pytest.mark.parametrize("role", ROLES)
 @torch.no_grad()
-def test_memoryvla_streams_live_across_batches(folder: Path, meta: dict[str, Any], weights: Any, role: str) -> None:
+def test_memoryvla_streams_live_across_batches(
+    folder: Path, meta: dict[str, Any], weights: Any, role: str
+) -> None:
     golden = arrays(folder, "bank")
     one = bank(meta["sizes"], role, weights)
     episode, state = None, one.init_state(golden[f"{role}/tokens"].shape[1])
     batches = sorted({name.split("/")[1] for name in golden if name.startswith(f"{role}/stream")})
     assert len(batches) > 1
     for name in batches:
-        tokens, times, ids = (golden[f"{role}/{name}/{what}"] for what in ("tokens", "times", "ids"))
-        places = torch.arange(len(ids)).split(torch.unique_consecutive(ids, return_counts=True)[1].tolist())
+        tokens, times, ids = (
+            golden[f"{role}/{name}/{what}"] for what in ("tokens", "times", "ids")
+        )
+        places = torch.arange(len(ids)).split(
+            torch.unique_consecutive(ids, return_counts=True)[1].tolist()
+        )
         fused = []
         for run in places:
             if int(ids[run[0]]) != episode:
@@ -163,8 +188,14 @@ def test_memoryvla_schedule(folder: Path) -> None:
     golden = arrays(folder, "dit")
     schedule = Schedule.cosine(len(golden["schedule/betas"]))
     np.testing.assert_allclose(schedule.betas, golden["schedule/betas"], rtol=1e-12)
-    np.testing.assert_allclose(schedule.alphas_cumprod, golden["schedule/alphas_cumprod"], rtol=1e-12)
-    counts = {int(name.split("/")[1].removeprefix("ddim")) for name in golden if name.startswith("schedule/ddim")}
+    np.testing.assert_allclose(
+        schedule.alphas_cumprod, golden["schedule/alphas_cumprod"], rtol=1e-12
+    )
+    counts = {
+        int(name.split("/")[1].removeprefix("ddim"))
+        for name in golden
+        if name.startswith("schedule/ddim")
+    }
     for count in counts:
         visited = schedule.ddim_steps(count)
         assert sorted(golden[f"schedule/ddim{count}/timesteps"].tolist()) == visited.tolist()
@@ -190,11 +221,20 @@ def test_memoryvla_head_stage_by_stage(folder: Path, network: MemoryVlaCore) -> 
         near(head.guided(x, t, z, per, scale), golden[name])
 
 
-def test_memoryvla_head_loss_and_gradients(folder: Path, meta: dict[str, Any], network: MemoryVlaCore) -> None:
+def test_memoryvla_head_loss_and_gradients(
+    folder: Path, meta: dict[str, Any], network: MemoryVlaCore
+) -> None:
     golden = arrays(folder, "dit")
     net = {name: golden[f"net/{name}"].clone().requires_grad_() for name in ("z", "per")}
-    draws = {"noise": golden["loss/noise"], "steps": golden["loss/steps"], "drop": golden["loss/drop_draw"]}
-    near(network.schedule.noised(golden["loss/actions"], draws["noise"], draws["steps"]), golden["loss/x_t"])
+    draws = {
+        "noise": golden["loss/noise"],
+        "steps": golden["loss/steps"],
+        "drop": golden["loss/drop_draw"],
+    }
+    near(
+        network.schedule.noised(golden["loss/actions"], draws["noise"], draws["steps"]),
+        golden["loss/x_t"],
+    )
     loss = network.noise_error(golden["loss/actions"], net["z"], net["per"], draws).mean()
     near(loss, golden["loss/value"])
     loss.backward()
@@ -203,8 +243,12 @@ def test_memoryvla_head_loss_and_gradients(folder: Path, meta: dict[str, Any], n
     gradients(golden, "loss/grad/", meta["cases"]["dit/loss/grad_l2"], network, "action_model.")
 
 
-def gradients(golden: dict[str, Tensor], stored: str, norms: dict[str, float], network: Any, prefix: str = "") -> None:
-    grads = {golden_name(name): p.grad for name, p in network.named_parameters() if p.grad is not None}
+def gradients(
+    golden: dict[str, Tensor], stored: str, norms: dict[str, float], network: Any, prefix: str = ""
+) -> None:
+    grads = {
+        golden_name(name): p.grad for name, p in network.named_parameters() if p.grad is not None
+    }
     for name in (name for name in golden if name.startswith(stored)):
         actual = grads[prefix + name.removeprefix(stored)]
         near(actual.reshape(golden[name].shape), golden[name], LONG)
@@ -229,9 +273,18 @@ def test_memoryvla_sampling_path(folder: Path, network: MemoryVlaCore) -> None:
         near(torch.stack(path), golden[name], LONG)
 
 
-def test_memoryvla_training_loss_over_two_groups(folder: Path, meta: dict[str, Any], network: MemoryVlaCore) -> None:
-    golden = {n.removeprefix("train/"): v for n, v in arrays(folder, "policy").items() if n.startswith("train/")}
-    hidden, vision = golden["hidden"].clone().requires_grad_(), golden["vision"].clone().requires_grad_()
+def test_memoryvla_training_loss_over_two_groups(
+    folder: Path, meta: dict[str, Any], network: MemoryVlaCore
+) -> None:
+    golden = {
+        n.removeprefix("train/"): v
+        for n, v in arrays(folder, "policy").items()
+        if n.startswith("train/")
+    }
+    hidden, vision = (
+        golden["hidden"].clone().requires_grad_(),
+        golden["vision"].clone().requires_grad_(),
+    )
     cognition = cognition_token(hidden, meta["sizes"]["patches"], golden["attention_mask"].sum(1))
     draws = {"noise": golden["noise"], "steps": golden["steps"], "drop": golden["drop_draw"]}
     groups = torch.arange(len(hidden)).split(meta["sizes"]["group_size"])
@@ -245,8 +298,14 @@ def test_memoryvla_training_loss_over_two_groups(folder: Path, meta: dict[str, A
 
 
 @torch.no_grad()
-def test_memoryvla_acting_over_a_stream(folder: Path, meta: dict[str, Any], network: MemoryVlaCore) -> None:
-    golden = {n.removeprefix("act/"): v for n, v in arrays(folder, "policy").items() if n.startswith("act/")}
+def test_memoryvla_acting_over_a_stream(
+    folder: Path, meta: dict[str, Any], network: MemoryVlaCore
+) -> None:
+    golden = {
+        n.removeprefix("act/"): v
+        for n, v in arrays(folder, "policy").items()
+        if n.startswith("act/")
+    }
     state = network.init_state()
     samples = []
     for i in range(len(golden["hidden"])):

@@ -23,7 +23,9 @@ def test_a_checkpoint_is_saved_by_components_and_read_again(tmp_path: Path) -> N
     model = torch.load(file, weights_only=True)["model"]
     assert model["per_compr"]["reduce.weight"].ndim == 4
     assert "retrieval_blocks.0.q_proj.weight" in model["cog_mem_bank"]
-    model["action_model"]["net.history_embedder.linear.weight"] = torch.zeros(2, 2)  # as CogACT's hold
+    model["action_model"]["net.history_embedder.linear.weight"] = torch.zeros(
+        2, 2
+    )  # as CogACT's hold
     torch.save({"model": model}, file)
     assert detect_format(file) == "memoryvla"
     load_weights(other, file)
@@ -36,14 +38,20 @@ def of_vlm(policy: Policy) -> dict[str, torch.Tensor]:
 
 def test_openvla_is_a_start_that_has_nothing_of_banks_and_head(tmp_path: Path) -> None:
     """Small files in the layout of `openvla/openvla-7b`, and in that of its Prismatic original."""
-    openvla = build_policy("openvla_oft", seed=1, backbone={"vision": {"image_size": 56}})  # as large as memoryvla_tiny
+    openvla = build_policy(
+        "openvla_oft", seed=1, backbone={"vision": {"image_size": 56}}
+    )  # as large as memoryvla_tiny
     source_names = openvla_adapter(openvla).export(openvla.state_dict())
     base = {
-        name.removeprefix(VLA): tensor.contiguous() for name, tensor in source_names.items() if name.startswith(VLA)
+        name.removeprefix(VLA): tensor.contiguous()
+        for name, tensor in source_names.items()
+        if name.startswith(VLA)
     }
     save_file(base, tmp_path / "model.safetensors")
     expected = {
-        n.removeprefix("backbone."): t for n, t in openvla.state_dict().items() if n.startswith("backbone.vlm.")
+        n.removeprefix("backbone."): t
+        for n, t in openvla.state_dict().items()
+        if n.startswith("backbone.vlm.")
     }
     policy = build_policy("memoryvla", seed=2)
     fresh = {name: tensor.clone() for name, tensor in policy.state_dict().items()}

@@ -1,4 +1,6 @@
-"""OpenVLA-OFT's images and numbers: resize, crops, colours, channels and clipped quantiles, as the original's."""
+"""OpenVLA-OFT's images and numbers: resize, crops, colours, channels and clipped quantiles, as the
+original's.
+"""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,11 +39,16 @@ def test_openvla_oft_resize_and_centre_crop(folder: Path) -> None:
     golden, about = case(folder, "pictures")
     resized = torch.from_numpy(image_ops.lanczos(golden["raw"].numpy(), about["size"]))
     same_levels(resized, golden["resized"])
-    same_levels(image_ops.centre_crop(channels_first(golden["resized"]))[0].permute(1, 2, 0), golden["center_crop"])
+    same_levels(
+        image_ops.centre_crop(channels_first(golden["resized"]))[0].permute(1, 2, 0),
+        golden["center_crop"],
+    )
 
 
 def test_openvla_oft_resize_after_jpeg_is_near_the_originals(folder: Path) -> None:
-    """Another JPEG library may differ by a few levels; without the round trip the images differ by more."""
+    """Another JPEG library may differ by a few levels; without the round trip the images differ by
+    more.
+    """
     golden, about = case(folder, "pictures")
     raw, expected = golden["raw"].numpy(), golden["resized_after_jpeg"].numpy().astype(int)
 
@@ -61,9 +68,11 @@ def test_openvla_oft_augmentation_step_by_step(folder: Path) -> None:
         pixels = image_ops.crop(start.float() / 255, draws[:, 0], draws[:, 1]).clamp(0, 1)
         assert error(pixels, channels_first(golden[f"{kind}/crop"])) <= FLOAT
         steps = {
-            "brightness": image_ops.brighten, "contrast": image_ops.contrast, "saturation": image_ops.saturate,
+            "brightness": image_ops.brighten,
+            "contrast": image_ops.contrast,
+            "saturation": image_ops.saturate,
             "hue": image_ops.shift_hue,
-        }  # fmt: skip
+        }
         for by, (name, change) in zip(draws[0, 2:], steps.items(), strict=True):
             pixels = change(pixels, by.float().view(1, 1, 1, 1)).clamp(0, 1)
             assert error(pixels, channels_first(golden[f"{kind}/{name}"])) <= FLOAT, name
@@ -82,7 +91,9 @@ def statistics(folder: Path) -> tuple[ClippedQuantiles, dict[str, Tensor], np.nd
     golden, about = case(folder, "policy")
     stats = about["norm_stats"]["action"]
     mask = np.array(stats["mask"])
-    statistics_ = SimpleNamespace(**{name: np.array(stats[name]) for name in ("q01", "q99", "min", "max")})
+    statistics_ = SimpleNamespace(
+        **{name: np.array(stats[name]) for name in ("q01", "q99", "min", "max")}
+    )
     return ClippedQuantiles.of(statistics_, mask), golden, mask
 
 
@@ -90,11 +101,15 @@ def test_openvla_oft_actions_come_back_from_their_quantiles(folder: Path) -> Non
     quantiles, golden, mask = statistics(folder)
     assert not mask.all(), "a number that is not scaled is part of the case"
     actions = quantiles.unnormalize(golden["out/predict_normalised"].double())
-    assert error(actions, golden["out/predict_actions"]) <= 1e-5 * float(golden["out/predict_actions"].abs().max())
+    assert error(actions, golden["out/predict_actions"]) <= 1e-5 * float(
+        golden["out/predict_actions"].abs().max()
+    )
 
 
 def test_numbers_outside_the_quantiles_are_clipped_and_those_that_never_shifted_are_zero() -> None:
-    stats = SimpleNamespace(q01=[0.0, 5.0, 0.0], q99=[2.0, 5.0, 1.0], min=[-1.0, 5.0, 0.0], max=[3.0, 5.0, 1.0])
+    stats = SimpleNamespace(
+        q01=[0.0, 5.0, 0.0], q99=[2.0, 5.0, 1.0], min=[-1.0, 5.0, 0.0], max=[3.0, 5.0, 1.0]
+    )
     quantiles = ClippedQuantiles.of(stats, np.array([True, True, False]))
     x = torch.tensor([[1.0, 5.0, 7.0], [4.0, 5.0, -7.0]], dtype=torch.float64)
     expected = torch.tensor([[0.0, 0.0, 7.0], [1.0, 0.0, -7.0]], dtype=torch.float64)

@@ -1,4 +1,6 @@
-"""OpenVLA-OFT: the original's stages, loss, gradients, predictions and first updates, at the golden models' size."""
+"""OpenVLA-OFT: the original's stages, loss, gradients, predictions and first updates, at the golden
+models' size.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -44,12 +46,19 @@ class Stages:
 
     def sequence(self) -> TokenSequence:
         observation = self.backbone.blocks_of(self.batch, fused(self.backbone, self.golden))
-        return self.backbone.sequence(self.policy.integration.inject(observation, self.memory).blocks)
+        return self.backbone.sequence(
+            self.policy.integration.inject(observation, self.memory).blocks
+        )
 
     def as_golden(self, rows: Tensor, sequence: TokenSequence) -> tuple[Tensor, Tensor]:
-        """Rows [b, n, …] in the original's order (padding last), and which of them are not padding."""
+        """Rows [b, n, …] in the original's order (padding last), and which of them are
+        not padding.
+        """
         mask = self.golden["out/multimodal_mask"]
-        out, real = torch.zeros(*mask.shape, *rows.shape[2:], dtype=rows.dtype), torch.zeros_like(mask)
+        out, real = (
+            torch.zeros(*mask.shape, *rows.shape[2:], dtype=rows.dtype),
+            torch.zeros_like(mask),
+        )
         for b in range(len(rows)):
             places = sequence.positions[b][sequence.valid[b]]
             out[b, places] = rows[b][sequence.valid[b]]
@@ -67,8 +76,9 @@ def test_openvla_oft_tokens_of_images_state_and_memory(stages: Stages) -> None:
     golden, backbone = stages.golden, stages.backbone
     pixels = golden["in/pixel_values"][:, :6]
     for name, tower, three in (
-        ("dino", backbone.vlm.vision.dino, pixels[:, :3]), ("siglip", backbone.vlm.vision.siglip, pixels[:, 3:])
-    ):  # fmt: skip
+        ("dino", backbone.vlm.vision.dino, pixels[:, :3]),
+        ("siglip", backbone.vlm.vision.siglip, pixels[:, 3:]),
+    ):
         (first,) = tower.forward_intermediates(
             three, indices=[0], output_fmt="NLC", intermediates_only=True, return_prefix_tokens=True
         )
@@ -90,7 +100,10 @@ def test_openvla_oft_sequence_hidden_states_and_read_out(stages: Stages) -> None
     near(embedded, golden["out/inputs_embeds"] * real[..., None])
     after: list[Tensor] = []
     layers = backbone.vlm.language.model.layers
-    hooks = [layer.register_forward_hook(lambda _layer, _inputs, out: after.append(out)) for layer in layers]
+    hooks = [
+        layer.register_forward_hook(lambda _layer, _inputs, out: after.append(out))
+        for layer in layers
+    ]
     last = backbone.hidden(sequence)
     for hook in hooks:
         hook.remove()
@@ -113,11 +126,17 @@ def test_openvla_oft_loss_and_gradients(stages: Stages) -> None:
     near(detached[:, 1:].mean(), torch.tensor(metrics["next_actions_l1_loss"]))
     policy.zero_grad()
     errors.mean().backward()
-    gradients = {golden_name(name): p.grad for name, p in policy.named_parameters() if p.grad is not None}
+    gradients = {
+        golden_name(name): p.grad for name, p in policy.named_parameters() if p.grad is not None
+    }
     for name, norm in about["grad_l2"].items():
         assert float(gradients[name].norm()) == pytest.approx(norm, rel=GRADIENT), name
     assert not set(about["no_gradient"]) & set(gradients)
-    learning = {golden_name(name) for name, parameter in policy.named_parameters() if parameter.requires_grad}
+    learning = {
+        golden_name(name)
+        for name, parameter in policy.named_parameters()
+        if parameter.requires_grad
+    }
     assert learning == set(about["trainable"])
 
 
@@ -125,8 +144,12 @@ def test_openvla_oft_loss_and_gradients(stages: Stages) -> None:
 def test_openvla_oft_prediction_from_the_prompt_alone(stages: Stages) -> None:
     """One sample at a time in the original; here all in one batch."""
     golden, stats = stages.golden, stages.about["norm_stats"]["proprio"]
-    quantiles = ClippedQuantiles.of(SimpleNamespace(**{name: stats[name] for name in ("q01", "q99", "min", "max")}))
-    observation_ = replace(stages.batch, proprio=quantiles.normalize(golden["in/raw_proprio"].double()).float())
+    quantiles = ClippedQuantiles.of(
+        SimpleNamespace(**{name: stats[name] for name in ("q01", "q99", "min", "max")})
+    )
+    observation_ = replace(
+        stages.batch, proprio=quantiles.normalize(golden["in/raw_proprio"].double()).float()
+    )
     observation = stages.backbone.blocks_of(observation_, fused(stages.backbone, golden))
     blocks = stages.policy.integration.inject(observation, stages.memory).blocks
     near(stages.backbone.predict_from(blocks), golden["out/predict_normalised"])
@@ -136,13 +159,22 @@ def test_openvla_oft_prediction_from_the_prompt_alone(stages: Stages) -> None:
 def test_openvla_oft_language_model_alone(folder: Path) -> None:
     golden, about = case(folder, "llama_small")
     layer = f"{VLA}language_model.model.layers"
-    depth = 1 + max(int(name.removeprefix(f"{layer}.").split(".")[0]) for name in about["parameters"] if layer in name)
-    width, mlp = golden["in/embeds"].shape[-1], about["parameters"][f"{layer}.0.mlp.gate_proj.weight"][0]
+    depth = 1 + max(
+        int(name.removeprefix(f"{layer}.").split(".")[0])
+        for name in about["parameters"]
+        if layer in name
+    )
+    width, mlp = (
+        golden["in/embeds"].shape[-1],
+        about["parameters"][f"{layer}.0.mlp.gate_proj.weight"][0],
+    )
     tower = TowerConfig(width=4, depth=2, mlp_dim=4, num_heads=1)
     best: dict[int, float] = {}
     for heads in _heads(width, about):
         vlm = Prismatic(
-            FusedVisionConfig(14, 14, tower, tower), LlamaConfig(width, mlp, depth, heads, about["rms_norm_eps"]), 8
+            FusedVisionConfig(14, 14, tower, tower),
+            LlamaConfig(width, mlp, depth, heads, about["rms_norm_eps"]),
+            8,
         )
         state = {name: openvla_name(f"backbone.vlm.{name}") for name in vlm.state_dict()}
         values = {
@@ -158,9 +190,12 @@ def test_openvla_oft_language_model_alone(folder: Path) -> None:
         hidden = vlm.read(golden["in/embeds"], allowed, places, every_layer=True)
         assert len(hidden) == sum(name.startswith("out/hidden") for name in golden)
         best[heads] = max(
-            float(((state - golden[f"out/hidden{i}"]).abs() * mask[..., None]).max()) for i, state in enumerate(hidden)
+            float(((state - golden[f"out/hidden{i}"]).abs() * mask[..., None]).max())
+            for i, state in enumerate(hidden)
         )
-    assert min(best.values()) <= TOLERANCE * max(float(golden[f"out/hidden{i}"].abs().max()) for i in range(depth + 1))
+    assert min(best.values()) <= TOLERANCE * max(
+        float(golden[f"out/hidden{i}"].abs().max()) for i in range(depth + 1)
+    )
 
 
 def _heads(width: int, about: dict[str, Any]) -> list[int]:
@@ -183,7 +218,9 @@ def test_openvla_oft_first_updates(folder: Path) -> None:
         rate = about["optimizer"]["lr"] * (about["gamma"] if i >= about["milestone"] else 1)
         assert rate == pytest.approx(update["lr"])
         optimizer.param_groups[0]["lr"] = rate
-        errors = absolute_error(backbone.predict_from(backbone.blocks_of(data, fused(backbone, golden))), data.actions)
+        errors = absolute_error(
+            backbone.predict_from(backbone.blocks_of(data, fused(backbone, golden))), data.actions
+        )
         assert errors.mean().item() == pytest.approx(update["loss_value"], rel=TOLERANCE)
         optimizer.zero_grad()
         errors.mean().backward()

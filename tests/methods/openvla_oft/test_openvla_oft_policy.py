@@ -19,9 +19,12 @@ MODELS = ["openvla_oft", *(f"openvla_oft_{kind}" for kind in (
 TOWER = {"width": 8, "depth": 2, "mlp_dim": 16, "num_heads": 2}
 SMALL = {
     "vision": {"image_size": 32, "patch_size": 2, "dino": TOWER, "siglip": TOWER},
-    "vlm": {"width": 32, "mlp_dim": 64, "depth": 2, "num_heads": 2}, "vocab_size": 128, "horizon": 5,
-    "action_dim": 8, "state_dim": 0,
-}  # fmt: skip
+    "vlm": {"width": 32, "mlp_dim": 64, "depth": 2, "num_heads": 2},
+    "vocab_size": 128,
+    "horizon": 5,
+    "action_dim": 8,
+    "state_dim": 0,
+}
 
 
 def tiny(name: str = "openvla_oft") -> OpenVlaPolicy:
@@ -33,7 +36,9 @@ def tiny(name: str = "openvla_oft") -> OpenVlaPolicy:
 
 def batch_for(policy: OpenVlaPolicy) -> Batch:
     batch = random_batch(policy, valid=64)
-    return replace(batch, proprio=torch.rand(len(batch.prompt), policy.embodiment.state.width) * 2 - 1)
+    return replace(
+        batch, proprio=torch.rand(len(batch.prompt), policy.embodiment.state.width) * 2 - 1
+    )
 
 
 def test_it_keeps_a_backbones_contract() -> None:
@@ -70,15 +75,28 @@ def test_the_state_and_the_memory_reach_the_actions_and_padding_does_not() -> No
     assert off(replace(batch, proprio=-batch.proprio)) > 1e-4
     features, mask = batch.history.features, batch.history.mask[..., None]
     assert off(replace(batch, history=replace(batch.history, features=features * 0.5))) > 1e-6
-    assert off(replace(batch, history=replace(batch.history, features=features + 7.0 * ~mask))) < 1e-5
+    assert (
+        off(replace(batch, history=replace(batch.history, features=features + 7.0 * ~mask))) < 1e-5
+    )
     longer = torch.nn.functional.pad(batch.prompt, (0, 5), value=3)
-    assert off(replace(batch, prompt=longer, prompt_mask=torch.nn.functional.pad(batch.prompt_mask, (0, 5)))) < 1e-5
+    assert (
+        off(
+            replace(
+                batch, prompt=longer, prompt_mask=torch.nn.functional.pad(batch.prompt_mask, (0, 5))
+            )
+        )
+        < 1e-5
+    )
 
 
 def test_prompts_ask_in_lower_case_name_the_subgoal_and_end_in_the_opening_piece() -> None:
     for name, subgoal, expected in (
         ("openvla_oft", None, "in: what action should the robot take to press the button.? out:"),
-        ("openvla_oft_simplesg", "Go Left", "take to press the button; current subgoal: go left? out:"),
+        (
+            "openvla_oft_simplesg",
+            "Go Left",
+            "take to press the button; current subgoal: go left? out:",
+        ),
     ):
         processor = tiny(name).require_processor()
         assert isinstance(processor, OpenVlaProcessor)
@@ -92,6 +110,8 @@ def test_what_this_backbone_cannot_do_is_refused_in_words() -> None:
     with pytest.raises(UserError, match="every token sees every other"):
         build_policy("openvla_oft_framesamp_context", integration={"prompt_sees_memory": False})
     with pytest.raises(UserError, match="'openvla' has no place for"):
-        build_policy("framesamp_modul", backbone="openvla_tiny", embodiment="robomme_joint_absolute")
+        build_policy(
+            "framesamp_modul", backbone="openvla_tiny", embodiment="robomme_joint_absolute"
+        )
     with pytest.raises(UserError, match="as wide as the robot's"):
         build_policy("openvla_oft", backbone={"action_dim": 32})

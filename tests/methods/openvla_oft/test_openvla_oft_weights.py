@@ -35,7 +35,10 @@ def test_a_run_is_saved_in_the_published_names_and_read_again(tmp_path: Path) ->
     folder = saved(policy, tmp_path / "run")
     assert detect_format(folder) == "openvla"
     names = set(load_file(folder / "model.safetensors"))
-    assert {"vision_backbone.featurizer.blocks.0.ls1.scale_factor", "language_model.lm_head.weight"} <= names
+    assert {
+        "vision_backbone.featurizer.blocks.0.ls1.scale_factor",
+        "language_model.lm_head.weight",
+    } <= names
     head = torch.load(folder / "action_head--0_checkpoint.pt", weights_only=True)
     assert "module.model.mlp_resnet_blocks.1.ffn.1.weight" in head
     other = built(seed=2)
@@ -48,7 +51,9 @@ def test_a_run_is_saved_in_the_published_names_and_read_again(tmp_path: Path) ->
 @pytest.mark.parametrize("module", ["vision_backbone", "noisy_action_projector"])
 def test_a_run_with_modules_that_no_policy_has_is_refused(module: str, tmp_path: Path) -> None:
     folder = saved(built(), tmp_path / "run")
-    torch.save({"module.featurizer.scale": torch.ones(2)}, folder / f"{module}--150000_checkpoint.pt")
+    torch.save(
+        {"module.featurizer.scale": torch.ones(2)}, folder / f"{module}--150000_checkpoint.pt"
+    )
     with pytest.raises(UserError, match=f"{module}--150000_checkpoint.pt"):
         load_weights(built(seed=2), folder)
 
@@ -60,7 +65,9 @@ def test_openvla_itself_is_a_start_that_lacks_head_state_token_and_memory(tmp_pa
     for name in ("openvla_oft", "openvla_oft_framesamp_context"):
         policy = built(name, seed=2)
         took = transfer(policy, folder)
-        assert took.new and all(policy.finetune_spec.component_of(new) in ("action", "memory") for new in took.new)
+        assert took.new and all(
+            policy.finetune_spec.component_of(new) in ("action", "memory") for new in took.new
+        )
         assert not took.left
     with pytest.raises(UserError, match="action_head/model"):
         load_weights(built(seed=2), folder)
@@ -88,7 +95,10 @@ def test_a_run_that_holds_its_adapters_alone_is_read_beside_its_base(tmp_path: P
     merged, loaded, fresh = policy.state_dict(), read.state_dict(), built().state_dict()
     for name, tensor in merged.items():
         torch.testing.assert_close(loaded[name], tensor, msg=name)
-    assert sum(not torch.equal(tensor, fresh[name]) for name, tensor in loaded.items()) == len(adapters) // 2
+    assert (
+        sum(not torch.equal(tensor, fresh[name]) for name, tensor in loaded.items())
+        == len(adapters) // 2
+    )
     with pytest.raises(UserError, match=r"adapters apart .*openvla/openvla-7b.*base="):
         load_weights(built(seed=2), run)
     with pytest.raises(UserError, match="leave it out"):

@@ -1,4 +1,6 @@
-"""SAM2Act+'s geometry against golden numbers of the original code, and what follows from its rules."""
+"""SAM2Act+'s geometry against golden numbers of the original code, and what follows
+from its rules.
+"""
 
 import numpy as np
 import pytest
@@ -21,7 +23,9 @@ def tensor(array: np.ndarray) -> torch.Tensor:
 
 
 def test_a_depth_image_becomes_world_points(golden: dict[str, np.ndarray]) -> None:
-    inputs = [golden[f"unproject/{name}"] for name in ("depth", "intrinsic", "extrinsic_world_to_camera")]
+    inputs = [
+        golden[f"unproject/{name}"] for name in ("depth", "intrinsic", "extrinsic_world_to_camera")
+    ]
     assert relative_error(unproject(*inputs), golden["unproject/points"]) < TOLERANCE
     # The benchmark writes extrinsics without their last row.
     assert np.array_equal(unproject(inputs[0], inputs[1], inputs[2][:3]), unproject(*inputs))
@@ -29,7 +33,9 @@ def test_a_depth_image_becomes_world_points(golden: dict[str, np.ndarray]) -> No
 
 def test_points_outside_the_bounds_are_dropped(golden: dict[str, np.ndarray]) -> None:
     cube = Cube.of(golden["bound/bounds"])
-    for number, (points, features) in enumerate(zip(golden["bound/points"], golden["bound/features"], strict=True)):
+    for number, (points, features) in enumerate(
+        zip(golden["bound/points"], golden["bound/features"], strict=True)
+    ):
         inside = cube.inside(tensor(points)).numpy()
         assert np.array_equal(points[inside], golden[f"bound/kept{number}"])
         assert np.array_equal(features[inside], golden[f"bound/kept_features{number}"])
@@ -59,7 +65,9 @@ def test_three_heatmaps_agree_on_a_point(golden: dict[str, np.ndarray]) -> None:
     finder = geometry.PointFinder(logits.shape[-1])
     assert relative_error(finder.find(logits), golden["waypoint/points"]) < TOLERANCE
     maps = logits[0, :, 0].flatten(1).softmax(-1).view_as(logits[0, :, 0])
-    assert relative_error(finder.scores(maps).flatten(), golden["waypoint/scores_first"]) < TOLERANCE
+    assert (
+        relative_error(finder.scores(maps).flatten(), golden["waypoint/scores_first"]) < TOLERANCE
+    )
     cells = torch.cartesian_prod(finder.line, finder.line, finder.line)
     assert relative_error(cells[:10], golden["waypoint/grid_first_ten"]) < TOLERANCE
     assert relative_error(cells[-1], golden["waypoint/grid_last"]) < TOLERANCE
@@ -82,19 +90,28 @@ def test_rotations_are_the_bins_of_the_original(golden: dict[str, np.ndarray]) -
 
 def test_the_renderer_follows_its_rules_to_the_pixel() -> None:
     golden = load("render")
-    points, features, side = tensor(golden["points"]), tensor(golden["features"]), int(golden["resolution"])
+    points, features, side = (
+        tensor(golden["points"]),
+        tensor(golden["features"]),
+        int(golden["resolution"]),
+    )
     nearest = geometry.z_buffer(points, features, side)
     splats = geometry.splat(*nearest, float(golden["radius"]))
     for kind, (image, depth) in {"plain": nearest, "splat": splats}.items():
         assert relative_error(image, golden[f"{kind}_image"]) < TOLERANCE
         assert relative_error(depth, golden[f"{kind}_depth"]) < TOLERANCE
     assert (
-        relative_error(geometry.render(points, features, side, float(golden["radius"])), golden["output"]) < TOLERANCE
+        relative_error(
+            geometry.render(points, features, side, float(golden["radius"])), golden["output"]
+        )
+        < TOLERANCE
     )
 
 
 def test_what_is_behind_a_camera_stands_before_everything() -> None:
-    points = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 1.5]])  # the second is above the eye of the view from the top
+    points = torch.tensor(
+        [[0.0, 0.0, 0.5], [0.0, 0.0, 1.5]]
+    )  # the second is above the eye of the view from the top
     images, depth = geometry.z_buffer(points, torch.tensor([[1.0], [2.0]]), 4)
     assert images[0, 2, 2].item() == 2.0
     assert depth[0, 2, 2].item() == 0.0
@@ -128,4 +145,6 @@ def test_turning_about_a_point_leaves_it_and_heights_alone() -> None:
     across, turned_across = points - centre[:, None], turned - centre[:, None]
     assert torch.allclose(turned_across[..., 0], -across[..., 1], atol=1e-6)
     shift = torch.tensor([[0.1, 0.2, 0.3]]).expand(2, 3)
-    assert torch.allclose(shift_and_rotate(points, centre, shift, quarter * 0), points + shift[:, None], atol=1e-6)
+    assert torch.allclose(
+        shift_and_rotate(points, centre, shift, quarter * 0), points + shift[:, None], atol=1e-6
+    )

@@ -81,17 +81,25 @@ def test_what_is_stored_is_what_was_recorded(folder: Path) -> None:
                 assert np.array_equal(shot.depth, recorded.depth)
                 assert np.array_equal(shot.intrinsic, recorded.intrinsic)
                 assert np.array_equal(shot.extrinsic, recorded.extrinsic)
-        assert stored.commanded_open([0, 12]).tolist() == [episode.commanded_open(0), episode.commanded_open(12)]
+        assert stored.commanded_open([0, 12]).tolist() == [
+            episode.commanded_open(0),
+            episode.commanded_open(12),
+        ]
 
 
 def test_recordings_without_depth_are_refused_by_name(tmp_path: Path) -> None:
     write_file(tmp_path / "record_dataset_Alpha.h5", [8], poses=True)
     refs = list_episodes(find_files([tmp_path]))
-    with open_episode(refs[0]) as episode, pytest.raises(UserError, match=r"front_depth.*record it with depth"):
+    with (
+        open_episode(refs[0]) as episode,
+        pytest.raises(UserError, match=r"front_depth.*record it with depth"),
+    ):
         write_keyframes(episode, tmp_path / "kept.npz")
 
 
-def test_a_conversion_without_keyframes_is_another_plan_and_has_none(folder: Path, tmp_path: Path) -> None:
+def test_a_conversion_without_keyframes_is_another_plan_and_has_none(
+    folder: Path, tmp_path: Path
+) -> None:
     refs = list_episodes(find_files([folder]))
     convert(refs, tmp_path / "out", ConvertOptions(images="png"))
     assert not file_of(tmp_path / "out", 0).exists()
@@ -108,7 +116,11 @@ def source_of(folder: Path) -> EpisodeSource:
 def test_transitions_are_one_for_every_keyframe_of_every_chain(folder: Path) -> None:
     source = source_of(folder)
     data = KeyframeDataset([source], Identity(), 1, sampled=False)
-    chains = [chain for e in range(len(LENGTHS)) for chain in EpisodeKeyframes(file_of(source.root, e)).chains]
+    chains = [
+        chain
+        for e in range(len(LENGTHS))
+        for chain in EpisodeKeyframes(file_of(source.root, e)).chains
+    ]
     assert len(data) == sum(map(len, chains))
     assert data.total_frames == sum(LENGTHS)
     item = data[0]
@@ -118,7 +130,9 @@ def test_transitions_are_one_for_every_keyframe_of_every_chain(folder: Path) -> 
 
 
 def test_windows_depend_on_seed_epoch_and_place_alone_and_spare_the_last_one(folder: Path) -> None:
-    data, again = (KeyframeDataset([source_of(folder)], Identity(), 3, seed=5, sampled=False) for _ in range(2))
+    data, again = (
+        KeyframeDataset([source_of(folder)], Identity(), 3, seed=5, sampled=False) for _ in range(2)
+    )
     begins: dict[int, set[int]] = {}
     for epoch in range(12):
         data.set_epoch(epoch)
@@ -134,7 +148,9 @@ def test_windows_depend_on_seed_epoch_and_place_alone_and_spare_the_last_one(fol
 
 
 class ManyTasks:
-    """Episodes of tasks with unlike numbers of episodes, chains and keyframes; an episode is its chains' lengths."""
+    """Episodes of tasks with unlike numbers of episodes, chains and keyframes; an episode is its
+    chains' lengths.
+    """
 
     def __init__(self, episodes: dict[str, list[list[int]]]) -> None:
         self.tasks = [task for task, of_task in episodes.items() for _ in of_task]
@@ -159,7 +175,9 @@ def sampled_shares(
 
     def keep(path: Path) -> Any:
         number = int(path.stem.split("_")[1])
-        chains = [[Link(place, place, place) for place in range(count)] for count in source.chains[number]]
+        chains = [
+            [Link(place, place, place) for place in range(count)] for count in source.chains[number]
+        ]
         return SimpleNamespace(chains=chains)
 
     monkeypatch.setattr(keyframes, "EpisodeKeyframes", keep)
@@ -176,19 +194,29 @@ def sampled_shares(
     return {k: n / total for k, n in counts.items()}, {k: n / total for k, n in places.items()}
 
 
-def test_the_first_stage_draws_a_task_and_then_one_of_its_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_stage_draws_a_task_and_then_one_of_its_transitions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     shares, places = sampled_shares({"few": [[2]], "many": [[4, 4, 4], [8]]}, 1, monkeypatch)
     assert shares == pytest.approx({"few": 0.5, "many": 0.5}, abs=0.03)
-    assert places[0, 0] == pytest.approx(0.25, abs=0.03) and places[2, 7] == pytest.approx(0.5 / 20, abs=0.01)
+    assert places[0, 0] == pytest.approx(0.25, abs=0.03) and places[2, 7] == pytest.approx(
+        0.5 / 20, abs=0.01
+    )
 
 
 def test_the_memorys_stage_draws_task_episode_and_chain_again_where_it_is_too_short(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of `half` every second sample is rejected, and then a task is sampled anew: it occurs half as often."""
-    shares, places = sampled_shares({"half": [[5, 1]], "whole": [[5], [5, 5, 5]], "never": [[2]]}, 3, monkeypatch)
+    """Of `half` every second sample is rejected, and then a task is sampled anew: it occurs half as
+    often.
+    """
+    shares, places = sampled_shares(
+        {"half": [[5, 1]], "whole": [[5], [5, 5, 5]], "never": [[2]]}, 3, monkeypatch
+    )
     assert shares == pytest.approx({"half": 1 / 3, "whole": 2 / 3}, abs=0.03)
-    assert places[1, 1] == pytest.approx(1 / 3, abs=0.03) and places[2, 3] == pytest.approx(1 / 3, abs=0.03)
+    assert places[1, 1] == pytest.approx(1 / 3, abs=0.03) and places[2, 3] == pytest.approx(
+        1 / 3, abs=0.03
+    )
 
 
 def test_depth_becomes_a_table_at_its_height(folder: Path) -> None:

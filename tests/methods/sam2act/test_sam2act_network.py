@@ -23,13 +23,19 @@ from mme_vla.methods.sam2act.weights import RATES, released_names
 from mme_vla.weights.tables import read
 
 MODULE, NETWORK, GRADIENT = 1e-4, 5e-4, 2e-3
-TINY_ENCODER = EncoderSizes(width=8, heads=1, blocks=(1, 1, 2, 1), windows=(8, 4, 4, 2), global_blocks=(3,), lora=2)
+TINY_ENCODER = EncoderSizes(
+    width=8, heads=1, blocks=(1, 1, 2, 1), windows=(8, 4, 4, 2), global_blocks=(3,), lora=2
+)
 
 
 def fill(module: nn.Module, weights: dict[str, Tensor], place: str, stages: int) -> None:
-    """Give a module the tensors that the released code names so; `place` is where it is in our network."""
+    """Give a module the tensors that the released code names so; `place` is where it is in our
+    network.
+    """
     table = released_names([f"{place}{name}" for name in module.state_dict()], stages)
-    module.load_state_dict({name.removeprefix(place): value for name, value in read(table, weights).items()})
+    module.load_state_dict(
+        {name.removeprefix(place): value for name, value in read(table, weights).items()}
+    )
 
 
 # Modules
@@ -41,7 +47,11 @@ def golden() -> dict[str, np.ndarray]:
 
 
 def params(golden: dict[str, np.ndarray], prefix: str = "sam2.") -> dict[str, Tensor]:
-    arrays = {name: torch.from_numpy(value) for name, value in golden.items() if name.startswith("params/")}
+    arrays = {
+        name: torch.from_numpy(value)
+        for name, value in golden.items()
+        if name.startswith("params/")
+    }
     return {prefix + name.removeprefix("params/"): value for name, value in arrays.items()}
 
 
@@ -53,7 +63,9 @@ def small_bank(golden: dict[str, np.ndarray]) -> KeyframeBank:
     """A bank of the golden file's sizes, every one of them read from its arrays."""
     weights, stages = params(golden), mask_stages(golden)
     width, remembered = golden["encoder/features"].shape[1], golden["params/maskmem_tpos_enc"].shape
-    layers = {name.split(".")[3] for name in weights if name.startswith("sam2.memory_attention.layers.")}
+    layers = {
+        name.split(".")[3] for name in weights if name.startswith("sam2.memory_attention.layers.")
+    }
     bank = KeyframeBank(
         grid=golden["encoder/features"].shape[-1],
         token=width,
@@ -71,7 +83,9 @@ def small_bank(golden: dict[str, np.ndarray]) -> KeyframeBank:
 def test_a_keyframe_is_encoded_as_the_original_does(golden: dict[str, np.ndarray]) -> None:
     bank = small_bank(golden)
     assert isinstance(bank.encoder, MemoryEncoder)
-    actual = bank.encoder(*(torch.from_numpy(golden[f"encoder/{name}"]) for name in ("features", "masks")))
+    actual = bank.encoder(
+        *(torch.from_numpy(golden[f"encoder/{name}"]) for name in ("features", "masks"))
+    )
     assert relative_error(actual, golden["encoder/out"]) < MODULE
     expected = golden["encoder/position"]
     positions = sine_positions(expected.shape[-1], expected.shape[1])
@@ -82,11 +96,18 @@ def test_a_keyframe_is_encoded_as_the_original_does(golden: dict[str, np.ndarray
 def test_tokens_attend_to_one_and_to_several_memories(golden: dict[str, np.ndarray]) -> None:
     attention = small_bank(golden).attention
     assert isinstance(attention, MemoryAttention)
-    current, positions = (torch.from_numpy(golden[f"attention/{name}"]) for name in ("current", "current_position"))
-    counts = [int(key.removeprefix("attention/out")) for key in golden if key.startswith("attention/out")]
+    current, positions = (
+        torch.from_numpy(golden[f"attention/{name}"]) for name in ("current", "current_position")
+    )
+    counts = [
+        int(key.removeprefix("attention/out")) for key in golden if key.startswith("attention/out")
+    ]
     assert len(counts) > 1
     for count in counts:
-        memories = [torch.from_numpy(golden[f"attention/{name}{count}"]) for name in ("memory", "memory_position")]
+        memories = [
+            torch.from_numpy(golden[f"attention/{name}{count}"])
+            for name in ("memory", "memory_position")
+        ]
         actual = attention(*(x.transpose(0, 1) for x in (current, positions, *memories)))
         assert relative_error(actual.transpose(0, 1), golden[f"attention/out{count}"]) < MODULE
 
@@ -94,7 +115,9 @@ def test_tokens_attend_to_one_and_to_several_memories(golden: dict[str, np.ndarr
 @torch.no_grad()
 def test_the_bank_follows_the_golden_stream(golden: dict[str, np.ndarray]) -> None:
     bank = small_bank(golden)
-    features, positions = (torch.from_numpy(golden[f"bank/{name}"]) for name in ("features", "position"))
+    features, positions = (
+        torch.from_numpy(golden[f"bank/{name}"]) for name in ("features", "position")
+    )
     side, reset = bank.grid, int(golden["bank/reset_before_step"])
     state = bank.init_state()
     for step in range(len(features)):
@@ -111,15 +134,23 @@ def test_the_bank_follows_the_golden_stream(golden: dict[str, np.ndarray]) -> No
 @torch.no_grad()
 def test_upsampling_is_convex_as_in_the_original(golden: dict[str, np.ndarray]) -> None:
     module = ConvexUp(golden["convex/in"].shape[1], golden["convex/out"].shape[1])
-    weights = {name.removeprefix("convex."): value for name, value in params(golden, "").items() if "convex." in name}
+    weights = {
+        name.removeprefix("convex."): value
+        for name, value in params(golden, "").items()
+        if "convex." in name
+    }
     module.load_state_dict(weights)
-    assert relative_error(module(torch.from_numpy(golden["convex/in"])), golden["convex/out"]) < MODULE
+    assert (
+        relative_error(module(torch.from_numpy(golden["convex/in"])), golden["convex/out"]) < MODULE
+    )
 
 
 @torch.no_grad()
 def test_adapters_reach_queries_and_values_alone(golden: dict[str, np.ndarray]) -> None:
     weights = {
-        name.removeprefix("lora_qkv."): value for name, value in params(golden, "").items() if "lora_qkv" in name
+        name.removeprefix("lora_qkv."): value
+        for name, value in params(golden, "").items()
+        if "lora_qkv" in name
     }
     out, into = weights["qkv.weight"].shape
     module = LoraProjection(nn.Linear(into, out), len(weights["linear_a_q.weight"]))
@@ -134,7 +165,9 @@ def test_adapters_reach_queries_and_values_alone(golden: dict[str, np.ndarray]) 
 
 
 class Rendered:
-    """The golden network: its sizes from the names' shapes, its weights and inputs random by rule."""
+    """The golden network: its sizes from the names' shapes, its weights and inputs
+    random by rule.
+    """
 
     def __init__(self) -> None:
         described = meta()
@@ -143,10 +176,14 @@ class Rendered:
         widths = {
             name: self.shapes[f"mvt1.{source}.weight"][0]
             for name, source in (
-                ("sam", "fusion.conv2d"), ("pictures", "patchify.conv2d"), ("state", "proprio_preprocess.linear"),
+                ("sam", "fusion.conv2d"),
+                ("pictures", "patchify.conv2d"),
+                ("state", "proprio_preprocess.linear"),
             )
-        }  # fmt: skip
-        masks = [re.search(r"mask_downsampler\.encoder\.(\d+)\.weight", name) for name in self.shapes]
+        }
+        masks = [
+            re.search(r"mask_downsampler\.encoder\.(\d+)\.weight", name) for name in self.shapes
+        ]
         self.stages = max(int(match[1]) for match in masks if match) // 3
         self.sizes = SAM2ActSizes(
             encoder=TINY_ENCODER,
@@ -168,7 +205,9 @@ class Rendered:
             **widths,
         )
         self.network = SAM2ActNetwork(self.sizes).eval()
-        source = {name: sample_weight(name, shape, self.seed) for name, shape in self.shapes.items()}
+        source = {
+            name: sample_weight(name, shape, self.seed) for name, shape in self.shapes.items()
+        }
         source["mvt2.feat_fc_init_bn.num_batches_tracked"] = torch.zeros((), dtype=torch.int64)
         self.weights = source
         for place in ("coarse.", "fine.", "memory."):
@@ -180,7 +219,9 @@ class Rendered:
 
         def part(name: str, *shape: int) -> Tensor:
             scale = 0.5 if name == "image" else 1.0
-            return torch.from_numpy((scale * sample_array(f"{tag}.{name}", shape, self.seed)).astype(np.float32))
+            return torch.from_numpy(
+                (scale * sample_array(f"{tag}.{name}", shape, self.seed)).astype(np.float32)
+            )
 
         image = part("image", batch, VIEWS, 7, sizes.side, sizes.side)
         constant = constant_channels(sizes.side).expand(batch, -1, -1, -1, -1)
@@ -191,7 +232,10 @@ class Rendered:
         )
         state = part("proprio", batch, sizes.state_dim)
         return EncodedViews(
-            torch.cat([image, constant], 2), maps, state, part("language", batch, sizes.words, sizes.language)
+            torch.cat([image, constant], 2),
+            maps,
+            state,
+            part("language", batch, sizes.words, sizes.language),
         )
 
 
@@ -207,12 +251,16 @@ def expected() -> dict[str, np.ndarray]:
 
 def test_every_golden_parameter_has_a_place_and_every_place_a_parameter(case: Rendered) -> None:
     targets = [name for name in case.network.state_dict() if not name.startswith("encoder.")]
-    sources = {piece.path for pieces in released_names(targets, case.stages).values() for piece in pieces}
+    sources = {
+        piece.path for pieces in released_names(targets, case.stages).values() for piece in pieces
+    }
     assert sources == set(case.shapes) - {RATES}
 
 
 @torch.no_grad()
-def test_the_coarse_view_follows_the_golden_stream(case: Rendered, expected: dict[str, np.ndarray]) -> None:
+def test_the_coarse_view_follows_the_golden_stream(
+    case: Rendered, expected: dict[str, np.ndarray]
+) -> None:
     remembered, finder = case.network.memory.init_state(), PointFinder(case.sizes.side)
     steps = int(expected["coarse_steps"])
     for step in range(steps):
@@ -228,7 +276,9 @@ def test_the_coarse_view_follows_the_golden_stream(case: Rendered, expected: dic
 
 
 @torch.no_grad()
-def test_the_closer_view_rotates_and_grips_as_the_original(case: Rendered, expected: dict[str, np.ndarray]) -> None:
+def test_the_closer_view_rotates_and_grips_as_the_original(
+    case: Rendered, expected: dict[str, np.ndarray]
+) -> None:
     logits, tokens = case.network.fine_step(case.encoded_views("fine", 1))
     assert relative_error(logits, expected["fine/trans"]) < NETWORK
     waypoint = PointFinder(case.sizes.side).find(logits)
@@ -246,7 +296,9 @@ def test_a_sequence_of_keyframes_has_the_golden_loss_and_gradients(case: Rendere
     golden, norms = load("training"), meta()["training_grad_l2"]
     waypoints = torch.from_numpy(golden["waypoints"])[:, 0]
     case.network.zero_grad()
-    logits = case.network.coarse_sequences(case.encoded_views("training", len(waypoints)), len(waypoints))
+    logits = case.network.coarse_sequences(
+        case.encoded_views("training", len(waypoints)), len(waypoints)
+    )
     assert relative_error(logits[-1:], golden["last_heatmap"]) < NETWORK
     loss = heatmap_loss(logits, waypoints).mean()
     assert relative_error(loss, golden["loss"]) < NETWORK

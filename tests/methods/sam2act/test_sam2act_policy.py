@@ -37,7 +37,11 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of one small episode with keyframes."""
     folder = tmp_path_factory.mktemp("sam2act")
     write_file(folder / "record_dataset_Alpha.h5", [40], [12], poses=True, depth=True)
-    convert(list_episodes(find_files([folder])), folder / "out", ConvertOptions(images="png", keyframes=True))
+    convert(
+        list_episodes(find_files([folder])),
+        folder / "out",
+        ConvertOptions(images="png", keyframes=True),
+    )
     return folder / "out"
 
 
@@ -49,7 +53,9 @@ def batch_of(policy: SAM2ActPolicy, data: Path, count: int = 2) -> KeyframeBatch
 def views(count: int, seed: int = 0) -> dict[str, np.ndarray]:
     """What an environment delivers of `count` frames."""
     rng = np.random.default_rng(seed)
-    images = {name: rng.integers(0, 255, (count, SIZE, SIZE, 3), np.uint8) for name in ("front", "wrist")}
+    images = {
+        name: rng.integers(0, 255, (count, SIZE, SIZE, 3), np.uint8) for name in ("front", "wrist")
+    }
     return images | readings(count, seed)
 
 
@@ -73,7 +79,9 @@ def test_each_stage_learns_what_it_trains_and_leaves_the_remainder(data: Path, s
         optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < losses[0]
-    assert metrics["loss"].item() == pytest.approx(sum(v.item() for k, v in metrics.items() if k != "loss"), rel=1e-5)
+    assert metrics["loss"].item() == pytest.approx(
+        sum(v.item() for k, v in metrics.items() if k != "loss"), rel=1e-5
+    )
     for name, value in policy.named_parameters():
         assert value.requires_grad or torch.equal(value, before[name]), name
     assert len(metrics) == {"first": 7, "memory": 2}[stage]
@@ -114,12 +122,18 @@ def test_an_episode_remembers_keyframes_once_they_lie_behind(policy: SAM2ActPoli
 
 def test_what_is_remembered_reaches_the_waypoints_scores(policy: SAM2ActPolicy) -> None:
     frames = views(2)
-    fresh, experienced = policy.start_episode("pick the cube"), policy.start_episode("pick the cube")
+    fresh, experienced = (
+        policy.start_episode("pick the cube"),
+        policy.start_episode("pick the cube"),
+    )
     experienced.observe(views(4, seed=5), states(4), True)
     for episode in (fresh, experienced):
         episode.observe(frames, states(2))
     observations = [policy.observation([episode])[0] for episode in (fresh, experienced)]
-    after = [policy.watch(s, e.remembered).maps[-1] for s, e in zip(observations, (fresh, experienced), strict=True)]
+    after = [
+        policy.watch(s, e.remembered).maps[-1]
+        for s, e in zip(observations, (fresh, experienced), strict=True)
+    ]
     assert not torch.equal(*after)
 
 

@@ -1,4 +1,6 @@
-"""SAM2Act+ in a rollout: depth and poses of cameras come along, one waypoint is one motion of many frames."""
+"""SAM2Act+ in a rollout: depth and poses of cameras come along, one waypoint is one motion of many
+frames.
+"""
 
 import numpy as np
 import pytest
@@ -54,5 +56,7 @@ def test_the_last_frame_of_a_motion_is_the_keyframe(policy: SAM2ActPolicy) -> No
 
 def test_an_environment_without_depth_is_refused_by_name(policy: SAM2ActPolicy) -> None:
     env = ChunkEnv(lambda: DepthEnv("PickXtimes", 0, blind=True), robot=policy.embodiment)
-    with pytest.raises(UserError, match="The policy reads 'front_depth', which this environment does not deliver"):
+    with pytest.raises(
+        UserError, match="The policy reads 'front_depth', which this environment does not deliver"
+    ):
         env.reset()

@@ -1,4 +1,6 @@
-"""SAM2Act+'s sizes and names at full size, as the released checkpoints have them, and files of that format."""
+"""SAM2Act+'s sizes and names at full size, as the released checkpoints have them, and files of that
+format.
+"""
 
 import math
 import re
@@ -59,7 +61,9 @@ def unread_parameters() -> int:
 
 def test_every_part_has_the_released_number_of_parameters(network: SAM2ActNetwork) -> None:
     assert {name: count(network.get_submodule(name)) for name in FULL} == FULL
-    adapters = sum(value.numel() for name, value in network.named_parameters() if ".linear_" in name)
+    adapters = sum(
+        value.numel() for name, value in network.named_parameters() if ".linear_" in name
+    )
     assert adapters == 637_952
     assert count(network) + unread_parameters() == WHOLE
 
@@ -103,12 +107,16 @@ def file(policy: SAM2ActPolicy, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return folder / WEIGHTS
 
 
-def test_a_file_in_the_authors_layout_comes_back_completely(policy: SAM2ActPolicy, file: Path) -> None:
+def test_a_file_in_the_authors_layout_comes_back_completely(
+    policy: SAM2ActPolicy, file: Path
+) -> None:
     assert detect_format(file) == "sam2act_plus"
     assert same(load_weights(build_policy("sam2act_plus", seed=1), file), policy)
 
 
-def test_a_policy_on_meta_is_filled_with_its_constants_too(policy: SAM2ActPolicy, file: Path) -> None:
+def test_a_policy_on_meta_is_filled_with_its_constants_too(
+    policy: SAM2ActPolicy, file: Path
+) -> None:
     loaded = load_weights(build_policy("sam2act_plus", device="meta"), file)
     assert isinstance(loaded, SAM2ActPolicy)
     assert not [name for name, value in loaded.state_dict().items() if value.is_meta]

@@ -22,7 +22,8 @@ def test_it_acts_in_lerobots_loop_as_by_itself(tmp_path: Path) -> None:
     policy.save_pretrained(tmp_path / "ours")
     rng, states = np.random.default_rng(0), np.full((1, 8), 0.1, np.float32)
     frames = [
-        {name: rng.integers(0, 255, (1, SIDE, SIDE, 3), np.uint8) for name in ("front", "wrist")} for _ in range(3)
+        {name: rng.integers(0, 255, (1, SIDE, SIDE, 3), np.uint8) for name in ("front", "wrist")}
+        for _ in range(3)
     ]
     episode = policy.start_episode("touch it", seed=42)
     for views in frames:
@@ -37,8 +38,14 @@ def test_it_acts_in_lerobots_loop_as_by_itself(tmp_path: Path) -> None:
         loaded.reset()
         assert not loaded.supports_rtc()
         for views in frames:
-            images = {name: torch.from_numpy(view).movedim(-1, 1).float() / 255 for name, view in views.items()}
-            batch = {"observation.images.image": images["front"], "observation.images.wrist_image": images["wrist"]}
+            images = {
+                name: torch.from_numpy(view).movedim(-1, 1).float() / 255
+                for name, view in views.items()
+            }
+            batch = {
+                "observation.images.image": images["front"],
+                "observation.images.wrist_image": images["wrist"],
+            }
             chunk = loaded.predict_action_chunk(
                 {**batch, "observation.state": torch.from_numpy(states), "task": ["touch it"]}
             )

@@ -1,4 +1,6 @@
-"""SimpleMemVLA computes what its authors' code computes: windows, prompts, pixels, hidden states, losses and chunks."""
+"""SimpleMemVLA computes what its authors' code computes: windows, prompts, pixels, hidden states,
+losses and chunks.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +19,14 @@ from mme_vla.methods.simplememvla.head import Condition, channel_loss, scaled_se
 from mme_vla.methods.simplememvla.model import response_condition, words_loss
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.methods.simplememvla.processor import VideoBatch
-from mme_vla.methods.simplememvla.prompt import CameraTokens, Robot, Tokens, WordTokenizer, encode, instruction
+from mme_vla.methods.simplememvla.prompt import (
+    CameraTokens,
+    Robot,
+    Tokens,
+    WordTokenizer,
+    encode,
+    instruction,
+)
 from mme_vla.methods.simplememvla.video import (
     Window,
     augment,
@@ -61,21 +70,28 @@ def test_windows_and_timestamps() -> None:
 def test_instructions() -> None:
     for case in read("prompt")["texts"]:
         robot = Robot("Panda single-arm robot", 20, 30)
-        assert instruction(case["goal"], robot, case["history_cameras"], case["current_cameras"]) == case["text"]
+        assert (
+            instruction(case["goal"], robot, case["history_cameras"], case["current_cameras"])
+            == case["text"]
+        )
 
 
 def test_token_layouts() -> None:
     meta, golden, config = read("meta"), arrays("prompt"), read("meta")["config"]
     tokenizer = WordTokenizer.load(folder() / "tokenizer.json")
     robot = Robot(config["robot_tag"], config["control_frequency_hz"], config["action_horizon"])
-    window = Window(config["history_video_sec"], config["history_video_fps"], config["native_video_fps"])
+    window = Window(
+        config["history_video_sec"], config["history_video_fps"], config["native_video_fps"]
+    )
     side = meta["processor"]["patch"] * meta["processor"]["merge"]
     names = [key.rpartition(".")[2] for key in config["image_keys"]]
     for k, case in enumerate(read("prompt")["layouts"]):
         cameras = [
             CameraTokens(
                 name,
-                _grid_of(meta["sizes"]["frame"], case["frames"] if name in case["history"] else 1, side),
+                _grid_of(
+                    meta["sizes"]["frame"], case["frames"] if name in case["history"] else 1, side
+                ),
                 window.times(case["frames"]) if name in case["history"] else None,
             )
             for name in names
@@ -85,7 +101,9 @@ def test_token_layouts() -> None:
         tokens = encode(tokenizer, cameras, request, case["answer"])
         np.testing.assert_array_equal(tokens.ids, golden[f"{k}/input_ids"])
         np.testing.assert_array_equal(tokens.kinds, golden[f"{k}/mm_token_type_ids"])
-        np.testing.assert_array_equal(np.arange(len(tokens.ids)) >= tokens.prompt, golden[f"{k}/span"])
+        np.testing.assert_array_equal(
+            np.arange(len(tokens.ids)) >= tokens.prompt, golden[f"{k}/span"]
+        )
 
 
 def _grid_of(size: list[int], count: int, side: int) -> tuple[int, int]:
@@ -106,13 +124,19 @@ def test_sizes_of_images() -> None:
 
 def test_pixels() -> None:
     golden, settings = arrays("pictures"), read("meta")["processor"]
-    patch, merge, bounds = settings["patch"], settings["merge"], (settings["min_pixels"], settings["max_pixels"])
+    patch, merge, bounds = (
+        settings["patch"],
+        settings["merge"],
+        (settings["min_pixels"], settings["max_pixels"]),
+    )
 
     def rows(images: Tensor, video: bool) -> Tensor:
         height, width = images.shape[-2:]
         size = fitting_size(height, width, len(images) if video else 1, patch * merge, bounds)
         images = resized(images, size)
-        pairs = images.unflatten(0, (-1, 2)) if video else images[:1, None].expand(-1, 2, -1, -1, -1)
+        pairs = (
+            images.unflatten(0, (-1, 2)) if video else images[:1, None].expand(-1, 2, -1, -1, -1)
+        )
         return pixel_rows(pairs, patch, merge)
 
     def first(name: str) -> Tensor:
@@ -133,13 +157,22 @@ def test_augmentation() -> None:
     k = 0
     while f"augment/{k}/params" in golden:
         params, clip = golden[f"augment/{k}/params"].numpy(), golden[f"augment/{k}/clip"].numpy()
-        assert np.abs(colour_matrix(*params[5:]) - golden[f"augment/{k}/matrix"].numpy()).max() < 1e-5
-        changed = augment(channels_first(views["front"][: len(clip)]), params).movedim(1, -1).numpy().astype(int)
+        assert (
+            np.abs(colour_matrix(*params[5:]) - golden[f"augment/{k}/matrix"].numpy()).max() < 1e-5
+        )
+        changed = (
+            augment(channels_first(views["front"][: len(clip)]), params)
+            .movedim(1, -1)
+            .numpy()
+            .astype(int)
+        )
         difference = np.abs(changed - clip)
         assert difference.max() <= 1 and (difference > 0).mean() < 1e-3
         k += 1
     source = np.random.RandomState(sizes["seed"])
-    draws = np.stack([augmentation_draw(source.random_sample(7).tolist()) for _ in golden["augment/drawn"]])
+    draws = np.stack(
+        [augmentation_draw(source.random_sample(7).tolist()) for _ in golden["augment/drawn"]]
+    )
     np.testing.assert_allclose(draws, golden["augment/drawn"].numpy(), rtol=1e-12)
 
 
@@ -150,7 +183,10 @@ def test_rotary_sections() -> None:
 
 def test_vision_tower(policy: SimpleMemVlaPolicy) -> None:
     golden, visual = arrays("vision"), policy.backbone.model.visual
-    assert error(visual(golden["pixels"], grid_thw=golden["grid"]).pooler_output, golden["features"]) < TOLERANCE
+    assert (
+        error(visual(golden["pixels"], grid_thw=golden["grid"]).pooler_output, golden["features"])
+        < TOLERANCE
+    )
     image = visual(golden["image_pixels"], grid_thw=golden["image_grid"]).pooler_output
     assert error(image, golden["image_features"]) < TOLERANCE
     pairs = policy.require_processor().video(channels_first(frames()["front"][:4]))
@@ -176,7 +212,9 @@ def test_head(policy: SimpleMemVlaPolicy) -> None:
     assert error(head(actions, times, condition, None), golden["without_state"]) < TOLERANCE
     assert error(head(actions, times, without_tokens, state), golden["without_tokens"]) < TOLERANCE
     assert error(head(short, times, condition, state), golden["shorter"]) < TOLERANCE
-    assert error(head(actions, times, odd, state), golden["odd_positions"]) < TOLERANCE  # unscaled sections: 5e-4
+    assert (
+        error(head(actions, times, odd, state), golden["odd_positions"]) < TOLERANCE
+    )  # unscaled sections: 5e-4
     assert error(head.time_embed(golden["time/in"]), golden["time/out"]) < TOLERANCE
     for steps in (1, 4, 10):
         chunk = head.sample(golden["sample/noise"], condition, state, steps)
@@ -189,10 +227,16 @@ def test_head(policy: SimpleMemVlaPolicy) -> None:
 
 def _training_batch(policy: SimpleMemVlaPolicy) -> VideoBatch:
     """The batch of the case, made by the processor from frames, states and words."""
-    golden, config, processor = arrays("training"), read("meta")["config"], policy.require_processor()
+    golden, config, processor = (
+        arrays("training"),
+        read("meta")["config"],
+        policy.require_processor(),
+    )
     views, anchors = frames(), golden["made/anchors"].tolist()
     items: list[dict[str, Any]] = []
-    for i, (anchor, output) in enumerate(zip(anchors, read("meta")["sizes"]["answers"], strict=True)):
+    for i, (anchor, output) in enumerate(
+        zip(anchors, read("meta")["sizes"]["answers"], strict=True)
+    ):
         video = processor.video(channels_first(views["front"][processor.frames(anchor)]))
         images = processor.images([views["wrist"][anchor]])
         request = processor.prompt(read("meta")["sizes"]["goal"])
@@ -205,7 +249,9 @@ def _training_batch(policy: SimpleMemVlaPolicy) -> VideoBatch:
                 "video": video,
                 "images": images,
                 "state": processor.states(golden["made/raw_states"][anchor]),
-                "actions": processor.actions(actions[steps.clamp(max=last)], golden["made/raw_states"][anchor]),
+                "actions": processor.actions(
+                    actions[steps.clamp(max=last)], golden["made/raw_states"][anchor]
+                ),
                 "action_mask": golden["batch/action_mask"][i, :, 0],
             }
         )
@@ -237,11 +283,16 @@ def test_hidden_states_velocity_and_losses(policy: SimpleMemVlaPolicy) -> None:
     assert error(hidden[valid], golden["last_hidden"][valid]) < TOLERANCE
     condition = response_condition(hidden, embedded, batch.positions, batch.spans)
     velocity = policy.action_head(
-        golden["head/in/noisy_actions"], golden["head/in/timesteps"], condition, golden["batch/state"]
+        golden["head/in/noisy_actions"],
+        golden["head/in/timesteps"],
+        condition,
+        golden["batch/state"],
     )
     assert error(velocity, golden["head/velocity"]) < TOLERANCE
     words, right = words_loss(policy.backbone, hidden, batch.ids, batch.spans)
-    assert right == 1  # the case is trained on these answers: the loss is near the precision of a probability of 1
+    assert (
+        right == 1
+    )  # the case is trained on these answers: the loss is near the precision of a probability of 1
     assert words.item() == pytest.approx(golden["vl_loss"].item(), rel=TOLERANCE, abs=1e-6)
     loss, metrics = policy(batch, {"noise": golden["noise"], "time": golden["times"]})
     assert error(metrics["action"], golden["action_loss"]) < TOLERANCE
@@ -256,11 +307,15 @@ def test_gradients(policy: SimpleMemVlaPolicy) -> None:
     largest = max(norms.values())
     for name, parameter in policy.named_parameters():
         assert parameter.grad is not None, name
-        assert abs(float(parameter.grad.norm()) - norms[name]) < TOLERANCE * max(norms[name], 1e-2 * largest), name
+        assert abs(float(parameter.grad.norm()) - norms[name]) < TOLERANCE * max(
+            norms[name], 1e-2 * largest
+        ), name
     policy.zero_grad()
 
 
-def _decided(policy: SimpleMemVlaPolicy, golden: dict[str, Tensor], key: str, step: int, prefix: str = "") -> Any:
+def _decided(
+    policy: SimpleMemVlaPolicy, golden: dict[str, Tensor], key: str, step: int, prefix: str = ""
+) -> Any:
     """An episode at a step of the case, its noise the case's."""
     views = frames(prefix)
     episode = policy.start_episode(read("meta")["sizes"]["goal"])
@@ -271,10 +326,16 @@ def _decided(policy: SimpleMemVlaPolicy, golden: dict[str, Tensor], key: str, st
 
 
 def test_decisions_from_images(policy: SimpleMemVlaPolicy) -> None:
-    golden, cases = arrays("acting"), [case for case in read("meta")["said"] if case["kind"] == "plain"]
+    golden, cases = (
+        arrays("acting"),
+        [case for case in read("meta")["said"] if case["kind"] == "plain"],
+    )
     for k, case in enumerate(cases):
         episode = _decided(policy, golden, f"plain/{k}", case["current"])
-        assert policy.require_processor().frames(case["current"]).tolist() == golden[f"plain/{k}/frames"].tolist()
+        assert (
+            policy.require_processor().frames(case["current"]).tolist()
+            == golden[f"plain/{k}/frames"].tolist()
+        )
         actions = torch.from_numpy(policy.act(episode))
         assert episode.subtask == case["said"]
         assert error(actions, golden[f"plain/{k}/actions"]) < TOLERANCE
@@ -284,7 +345,9 @@ def test_decisions_from_images(policy: SimpleMemVlaPolicy) -> None:
         assert error(condition.hidden, golden[f"plain/{k}/cond_hidden"]) < TOLERANCE
         assert condition.tokens is not None
         assert error(condition.tokens, golden[f"plain/{k}/cond_token"]) < TOLERANCE
-        np.testing.assert_array_equal(condition.positions.transpose(0, 1), golden[f"plain/{k}/cond_pos"])
+        np.testing.assert_array_equal(
+            condition.positions.transpose(0, 1), golden[f"plain/{k}/cond_pos"]
+        )
 
 
 def _with_features(policy: SimpleMemVlaPolicy, *episodes: Any) -> VideoBatch:
@@ -297,7 +360,10 @@ def test_an_answer_that_reaches_the_limit_of_words(tmp_path: Path) -> None:
     golden, case = arrays("acting"), next(c for c in read("meta")["said"] if c["kind"] == "capped")
     policy = golden_policy(tmp_path, max_words=case["limit"])
     episode = _decided(
-        policy, {f"capped/{n}": golden[f"plain/1/{n}"] for n in ("state", "noise")}, "capped", case["current"]
+        policy,
+        {f"capped/{n}": golden[f"plain/1/{n}"] for n in ("state", "noise")},
+        "capped",
+        case["current"],
     )
     actions = torch.from_numpy(policy.act(episode))
     assert episode.subtask == case["said"].strip()
@@ -315,7 +381,9 @@ def test_two_episodes_in_a_batch(policy: SimpleMemVlaPolicy) -> None:
     actions = torch.from_numpy(policy.act(pair))
     for row, episode in enumerate(pair):
         assert error(actions[row], golden[f"batched/{row}/actions"]) < TOLERANCE
-        assert episode.subtask == next(c["said"] for c in cases if c["kind"] == "batched" and c["row"] == row)
+        assert episode.subtask == next(
+            c["said"] for c in cases if c["kind"] == "batched" and c["row"] == row
+        )
 
 
 def test_prompts_that_were_read_ahead(tmp_path: Path) -> None:
@@ -361,7 +429,9 @@ def test_the_cache_of_a_prefix(tmp_path: Path) -> None:
     for name, expected in golden.items():
         if name.startswith("prefix/"):
             _, layer, kind = name.split("/")
-            cached = getattr(episode.video.ahead.cache.layers[int(layer.removeprefix("layer"))], kind)
+            cached = getattr(
+                episode.video.ahead.cache.layers[int(layer.removeprefix("layer"))], kind
+            )
             assert error(cached, expected) < TOLERANCE
 
 

@@ -1,4 +1,6 @@
-"""SimpleMemVLA in a policy's hands: reading ahead, episodes, memories in the video's place, recipes."""
+"""SimpleMemVLA in a policy's hands: reading ahead, episodes, memories in the video's place,
+recipes.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,13 @@ from helpers.prior_vla_runs import UNTESTED, losses, run
 from mme_vla import UserError, build_policy
 from mme_vla.config.composition import compose
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
-from mme_vla.methods.simplememvla.prompt import CameraTokens, Robot, WordTokenizer, encode, instruction
+from mme_vla.methods.simplememvla.prompt import (
+    CameraTokens,
+    Robot,
+    WordTokenizer,
+    encode,
+    instruction,
+)
 from mme_vla.methods.simplememvla.video import TEMPORAL
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_from_config
@@ -55,11 +63,15 @@ def policy() -> SimpleMemVlaPolicy:
 
 def observations(count: int, seed: int = 0) -> tuple[dict[str, np.ndarray], np.ndarray]:
     rng = np.random.default_rng(seed)
-    views = {name: rng.integers(0, 255, (count, SIDE, SIDE, 3), np.uint8) for name in ("front", "wrist")}
+    views = {
+        name: rng.integers(0, 255, (count, SIDE, SIDE, 3), np.uint8) for name in ("front", "wrist")
+    }
     return views, np.full((count, 8), 0.1, np.float32)
 
 
-def observe(episode: Any, views: dict[str, np.ndarray], states: np.ndarray, start: int, end: int) -> None:
+def observe(
+    episode: Any, views: dict[str, np.ndarray], states: np.ndarray, start: int, end: int
+) -> None:
     episode.observe({name: view[start:end] for name, view in views.items()}, states[start:end])
 
 
@@ -67,7 +79,9 @@ def observe(episode: Any, views: dict[str, np.ndarray], states: np.ndarray, star
 def test_a_prompt_has_the_same_tokens_with_a_response_as_alone(vocabulary: str) -> None:
     tokenizer, cameras = WordTokenizer.load(vocabulary), [CameraTokens("front", (1, 1), [0.5])]
     request = instruction("pick up the cube twice", Robot("arm", 20, 4), 1, 0)
-    alone, learned = (encode(tokenizer, cameras, request, response) for response in (None, "pick up the cube"))
+    alone, learned = (
+        encode(tokenizer, cameras, request, response) for response in (None, "pick up the cube")
+    )
     assert alone.prompt == learned.prompt == len(alone.ids)
     np.testing.assert_array_equal(learned.ids[: learned.prompt], alone.ids)
     assert tokenizer.decode(learned.ids[learned.prompt :].tolist()) == "pick up the cube\n"
@@ -89,7 +103,9 @@ def test_reading_ahead_changes_no_action() -> None:
         assert step < 32 or planned.video.ahead.length > 0
 
 
-def test_an_interrupted_reading_ahead_is_continued_where_it_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_reading_ahead_is_continued_where_it_stopped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("mme_vla.methods.simplememvla.episode.PIECE", 2)
     policy = small(**{"processor.seconds": 20})
     views, states = observations(200)
@@ -140,11 +156,15 @@ def test_only_frames_of_the_video_need_to_be_rendered(policy: SimpleMemVlaPolicy
     full, sparse = (policy.start_episode("pick up the cube", seed=1) for _ in range(2))
     observe(full, views, states, 0, 60)
     rendered = {"front": read, "wrist": np.array([59])}
-    sparse.observe({name: views[name][index] for name, index in rendered.items()}, states, rendered=rendered)
+    sparse.observe(
+        {name: views[name][index] for name, index in rendered.items()}, states, rendered=rendered
+    )
     np.testing.assert_array_equal(policy.act(full), policy.act(sparse))
     bare = policy.start_episode("pick up the cube", seed=1)
     rendered["front"] = read[1:]
-    bare.observe({name: views[name][index] for name, index in rendered.items()}, states, rendered=rendered)
+    bare.observe(
+        {name: views[name][index] for name, index in rendered.items()}, states, rendered=rendered
+    )
     with pytest.raises(UserError, match="not rendered or not observed"):
         policy.act(bare)
 
@@ -188,7 +208,10 @@ def test_a_memory_of_the_paper_in_the_videos_place(memory: str, tmp_path: Path) 
     observe(episode, views, states, 0, 6)
     tokens = policy.observation([episode])
     assert int((tokens.kinds == 3).sum()) == policy.memory.budget
-    assert policy.act(episode, 2).shape == (policy.horizon, 8) and np.isfinite(policy.act(episode, 2)).all()
+    assert (
+        policy.act(episode, 2).shape == (policy.horizon, 8)
+        and np.isfinite(policy.act(episode, 2)).all()
+    )
     with torch.no_grad():
         assert policy.memory_proj is not None
         policy.memory_proj.weight.normal_()
@@ -212,7 +235,11 @@ def test_lora_trains_adapters_of_the_language_model_and_the_head() -> None:
     batch = policy.full_batch()
     loss, _ = policy.train()(batch)
     loss.backward()
-    assert all(p.grad is not None for name, p in policy.named_parameters() if p.requires_grad and "lora_B" in name)
+    assert all(
+        p.grad is not None
+        for name, p in policy.named_parameters()
+        if p.requires_grad and "lora_B" in name
+    )
 
 
 def test_a_language_model_without_delta_nets_generates() -> None:
@@ -223,14 +250,26 @@ def test_a_language_model_without_delta_nets_generates() -> None:
 
 
 @pytest.mark.slow
-def test_a_lora_training_lowers_the_loss_and_changes_adapters_and_the_head_alone(tmp_path: Path) -> None:
-    words = [*WORDS, "finetune=simplememvla", "train.steps=30", "train.batch_size=2", "train.lr=2e-3",
-             "train.warmup=2"]  # fmt: skip
+def test_a_lora_training_lowers_the_loss_and_changes_adapters_and_the_head_alone(
+    tmp_path: Path,
+) -> None:
+    words = [
+        *WORDS,
+        "finetune=simplememvla",
+        "train.steps=30",
+        "train.batch_size=2",
+        "train.lr=2e-3",
+        "train.warmup=2",
+    ]
     trained = Policy.from_pretrained(run("simplememvla", tmp_path / "run", *words, short=UNTESTED))
     values = losses(tmp_path / "run")
     assert len(values) == 30 and np.mean(values[-10:]) < 0.95 * np.mean(values[:10])
-    fresh = dict(build_from_config(compose("train", ["model=simplememvla", *words])).named_parameters())
-    weights = {name.replace(".base_layer.", "."): value for name, value in trained.named_parameters()}
+    fresh = dict(
+        build_from_config(compose("train", ["model=simplememvla", *words])).named_parameters()
+    )
+    weights = {
+        name.replace(".base_layer.", "."): value for name, value in trained.named_parameters()
+    }
     adapters = {name for name in weights if ".lora_" in name}
     assert adapters and all(weights[name].any() for name in adapters)
     changed = {name for name in fresh if not torch.equal(weights[name], fresh[name])}
@@ -242,15 +281,31 @@ def test_a_lora_training_lowers_the_loss_and_changes_adapters_and_the_head_alone
 
 def test_the_recipe_has_two_learning_rates(policy: SimpleMemVlaPolicy) -> None:
     cfg = compose("train", ["experiment=simplememvla"])
-    assert cfg.name == "simplememvla" and cfg.backbone.horizon == 30 and cfg.embodiment.action.execute == 16
-    settings = TrainSettings(steps=1, batch_size=1, lr=5e-5, part_lr={"vision": 0.1, "vlm": 0.1}, decay_min_dim=2)
+    assert (
+        cfg.name == "simplememvla"
+        and cfg.backbone.horizon == 30
+        and cfg.embodiment.action.execute == 16
+    )
+    settings = TrainSettings(
+        steps=1, batch_size=1, lr=5e-5, part_lr={"vision": 0.1, "vlm": 0.1}, decay_min_dim=2
+    )
     named = dict(policy.named_parameters())
-    optimizer = make_optimizer(named.values(), settings, lr_factors(named, policy.finetune_spec, settings))
-    factors = {id(p): group.get("lr_factor", 1.0) for group in optimizer.param_groups for p in group["params"]}
+    optimizer = make_optimizer(
+        named.values(), settings, lr_factors(named, policy.finetune_spec, settings)
+    )
+    factors = {
+        id(p): group.get("lr_factor", 1.0)
+        for group in optimizer.param_groups
+        for p in group["params"]
+    }
     assert {factors[id(p)] for name, p in named.items() if name.startswith("backbone.")} == {0.1}
     assert {factors[id(p)] for name, p in named.items() if name.startswith("action_head.")} == {1.0}
     with pytest.raises(UserError, match=r"train\.part_lr names 'tower'"):
-        lr_factors(named, policy.finetune_spec, TrainSettings(steps=1, batch_size=1, lr=1.0, part_lr={"tower": 1.0}))
+        lr_factors(
+            named,
+            policy.finetune_spec,
+            TrainSettings(steps=1, batch_size=1, lr=1.0, part_lr={"tower": 1.0}),
+        )
 
 
 def test_a_video_of_another_rate_is_refused() -> None:

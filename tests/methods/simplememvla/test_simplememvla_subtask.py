@@ -1,4 +1,6 @@
-"""π0.5 with the sub-task channel: it trains, generates words, and its words decide about actions."""
+"""π0.5 with the sub-task channel: it trains, generates words, and its words decide
+about actions.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -50,7 +52,9 @@ def test_sample_weights_weigh_the_words_too() -> None:
     losses = [policy(sample, noise)[1]["words"] for sample in samples]
     assert losses[0] != losses[1]
     rows = replace(join(samples), weight=torch.tensor([0.0, 3.0]))
-    words, mask = (torch.cat([getattr(sample, name) for sample in samples]) for name in ("words", "words_mask"))
+    words, mask = (
+        torch.cat([getattr(sample, name) for sample in samples]) for name in ("words", "words_mask")
+    )
     both = SubtaskBatch(**vars(rows), words=words, words_mask=mask)
     noises = {name: torch.cat([value, value]) for name, value in noise.items()}
     assert torch.allclose(policy(both, noises)[1]["words"], 1.5 * losses[1])

@@ -41,16 +41,27 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_published_folder_is_written_and_read_again(published: Path, tmp_path: Path) -> None:
     assert detect_format(published) == "simplememvla"
     tensors = load_file(published / "model.safetensors")
-    assert torch.equal(tensors[LM_HEAD], tensors["backbone.model.language_model.embed_tokens.weight"])
+    assert torch.equal(
+        tensors[LM_HEAD], tensors["backbone.model.language_model.embed_tokens.weight"]
+    )
     config = json.loads((published / "config.json").read_text())
-    assert (config["history_video_sec"], config["action_horizon"], config["native_video_fps"]) == (60, 30, 20)
+    assert (config["history_video_sec"], config["action_horizon"], config["native_video_fps"]) == (
+        60,
+        30,
+        20,
+    )
     policy, other = tiny(1), tiny(2)
     load_weights(other, published)
     assert same(policy, other)
     stats = read_stats(published)
-    assert stats is not None and stats.state.mean.tolist() == policy.require_processor().stats.state.mean.tolist()  # type: ignore[union-attr]
+    assert (
+        stats is not None
+        and stats.state.mean.tolist() == policy.require_processor().stats.state.mean.tolist()
+    )  # type: ignore[union-attr]
     del tensors[LM_HEAD]
-    save_file(tensors, tmp_path / "model.safetensors")  # also without the tied head, and without a description
+    save_file(
+        tensors, tmp_path / "model.safetensors"
+    )  # also without the tied head, and without a description
     load_weights(tiny(3), tmp_path)
 
 
@@ -58,7 +69,9 @@ def test_a_folder_brings_its_window_and_sizes(published: Path, tmp_path: Path) -
     source = tmp_path / "source"
     shutil.copytree(published, source)
     config = json.loads((source / "config.json").read_text())
-    (source / "config.json").write_text(json.dumps(config | {"history_video_sec": 3, "robot_tag": "Two arms"}))
+    (source / "config.json").write_text(
+        json.dumps(config | {"history_video_sec": 3, "robot_tag": "Two arms"})
+    )
     convert(source, tmp_path / "ours", ["processor=simplememvla_tiny", "backbone.image_size=32"])
     settings = Policy.from_pretrained(tmp_path / "ours").require_processor().settings  # type: ignore[attr-defined]
     assert (settings.seconds, settings.robot) == (3, "Two arms")
@@ -68,7 +81,11 @@ def test_a_folder_brings_its_window_and_sizes(published: Path, tmp_path: Path) -
 
 def test_qwen_is_a_start_without_a_head(published: Path, tmp_path: Path) -> None:
     tensors = load_file(published / "model.safetensors")
-    base = {name.removeprefix("backbone."): t for name, t in tensors.items() if name.startswith("backbone.")}
+    base = {
+        name.removeprefix("backbone."): t
+        for name, t in tensors.items()
+        if name.startswith("backbone.")
+    }
     base["mtp.layers.0.weight"] = torch.zeros(2, 2)
     save_file(base, tmp_path / "model.safetensors")
     policy = tiny(2)

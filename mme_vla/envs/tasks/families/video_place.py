@@ -1,4 +1,6 @@
-"""What the two VideoPlace tasks share: a cube is carried over targets in the video; put it on one of them again."""
+"""What the two VideoPlace tasks share: a cube is carried over targets in the video; put it on one
+of them again.
+"""
 
 from abc import abstractmethod
 from collections.abc import Collection, Mapping
@@ -49,11 +51,15 @@ class Place(Thing):
 
 
 class VideoPlace(Task):
-    """The cube visits targets, then a spot of the table; in hard episodes two targets then change places."""
+    """The cube visits targets, then a spot of the table; in hard episodes two targets then change
+    places.
+    """
 
     dials = frozenset({"delay"})
     spot_radius: ClassVar[float]
-    """How far the spot where the video puts the cube at its end stays from the edge of its region."""
+    """How far the spot where the video puts the cube at its end stays from the edge of
+    its region.
+    """
     target_counts: ClassVar[dict[str, int]]
     operation: ClassVar[str] = "which"
     """What is mistaken by who puts the cube on another target."""
@@ -61,32 +67,46 @@ class VideoPlace(Task):
     def build(self, draws: Draws) -> None:
         values, table = self.values, Region((0, 0), 0.2)
         region = Region((-0.1, 0), 0.1)
-        self.spot = add_target(self, draws, "spot", "layout.goal_xy", region, self.spot_radius, [], gap=H)
+        self.spot = add_target(
+            self, draws, "spot", "layout.goal_xy", region, self.spot_radius, [], gap=H
+        )
         self.button = add_button(self, draws, (0.1, 0), (0.05, 0.3))
         colours = sample_colours(self, draws, ("red", "blue", "green"))[: CUBES[self.difficulty]]
         avoid: list[Avoid] = [self.spot, self.button]
         self.cubes: list[Cube] = []
         for name in cube_names(self, "layout.cubes", colours):
             colour, value = name.split("_")[0], f"layout.cubes.{name}"
-            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, table, avoid, value=value))
+            self.cubes.append(
+                add_cube(self, draws, f"cube_{colour}", colour, table, avoid, value=value)
+            )
             avoid.append(self.cubes[-1])
         self.targets: list[Disc] = []
-        count = values.count("layout.targets") if values.specified else self.target_counts[self.difficulty]
+        count = (
+            values.count("layout.targets")
+            if values.specified
+            else self.target_counts[self.difficulty]
+        )
         for i in range(count):
             value = f"layout.targets.{i}"
-            self.targets.append(add_target(self, draws, f"target_{i}", value, table, TARGET_RADIUS, avoid, gap=H))
+            self.targets.append(
+                add_target(self, draws, f"target_{i}", value, table, TARGET_RADIUS, avoid, gap=H)
+            )
             avoid.append(self.targets[-1])
         if count < 2:
             raise values.error("layout.targets", f"has {count} targets; expected at least 2")
         spot = values.find("layout.goal_xy")
         self.spot.set_home(sapien.Pose([*spot, SUNK_Z], self.spot.pose.q))
         n_cubes = len(self.cubes)
-        self.demonstrated = values.indices("objects.demo_ids", lambda: [draws.integer(0, n_cubes)], n_cubes)
+        self.demonstrated = values.indices(
+            "objects.demo_ids", lambda: [draws.integer(0, n_cubes)], n_cubes
+        )
         if not self.demonstrated:
             raise values.error("objects.demo_ids", "is empty; expected the cubes of the video")
         self.cube = self.cubes[self.demonstrated[0]]
         hard = self.difficulty == "hard"
-        swapped = values.indices("objects.swap_pair_ids", lambda: draws.permutation(count) if hard else [], count)
+        swapped = values.indices(
+            "objects.swap_pair_ids", lambda: draws.permutation(count) if hard else [], count
+        )
         self._swapped = [self.targets[i] for i in swapped[:2]]
         if len(self._swapped) == 1:
             raise values.error("objects.swap_pair_ids", "has one target; expected two, or none")
@@ -126,7 +146,9 @@ class VideoPlace(Task):
         return choices_made(ended, "bc", video=True) | active_motions(swap)
 
     def failure(self) -> bool:
-        """Notes whether the swap may begin, one step after its stage is entered; the rules belong to the stages."""
+        """Notes whether the swap may begin, one step after its stage is entered; the rules belong
+        to the stages.
+        """
         self._swap_due = bool(self._swapped) and self.progress.current is self._swap_stage
         return False
 
@@ -178,7 +200,13 @@ class VideoPlace(Task):
         other_cubes = [c for c in self.cubes if c is not cube]
         other_targets = [t for t in self.targets if t is not target]
         return [
-            pick(self, cube, "pick up the cube", failed=lambda: any_picked_up(self, other_cubes), pick=True),
+            pick(
+                self,
+                cube,
+                "pick up the cube",
+                failed=lambda: any_picked_up(self, other_cubes),
+                pick=True,
+            ),
             SubTask(
                 "place the cube onto the correct target",
                 done=lambda: dropped_onto(self, cube, target),
@@ -194,6 +222,8 @@ class VideoPlace(Task):
     def choices(self) -> list[Choice]:
         return [
             Choice("a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
-            Choice("b", "drop onto", lambda demo, target: demo.place_on(target), lambda: self.targets),
+            Choice(
+                "b", "drop onto", lambda demo, target: demo.place_on(target), lambda: self.targets
+            ),
             Choice("c", "press the button", lambda demo, _: demo.press(self.button)),
         ]

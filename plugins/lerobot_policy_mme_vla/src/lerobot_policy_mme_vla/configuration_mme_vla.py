@@ -19,15 +19,16 @@ IS_DEMO = "observation.is_demo"
 class MMEVLAConfig(PreTrainedConfig):
     """A composition of mme-vla by its name, with overrides in the words of its own commands.
 
-    model, overrides: `--policy.model=framesamp_modul --policy.overrides='["backbone=pi05","memory.budget=256"]'`.
-    init_from: weights to start from, in any format that mme-vla reads.
-    composition: the whole configuration as JSON; saving writes it, so that a checkpoint needs no other file for it.
-    exec_starts: side file of first execution frames, for datasets that do not mark their conditioning video.
-    cache_root: folder of the vision caches that a memory trains on. max_build_frames: larger datasets have theirs built
+    model, overrides: `--policy.model=framesamp_modul
+    --policy.overrides='["backbone=pi05","memory.budget=256"]'`. init_from: weights to start from,
+    in any format that mme-vla reads. composition: the whole configuration as JSON; saving writes
+    it, so that a checkpoint needs no other file for it. exec_starts: side file of first execution
+    frames, for datasets that do not mark their conditioning video. cache_root: folder of the vision
+    caches that a memory trains on. max_build_frames: larger datasets have theirs built
         beforehand (`mme-vla cache`). cache_local: every machine has a `cache_root` of its own.
     freeze_vision: leave the vision tower as it is; a memory needs that.
-    n_action_steps: actions of a chunk that are executed; by default the embodiment's. flow_steps: of the sampler.
-    seed: of fresh weights, and of every episode's noise.
+    n_action_steps: actions of a chunk that are executed; by default the embodiment's. flow_steps:
+    of the sampler. seed: of fresh weights, and of every episode's noise.
     """
 
     model: str = "framesamp_modul"
@@ -44,7 +45,9 @@ class MMEVLAConfig(PreTrainedConfig):
     seed: int = 42
     # The policy's own processor normalises, relative to the state where the embodiment says so.
     normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
+        default_factory=lambda: dict.fromkeys(
+            ("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY
+        )
     )
     lr: float = 5e-5
     lr_end: float = 5e-5
@@ -52,7 +55,9 @@ class MMEVLAConfig(PreTrainedConfig):
     decay_steps: int = 80_000
 
     def validate_features(self) -> None:
-        """LeRobot asks at construction; `check_robot` can say more, once the embodiment is known."""
+        """LeRobot asks at construction; `check_robot` can say more, once the
+        embodiment is known.
+        """
 
     def check_robot(self, robot: Embodiment) -> None:
         """Make sure that the dataset or environment has what this robot's policy reads and returns.
@@ -82,7 +87,10 @@ class MMEVLAConfig(PreTrainedConfig):
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
         """The released recipe's: a warm-up, and then, as `lr_end` is `lr`, constant."""
         return CosineDecayWithWarmupSchedulerConfig(
-            peak_lr=self.lr, decay_lr=self.lr_end, num_decay_steps=self.decay_steps, num_warmup_steps=self.warmup
+            peak_lr=self.lr,
+            decay_lr=self.lr_end,
+            num_decay_steps=self.decay_steps,
+            num_warmup_steps=self.warmup,
         )
 
     @property
@@ -112,6 +120,7 @@ def image_key(camera: Camera, features: Collection[str]) -> str:
         if name in features:
             return str(name)
     raise UserError(
-        f"No images of the camera {camera.name!r}: none of {', '.join(names)} is among {listed(sorted(features))}. "
-        'Say which it is with --rename_map=\'{"observation.images.<theirs>": "' + names[0] + "\"}'."
+        f"No images of the camera {camera.name!r}: none of {', '.join(names)} is among"
+        f" {listed(sorted(features))}. Say which it is with"
+        ' --rename_map=\'{"observation.images.<theirs>": "' + names[0] + "\"}'."
     )

@@ -1,4 +1,6 @@
-"""`python -m lerobot_policy_mme_vla.convert SRC DST`: a checkpoint of mme-vla for LeRobot's commands, and back."""
+"""`python -m lerobot_policy_mme_vla.convert SRC DST`: a checkpoint of mme-vla for LeRobot's
+commands, and back.
+"""
 
 import argparse
 from collections.abc import Sequence
@@ -22,7 +24,10 @@ def for_lerobot(policy: Policy, device: str = "cpu") -> MMEVLAPolicy:
     """A policy of mme-vla as LeRobot's commands know it."""
     image_features, numbers = features_of(policy.embodiment)
     config = MMEVLAConfig(
-        model=str(policy.config.get("name")), device=device, input_features=image_features, output_features=numbers
+        model=str(policy.config.get("name")),
+        device=device,
+        input_features=image_features,
+        output_features=numbers,
     )
     return MMEVLAPolicy(config, model=policy).to(device).eval()
 
@@ -30,11 +35,15 @@ def for_lerobot(policy: Policy, device: str = "cpu") -> MMEVLAPolicy:
 def features_of(robot: Embodiment) -> tuple[dict[str, PolicyFeature], dict[str, PolicyFeature]]:
     """The features that LeRobot lists for a robot's policy; images may have any size."""
     image_features = {
-        f"observation.images.{camera.key or camera.name}": PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE))
+        f"observation.images.{camera.key or camera.name}": PolicyFeature(
+            FeatureType.VISUAL, (3, SIDE, SIDE)
+        )
         for camera in robot.cameras
     }
     state = PolicyFeature(FeatureType.STATE, (robot.state.width,))
-    return {**image_features, STATE: state}, {"action": PolicyFeature(FeatureType.ACTION, (robot.action.width,))}
+    return {**image_features, STATE: state}, {
+        "action": PolicyFeature(FeatureType.ACTION, (robot.action.width,))
+    }
 
 
 def convert(source: str, target: Path) -> None:
@@ -59,8 +68,12 @@ def convert(source: str, target: Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Read the command line and convert."""
-    parser = argparse.ArgumentParser(prog="python -m lerobot_policy_mme_vla.convert", description=__doc__)
-    parser.add_argument("source", help="checkpoint folder, or owner/name on the hub; of mme-vla, or of this plugin")
+    parser = argparse.ArgumentParser(
+        prog="python -m lerobot_policy_mme_vla.convert", description=__doc__
+    )
+    parser.add_argument(
+        "source", help="checkpoint folder, or owner/name on the hub; of mme-vla, or of this plugin"
+    )
     parser.add_argument("target", type=Path, help="new folder")
     args = parser.parse_args(arguments)
     with print_user_errors():

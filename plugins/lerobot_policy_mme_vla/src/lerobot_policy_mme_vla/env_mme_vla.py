@@ -1,7 +1,8 @@
 """RoboMME for `lerobot-eval`, conditioning video included.
 
-LeRobot's loop gives an action for every observation, and its observations have one shape. So the video is played frame
-by frame: each step shows the next one, flags it with `is_demo`, and does nothing with the action.
+LeRobot's loop gives an action for every observation, and its observations have one shape. So the
+video is played frame by frame: each step shows the next one, flags it with `is_demo`, and does
+nothing with the action.
 """
 
 from collections.abc import Callable
@@ -36,7 +37,9 @@ class RoboMMEWithVideo(gym.Env):
 
     def __init__(self, task: str, split: str, episode: int, max_steps: int) -> None:
         self.task = self.task_description = task
-        self._make: Callable[[], Any] = partial(make_env, task, split=split, episode=episode, max_steps=max_steps)
+        self._make: Callable[[], Any] = partial(
+            make_env, task, split=split, episode=episode, max_steps=max_steps
+        )
         self._env: Any = None
         self._max_episode_steps = max_steps + LONGEST_VIDEO
         self._waiting: list[dict[str, Any]] = []
@@ -61,7 +64,8 @@ class RoboMMEWithVideo(gym.Env):
         frames = _frames(lists)
         if len(frames) > LONGEST_VIDEO:
             raise UserError(
-                f"{self.task}: a video of {len(frames) - 1} frames; this environment plays {LONGEST_VIDEO}."
+                f"{self.task}: a video of {len(frames) - 1} frames; this environment plays"
+                f" {LONGEST_VIDEO}."
             )
         for frame in frames[:-1]:
             frame["is_demo"][:] = 1
@@ -78,7 +82,9 @@ class RoboMMEWithVideo(gym.Env):
             self._frame = _frames(lists)[-1]
         status = info["status"]
         over = bool(terminated) or status == "error"
-        reasons = {key: str(info[key]) for key in ("error_message", "exception_type") if info.get(key)}
+        reasons = {
+            key: str(info[key]) for key in ("error_message", "exception_type") if info.get(key)
+        }
         facts = {"is_success": status == "success", "status": status, **reasons}
         return self._frame, 0.0, over, bool(truncated), facts
 
@@ -107,7 +113,9 @@ def _frames(lists: dict[str, list[Any]]) -> list[dict[str, Any]]:
 
 
 def _features() -> dict[str, PolicyFeature]:
-    image_features = {f"pixels/{name}": PolicyFeature(FeatureType.VISUAL, (SIDE, SIDE, 3)) for name in VIEWS}
+    image_features = {
+        f"pixels/{name}": PolicyFeature(FeatureType.VISUAL, (SIDE, SIDE, 3)) for name in VIEWS
+    }
     return {
         "action": PolicyFeature(FeatureType.ACTION, (ACTION,)),
         **image_features,
@@ -145,12 +153,18 @@ class MMEVLAEnvConfig(EnvConfig):
         return {}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
-        """Task → first episode → batch of environments, each of which stops where its episode ends."""
-        kind: Any = gym.vector.AsyncVectorEnv if use_async_envs and n_envs > 1 else gym.vector.SyncVectorEnv
+        """Task → first episode → batch of environments, each of which stops where its
+        episode ends.
+        """
+        kind: Any = (
+            gym.vector.AsyncVectorEnv if use_async_envs and n_envs > 1 else gym.vector.SyncVectorEnv
+        )
 
         def batch(task: str, first: int) -> Any:
             made = [
-                freeze_after_episode_end(partial(RoboMMEWithVideo, task, self.split, first + i, self.max_steps))
+                freeze_after_episode_end(
+                    partial(RoboMMEWithVideo, task, self.split, first + i, self.max_steps)
+                )
                 for i in range(n_envs)
             ]
             return kind(made)

@@ -15,7 +15,8 @@ BLOCK = 256  # frames of a conditioning video that wait to be read together
 class Row:
     """One environment's episode, the frames it has not read yet, and what is left of its chunk.
 
-    Frames are read when a chunk is chosen, all since the last one at once, as mme-vla's own evaluation does.
+    Frames are read when a chunk is chosen, all since the last one at once, as mme-vla's own
+    evaluation does.
     """
 
     episode: Episode
@@ -38,7 +39,10 @@ class Row:
         """Hand the waiting frames to the episode."""
         if not self._frames:
             return
-        views = {camera: np.stack([frame[camera] for frame in self._frames]) for camera in self._frames[0]}
+        views = {
+            camera: np.stack([frame[camera] for frame in self._frames])
+            for camera in self._frames[0]
+        }
         self.episode.observe(views, np.stack(self._states), np.array(self._demo))
         self._frames, self._states, self._demo = [], [], []
 

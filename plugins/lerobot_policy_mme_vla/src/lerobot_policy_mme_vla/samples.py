@@ -1,8 +1,8 @@
 """Training samples: LeRobot says which steps, mme-vla reads them.
 
-LeRobot's samples hold a fixed number of neighbouring frames, and its pipelines drop what marks the conditioning video.
-So a step is looked up by its `index` in the dataset as mme-vla opens it: history from the vision cache, statistics and
-chunks as in mme-vla's own training.
+LeRobot's samples hold a fixed number of neighbouring frames, and its pipelines drop what marks the
+conditioning video. So a step is looked up by its `index` in the dataset as mme-vla opens it:
+history from the vision cache, statistics and chunks as in mme-vla's own training.
 """
 
 import os
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 
 class Samples:
-    """The steps of one dataset as batches; it is opened when the first one is asked for, with the weights of then.
+    """The steps of one dataset as batches; it is opened when the first one is asked for, with the
+    weights of then.
 
     Args:
         meta: LeRobot's metadata of the dataset.
@@ -57,9 +58,19 @@ class Samples:
 
 @contextmanager
 def _one_first(of_machine: bool) -> Iterator[None]:
-    """Of processes that train together the first (of each machine) goes ahead, so that caches are built once."""
-    together = distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1
-    rank = int(os.environ.get("LOCAL_RANK", "0")) if of_machine or not together else distributed.get_rank()
+    """Of processes that train together the first (of each machine) goes ahead, so that caches are
+    built once.
+    """
+    together = (
+        distributed.is_available()
+        and distributed.is_initialized()
+        and distributed.get_world_size() > 1
+    )
+    rank = (
+        int(os.environ.get("LOCAL_RANK", "0"))
+        if of_machine or not together
+        else distributed.get_rank()
+    )
     first = rank == 0
     if together and not first:
         distributed.barrier()
@@ -72,14 +83,23 @@ def _one_first(of_machine: bool) -> Iterator[None]:
 
 def _steps(model: Policy, config: "MMEVLAConfig", entry: dict[str, Any]) -> TrainingDataset:
     data = {
-        "name": entry["name"], "sources": [entry], "val_fraction": 0.0, "val_episodes": [], "action_offset": 0,
-        "mask_padding": False, "jitter": False,
-        "cache": {"root": config.cache_root, "batch_size": 32, "max_build_frames": config.max_build_frames},
-    }  # fmt: skip
+        "name": entry["name"],
+        "sources": [entry],
+        "val_fraction": 0.0,
+        "val_episodes": [],
+        "action_offset": 0,
+        "mask_padding": False,
+        "jitter": False,
+        "cache": {
+            "root": config.cache_root,
+            "batch_size": 32,
+            "max_build_frames": config.max_build_frames,
+        },
+    }
     steps = prepare_data(model, data, config.seed).train
     if type(steps) is not TrainingDataset:
         raise UserError(
-            f"{config.model} is trained on groups of steps or on keyframes, which LeRobot's sampler does not draw: "
-            "train it with python -m mme_vla.train."
+            f"{config.model} is trained on groups of steps or on keyframes, which LeRobot's sampler"
+            " does not draw: train it with python -m mme_vla.train."
         )
     return steps

@@ -19,7 +19,8 @@ class BenchmarkEnvBuilder:
         dataset: `train`, `val` or `test`.
         action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
         gui_render: a window; there is none here.
-        override_metadata_path: a folder of `record_dataset_<Task>_metadata.json`, in place of the benchmark's episodes.
+        override_metadata_path: a folder of `record_dataset_<Task>_metadata.json`, in place of the
+            benchmark's episodes.
         max_steps: control steps until the status becomes `timeout`.
 
     Raises:
@@ -36,9 +37,17 @@ class BenchmarkEnvBuilder:
         max_steps: int = 10000,
     ) -> None:
         if gui_render:
-            raise UserError("gui_render=True: these environments open no window. Leave it out, and use render().")
+            raise UserError(
+                "gui_render=True: these environments open no window. Leave it out, and use"
+                " render()."
+            )
         check_names(env_id, action_space, None, None)
-        self.env_id, self.dataset, self.action_space, self.max_steps = env_id, dataset, action_space, max_steps
+        self.env_id, self.dataset, self.action_space, self.max_steps = (
+            env_id,
+            dataset,
+            action_space,
+            max_steps,
+        )
         if override_metadata_path is None:
             self._episodes = metadata.episodes(env_id, dataset)
         else:
@@ -61,16 +70,20 @@ class BenchmarkEnvBuilder:
             UserError: there is no such episode.
         """
         if not 0 <= episode < len(self._episodes):
-            raise UserError(f"{self.env_id} has the episodes 0 to {len(self._episodes) - 1}, and no {episode}.")
+            raise UserError(
+                f"{self.env_id} has the episodes 0 to {len(self._episodes) - 1}, and no {episode}."
+            )
         spec = self._episodes[episode]
         return spec.seed, spec.difficulty
 
-    def make_env_for_episode(self, episode_idx: int, max_steps: int | None = None, **include: bool) -> RoboMMEEnv:
+    def make_env_for_episode(
+        self, episode_idx: int, max_steps: int | None = None, **include: bool
+    ) -> RoboMMEEnv:
         """Make an episode's environment; call `reset()` first.
 
         Args:
-            max_steps: by default the builder's. include: `include_front_depth` and the like, as `mme_vla.envs.make_env`
-                takes them.
+            max_steps: by default the builder's. include: `include_front_depth` and the like, as
+                `mme_vla.envs.make_env` takes them.
 
         Raises:
             UserError: no such episode, an unknown option, a missing package, or no Vulkan driver.
