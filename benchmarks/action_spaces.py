@@ -17,7 +17,7 @@ import numpy as np
 from mme_vla.envs import make_env
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import TASK_NAMES, episode
-from mme_vla.envs.recording.recorder import RecordedStep, Recorder
+from mme_vla.envs.robomme.recording.recorder import RecordedStep, Recorder
 
 SPACES = {
     "joint_angle": "joint_action",

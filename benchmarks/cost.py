@@ -3,7 +3,7 @@
     # all four without a choice
     python benchmarks/cost.py [--count] [--budgets] [--time] [--memory] [--models …]
 
-FLOPs are counted by `mme_vla.evaluation.analyses.cost`, which says what counts;
+FLOPs are counted by `mme_vla.extras.probing.analyses.cost`, which says what counts;
 `python -m mme_vla.analyse cost` prints them as well.
 """
 
@@ -17,7 +17,7 @@ from variants import chunk, training_step
 
 from mme_vla import build_policy
 from mme_vla.config.composition import compose
-from mme_vla.evaluation.analyses.cost import count_model
+from mme_vla.extras.probing.analyses.cost import count_model
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import ALL_BEYOND, ALL_MODELS, NEURAL, random_batch
 from mme_vla.training.logging import resident_gib

@@ -13,8 +13,8 @@ import time
 
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import TASK_NAMES
-from mme_vla.envs.recording.recorder import Recorder
-from mme_vla.envs.scene.placement import SceneError
+from mme_vla.envs.robomme.recording.recorder import Recorder
+from mme_vla.envs.robomme.scene.placement import SceneError
 from mme_vla.evaluation.results.scopes import task_facts
 
 WEIGHTS = {"easy": 0.5, "medium": 0.25, "hard": 0.25}

@@ -21,8 +21,8 @@ from typing import Any
 from timing import machine
 
 from mme_vla.cli.record import record_episode
-from mme_vla.envs.recording.frames import FrameChoice
-from mme_vla.envs.recording.outputs import Job as Demonstration
+from mme_vla.envs.robomme.recording.frames import FrameChoice
+from mme_vla.envs.robomme.recording.outputs import Job as Demonstration
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env

@@ -19,8 +19,8 @@ from typing import Any
 
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import SPLITS, TASK_NAMES, EpisodeSpec, episode, formula
-from mme_vla.envs.recording.recorder import Recorder
-from mme_vla.envs.scene.placement import SceneError
+from mme_vla.envs.robomme.recording.recorder import Recorder
+from mme_vla.envs.robomme.scene.placement import SceneError
 
 MOST_TRIES = 20
 

@@ -46,8 +46,8 @@ from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.envs import metadata
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import RECORDS, read_records, read_run
-from mme_vla.play.game import Option
-from mme_vla.play.vlm_players import parse_choice
+from mme_vla.extras.play.game import Option
+from mme_vla.extras.play.vlm_players import parse_choice
 from mme_vla.policy.tensor_files import WEIGHTS, save_tensors
 from mme_vla.subgoal.text import (
     MalformedReply,

@@ -13,7 +13,7 @@ from torch import Tensor, distributed
 from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla import MMEPolicy, build_policy
-from mme_vla.evaluation.analyses.cost import flops
+from mme_vla.extras.probing.analyses.cost import flops
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.speed import HasAttentionBackends
 from mme_vla.types import Batch

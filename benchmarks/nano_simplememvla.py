@@ -24,11 +24,11 @@ from accelerate import Accelerator
 
 from mme_vla.config.composition import compose, resolved
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
-from mme_vla.methods.simplememvla.video import Window
-from mme_vla.nano.demonstrations import Demonstration, Scene
-from mme_vla.nano.learning import statistics
-from mme_vla.nano.runs import Group, demonstrate
+from mme_vla.extras.methods.simplememvla.policy import SimpleMemVlaPolicy
+from mme_vla.extras.methods.simplememvla.video import Window
+from mme_vla.extras.nano.demonstrations import Demonstration, Scene
+from mme_vla.extras.nano.learning import statistics
+from mme_vla.extras.nano.runs import Group, demonstrate
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_from_config
 from mme_vla.processing.base import Sample

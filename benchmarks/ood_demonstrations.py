@@ -23,9 +23,9 @@ from typing import Any
 
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task
-from mme_vla.envs.recording.recorder import Recorder
-from mme_vla.envs.robot import control
-from mme_vla.envs.scene.placement import SceneError
+from mme_vla.envs.robomme.recording.recorder import Recorder
+from mme_vla.envs.robomme.robot import control
+from mme_vla.envs.robomme.scene.placement import SceneError
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 OOD_FOLDER = Path(os.environ.get("MME_VLA_OOD") or SHARED / "ood")

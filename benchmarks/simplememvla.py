@@ -17,7 +17,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode, conv_flop_count
 
 from mme_vla import build_policy
-from mme_vla.evaluation.analyses.cost import flops, on_meta
+from mme_vla.extras.probing.analyses.cost import flops, on_meta
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.testing.small import unit_stats
 

@@ -17,12 +17,12 @@ from pathlib import Path
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import DIALS
-from mme_vla.envs.recording.recorder import Recorder
-from mme_vla.envs.scene.placement import SceneError
-from mme_vla.play import OraclePlayer
-from mme_vla.play.game import MAX_CHOICES
-from mme_vla.play.players import play
-from mme_vla.play.run import make_session
+from mme_vla.envs.robomme.recording.recorder import Recorder
+from mme_vla.envs.robomme.scene.placement import SceneError
+from mme_vla.extras.play import OraclePlayer
+from mme_vla.extras.play.game import MAX_CHOICES
+from mme_vla.extras.play.players import play
+from mme_vla.extras.play.run import make_session
 
 VALUES = {
     "count": (0, 2, 5, 10),

@@ -22,7 +22,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from mme_vla.evaluation.analyses.cost import count_model, flops
+from mme_vla.extras.probing.analyses.cost import count_model, flops
 from mme_vla.subgoal import Gemini, Memer, QwenVL
 from mme_vla.subgoal.finetuning.collecting import Demonstration, open_input
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes

@@ -11,7 +11,7 @@ import numpy as np
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import TASK_NAMES
-from mme_vla.envs.recording.recorder import Recorder
+from mme_vla.envs.robomme.recording.recorder import Recorder
 
 
 def demonstrate(task: str, episode: int, in_view: bool) -> tuple[bool, np.ndarray]:

@@ -8,9 +8,9 @@ import numpy as np
 from torch import Tensor
 
 from mme_vla import register
+from mme_vla.extras.methods.simplememvla.video import Window
 from mme_vla.memory.base import MemoryModule, union_frames
 from mme_vla.memory.history import History, StorageSpec
-from mme_vla.methods.simplememvla.video import Window
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mme_vla.envs.vector.pool import make_vec_env
     from mme_vla.errors import UserError
     from mme_vla.evaluation.api import evaluate
+    from mme_vla.extras.probing.run import probe
     from mme_vla.integration.base import Integration
     from mme_vla.memory.base import Memory, PerceptualMemory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from mme_vla.policy.build import build_policy
     from mme_vla.policy.episode import Episode
     from mme_vla.policy.mme import MMEPolicy
-    from mme_vla.probing.run import probe
     from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, SUBGOALS, TASKS, register
     from mme_vla.subgoal.base import SubgoalPredictor
     from mme_vla.types import Batch, HistoryTokens, MemoryTokens
@@ -54,7 +54,7 @@ _MODULES = {
     "policy.build": ["build_policy"],
     "policy.episode": ["Episode"],
     "policy.mme": ["MMEPolicy"],
-    "probing.run": ["probe"],
+    "extras.probing.run": ["probe"],
     "registry": ["BACKBONES", "INTEGRATIONS", "MEMORIES", "SUBGOALS", "TASKS", "register"],
     "subgoal.base": ["SubgoalPredictor"],
     "types": ["Batch", "HistoryTokens", "MemoryTokens"],

@@ -4,7 +4,7 @@ name.
 
 import sys
 
-from mme_vla.cli import COMMANDS, run
+from mme_vla.cli import commands, run
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.errors import did_you_mean
 
@@ -15,23 +15,23 @@ def main() -> None:
     """
     name, *words = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help"):
-        width = max(map(len, COMMANDS))
+        width = max(map(len, commands()))
         lines = "\n".join(
-            f"  {command:<{width}}  {does}" for command, (_, does) in COMMANDS.items()
+            f"  {name:<{width}}  {command.text}" for name, command in commands().items()
         )
         with print_user_errors():
             print(
                 f"usage: mme-vla COMMAND …\n\n{lines}\n\nmme-vla COMMAND --help says more of one."
             )
         return
-    if name not in COMMANDS:
+    if name not in commands():
         print(
-            f"mme-vla: there is no command {name!r}. {did_you_mean(name, COMMANDS)}",
+            f"mme-vla: there is no command {name!r}. {did_you_mean(name, commands())}",
             file=sys.stderr,
         )
         raise SystemExit(2)
     sys.argv = [f"mme-vla {name}", *words]
-    run(COMMANDS[name][0])
+    run(name)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""`python -m mme_vla.analyse`: the command is mme_vla/cli/analyse.py."""
+"""`python -m mme_vla.analyse`: the command is mme_vla/extras/probing/cli/analyse.py."""
 
 from mme_vla.cli import run
 

@@ -1,4 +1,4 @@
-"""`python -m mme_vla.probe`: the command is mme_vla/cli/probe.py."""
+"""`python -m mme_vla.probe`: the command is mme_vla/extras/probing/cli/probe.py."""
 
 from mme_vla.cli import run
 

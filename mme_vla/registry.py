@@ -1,12 +1,125 @@
-"""Name → class tables. A decorator registers; a configuration names the key."""
+"""Name → class tables, and the packages that add to them.
+
+A decorator registers; a configuration names the key. `mme_vla.extras` and installed packages list
+what they add in an `Extension`.
+"""
 
 import importlib
 import inspect
+import pkgutil
 import re
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Literal
 
 from mme_vla.errors import UserError, brief, check_choice, did_you_mean, require
+
+ENTRY_POINTS = "mme_vla.plugins"
+"""The entry-point group in which an installed package names its `Extension`."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of `mme-vla`.
+
+    module: its `main` runs the command. text: one line of help. config: the YAML file of the tree's
+    top level that configures it; empty for commands with options. usage: how it is typed; by
+    default `mme-vla NAME`. processes: what it does where a launcher starts several: `one` is
+    refused, `shared` divides the work, `any` only reads.
+    """
+
+    module: str
+    text: str
+    config: str = ""
+    usage: str = ""
+    processes: Literal["one", "shared", "any"] = "one"
+
+
+@dataclass(frozen=True)
+class WeightFormat:
+    """A checkpoint format of one method: the functions that read and write it.
+
+    module: where the functions are, imported when first used. text: what the format is. matches:
+    whether tensor names are its. adapter: its name table for a policy. write: a policy as its
+    files. native: tensors under the one spelling of the name table, for files of `torch.save`.
+    stats: reads its statistics. spelling: as native, for safetensors. check: compares its
+    config.json with a policy. configure: a composed configuration as its config.json says.
+    """
+
+    module: str
+    text: str
+    matches: str
+    adapter: str
+    write: str
+    native: str | None = None
+    stats: str | None = None
+    spelling: str | None = None
+    check: str | None = None
+    configure: str | None = None
+
+    def function(self, role: str) -> Callable[..., Any]:
+        """The function that has this role, imported now."""
+        name: str = getattr(self, role)
+        function: Callable[..., Any] = getattr(importlib.import_module(self.module), name)
+        return function
+
+
+@dataclass(frozen=True)
+class Extension:
+    """What a package adds to the library: names alone, so that reading it imports nothing.
+
+    parts: kind of `REGISTRIES` → name → module that registers it. commands: name → command.
+    configs: a folder of YAML files, searched after the library's. checkpoints: name → folder.
+    weight_formats: name → format that `weights` reads and writes.
+    """
+
+    parts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    commands: Mapping[str, Command] = field(default_factory=dict)
+    configs: Path | None = None
+    checkpoints: Mapping[str, Path] = field(default_factory=dict)
+    weight_formats: Mapping[str, WeightFormat] = field(default_factory=dict)
+
+
+@cache
+def extras() -> tuple[Extension, ...]:
+    """The extensions in `mme_vla.extras`, found by listing its packages."""
+    package = importlib.import_module("mme_vla.extras")
+    names = sorted(module.name for module in pkgutil.iter_modules(package.__path__))
+    modules = [importlib.import_module(f"{package.__name__}.{name}.extension") for name in names]
+    return tuple(module.EXTENSION for module in modules)
+
+
+@cache
+def installed_extensions() -> tuple[Extension, ...]:
+    """The extensions of installed packages, which name theirs under `mme_vla.plugins`.
+
+    Raises:
+        UserError: a package's entry point cannot be imported, or is no `Extension`.
+    """
+    found = []
+    for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
+        try:
+            extension = entry.load()
+        except Exception as error:  # whatever a package of somebody else raises
+            raise UserError(
+                f"The installed plugin {entry.name!r} ({entry.value}) cannot be imported:"
+                f" {type(error).__name__}: {error}. Mend or uninstall it."
+            ) from error
+        require(
+            isinstance(extension, Extension),
+            f"The installed plugin {entry.name!r} ({entry.value}) is no"
+            " mme_vla.registry.Extension.",
+        )
+        found.append(extension)
+    return tuple(found)
+
+
+def extensions() -> tuple[Extension, ...]:
+    """All that add to the library: its extras, then installed packages."""
+    return extras() + installed_extensions()
 
 
 class Registry[T]:
@@ -19,16 +132,29 @@ class Registry[T]:
     True
     """
 
-    def __init__(self, kind: str, shipped: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, kind: str, shipped: Mapping[str, str] | None = None, key: str | None = None
+    ) -> None:
         """Make a table.
 
         Args:
             kind: what its entries are, for messages.
             shipped: name → module that registers it, imported when the name is first asked for.
+            key: the kind's name in `REGISTRIES`, under which extensions add to it; by default
+                `kind`.
         """
-        self.kind = kind
+        self.kind, self.key = kind, key or kind
         self._entries: dict[str, T] = {}
-        self._shipped = dict(shipped or {})
+        self._core = dict(shipped or {})
+
+    @property
+    def _shipped(self) -> dict[str, str]:
+        """Name → module: the library's own, its extras', and those of installed packages."""
+        modules = dict(self._core)
+        for extension in extensions():
+            for name, module in extension.parts.get(self.key, {}).items():
+                modules.setdefault(name, module)
+        return modules
 
     def register(self, name: str) -> Callable[[Any], Any]:
         """Return a decorator that files a class or function under `name`."""
@@ -166,45 +292,17 @@ INTEGRATIONS: Registry[Any] = Registry(
     {name: f"mme_vla.integration.{name}" for name in ("context", "modulator", "film")}
     | {"expert": "mme_vla.integration.context"},
 )
-BACKBONES: Registry[Any] = Registry(
-    "backbone",
-    {
-        "pi05": "mme_vla.backbone.pi05",
-        "nano": "mme_vla.backbone.nano",
-        "openvla": "mme_vla.methods.openvla_oft.model",
-    },
-)
+BACKBONES: Registry[Any] = Registry("backbone", {"pi05": "mme_vla.backbone.pi05"})
 HEADS: Registry[Any] = Registry(
     "action head",
     {
         **dict.fromkeys(("flow", "clean_flow"), "mme_vla.backbone.flow"),
         "choice": "mme_vla.backbone.choice",
     },
+    key="head",
 )
-POLICIES: Registry[Any] = Registry(
-    "policy",
-    {
-        "mme": "mme_vla.policy.mme",
-        "diffusion_policy": "mme_vla.methods.diffusion_policy.policy",
-        "sam2act_plus": "mme_vla.methods.sam2act.policy",
-        "openvla": "mme_vla.methods.openvla_oft.policy",
-        "memoryvla": "mme_vla.methods.memoryvla.policy",
-        "simplememvla": "mme_vla.methods.simplememvla.policy",
-        "subtask": "mme_vla.methods.simplememvla.subtask",
-    },
-)
-PROCESSORS: Registry[Any] = Registry(
-    "processor",
-    {
-        "pi05": "mme_vla.processing.processor",
-        "diffusion_policy": "mme_vla.methods.diffusion_policy.processor",
-        "sam2act_plus": "mme_vla.methods.sam2act.processor",
-        "openvla": "mme_vla.methods.openvla_oft.processor",
-        "memoryvla": "mme_vla.methods.memoryvla.processor",
-        "simplememvla": "mme_vla.methods.simplememvla.processor",
-        "subtask": "mme_vla.methods.simplememvla.subtask",
-    },
-)
+POLICIES: Registry[Any] = Registry("policy", {"mme": "mme_vla.policy.mme"})
+PROCESSORS: Registry[Any] = Registry("processor", {"pi05": "mme_vla.processing.processor"})
 SUBGOALS: Registry[Any] = Registry(
     "subgoal predictor",
     {
@@ -214,6 +312,7 @@ SUBGOALS: Registry[Any] = Registry(
         },
         "openai": "mme_vla.subgoal.gemini",
     },
+    key="subgoal",
 )
 PROMPTS: Registry[Any] = Registry(
     "prompt format",
@@ -229,18 +328,13 @@ PROMPTS: Registry[Any] = Registry(
         ),
         "mme_vla.processing.prompt",
     ),
+    key="prompt",
 )
 TASKS: Registry[Any] = Registry("task")
 ENVS: Registry[Any] = Registry(
-    "environment", dict.fromkeys(("mme_vla", "official"), "mme_vla.envs.benchmark")
+    "environment", dict.fromkeys(("mme_vla", "official"), "mme_vla.envs.benchmark"), key="env"
 )
-PLAYERS: Registry[Any] = Registry(
-    "player",
-    {
-        **dict.fromkeys(("random", "oracle"), "mme_vla.play.players"),
-        **dict.fromkeys(("qwenvl", "gemini", "openai"), "mme_vla.play.vlm_players"),
-    },
-)
+PLAYERS: Registry[Any] = Registry("player")
 INTERVENTIONS: Registry[Any] = Registry("intervention")
 REWARDS: Registry[Any] = Registry(
     "reward", dict.fromkeys(("none", "sparse", "subtask"), "mme_vla.envs.subtasks")
@@ -248,11 +342,26 @@ REWARDS: Registry[Any] = Registry(
 HISTORY_TRANSFORMS: Registry[Any] = Registry(
     "history transform",
     dict.fromkeys(("repeat_frame", "speed", "drop_frames", "noise"), "mme_vla.memory.transforms"),
+    key="history_transform",
 )
 EVENTS: Registry[Any] = Registry(
     "event",
     dict.fromkeys(("pause", "gap", "speed", "restart"), "mme_vla.evaluation.rollout.events"),
 )
+TRAINING_SETS: Registry[Any] = Registry("kind of training samples", key="training_set")
+"""`SampleSpec.kind` → a dataset of such samples, for policies that do not learn from steps.
+
+Called with sources, processor and policy, and with `episodes`, `seed` and `sampled` (false for
+held-out samples).
+"""
+SIDE_FILES: Registry[Any] = Registry("side file of a dataset", key="side_file")
+"""What `convert` keeps of each recording beside a dataset's tables: a module with
+`file_of(root, episode)` and `write(episode, path)`.
+"""
+SPLIT_POLICIES: Registry[Any] = Registry("dial of a split", key="split_policy")
+"""A dial of `split=stress:<dial>=…` → the policy as this split evaluates it; called with policy,
+split and recordings.
+"""
 REGISTRIES = {
     "memory": MEMORIES,
     "integration": INTEGRATIONS,
@@ -269,6 +378,9 @@ REGISTRIES = {
     "history_transform": HISTORY_TRANSFORMS,
     "prompt": PROMPTS,
     "event": EVENTS,
+    "training_set": TRAINING_SETS,
+    "side_file": SIDE_FILES,
+    "split_policy": SPLIT_POLICIES,
 }
 
 

@@ -28,6 +28,7 @@ from matplotlib.patches import Rectangle
 
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig, VisionConfig
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.extras.probing.run import probed_folder
 from mme_vla.integration.base import Integration
 from mme_vla.integration.context import Context, MemoryExpert
 from mme_vla.integration.modulator import Modulator
@@ -37,7 +38,6 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.rmt import RMT
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.memory.ttt import TTT
-from mme_vla.probing.run import probed_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "concepts" / "figures"

@@ -15,9 +15,9 @@ from mme_vla.evaluation.receipts import read_receipt
 from mme_vla.evaluation.results.paper import paper_methods
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.store import RECORDS
-from mme_vla.nano import board_page
-from mme_vla.nano.board import MATCHED, Board
-from mme_vla.nano.rows import CHOICES, FILES, SCENES, read_rows, read_training
+from mme_vla.extras.nano import board_page
+from mme_vla.extras.nano.board import MATCHED, Board
+from mme_vla.extras.nano.rows import CHOICES, FILES, SCENES, read_rows, read_training
 from mme_vla.utils import read_json, with_checksum, write_json
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,19 +12,16 @@ from helpers import REPOSITORY
 PACKAGE = REPOSITORY / "mme_vla"
 
 # From the top: a package or top-level module imports only itself and what is below it.
-ORDER = [
+EXTRAS = ["nano", "probing", "play", "trajectories", "methods"]
+CORE = [
     "cli",
-    "nano",
     "testing",
-    "play",
-    "probing",
     "evaluation",
     "serving",
     "training",
     "subgoal",
     "envs",
     "data",
-    "methods",
     "weights",
     "policy",
     "model",
@@ -40,10 +37,12 @@ ORDER = [
     "utils",
     "errors",
 ]
-ENTRIES = {"train", "evaluate", "results", "analyse", "probe", "inspect", "serve", "__main__"}
-"""Top-level modules that only run a command, as `__main__.py` of `nano` and `play` does: they
-belong to `cli`.
-"""
+ORDER = ["entries", *(f"extras.{name}" for name in EXTRAS), *CORE]
+ENTRIES = {
+    "train", "evaluate", "results", "analyse", "probe", "inspect", "serve", "nano", "play",
+    "__main__", "extras",
+}  # fmt: skip
+"""Top-level modules that only run a command; `mme_vla.extras` itself holds nothing but a text."""
 APART = ("memory", "backbone")
 """Packages that do not import each other in either direction."""
 
@@ -62,7 +61,11 @@ def level_of(module: str) -> str:
     the top.
     """
     parts = module.split(".")
-    return "cli" if parts[-1] == "__main__" or len(parts) == 1 or parts[1] in ENTRIES else parts[1]
+    if parts[1:2] == ["extras"] and len(parts) > 2:
+        return f"extras.{parts[2]}"
+    if len(parts) == 1 or parts[1] in ENTRIES:
+        return "entries"
+    return parts[1]
 
 
 @cache
@@ -106,6 +109,20 @@ def test_imports_point_downward() -> None:
         if ORDER.index(level_of(target)) < ORDER.index(level_of(module))
     ]
     assert upward == []
+
+
+def test_the_core_names_no_extra() -> None:
+    """Not in a string either: extras are found by listing `mme_vla.extras`."""
+    for module, file in modules().items():
+        if level_of(module) in CORE:
+            assert "mme_vla.extras." not in file.read_text().replace("{name}", ""), file
+
+
+def test_an_extension_imports_nothing_but_the_registry() -> None:
+    for name in EXTRAS:
+        assert imports(f"mme_vla.extras.{name}.extension") == {"mme_vla.registry"}
+        lines = modules()[f"mme_vla.extras.{name}"].read_text().splitlines()
+        assert [line for line in lines if line.startswith("from mme_vla")] == []
 
 
 def test_no_import_cycles() -> None:

@@ -8,7 +8,7 @@ import torch
 
 from mme_vla import MMEPolicy, build_policy, make_env
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollouts import join, rollouts, with_view_tokens
+from mme_vla.extras.trajectories.rollouts import join, rollouts, with_view_tokens
 from mme_vla.processing.normalise import NormStats
 from mme_vla.types import Batch
 

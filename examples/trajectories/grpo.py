@@ -7,8 +7,8 @@ from two_choices import make_two_choices
 
 from mme_vla import MMEPolicy, build_policy
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollouts import Trajectory, join, rollouts, with_view_tokens
-from mme_vla.policy.log_prob import log_prob
+from mme_vla.extras.trajectories.log_prob import log_prob
+from mme_vla.extras.trajectories.rollouts import Trajectory, join, rollouts, with_view_tokens
 from mme_vla.processing.normalise import NormStats
 
 JOBS = [Job("TwoChoices", "train", episode) for episode in range(4)]

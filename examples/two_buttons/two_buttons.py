@@ -1,9 +1,9 @@
 """A task of one's own: press two buttons in the order that the goal says."""
 
 from mme_vla import Task, register
-from mme_vla.envs.scene.articulated import build_button
-from mme_vla.envs.scene.placement import Draws, draw_button
-from mme_vla.envs.scene.predicates import pressed
+from mme_vla.envs.robomme.scene.articulated import build_button
+from mme_vla.envs.robomme.scene.placement import Draws, draw_button
+from mme_vla.envs.robomme.scene.predicates import pressed
 from mme_vla.envs.subtasks import Choice, SubTask
 
 NAMES = ("left", "right")

@@ -117,7 +117,7 @@ class FlowHead:
         time_distribution: `beta` or `uniform`, see `sample_time`.
         steps: Euler steps unless the caller says otherwise.
         deviation: σ of Gaussian noise in each Euler step while sampling, in units of normalised
-            actions (policy gradients, `mme_vla.policy.log_prob`); 0 samples without it.
+            actions (policy gradients); 0 samples without it.
     """
 
     supports_rtc: ClassVar[bool] = True

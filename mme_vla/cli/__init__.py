@@ -8,61 +8,110 @@ from importlib import import_module
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.errors import require
+from mme_vla.registry import Command, extensions
 from mme_vla.utils.processes import started_processes
 
-COMMANDS: dict[str, tuple[str, str]] = {
-    "train": ("train", "train a policy"),
-    "evaluate": ("evaluate", "run a policy on the benchmark"),
-    "results": ("results", "tables, comparisons and a report from finished runs"),
-    "analyse": ("analyse", "what a memory attends to, selects, modulates and costs"),
-    "probe": (
-        "probe",
-        "what a policy takes from its memory, on recorded episodes and in closed loop",
+COMMANDS = {
+    "train": Command(
+        "mme_vla.cli.train",
+        "train a policy",
+        config="train",
+        usage="python -m mme_vla.train",
+        processes="shared",
     ),
-    "inspect": (
-        "inspect",
+    "evaluate": Command(
+        "mme_vla.cli.evaluate",
+        "run a policy on the benchmark",
+        config="evaluate",
+        usage="python -m mme_vla.evaluate",
+        processes="shared",
+    ),
+    "results": Command(
+        "mme_vla.cli.results",
+        "tables, comparisons and a report from finished runs",
+        usage="python -m mme_vla.results",
+        processes="any",
+    ),
+    "inspect": Command(
+        "mme_vla.cli.inspect",
         "what is in a checkpoint, a dataset or an episode, and what a memory remembers of it",
+        config="inspect",
+        usage="python -m mme_vla.inspect",
+        processes="any",
     ),
-    "serve": ("serve", "put a policy behind a port"),
-    "harness": ("harness", "put a policy behind AI2's vla-evaluation-harness"),
-    "play": ("play", "play the tasks yourself, or let a model play"),
-    "convert": ("convert", "official HDF5 demonstrations to one LeRobot dataset"),
-    "exec-starts": (
-        "exec_starts",
+    "serve": Command(
+        "mme_vla.cli.serve",
+        "put a policy behind a port",
+        config="serve",
+        usage="python -m mme_vla.serve",
+    ),
+    "harness": Command("mme_vla.cli.harness", "put a policy behind AI2's vla-evaluation-harness"),
+    "convert": Command(
+        "mme_vla.cli.convert",
+        "official HDF5 demonstrations to one LeRobot dataset",
+        config="convert",
+    ),
+    "exec-starts": Command(
+        "mme_vla.cli.exec_starts",
         "where the conditioning videos of a dataset end, if it has no such column",
+        config="exec_starts",
     ),
-    "cache": ("cache", "the vision tokens of a dataset, computed once"),
-    "nano": (
-        "nano",
-        "small policies from nothing to results on two cores; `nano board` ranks them",
+    "cache": Command(
+        "mme_vla.cli.cache",
+        "the vision tokens of a dataset, computed once",
+        config="cache",
+        processes="shared",
     ),
-    "vision-pretrain": (
-        "vision_pretrain",
-        "the vision tower of the nano backbone, from renders of the tasks",
+    "record": Command(
+        "mme_vla.cli.record",
+        "demonstrate episodes of the benchmark and keep them as a dataset",
+        config="record",
     ),
-    "record": ("record", "demonstrate episodes of the benchmark and keep them as a dataset"),
-    "gallery": ("gallery", "the tasks at a glance, one demonstrated episode each, on one page"),
-    "weights": ("weights", "a checkpoint from one format to another"),
-    "subgoal-build": ("subgoal_build", "training data of the subgoal predictors"),
-    "subgoal-train": ("subgoal_train", "fine-tune a subgoal predictor"),
-    "sample": ("sample", "the dataset that the package ships, from a full one"),
-    "train-tokenizer": ("train_tokenizer", "the small tokenizer of the package"),
-    "docs": ("docs", "this documentation as a site, built and opened without a network"),
+    "gallery": Command(
+        "mme_vla.cli.gallery",
+        "the tasks at a glance, one demonstrated episode each, on one page",
+        config="show",
+    ),
+    "weights": Command("mme_vla.cli.weights", "a checkpoint from one format to another"),
+    "subgoal-build": Command(
+        "mme_vla.cli.subgoal_build",
+        "training data of the subgoal predictors",
+        config="subgoal_build",
+    ),
+    "subgoal-train": Command(
+        "mme_vla.cli.subgoal_train",
+        "fine-tune a subgoal predictor",
+        config="subgoal_train",
+        processes="shared",
+    ),
+    "sample": Command("mme_vla.cli.sample", "the dataset that the package ships, from a full one"),
+    "train-tokenizer": Command("mme_vla.cli.train_tokenizer", "the small tokenizer of the package"),
+    "docs": Command(
+        "mme_vla.cli.docs", "this documentation as a site, built and opened without a network"
+    ),
 }
-"""Name on the command line → module of this package, and a line of help."""
+"""The core's commands by the name on the command line."""
 
 
-SHARED = {"train", "evaluate", "probe", "cache", "subgoal_train"}
-"""Modules of commands whose work several processes of a launcher share."""
-READING = {"results", "analyse", "inspect"}
-"""Modules of commands that print what exists, which any number of processes may do."""
+def commands() -> dict[str, Command]:
+    """All commands: the core's, its extras', and those of installed packages."""
+    found = dict(COMMANDS)
+    for extension in extensions():
+        for name, command in extension.commands.items():
+            found.setdefault(name, command)
+    return found
+
+
+def usage(name: str) -> str:
+    """How a command is typed."""
+    return commands()[name].usage or f"mme-vla {name}"
+
 
 _WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}  # Options that only print
 
 
-def run(module: str) -> None:
-    """Run the command in a module of this package, importing it first: Ctrl-C ends the import with
-    a message, too.
+def run(name: str) -> None:
+    """Run a command, importing its module first: Ctrl-C ends the import with a message, too.
 
     A terminal gets a line at once, since imports take seconds. Logs and pipes stay as they are.
     """
@@ -71,24 +120,25 @@ def run(module: str) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with print_user_errors():
         if _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
-            check_launcher(module)
+            check_launcher(name)
         first = os.environ.get("LOCAL_RANK", "0") == "0"
         if first and sys.stderr.isatty() and _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
             print("Loading PyTorch and LeRobot …", file=sys.stderr, flush=True)
-        import_module(f"{__name__}.{module}").main()
+        import_module(commands()[name].module).main()
 
 
-def check_launcher(module: str) -> None:
+def check_launcher(name: str) -> None:
     """Refuse to start a command in several processes that would each do all of its work.
 
     Raises:
         UserError: a launcher started this process beside others, and the command does not share its
             work; or a launcher was asked for several processes and started one.
     """
-    if module in SHARED | READING:
+    known = commands()
+    if known[name].processes != "one":
         return
     started = started_processes()
-    sharing = ", ".join(name for name, (other, _) in COMMANDS.items() if other in SHARED)
+    sharing = ", ".join(name for name, command in known.items() if command.processes == "shared")
     require(
         started == 1,
         f"{started} processes were started (WORLD_SIZE), and each would do all of this command's"

@@ -53,11 +53,9 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     """Run the episodes of one policy; `training` is the folder of its records in `output`."""
     import torch
 
-    from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import named_tasks
-    from mme_vla.evaluation.feed import with_sessions
-    from mme_vla.evaluation.recordings import all_recordings
+    from mme_vla.evaluation.api import policy_of_split
     from mme_vla.evaluation.results.report import policy_facts
     from mme_vla.evaluation.rollout.evaluation import (
         choose_episodes,
@@ -87,10 +85,6 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     device = process_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "evaluate", logger, device)
     prepare_sampling(policy, cfg.sampling, logger)
-    sessions = values["recordings"]
-    recordings = (
-        [] if sessions is None else all_recordings(open_sources(sessions, policy.embodiment))
-    )
     subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
     predictor = None if subgoals is None else str(values["subgoal"]["name"])
     facts = facts_of(policy, name, source, settings, predictor)
@@ -122,7 +116,7 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
         multiprocessing.set_start_method("spawn", force=True)
     try:
         done = evaluate_events(
-            with_sessions(policy, settings.split, recordings),
+            policy_of_split(policy, settings.split, values["recordings"]),
             jobs,
             output,
             facts,

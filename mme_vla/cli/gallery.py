@@ -39,8 +39,8 @@ class Snapshot:
 def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snapshot], bool]:
     """Demonstrate a task, with an image every few steps; also returns whether it succeeded."""
     from mme_vla.envs.observations import Include, Observer
-    from mme_vla.envs.recording.recorder import demonstrate
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.robomme.recording.recorder import demonstrate
+    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
     from mme_vla.envs.subtasks import NO_RECORD
 
     observer = Observer(task, Include(), render=True)
@@ -114,7 +114,7 @@ def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
     """The first seed from the episode's on whose demonstration succeeds, as the official episodes
     were found.
     """
-    from mme_vla.envs.scene.placement import SceneError
+    from mme_vla.envs.robomme.scene.placement import SceneError
 
     for seed in range(spec.seed, spec.seed + (1 if spec.row else 100)):
         try:

@@ -19,27 +19,16 @@ from typing import Any
 
 import yaml
 
+from mme_vla.cli import commands, usage
 from mme_vla.errors import UserError, did_you_mean
 
-COMMANDS = {
-    "train": "python -m mme_vla.train",
-    "policy": "build_policy(…)",
-    "convert": "mme-vla convert",
-    "exec_starts": "mme-vla exec-starts",
-    "cache": "mme-vla cache",
-    "inspect": "python -m mme_vla.inspect",
-    "serve": "python -m mme_vla.serve",
-    "record": "mme-vla record",
-    "show": "mme-vla gallery",
-    "play": "python -m mme_vla.play",
-    "nano": "python -m mme_vla.nano",
-    "vision_pretrain": "mme-vla vision-pretrain",
-    "evaluate": "python -m mme_vla.evaluate",
-    "probe": "python -m mme_vla.probe",
-    "subgoal_build": "mme-vla subgoal-build",
-    "subgoal_train": "mme-vla subgoal-train",
-}
-"""Which command a file of the tree's top level configures."""
+
+def configured_commands() -> dict[str, str]:
+    """File of the tree's top level → how the command that it configures is typed."""
+    usages = {command.config: usage(name) for name, command in commands().items() if command.config}
+    return usages | {"policy": "build_policy(…)"}
+
+
 _KEY = re.compile(
     r"^(?P<indent> *(?:- )?)(?P<key>[\w/]+):(?: +(?P<value>[^#]*?))?(?: +# (?P<comment>.*))?$"
 )
@@ -188,14 +177,14 @@ def help_page(
             )
             for line in lines
         )
-    command = COMMANDS.get(config_name, f"python {Path(sys.argv[0]).name}")
+    command = configured_commands().get(config_name, f"python {Path(sys.argv[0]).name}")
     examples, text = heading(file)
     lines = [f"Usage: {command} [KEY=VALUE | GROUP=NAME] …", "", *_wrapped(text), ""]
     lines += ["Examples", *(f"  {example}" for example in examples), ""] if examples else []
     for part in [file, *_included(file, trees)]:
         rows = [key for key in keys(part) if key.default or key.comment]
         if rows:
-            of = "" if part == file else f" of {COMMANDS.get(part.stem, part.stem)}"
+            of = "" if part == file else f" of {configured_commands().get(part.stem, part.stem)}"
             lines += [f"Keys{of}", *_table([(_assigned(key), key.comment) for key in rows]), ""]
     lines += _group_pages(groups, {word.partition("=")[0] for word in overrides}, trees)
     lines += ["Options", *_table(OPTIONS)]

@@ -173,7 +173,7 @@ def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Con
 
 def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tuple[int, int]:
     """The episode and step asked for; the last step by default."""
-    from mme_vla.evaluation.analyses.replay import check_episode
+    from mme_vla.data.episodes import check_episode
 
     check_episode(source, episode)
     length = int(source.lengths[episode])

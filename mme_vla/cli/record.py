@@ -12,10 +12,10 @@ from omegaconf import OmegaConf
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import ROBOMME, make_task, require_simulator
-from mme_vla.envs.recording.frames import FrameChoice
-from mme_vla.envs.recording.outputs import Job, RecordingPlan
-from mme_vla.envs.recording.own import record_own
-from mme_vla.envs.recording.processes import carry_out, simulation_pool
+from mme_vla.envs.robomme.recording.frames import FrameChoice
+from mme_vla.envs.robomme.recording.outputs import Job, RecordingPlan
+from mme_vla.envs.robomme.recording.own import record_own
+from mme_vla.envs.robomme.recording.processes import carry_out, simulation_pool
 from mme_vla.envs.rows import task_options
 from mme_vla.errors import UserError, require
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
@@ -24,7 +24,7 @@ from mme_vla.utils.processes import signals_deferred
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-    from mme_vla.envs.recording.recorder import Recording
+    from mme_vla.envs.robomme.recording.recorder import Recording
 
 
 KEYS = ("frames", "memory")
@@ -41,9 +41,9 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
         Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed
         seeds with reasons.
     """
-    from mme_vla.envs.recording.outputs import EpisodeWriter
-    from mme_vla.envs.recording.recorder import Recorder
-    from mme_vla.envs.scene.placement import SceneError
+    from mme_vla.envs.robomme.recording.outputs import EpisodeWriter
+    from mme_vla.envs.robomme.recording.recorder import Recorder
+    from mme_vla.envs.robomme.scene.placement import SceneError
 
     failures: dict[int, str] = {}
     draft = folder / f"{job.name}.writing"
@@ -107,7 +107,7 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
 
 def _unseen(task: str, scene: dict[str, Any]) -> "Recording":
     """The same demonstration without images, its steps in memory."""
-    from mme_vla.envs.recording.recorder import Recorder
+    from mme_vla.envs.robomme.recording.recorder import Recorder
 
     env = make_task(task, render=False, **scene)
     try:
@@ -146,7 +146,7 @@ def report_coverage(
     their goals.
     """
     from mme_vla.data.console import progress
-    from mme_vla.envs.recording.coverage import compare, goal_of, goals_recorded, in_words
+    from mme_vla.envs.robomme.recording.coverage import compare, goal_of, goals_recorded, in_words
 
     specs, goals = choose_episodes(tasks, None, split), []
     with progress("goals", len(specs), unit="episodes") as advance, ExitStack() as stack:

@@ -23,7 +23,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
 from mme_vla.weights.load import adapter_of, read_as
-from mme_vla.weights.source import FORMATS, METHOD_FORMATS, Source, open_source
+from mme_vla.weights.source import Source, formats, method_formats, open_source
 from mme_vla.weights.statistics import read_stats
 from mme_vla.weights.tables import Adapter
 from mme_vla.weights.writers import check_target, write_policy
@@ -34,7 +34,7 @@ def print_mapping(policy: Policy, source: Source, to: str, console: Console | No
     layers are one row.
     """
     console = console or Console(width=None if sys.stdout.isatty() else 200)
-    read, target_format = f"{source.folder} ({FORMATS[source.format]})", FORMATS[to]
+    read, target_format = f"{source.folder} ({formats()[source.format]})", formats()[to]
     console.print(f"{read} → {target_format}; every tensor fits.", soft_wrap=True)
     sides = {
         fmt: title for fmt, title in ((source.format, "read"), (to, "written")) if fmt != "ours"
@@ -132,7 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("overrides", nargs="*", help="model=…, backbone=…, memory.budget=…")
     parser.add_argument(
-        "--to", default="ours", choices=list(FORMATS), help="format to write (default: ours)"
+        "--to", default="ours", choices=list(formats()), help="format to write (default: ours)"
     )
     parser.add_argument(
         "--dtype", default="float32", choices=list(DTYPES), help="what weights are stored in"
@@ -263,6 +263,6 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
     from mme_vla.policy.build import build_from_config
 
     composed = compose("policy", words)
-    if (of := METHOD_FORMATS.get(opened.format)) is not None and of.configure is not None:
+    if (of := method_formats().get(opened.format)) is not None and of.configure is not None:
         composed = of.function("configure")(composed, opened.config, opened.folder)
     return build_from_config(composed, device="meta")

@@ -15,7 +15,7 @@ import hydra
 from hydra import version
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
-from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.config_search_path import ConfigSearchPath, SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -23,6 +23,7 @@ from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobRuntime
 from hydra.errors import OverrideParseException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
@@ -39,6 +40,7 @@ from mme_vla.config.naming import (
 )  # fmt: skip
 from mme_vla.config.override_errors import COMPOSITION_ERRORS, ConfigTree
 from mme_vla.errors import UserError, require
+from mme_vla.registry import extensions
 
 VERSION_BASE = "1.3"
 
@@ -63,6 +65,40 @@ def config_dir() -> Path:
     package = Path(__file__).resolve().parents[1]
     shipped = package / "configs"
     return shipped if shipped.is_dir() else package.parent / "configs"
+
+
+def library_trees() -> tuple[Path, ...]:
+    """Folders of YAML files of the library: its core's, then those of its extras and of installed
+    packages.
+    """
+    folders = [extension.configs for extension in extensions()]
+    return (config_dir(), *(folder for folder in folders if folder is not None))
+
+
+def library_files(group: str) -> dict[str, Path]:
+    """Name → YAML file of a group (of the top level where it is empty), in all `library_trees`."""
+    files = [file for tree in library_trees() for file in (tree / group).glob("*.yaml")]
+    return {file.stem: file for file in sorted(files, key=lambda file: file.stem)}
+
+
+class ExtensionTrees(SearchPathPlugin):
+    """Hydra searches the folders of extensions after the library's own."""
+
+    PROVIDER = "mme_vla.extensions"
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append the folders, where the library's own tree is what is composed."""
+        main = [path for path in search_path.get_path() if path.provider == "main"]
+        own = f"file://{config_dir().resolve()}"
+        if not any(
+            str(path.path).rstrip("/") in (own, str(config_dir().resolve())) for path in main
+        ):
+            return
+        for folder in library_trees()[1:]:
+            search_path.append(self.PROVIDER, f"file://{folder.resolve()}")
+
+
+Plugins.instance().register(ExtensionTrees)
 
 
 @contextmanager
@@ -155,7 +191,9 @@ def command_trees() -> tuple[Path, ...]:
     `--config-dir`.
     """
     sources = [
-        source for source in HydraConfig.get().runtime.config_sources if source.schema == "file"
+        source
+        for source in HydraConfig.get().runtime.config_sources
+        if source.schema == "file" and source.provider != ExtensionTrees.PROVIDER
     ]
     # The command's own comes first, whatever the order in which Hydra searches.
     sources.sort(key=lambda source: source.provider != "main")
@@ -212,7 +250,13 @@ def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str
         "policy" if (trees[0] / "policy.yaml").is_file() else config_name
     )  # the least that holds a model
     mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
-    plugin_models = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
+    is_library = trees[0] == config_dir().resolve()
+    model_files = (
+        library_files("model")
+        if is_library
+        else {file.stem: file for file in (trees[0] / "model").glob("*.yaml")}
+    )
+    plugin_models = set(model_files) - mine
 
     def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
         library_alone = searched == (
@@ -244,7 +288,7 @@ def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str
     sections = decisive(cfg)
 
     def reference(model: str) -> tuple[str, Sections] | None:
-        if model in plugin_models and not may_be_of(trees[0] / "model" / f"{model}.yaml", sections):
+        if model in plugin_models and not may_be_of(model_files[model], sections):
             return None
         return composed((f"model={model}",), trees[:1] if model in plugin_models else trees)
 

@@ -27,11 +27,11 @@ from mme_vla.data.hdf5 import (
     open_episode,
     recorded_options,
 )
-from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX, SIDE_FILE, parquet_files
 from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
 from mme_vla.errors import UserError, did_you_mean, require
+from mme_vla.registry import SIDE_FILES
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced, video_frame, write_video
 
@@ -124,7 +124,7 @@ class ConvertOptions:
     the tables; `convert` keeps
         them where all episodes have them.
     keyframes: keep the keyframes' depth and camera poses beside the tables too
-    (`mme_vla.data.keyframes`). partly: say in two more columns which frames were drawn; `convert`
+    (`SIDE_FILES`). partly: say in two more columns which frames were drawn; `convert`
     does where an episode was recorded at a choice of
         frames. The images of the others repeat an earlier one, and readers refuse them.
     """
@@ -336,7 +336,7 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
     with open_episode(ref) as episode:
         _write_dataset(episode, draft, options)
         if options.keyframes:
-            write_keyframes(episode, draft / _KEYFRAMES)
+            SIDE_FILES["keyframes"].write(episode, draft / _KEYFRAMES)
         side = {
             "task": ref.task,
             "source_file": ref.file.name,
@@ -427,8 +427,9 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
     stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
     for i, part in enumerate(parts):
         if (part / _KEYFRAMES).is_file():
-            file_of(merged, i).parent.mkdir(exist_ok=True)
-            shutil.copy(part / _KEYFRAMES, file_of(merged, i))
+            side_file = SIDE_FILES["keyframes"].file_of(merged, i)
+            side_file.parent.mkdir(exist_ok=True)
+            shutil.copy(part / _KEYFRAMES, side_file)
     episodes = [{"episode_index": i, **side} for i, side in enumerate(sides)]
     (merged / SIDE_FILE).write_text(json.dumps({"plan": plan, "episodes": episodes}, indent=1))
     write_sums(merged)  # LeRobot's format has none: damage would be read as data

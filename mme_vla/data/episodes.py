@@ -524,3 +524,9 @@ class EpisodeSource:
 
     def _column(self, name: str) -> np.ndarray:
         return flat(self._table.select_columns(name)[:][name]).to_numpy(zero_copy_only=False)
+
+
+def check_episode(source: EpisodeSource, episode: Any) -> None:
+    """Refuse an episode that a dataset does not have."""
+    if not isinstance(episode, int) or not 0 <= episode < len(source):
+        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")

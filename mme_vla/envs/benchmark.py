@@ -60,7 +60,7 @@ class RoboMME(Environment):
 
     def scene_digest(self, spec: EpisodeSpec) -> str:
         """Without the conditioning video, which does not belong to the scene."""
-        from mme_vla.envs.scene.placement import SceneError
+        from mme_vla.envs.robomme.scene.placement import SceneError
 
         self.check_installed()
         try:

@@ -8,7 +8,7 @@ import numpy as np
 from mme_vla.envs.observations import INTRINSIC, front_extrinsic
 
 if TYPE_CHECKING:
-    from mme_vla.envs.scene.things import Thing
+    from mme_vla.envs.robomme.scene.things import Thing
     from mme_vla.envs.subtasks import SubTask
 
 PLACE = "<>"

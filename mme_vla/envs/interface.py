@@ -28,8 +28,8 @@ from mme_vla.envs.observations import (
     frame_keys,
     observation_space,
 )
-from mme_vla.envs.robot.control import PlanningError
-from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.robomme.robot.control import PlanningError
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
 from mme_vla.envs.spaces import Control, UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD

@@ -171,10 +171,10 @@ def load_tasks(*tasks: str) -> None:
     >>> gymnasium.make("StopCube", seed=0, difficulty="easy", obs_mode="rgb")  # doctest: +SKIP
     """
     require_simulator()
-    from mme_vla.envs.tasks import module_name
+    from mme_vla.envs.robomme.tasks import module_name
 
     for task in tasks or TASK_NAMES:
-        import_module(f"mme_vla.envs.tasks.{module_name(task)}")
+        import_module(f"mme_vla.envs.robomme.tasks.{module_name(task)}")
 
 
 def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any) -> Any:

@@ -24,11 +24,11 @@ from scipy.spatial.transform import Rotation
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, POSE, SIDE
 from mme_vla.envs.grounding import project
-from mme_vla.envs.robot.control import GRIPPER_STEPS
+from mme_vla.envs.robomme.robot.control import GRIPPER_STEPS
 from mme_vla.errors import UserError, check_known, did_you_mean, require
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
     from mme_vla.envs.task import Task
 
 

@@ -10,8 +10,8 @@ from mme_vla.errors import brief, require
 from mme_vla.registry import REWARDS
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.demonstrator import Demonstrator
-    from mme_vla.envs.scene.things import Thing
+    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
+    from mme_vla.envs.robomme.scene.things import Thing
 
 
 ORDINALS = (

@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 
 import torch
 
+from mme_vla.envs.robomme.scene.motions import Cue, build_cue, show_cue
+from mme_vla.envs.robomme.scene.placement import Draws
+from mme_vla.envs.robomme.scene.stage import Stage
+from mme_vla.envs.robomme.scene.values import Values
 from mme_vla.envs.rows import DIFFICULTIES
-from mme_vla.envs.scene.motions import Cue, build_cue, show_cue
-from mme_vla.envs.scene.placement import Draws
-from mme_vla.envs.scene.stage import Stage
-from mme_vla.envs.scene.values import Values
 from mme_vla.envs.subtasks import Choice, Progress, SubTask
 from mme_vla.errors import check_known, require
 

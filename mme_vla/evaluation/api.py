@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.config.sections import read_section
-from mme_vla.data.sources import open_sources
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
-from mme_vla.evaluation.feed import with_sessions
-from mme_vla.evaluation.recordings import all_recordings
+from mme_vla.envs.metadata import read_variant
+from mme_vla.errors import require
 from mme_vla.evaluation.rollout.evaluation import (
     Evaluation,
     choose_episodes,
@@ -23,6 +22,7 @@ from mme_vla.evaluation.rollout.evaluation import (
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy
+from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.subgoal import SubgoalPredictor
 
 
@@ -85,10 +85,7 @@ def evaluate(
     )
     facts = facts_of(loaded, name, source, run_settings, subgoal_label)
     folder = default_output(facts) if output is None else Path(output).expanduser()
-    donor_episodes = (
-        [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
-    )
-    wrapped = with_sessions(loaded.eval(), run_settings.split, donor_episodes)
+    wrapped = policy_of_split(loaded.eval(), run_settings.split, recordings)
     options: dict[str, Any] = {
         "subgoals": predictor,
         "source": source,
@@ -96,6 +93,23 @@ def evaluate(
         "show_progress": show_progress,
     }
     return evaluate_events(wrapped, jobs, folder, facts, run_settings, arms, **options)
+
+
+def policy_of_split(policy: Policy, split: str, recordings: Any = None) -> Policy:
+    """The policy as a split evaluates it.
+
+    Args:
+        recordings: datasets whose episodes a split shows before its own (`stress:sessions=<n>`).
+    """
+    variant = read_variant(split)
+    if variant is not None and variant.dial in SPLIT_POLICIES:
+        wrapped: Policy = SPLIT_POLICIES[variant.dial](policy, split, recordings)
+        return wrapped
+    require(
+        not recordings,
+        f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.",
+    )
+    return policy
 
 
 def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:

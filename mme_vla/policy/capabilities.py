@@ -166,14 +166,6 @@ class LimitsActions(Protocol):
 
 
 @runtime_checkable
-class TrainsOnKeyframes(Protocol):
-    """Trains on sequences of keyframes."""
-
-    keyframes: int
-    """Keyframes of a training sample."""
-
-
-@runtime_checkable
 class ShowsDistractors(Protocol):
     """Is shown unrelated episodes before each of its own, as a stress split requires."""
 

@@ -3,10 +3,10 @@ means.
 """
 
 import re
-from importlib.resources import files
 from pathlib import Path
 
 from mme_vla.errors import UserError, require
+from mme_vla.registry import extensions
 
 CHECKPOINTS = "checkpoints"
 STATE = "training_state.json"
@@ -66,20 +66,25 @@ LATEST = "latest"
 """`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder
 is called so.
 """
-SHIPPED = ("nano", "nano16")
-"""The checkpoints that ship with the library, folders of `mme_vla/assets` (docs/train/nano.md)."""
+
+
+def shipped_checkpoints() -> dict[str, Path]:
+    """The checkpoints that extras and installed packages bring along: name → folder."""
+    return {
+        name: path for extension in extensions() for name, path in extension.checkpoints.items()
+    }
 
 
 def find_run(path: Path) -> Path:
     """`path`, the newest run where it ends in `latest`, or the checkpoint that ships under this
-    name (`SHIPPED`).
+    name (`shipped_checkpoints`).
 
     A file or folder of that name goes first.
     """
     if path.exists():
         return path
-    if str(path) in SHIPPED:
-        return Path(str(files("mme_vla").joinpath("assets", str(path))))
+    if str(path) in shipped_checkpoints():
+        return shipped_checkpoints()[str(path)]
     if path.name != LATEST:
         return path
     runs = [run for run in path.parent.glob("*") if newest_write(run)]
@@ -95,8 +100,8 @@ def resolve_checkpoint(path: Path) -> Path:
     """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints`
     folder (then the newest).
 
-    A path that ends in `latest` means the newest run of its folder, and a name of `SHIPPED` that
-    checkpoint.
+    A path that ends in `latest` means the newest run of its folder, and a name of
+    `shipped_checkpoints` that checkpoint.
     """
     newest = newest_checkpoint(path)
     if newest != path or (path / "config.json").is_file():
@@ -113,7 +118,7 @@ def resolve_checkpoint(path: Path) -> Path:
             " (with model=<model> where no history_config.txt names the variant)."
         )
     require(
-        str(path) not in SHIPPED,
+        str(path) not in shipped_checkpoints(),
         f"The folder {path} holds no checkpoint, and hides the one that ships under this name:"
         " rename it, or run the command in another folder.",
     )

@@ -60,8 +60,8 @@ def _scene(task: str, seed: int, difficulty: str | None, options: dict[str, Any]
 def _demonstrated(
     task: str, seed: int, difficulty: str | None, options: dict[str, Any]
 ) -> dict[str, Any]:
-    from mme_vla.envs.recording.recorder import demonstrate
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.robomme.recording.recorder import demonstrate
+    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 
     env = _make(task, seed, difficulty, options)
     try:

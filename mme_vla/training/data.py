@@ -10,26 +10,30 @@ from typing import Any
 from mme_vla.data.cache import COMMAND
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.dataset import GroupDataset, TrainingDataset
-from mme_vla.data.keyframes import KeyframeDataset
 from mme_vla.data.sources import default_val_episodes, open_sources, split_episodes
 from mme_vla.data.statistics import NARROW, compute_norm_stats
 from mme_vla.errors import check_choice, require
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import TrainsOnKeyframes, WeighsLosses, with_vision_memory
+from mme_vla.policy.capabilities import WeighsLosses, with_vision_memory
 from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import SubgoalText
+from mme_vla.registry import TRAINING_SETS
 from mme_vla.types import labels_read
 from mme_vla.utils import checked_file
 
 
 @dataclass(frozen=True)
 class SplitData:
-    """The training steps and the held-out ones (None where the split holds nothing out)."""
+    """The two sides of the split.
 
-    train: TrainingDataset | KeyframeDataset
-    val: TrainingDataset | KeyframeDataset | None
+    train, val: datasets of training samples and of held-out ones: `TrainingDataset`, or what
+    `TRAINING_SETS` builds for this kind of samples. val is None where nothing is held out.
+    """
+
+    train: Any
+    val: Any | None
     content: list[str]
     """A fingerprint of each dataset's content."""
 
@@ -104,17 +108,15 @@ def prepare_data(
 
     transforms = build_transforms(data.get("history_transforms"))
     require(
-        not transforms or processor.samples.kind != "keyframes",
-        "data.history_transforms changes frames, and this policy learns from keyframes: leave it"
-        " empty.",
+        not transforms or processor.samples.kind == "steps",
+        "data.history_transforms changes frames, and this policy learns from"
+        f" {processor.samples.kind}: leave it empty.",
     )
 
-    def side(episodes: list[Any], held_out: bool = False) -> TrainingDataset | KeyframeDataset:
-        if processor.samples.kind == "keyframes":
-            keyframes = policy.keyframes if isinstance(policy, TrainsOnKeyframes) else 1
-            return KeyframeDataset(
-                sources, processor, keyframes, episodes=episodes, seed=seed, sampled=not held_out
-            )
+    def side(episodes: list[Any], held_out: bool = False) -> Any:
+        if processor.samples.kind != "steps":
+            build = TRAINING_SETS[processor.samples.kind]
+            return build(sources, processor, policy, episodes, seed=seed, sampled=not held_out)
         kind = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
         return kind(
             sources,

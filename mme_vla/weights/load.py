@@ -23,7 +23,7 @@ from mme_vla.policy.tensor_files import (
 from mme_vla.processing.base import CONFIG_FILE, read_settings
 from mme_vla.weights.ports import HISTORY, check_window, port_adapter
 from mme_vla.weights.released import members_of, partial_adapter, released_adapter
-from mme_vla.weights.source import METHOD_FORMATS, Source, open_source
+from mme_vla.weights.source import Source, method_formats, open_source
 from mme_vla.weights.statistics import read_stats, stats_files
 from mme_vla.weights.tables import Adapter, memory_parameters
 
@@ -38,7 +38,7 @@ def adapter_of(fmt: str, policy: Policy) -> Adapter:
     """The name table of a format for a policy; raises an error where the format does not hold such
     a policy.
     """
-    make = _ADAPTERS[fmt] if fmt in _ADAPTERS else METHOD_FORMATS[fmt].function("adapter")
+    make = _ADAPTERS[fmt] if fmt in _ADAPTERS else method_formats()[fmt].function("adapter")
     adapter: Adapter = make(policy)
     return adapter
 
@@ -101,7 +101,7 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
         return merge_state(source.tensors(), source.config.get("adapters"))
     if source.format == "lerobot":
         check_window(policy, source.config, str(source.folder))
-    if (of := METHOD_FORMATS.get(source.format)) is not None and of.check is not None:
+    if (of := method_formats().get(source.format)) is not None and of.check is not None:
         of.function("check")(policy, source.config, str(source.folder))
     adapter, state = adapter_of(source.format, policy), policy.state_dict()
     tensors = source.tensors(lambda values: adapter.check_fit(values, state, source.label))

@@ -12,6 +12,7 @@ from torch import Tensor
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.saving import CONFIG, local_folder, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
+from mme_vla.registry import WeightFormat, extensions
 from mme_vla.utils import SUMS, check_sums, decoding, require_file
 from mme_vla.weights.names.jax_memory import ENCODER
 from mme_vla.weights.orbax import (
@@ -32,92 +33,27 @@ FORMATS = {
     "lerobot": "LeRobot's pi05 (safetensors)",
     "openpi": "openpi's PyTorch π0.5 (safetensors)",
     "released": "openpi's and MME-VLA's JAX parameter trees (Orbax)",
-    "diffusion_policy": "Diffusion Policy as RoboMME's authors train it (.pth)",
-    "sam2act_plus": "SAM2Act and SAM2Act+ as their authors train them (.pth)",
-    "openvla": (
-        "OpenVLA, or a run of OpenVLA-OFT, merged or beside its base (safetensors, with .pt files)"
-    ),
-    "memoryvla": "MemoryVLA as its authors train it (.pt)",
-    "simplememvla": "SimpleMemVLA as its authors publish it, or Qwen3.5 (safetensors)",
 }
 
 
-@dataclass(frozen=True)
-class MethodFormat:
-    """A format of one method: where the functions are that read and write it, imported when first
-    used.
-
-    matches: whether tensor names are its. adapter: its name table for a policy. write: a policy as
-    its files. native: tensors under the one spelling of the name table, for files of `torch.save`.
-    stats: reads its statistics. spelling: the same for safetensors. check: compares its config.json
-    with a policy. configure: a composed
-        configuration as its config.json says.
-    """
-
-    module: str
-    matches: str
-    adapter: str
-    write: str
-    native: str | None = None
-    stats: str | None = None
-    spelling: str | None = None
-    check: str | None = None
-    configure: str | None = None
-
-    def function(self, role: str) -> Callable[..., Any]:
-        name: str = getattr(self, role)
-        function: Callable[..., Any] = getattr(importlib.import_module(self.module), name)
-        return function
+def method_formats() -> dict[str, WeightFormat]:
+    """The formats that extensions add, by name."""
+    return {name: of for extension in extensions() for name, of in extension.weight_formats.items()}
 
 
-METHOD_FORMATS = {
-    "simplememvla": MethodFormat(
-        "mme_vla.methods.simplememvla.weights",
-        "is_simplememvla",
-        "simplememvla_adapter",
-        "write_simplememvla",
-        stats="read_published_stats",
-        spelling="read_names",
-        check="check_config",
-        configure="configured",
-    ),
-    "diffusion_policy": MethodFormat(
-        "mme_vla.methods.diffusion_policy.weights",
-        "is_diffusion_policy",
-        "diffusion_adapter",
-        "write_diffusion_policy",
-        native="unwrap_names",
-        stats="read_diffusion_stats",
-    ),
-    "sam2act_plus": MethodFormat(
-        "mme_vla.methods.sam2act.weights",
-        "is_sam2act",
-        "sam2act_adapter",
-        "write_sam2act",
-        native="unwrap_sam2act_names",
-    ),
-    "memoryvla": MethodFormat(
-        "mme_vla.methods.memoryvla.weights",
-        "is_memoryvla",
-        "memoryvla_adapter",
-        "write_memoryvla",
-        native="read_names",
-    ),
-    "openvla": MethodFormat(
-        "mme_vla.methods.openvla_oft.weights",
-        "is_openvla",
-        "openvla_adapter",
-        "write_openvla",
-        stats="read_dataset_statistics",
-    ),
-}
-NATIVE_FORMATS = [name for name, of in METHOD_FORMATS.items() if of.native]
-"""Formats in files of `torch.save`; each is called as the model it holds."""
+def formats() -> dict[str, str]:
+    """Name → what it is, of all formats."""
+    return FORMATS | {name: of.text for name, of in method_formats().items()}
+
+
+def native_formats() -> list[str]:
+    """Formats in files of `torch.save`; each is called as the model it holds."""
+    return [name for name, of in method_formats().items() if of.native]
 
 
 def _openvla() -> Any:
     """The reader of OpenVLA-OFT's adapters and heads, which lie in files of their own."""
-    return importlib.import_module(METHOD_FORMATS["openvla"].module)
+    return importlib.import_module(method_formats()["openvla"].module)
 
 
 VARIANTS = {
@@ -140,7 +76,7 @@ VARIANTS = {
 class Source:
     """A checkpoint that was found.
 
-    format: a key of `FORMATS`. folder: what belongs to it lies here: configuration, statistics.
+    format: a key of `formats()`. folder: what belongs to it lies here: configuration, statistics.
     files: its safetensors files; empty for an Orbax checkpoint.
     params: the Orbax arrays' folder, or their place in an archive.
     base: of a run that holds adapters alone, what they were trained on.
@@ -164,8 +100,8 @@ class Source:
         if self.params is not None:
             self._check_orbax()
             return read_orbax(self.params, fits)
-        if self.format in NATIVE_FORMATS:
-            to_native = METHOD_FORMATS[self.format].function("native")
+        if self.format in native_formats():
+            to_native = method_formats()[self.format].function("native")
             check_sums(self.folder, [self.files[0].name])
             native: dict[str, Tensor] = to_native(
                 read_torch_file(self.files[0]), str(self.files[0])
@@ -177,7 +113,7 @@ class Source:
         tensors = read_files(self.folder, self.files)
         if self.format == "openvla":
             tensors = _openvla().with_heads(tensors, self.folder)
-        if (of := METHOD_FORMATS.get(self.format)) is not None and of.spelling is not None:
+        if (of := method_formats().get(self.format)) is not None and of.spelling is not None:
             spelled: dict[str, Tensor] = of.function("spelling")(tensors, str(self.folder))
             return spelled
         return (
@@ -224,7 +160,7 @@ class Source:
         A word in `history_config.txt` that is no variant of the released code never becomes part of
         a configuration: the names of the tensors tell the variant.
         """
-        if self.format in (*NATIVE_FORMATS, "simplememvla"):
+        if self.format in (*native_formats(), "simplememvla"):
             return [self.format]
         if self.format == "openvla":
             return ["openvla_oft"]
@@ -274,7 +210,7 @@ def _variants_with(leaves: Collection[str], word: str) -> list[str]:
 
 
 def detect_format(source: str | Path) -> str:
-    """The key of `FORMATS` that `source` has."""
+    """The key of `formats()` that `source` has."""
     return open_source(source).format
 
 
@@ -307,7 +243,7 @@ def open_source(
         base_source = open_source(base)
         require(
             base_source.format == "openvla",
-            f"base={str(base)!r} is {FORMATS[base_source.format]}; the adapters in {path} are"
+            f"base={str(base)!r} is {formats()[base_source.format]}; the adapters in {path} are"
             " OpenVLA's.",
         )
         return Source("openvla", path, base=base_source)
@@ -348,7 +284,7 @@ def open_source(
             f"{path} holds a PEFT adapter alone, not a policy: merge it into its base model first."
         )
     raise UserError(
-        f"{path} holds no checkpoint of a known kind. Known: {'; '.join(FORMATS.values())}."
+        f"{path} holds no checkpoint of a known kind. Known: {'; '.join(formats().values())}."
     )
 
 
@@ -365,31 +301,31 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         return Source("lerobot" if lerobot or described else "openpi", folder, files)
     is_native = "backbone" in Source("ours", folder).config
     has_qwen = any(name.endswith("model.visual.pos_embed.weight") for name in names)
-    if not is_native and has_qwen and METHOD_FORMATS["simplememvla"].function("matches")(names):
+    if not is_native and has_qwen and method_formats()["simplememvla"].function("matches")(names):
         return Source("simplememvla", folder, files)
     # Not every kind of policy has a backbone among its modules; each has one in its configuration.
     if any(name.startswith("backbone.") for name in names) or is_native:
         return Source("ours", folder, files)
-    if METHOD_FORMATS["openvla"].function("matches")(names):
+    if method_formats()["openvla"].function("matches")(names):
         return Source("openvla", folder, files)
     if any(name.startswith("PaliGemma/") for name in names):
         return Source("released", folder, files)
     few = listed(sorted(names), 3) or "none at all"
     raise UserError(
         f"{files[0]} is no policy of a known kind: its tensors are called {few}. Known:"
-        f" {'; '.join(FORMATS.values())}."
+        f" {'; '.join(formats().values())}."
     )
 
 
 def _of_torch_file(path: Path) -> Source:
     names = list(read_torch_file(path, mapped=True))
-    for name in NATIVE_FORMATS:
-        if METHOD_FORMATS[name].function("matches")(names):
+    for name in native_formats():
+        if method_formats()[name].function("matches")(names):
             return Source(name, path.parent, (path,))
     few = listed(sorted(names), 3)
     raise UserError(
         f"{path} holds no policy known here: its tensors are called {few}. Known:"
-        f" {', '.join(NATIVE_FORMATS)}."
+        f" {', '.join(native_formats())}."
     )
 
 

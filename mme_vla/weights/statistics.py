@@ -11,7 +11,7 @@ from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.tensor_files import read_safetensors
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import checked_file, read_json
-from mme_vla.weights.source import METHOD_FORMATS
+from mme_vla.weights.source import method_formats
 
 _PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _FEATURES = {"state": "observation.state", "actions": "action"}
@@ -46,7 +46,7 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
     files |= {"": folder / "norm_stats.json"} if (folder / "norm_stats.json").is_file() else {}
     if files:
         return NormStats.load(_local_file(folder, next(iter(files.values()))))
-    for fmt in METHOD_FORMATS.values():
+    for fmt in method_formats().values():
         if fmt.stats is not None and (stats := fmt.function("stats")(folder)) is not None:
             return stats
     return next(_lerobot_stats(folder), None)

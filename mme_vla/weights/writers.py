@@ -23,7 +23,7 @@ from mme_vla.weights.names.torch_backbone import EMBEDDING
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
 from mme_vla.weights.released import released_table, to_released
-from mme_vla.weights.source import METHOD_FORMATS, VARIANTS
+from mme_vla.weights.source import VARIANTS, method_formats
 
 BEFORE, AFTER = "policy_preprocessor", "policy_postprocessor"
 _QUANTILES = {"VISUAL": "IDENTITY", "STATE": "QUANTILES", "ACTION": "QUANTILES"}
@@ -131,8 +131,8 @@ def check_target(policy: Policy, fmt: str) -> None:
         )
     if fmt == "released":
         released_table(mme_of(policy, "The released layout"))
-    if fmt in METHOD_FORMATS:
-        METHOD_FORMATS[fmt].function("adapter")(policy)
+    if fmt in method_formats():
+        method_formats()[fmt].function("adapter")(policy)
 
 
 def write_native(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
@@ -233,8 +233,8 @@ _WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None
 def write_policy(
     policy: Policy, folder: Path, fmt: str, dtype: torch.dtype, stats: NormStats | None
 ) -> None:
-    """Write a policy into `folder` in a format of `FORMATS`."""
-    writer = _WRITERS[fmt] if fmt in _WRITERS else METHOD_FORMATS[fmt].function("write")
+    """Write a policy into `folder` in a format of `formats()`."""
+    writer = _WRITERS[fmt] if fmt in _WRITERS else method_formats()[fmt].function("write")
     writer(policy, folder, dtype, stats)
 
 

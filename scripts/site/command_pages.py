@@ -8,8 +8,9 @@ from importlib import import_module
 
 import config_pages
 
-from mme_vla.cli import COMMANDS
+from mme_vla.cli import commands
 from mme_vla.cli import help as cli_help
+from mme_vla.config.composition import library_files
 from mme_vla.errors import UserError
 
 GUIDES = {
@@ -56,10 +57,7 @@ WIDTH = 78
 
 def config_of(command: str) -> str | None:
     """The stem of the YAML file that configures a command; None where it takes options instead."""
-    names = {
-        usage.replace("mme_vla.", "").split()[-1]: stem for stem, usage in cli_help.COMMANDS.items()
-    }
-    return names.get(command)
+    return commands()[command].config or None
 
 
 def help_text(command: str) -> str:
@@ -71,7 +69,7 @@ def help_text(command: str) -> str:
     printed = io.StringIO()
     try:
         with redirect_stdout(printed), redirect_stderr(printed):
-            import_module(f"mme_vla.cli.{COMMANDS[command][0]}").main()
+            import_module(commands()[command].module).main()
     except SystemExit:
         pass  # argparse ends so
     except UserError as error:
@@ -84,7 +82,7 @@ def help_text(command: str) -> str:
 
 def page(command: str) -> str:
     """The page of one command."""
-    purpose = COMMANDS[command][1]
+    purpose = commands()[command].text
     guide = f"The [guide](../../{GUIDES[command]}) shows it at work."
     parts = [f"# `mme-vla {command}`", f"{purpose[0].upper()}{purpose[1:]}. {guide}"]
     stem = config_of(command)
@@ -94,10 +92,10 @@ def page(command: str) -> str:
             f"## Options\n\n```text\n{help_text(command)}\n```",
         ]
         return "\n\n".join(parts) + "\n"
-    file = config_pages.CONFIGS / f"{stem}.yaml"
+    file = library_files("")[stem]
     parts += [
         config_pages.introduction(file),
-        f"## Keys of [{file.name}](../../../configs/{file.name})",
+        f"## Keys of [{file.name}]({config_pages.source_link(file)})",
     ]
     parts.append(config_pages.key_table(file))
     chosen = cli_help.defaults(file)
@@ -106,7 +104,7 @@ def page(command: str) -> str:
     groups = {
         group: name
         for stem in [*chosen.files, stem]
-        for group, name in cli_help.defaults(config_pages.CONFIGS / f"{stem}.yaml").groups.items()
+        for group, name in cli_help.defaults(library_files("")[stem]).groups.items()
     }
     if groups:
         rows = [f"| {group_link(group)} | `{name}` |" for group, name in sorted(groups.items())]
@@ -116,8 +114,8 @@ def page(command: str) -> str:
 
 def included(stem: str) -> str:
     """A link to the page with the keys of a YAML file that another one includes."""
-    command = cli_help.COMMANDS[stem].replace("mme_vla.", "").split()[-1]
-    if command in COMMANDS:
+    command = cli_help.configured_commands()[stem].replace("mme_vla.", "").split()[-1]
+    if command in commands():
         return f"[`{command}`]({command}.md)"
     return f"[`{command}`](../configuration.md)"
 
@@ -134,9 +132,9 @@ def pages() -> dict[str, str]:
     Raises:
         ValueError: a command has no guide, or no example.
     """
-    examples = EXAMPLES.keys() | filter(config_of, COMMANDS)
-    if missing := COMMANDS.keys() - (GUIDES.keys() & examples):
+    examples = EXAMPLES.keys() | filter(config_of, commands())
+    if missing := commands().keys() - (GUIDES.keys() & examples):
         raise ValueError(
             f"scripts/site/command_pages.py: no entry in GUIDES or EXAMPLES for {sorted(missing)}"
         )
-    return {f"reference/commands/{command}.md": page(command) for command in COMMANDS}
+    return {f"reference/commands/{command}.md": page(command) for command in commands()}

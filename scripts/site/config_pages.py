@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from mme_vla.cli.help import heading, keys
+from mme_vla.config.composition import library_files, library_trees
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+REPOSITORY = Path(__file__).resolve().parents[2]
 INTRODUCTION = """# Configuration
 
 Every command takes `key=value` and `group=file` words: `python -m mme_vla.train model=framesamp_modul train.lr=1e-3`.
@@ -60,18 +61,23 @@ def section(file: Path, title: str) -> str:
     return "\n\n".join(part for part in (title, introduction(file), key_table(file)) if part)
 
 
-def groups() -> list[Path]:
-    """The folders of files to choose from."""
-    return sorted(folder for folder in CONFIGS.iterdir() if folder.is_dir())
+def groups() -> list[str]:
+    """The groups of files to choose from, of the core and of the extras."""
+    return sorted(
+        {folder.name for tree in library_trees() for folder in tree.iterdir() if folder.is_dir()}
+    )
+
+
+def source_link(file: Path) -> str:
+    """The address of a file of the repository from a page of a group or command."""
+    return f"../../../{file.relative_to(REPOSITORY)}"
 
 
 def overview() -> str:
     """Introduction, and a table of the groups with their files."""
-    files = {
-        group.name: " · ".join(f"`{file.stem}`" for file in files_of(group)) for group in groups()
-    }
+    files = {group: " · ".join(f"`{name}`" for name in library_files(group)) for group in groups()}
     rows = [f"| [`{name}`](configuration/{name}.md) | {stems} |" for name, stems in files.items()]
-    policy = section(CONFIGS / "policy.yaml", "## `build_policy`")
+    policy = section(library_files("")["policy"], "## `build_policy`")
     return "\n\n".join(
         [
             INTRODUCTION.strip(),
@@ -82,23 +88,19 @@ def overview() -> str:
     )
 
 
-def files_of(group: Path) -> list[Path]:
-    return sorted(group.glob("*.yaml"))
-
-
-def group_page(group: Path) -> str:
+def group_page(group: str) -> str:
     """The files of a group, each with its keys."""
     parts = [
-        f"# `{group.name}`",
-        f"`{group.name}=NAME` takes one of these files. *default* is the file's value.",
+        f"# `{group}`",
+        f"`{group}=NAME` takes one of these files. *default* is the file's value.",
     ]
-    for file in files_of(group):
-        title = f"## [`{group.name}={file.stem}`](../../../configs/{group.name}/{file.name})"
+    for file in library_files(group).values():
+        title = f"## [`{group}={file.stem}`]({source_link(file)})"
         parts.append(section(file, title))
     return "\n\n".join(parts) + "\n"
 
 
 def pages() -> dict[str, str]:
     """Path under `docs/` → Markdown: the overview, and a page for each group."""
-    named = {f"reference/configuration/{group.name}.md": group_page(group) for group in groups()}
+    named = {f"reference/configuration/{group}.md": group_page(group) for group in groups()}
     return {"reference/configuration.md": overview(), **named}

@@ -20,12 +20,12 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from helpers.h5_files import write_file
-from mme_vla.cli import COMMANDS
+from mme_vla.cli import commands
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import find_records, read_folders
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-FOLDER = REPOSITORY / "tests" / "extras"
+FOLDER = REPOSITORY / "tests" / "data" / "hidden_modules"
 LEROBOT_EXTRAS = ("dataset",)  # of which the library itself depends
 NEW = "uv sync --inexact --extra {}"
 
@@ -290,7 +290,7 @@ def test_a_command_names_the_extra_that_it_needs(folder: Path, case: Case) -> No
 def test_every_command_is_among_the_cases() -> None:
     words = [case.words.split() for case in SUFFICE]
     assert {w[1] if w[0] == "mme_vla" else w[0].removeprefix("mme_vla.") for w in words} == set(
-        COMMANDS
+        commands()
     )
 
 

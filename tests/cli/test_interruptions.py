@@ -15,7 +15,7 @@ from helpers.h5_files import write_file
 from mme_vla.cli.errors import Terminated, print_user_errors
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
-from mme_vla.envs.recording.outputs import Job, RecordingPlan
+from mme_vla.envs.robomme.recording.outputs import Job, RecordingPlan
 from mme_vla.errors import UserError
 from mme_vla.training.runs import MAY_DIFFER, SUMMARY, check_content, claim_run
 from mme_vla.utils import (

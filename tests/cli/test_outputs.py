@@ -8,10 +8,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from mme_vla.cli import board, docs, gallery, results, train_tokenizer
-from mme_vla.cli.analyse import _beside, _save
+from mme_vla.cli import docs, gallery, results, train_tokenizer
 from mme_vla.errors import UserError
-from mme_vla.nano.fitting import _remove_drafts
+from mme_vla.extras.nano.cli import board
+from mme_vla.extras.nano.fitting import _remove_drafts
+from mme_vla.extras.probing.cli.analyse import _beside, _save
 from mme_vla.policy.tensor_files import replace_folder
 from mme_vla.utils import require_replaceable
 

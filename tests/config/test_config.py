@@ -13,7 +13,12 @@ from omegaconf import OmegaConf
 
 from helpers import commands
 from mme_vla.cli.command import check_overrides, cli, options_first
-from mme_vla.config.composition import compose, config_dir, import_plugins
+from mme_vla.config.composition import (
+    compose,
+    import_plugins,
+    library_files,
+    library_trees,
+)
 from mme_vla.errors import UserError
 
 TREE = {
@@ -145,7 +150,7 @@ def test_every_choice_of_a_sweep_is_checked(tree: Path) -> None:
 
 
 def test_a_sweep_of_any_command_writes_under_outputs() -> None:
-    for file in config_dir().glob("*.yaml"):
+    for file in library_files("").values():
         if "hydra" in (cfg := OmegaConf.load(file)):
             assert str(OmegaConf.to_container(cfg.hydra)["sweep"]["dir"]).startswith(
                 "outputs/sweeps/"
@@ -298,7 +303,7 @@ def test_a_command_ends_before_it_starts_a_run(
     assert message in "".join(capfd.readouterr())
 
 
-@pytest.mark.parametrize("file", sorted(config_dir().glob("*.yaml")), ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", list(library_files("").values()), ids=lambda file: file.stem)
 def test_no_key_of_a_command_has_the_name_of_a_folder_that_it_does_not_choose_from(
     file: Path,
 ) -> None:
@@ -310,5 +315,7 @@ def test_no_key_of_a_command_has_the_name_of_a_folder_that_it_does_not_choose_fr
         if isinstance(entry, dict)
         for key in entry
     }
-    folders = {folder.name for folder in config_dir().iterdir() if folder.is_dir()}
+    folders = {
+        folder.name for tree in library_trees() for folder in tree.iterdir() if folder.is_dir()
+    }
     assert not (set(tree) & folders) - chosen

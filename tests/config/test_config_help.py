@@ -12,15 +12,17 @@ import pytest
 from helpers import REPOSITORY
 from mme_vla import cli
 from mme_vla.cli.command import help_text
-from mme_vla.cli.help import COMMANDS, choices, defaults, keys
-from mme_vla.config.composition import compose, config_dir
+from mme_vla.cli.help import choices, configured_commands, defaults, keys
+from mme_vla.config.composition import compose, library_files, library_trees
 from mme_vla.errors import UserError
+
+COMMANDS = configured_commands()
 
 
 @pytest.mark.parametrize("name", [name for name, words in COMMANDS.items() if "python" in words])
 def test_help_tells_what_a_command_does_with_examples_and_every_key(name: str) -> None:
-    text = help_text(name, [], [config_dir()])
-    file = config_dir() / f"{name}.yaml"
+    text = help_text(name, [], library_trees())
+    file = library_files("")[name]
     assert text.startswith(f"Usage: {COMMANDS[name]} ")
     assert f"Examples\n  {COMMANDS[name]}" in text
     flat = re.sub(r"\s+", " ", text)
@@ -30,7 +32,7 @@ def test_help_tells_what_a_command_does_with_examples_and_every_key(name: str) -
     for group, option in defaults(file).groups.items():
         if not group.startswith("override"):
             assert f"{group}={option}" in flat
-            assert all(choice in flat for choice in choices([config_dir()], group))
+            assert all(choice in flat for choice in choices(library_trees(), group))
 
 
 def test_help_names_the_files_of_a_group_and_custom_ones_too(tmp_path: Path) -> None:
@@ -38,14 +40,14 @@ def test_help_names_the_files_of_a_group_and_custom_ones_too(tmp_path: Path) -> 
     (tmp_path / "memory" / "mine.yaml").write_text(
         "# Remembers what I like.\nname: mine\nspacing: 4 # steps apart\n"
     )
-    text = help_text("train", ["memory"], [config_dir(), tmp_path])
+    text = help_text("train", ["memory"], library_trees(), [tmp_path])
     assert "memory=mine\n  Remembers what I like.\n" in text
     assert re.search(r"memory.spacing=4 +steps apart", text)
     assert re.search(r"memory.budget=512 +memory tokens; a multiple of grid²", text)
     with pytest.raises(
         UserError, match=r"'memori' is no group of this command\. Did you mean 'memory'\?"
     ):
-        help_text("train", ["memori"], [config_dir()])
+        help_text("train", ["memori"], library_trees())
 
 
 @pytest.mark.slow

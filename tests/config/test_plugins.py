@@ -14,7 +14,7 @@ import torch
 
 from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.cli import analyse, inspect
+from mme_vla.cli import inspect
 from mme_vla.cli.weights import convert
 from mme_vla.config import plugins
 from mme_vla.config.composition import compose, import_plugins
@@ -24,6 +24,7 @@ from mme_vla.envs import metadata
 from mme_vla.evaluation.rollout.evaluation import choose_episodes, evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.extras.probing.cli import analyse
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
 
 MEMORY = '''

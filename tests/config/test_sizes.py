@@ -6,12 +6,12 @@ from typing import Any
 import pytest
 
 from mme_vla.backbone.config import BackboneConfig
-from mme_vla.backbone.nano import NanoConfig
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
+from mme_vla.extras.methods.memoryvla.model import MemoryVlaConfig
+from mme_vla.extras.methods.openvla_oft.config import OpenVlaConfig
+from mme_vla.extras.nano.backbone import NanoConfig
 from mme_vla.integration.context import MemoryExpert
-from mme_vla.methods.memoryvla.model import MemoryVlaConfig
-from mme_vla.methods.openvla_oft.config import OpenVlaConfig
 
 TOWER = {"width": 8, "depth": 2, "mlp_dim": 8, "num_heads": 2}
 

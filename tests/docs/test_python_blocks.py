@@ -31,7 +31,7 @@ TESTED_BY = {
     "docs/extend/cached-keys-and-values.md": "tests/end_to_end/test_examples.py",
     "docs/extend/notes.md": "tests/end_to_end/test_examples.py",
     "docs/extend/history-transforms.md": "tests/end_to_end/test_examples.py",
-    "docs/extend/trajectories.md": "tests/evaluation/test_rollouts.py",
+    "docs/extend/trajectories.md": "tests/extras/trajectories/test_rollouts.py",
     "docs/start/first-hour.md": "tests/end_to_end/test_first_hour.py",
     "docs/concepts/budget.md": "tests/end_to_end/test_guides.py",
     "docs/concepts/history.md": "tests/end_to_end/test_guides.py",

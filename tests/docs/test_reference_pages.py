@@ -12,8 +12,10 @@ import hooks
 import notebook_pages
 import pytest
 
-from mme_vla.cli import COMMANDS
+from mme_vla.cli import commands
 from mme_vla.cli import help as cli_help
+from mme_vla.config.composition import library_files
+from mme_vla.registry import Command
 
 
 def test_every_public_name_has_a_description() -> None:
@@ -52,16 +54,17 @@ def test_a_long_signature_has_a_line_for_each_argument() -> None:
 
 
 def test_every_file_of_the_top_level_configures_a_command() -> None:
-    assert {file.stem for file in config_pages.CONFIGS.glob("*.yaml")} == set(cli_help.COMMANDS)
+    assert set(library_files("")) == set(cli_help.configured_commands())
 
 
 def test_every_key_has_a_comment_in_one_file_of_its_group() -> None:
     """A group's other files may repeat a key without explaining it again."""
     unexplained = []
-    configs = config_pages.CONFIGS
-    for folder in [configs, *(group for group in config_pages.groups() if group.name != "model")]:
-        files = config_pages.files_of(folder)
-        for group in [[file] for file in files] if folder == configs else [files]:
+    for name in ["", *config_pages.groups()]:
+        if name == "model":
+            continue
+        files = list(library_files(name).values())
+        for group in [files] if name else [[file] for file in files]:
             rows = [(file, key.name, key.comment) for file in group for key in cli_help.keys(file)]
             explained = {key for _, key, comment in rows if comment}
             sections = {
@@ -94,17 +97,18 @@ def test_comments_become_markdown() -> None:
 
 def test_each_command_has_a_page_with_its_options() -> None:
     pages = command_pages.pages()
-    assert set(pages) == {f"reference/commands/{command}.md" for command in COMMANDS}
+    assert set(pages) == {f"reference/commands/{command}.md" for command in commands()}
     assert "| `max_steps` |" in pages["reference/commands/evaluate.md"]
     assert "| [`model`](../configuration/model.md) |" in pages["reference/commands/train.md"]
     assert "--compare" in pages["reference/commands/results.md"]
-    for command in COMMANDS:
+    for command in commands():
         page = pages[f"reference/commands/{command}.md"]
         assert "```bash" in page, f"{command} has no example"
 
 
 def test_a_command_without_a_guide_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(command_pages.COMMANDS, "dance", ("dance", "dance"))
+    known = commands() | {"dance": Command("dance", "dance")}
+    monkeypatch.setattr(command_pages, "commands", lambda: known)
     with pytest.raises(ValueError, match="dance"):
         command_pages.pages()
 

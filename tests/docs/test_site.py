@@ -7,11 +7,13 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
 
+import config_pages
 import pytest
 
-from helpers import REPOSITORY, commands
+from helpers import commands
 from helpers.browser import Browser
-from mme_vla.cli import COMMANDS, docs
+from mme_vla import cli
+from mme_vla.cli import docs
 from mme_vla.errors import UserError
 
 pytestmark = pytest.mark.slow
@@ -55,8 +57,10 @@ def pages(site: Path) -> dict[Path, Page]:
 
 
 def test_each_command_and_group_has_a_page(site: Path) -> None:
-    assert {file.stem for file in (site / "reference" / "commands").iterdir()} == set(COMMANDS)
-    groups = {folder.name for folder in (REPOSITORY / "configs").iterdir() if folder.is_dir()}
+    assert {file.stem for file in (site / "reference" / "commands").iterdir()} == set(
+        cli.commands()
+    )
+    groups = set(config_pages.groups())
     assert {file.stem for file in (site / "reference" / "configuration").iterdir()} == groups
 
 

@@ -13,7 +13,7 @@ import torch
 from omegaconf import OmegaConf
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.config.composition import compose, config_dir
+from mme_vla.config.composition import compose, library_files
 from mme_vla.data.lerobot_files import check_vectors
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import check_benchmark, embodiment_of
@@ -22,7 +22,7 @@ from mme_vla.processing.processor import Processor
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
 from mme_vla.utils import SUMS
 
-SHIPPED = sorted(path.stem for path in (config_dir() / "embodiment").glob("*.yaml"))
+SHIPPED = list(library_files("embodiment"))
 SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
 TINY = {"vision": {**SMALL_VISION, "patch_size": 16}}
 

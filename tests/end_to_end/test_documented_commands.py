@@ -20,11 +20,11 @@ from hydra._internal.utils import get_args_parser
 from helpers import REPOSITORY
 from mme_vla import cli
 from mme_vla.cli.command import check_overrides
-from mme_vla.cli.help import COMMANDS
-from mme_vla.cli.nano import with_settings
+from mme_vla.cli.help import configured_commands
 from mme_vla.cli.results import main as results
 from mme_vla.config.composition import compose
 from mme_vla.config.plugins import trust_as_override
+from mme_vla.extras.nano.cli.nano import with_settings
 
 pytestmark = pytest.mark.slow
 
@@ -53,7 +53,7 @@ NOT_RUN = {
     r"mme_vla\.train ": "trains for minutes or hours",
     r"mme(_vla\.|-vla )nano( |$)": "trains for minutes or hours",
     r"mme-vla vision-pretrain ": (
-        "trains for minutes; tests/nano/test_vision_pretrain.py runs it on few scenes"
+        "trains for minutes; tests/extras/nano/test_vision_pretrain.py runs it on few scenes"
     ),
     r"mme_vla\.(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": (
         "needs a policy that was trained before"
@@ -62,11 +62,11 @@ NOT_RUN = {
     r"mme_vla\.results outputs/|mme-vla results verify": "needs the records of an evaluation",
     r"mme-vla probe card": "needs recorded episodes",
     r"analyse writing --memories anchors": (
-        "demonstrates 48 episodes; tests/probing/test_writing.py runs it on one"
+        "demonstrates 48 episodes; tests/extras/probing/test_writing.py runs it on one"
     ),
     r"benchmarks/\w+\.py (memory|update|chunk)": "needs a GPU, or a mock driver",
     r"python (dagger|grpo|reward_weighted)\.py": (
-        "tests/evaluation/test_rollouts.py or test_dagger_example.py runs it"
+        "tests/extras/trajectories/test_rollouts.py or test_dagger_example.py runs it"
     ),
     r"mme_vla\.serve ": "serves until it is stopped",
     r"mme-vla harness ": "serves until it is stopped",
@@ -178,12 +178,12 @@ def test_the_words_of_other_documented_commands_are_valid(page: str, command: st
         return
     program, arguments = words[start], words[start + 1 :]
     if program in ("mme-vla", "mme_vla"):
-        assert arguments[0] in cli.COMMANDS
+        assert arguments[0] in cli.commands()
         entry, arguments = f"mme-vla {arguments[0]}", arguments[1:]
     else:
         assert find_spec(program) is not None
         entry = f"python -m {program}"
-    name = {documented: name for name, documented in COMMANDS.items()}.get(entry)
+    name = {documented: name for name, documented in configured_commands().items()}.get(entry)
     if name is None:  # it takes options instead of a configuration
         return
     arguments = trust_as_override(arguments)

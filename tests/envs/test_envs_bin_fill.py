@@ -9,8 +9,8 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 import sapien
 
 from helpers.env_tasks import COLOURS, Flags, Hand, push_down, wait
-from mme_vla.envs.scene.objects import Cube
-from mme_vla.envs.tasks.bin_fill import BinFill
+from mme_vla.envs.robomme.scene.objects import Cube
+from mme_vla.envs.robomme.tasks.bin_fill import BinFill
 
 STREAMING, STATIC = 4, 1  # seeds: cubes appear one after another, or are all there from the start
 

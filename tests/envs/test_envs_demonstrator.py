@@ -13,17 +13,17 @@ import sapien
 from scipy.spatial.transform import Rotation
 
 from helpers.env_scenes import Scene
-from mme_vla.envs.robot.demonstrator import Demonstrator, PlanningError, arc
-from mme_vla.envs.robot.gripper_skills import failing_offset, grasp_orientation
-from mme_vla.envs.scene.articulated import PEG_COLOUR, build_button, build_peg
-from mme_vla.envs.scene.objects import (
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator, PlanningError, arc
+from mme_vla.envs.robomme.robot.gripper_skills import failing_offset, grasp_orientation
+from mme_vla.envs.robomme.scene.articulated import PEG_COLOUR, build_button, build_peg
+from mme_vla.envs.robomme.scene.objects import (
     build_aperture_box,
     build_board,
     build_container,
     build_cube,
     build_disc,
 )
-from mme_vla.envs.scene.things import distance_xy
+from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.task import Task
 
 

@@ -9,10 +9,10 @@ import sapien
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_tasks import steps_of_demonstration, wait
-from mme_vla.envs.robot.control import PlanningError
-from mme_vla.envs.scene.articulated import Peg
-from mme_vla.envs.scene.objects import at
-from mme_vla.envs.tasks.insert_peg import InsertPeg
+from mme_vla.envs.robomme.robot.control import PlanningError
+from mme_vla.envs.robomme.scene.articulated import Peg
+from mme_vla.envs.robomme.scene.objects import at
+from mme_vla.envs.robomme.tasks.insert_peg import InsertPeg
 
 GRASPING, INSERTING = 4, 5
 """Indices of the execution's sub-tasks."""

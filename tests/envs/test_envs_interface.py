@@ -18,7 +18,7 @@ pytest.importorskip(
 from mme_vla.envs import make, make_env, rendering
 from mme_vla.envs.grounding import Grounding, centroid, ground, project
 from mme_vla.envs.observations import AngleTrack, front_extrinsic
-from mme_vla.envs.robot.control import PlanningError
+from mme_vla.envs.robomme.robot.control import PlanningError
 from mme_vla.errors import UserError
 
 STILL = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4, 1], np.float32)
@@ -145,7 +145,7 @@ def test_one_unplanned_video_motion_does_not_stop_the_video(
     def fail(*_: Any) -> None:
         raise PlanningError("no way")
 
-    monkeypatch.setattr("mme_vla.envs.robot.control.RobotControl.hold", fail)
+    monkeypatch.setattr("mme_vla.envs.robomme.robot.control.RobotControl.hold", fail)
     observation, info = env.reset()
     assert len(observation["joint_state_list"]) == 1
     assert info["status"] == "ongoing"

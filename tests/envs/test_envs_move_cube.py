@@ -7,9 +7,9 @@ import sapien
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_tasks import go_to, steps_of_demonstration, wait
-from mme_vla.envs.scene.objects import H
-from mme_vla.envs.scene.things import Thing
-from mme_vla.envs.tasks.move_cube import MoveCube
+from mme_vla.envs.robomme.scene.objects import H
+from mme_vla.envs.robomme.scene.things import Thing
+from mme_vla.envs.robomme.tasks.move_cube import MoveCube
 
 HOOK, PUSH, GRASP = 5, 3, 0  # seeds
 PICK_PEG, HOOK_CUBE = "Pick up the peg", "Hook the cube to the target with the peg"

@@ -6,8 +6,8 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_tasks import Ear, Tip, wait
-from mme_vla.envs.scene.placement import Draws
-from mme_vla.envs.tasks.pattern_lock import DIRECTIONS, PatternLock
+from mme_vla.envs.robomme.scene.placement import Draws
+from mme_vla.envs.robomme.tasks.pattern_lock import DIRECTIONS, PatternLock
 
 WORDS = (
     "forward",

@@ -11,9 +11,15 @@ import torch
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_scenes import Scene
-from mme_vla.envs.scene.articulated import build_button
-from mme_vla.envs.scene.objects import H, build_board, build_container, build_cube, build_disc
-from mme_vla.envs.scene.placement import (
+from mme_vla.envs.robomme.scene.articulated import build_button
+from mme_vla.envs.robomme.scene.objects import (
+    H,
+    build_board,
+    build_container,
+    build_cube,
+    build_disc,
+)
+from mme_vla.envs.robomme.scene.placement import (
     CONTAINER_HALF,
     TRIALS,
     Box2D,

@@ -15,9 +15,9 @@ import sapien
 from scipy.spatial.transform import Rotation
 
 from helpers.env_scenes import Scene, recorded
-from mme_vla.envs.robot.control import LIMITS
-from mme_vla.envs.robot.kinematics import Arm, pose_distance
-from mme_vla.envs.robot.planning import (
+from mme_vla.envs.robomme.robot.control import LIMITS
+from mme_vla.envs.robomme.robot.kinematics import Arm, pose_distance
+from mme_vla.envs.robomme.robot.planning import (
     CONTROL_STEP,
     Obstacles,
     plan_free,
@@ -25,7 +25,7 @@ from mme_vla.envs.robot.planning import (
     sample_path,
     twist_of,
 )
-from mme_vla.envs.scene.stage import RESET_QPOS
+from mme_vla.envs.robomme.scene.stage import RESET_QPOS
 
 EPISODES = [("PickXtimes", 8), ("VideoUnmask", 4), ("PatternLock", 8)]
 # Where planned motions begin in the recordings, and how many steps they take.

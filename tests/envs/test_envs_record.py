@@ -16,7 +16,7 @@ from mme_vla.config.composition import compose
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.envs.make import make_task
-from mme_vla.envs.recording.recorder import Recorder
+from mme_vla.envs.robomme.recording.recorder import Recorder
 from mme_vla.errors import UserError
 from mme_vla.utils.media import GAP, MARGIN, TILE
 

@@ -19,9 +19,9 @@ from helpers.env_scenes import Scene
 from mme_vla.envs import make_env, rendering
 from mme_vla.envs.observations import SENSORS, RenderRequest, capture, read_images
 from mme_vla.envs.rendering import PACK, renderer_works, without_table
-from mme_vla.envs.robot import robots
-from mme_vla.envs.robot.robots import CELL, coarsen, read_stl, stl_bytes
-from mme_vla.envs.scene import stage
+from mme_vla.envs.robomme.robot import robots
+from mme_vla.envs.robomme.robot.robots import CELL, coarsen, read_stl, stl_bytes
+from mme_vla.envs.robomme.scene import stage
 
 HOLD = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4, 1], np.float32)
 DOWN = np.array([-0.0605, 0, 0.47, np.pi, 0, 0, -1], np.float32)

@@ -7,10 +7,10 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_tasks import Ear, Flags, Tip, wait
-from mme_vla.envs.robot.demonstrator import arc
-from mme_vla.envs.scene.objects import Disc
-from mme_vla.envs.scene.placement import Draws
-from mme_vla.envs.tasks.route_stick import RouteStick
+from mme_vla.envs.robomme.robot.demonstrator import arc
+from mme_vla.envs.robomme.scene.objects import Disc
+from mme_vla.envs.robomme.scene.placement import Draws
+from mme_vla.envs.robomme.tasks.route_stick import RouteStick
 
 MOVES = {"easy": ((2, 3), False), "medium": ((4, 5), False), "hard": ((4, 7), True)}
 """How many, and whether they may turn back."""

@@ -17,9 +17,9 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from helpers.env_scenes import Scene, one_of_everything, recorded, replay, setup
 from mme_vla.envs import TASK_NAMES, load_tasks
 from mme_vla.envs.grounding import centroid, project
-from mme_vla.envs.robot.robots import description
-from mme_vla.envs.scene.objects import build_disc
-from mme_vla.envs.tasks.pick_xtimes import PickXtimes
+from mme_vla.envs.robomme.robot.robots import description
+from mme_vla.envs.robomme.scene.objects import build_disc
+from mme_vla.envs.robomme.tasks.pick_xtimes import PickXtimes
 
 PICK = ("PickXtimes", 8)
 LOCK = ("PatternLock", 8)
@@ -188,7 +188,7 @@ def test_objects_have_their_pixels_where_the_official_images_show_them(h5_folder
 def test_what_waits_under_the_floor_is_left_out_of_the_images_until_it_is_displayed(
     renderer: str,
 ) -> None:
-    from mme_vla.envs.scene.motions import Mark, build_mark
+    from mme_vla.envs.robomme.scene.motions import Mark, build_mark
 
     def fill(env: Scene) -> None:
         env.add(build_disc(env, "target", 0.04, 0.005, "gray", (0.0, 0.0)))

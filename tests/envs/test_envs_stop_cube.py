@@ -6,10 +6,10 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_tasks import Flags, push_down, wait
-from mme_vla.envs.robot.demonstrator import Demonstrator
-from mme_vla.envs.scene.placement import Draws
-from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.tasks.stop_cube import StopCube
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
+from mme_vla.envs.robomme.scene.placement import Draws
+from mme_vla.envs.robomme.scene.things import distance_xy
+from mme_vla.envs.robomme.tasks.stop_cube import StopCube
 
 
 def a_seed(interval: int, visit: int) -> int:
@@ -30,7 +30,7 @@ SCENE = (StopCube, a_seed(60, 2), "easy")  # crossings at steps 30, 90, 150, ...
 @pytest.fixture
 def prepared(env: StopCube, monkeypatch: pytest.MonkeyPatch) -> StopCube:
     """The arm counts as being above the button."""
-    monkeypatch.setattr("mme_vla.envs.tasks.stop_cube.hovering", lambda *_: True)
+    monkeypatch.setattr("mme_vla.envs.robomme.tasks.stop_cube.hovering", lambda *_: True)
     return env
 
 

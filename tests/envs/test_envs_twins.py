@@ -17,8 +17,8 @@ from mme_vla.embodiment.robomme import SIDE
 from mme_vla.envs import make_env
 from mme_vla.envs.grounding import project
 from mme_vla.envs.metadata import TASK_NAMES
-from mme_vla.envs.robot.demonstrator import arc
-from mme_vla.envs.scene.motions import TALLY_RADIUS, TALLY_X
+from mme_vla.envs.robomme.robot.demonstrator import arc
+from mme_vla.envs.robomme.scene.motions import TALLY_RADIUS, TALLY_X
 
 TALLIED = ("BinFill", "PickXtimes", "SwingXtimes", "StopCube", "VideoRepick")
 FOREMOST = 0.28

@@ -6,10 +6,10 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_tasks import go_to, steps_of_demonstration, wait
-from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.tasks.families.video_place import VideoPlace
-from mme_vla.envs.tasks.video_place_button import VideoPlaceButton
-from mme_vla.envs.tasks.video_place_order import VideoPlaceOrder
+from mme_vla.envs.robomme.scene.things import distance_xy
+from mme_vla.envs.robomme.tasks.families.video_place import VideoPlace
+from mme_vla.envs.robomme.tasks.video_place_button import VideoPlaceButton
+from mme_vla.envs.robomme.tasks.video_place_order import VideoPlaceOrder
 
 NEAR, FAR = np.array([0.049, 0, 0]), np.array([0.051, 0, 0])
 PICK, PLACE = "pick up the cube", "place the cube onto the correct target"

@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_tasks import go_to, push_down, wait
-from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.tasks.video_repick import VideoRepick
+from mme_vla.envs.robomme.scene.things import distance_xy
+from mme_vla.envs.robomme.tasks.video_repick import VideoRepick
 
 ONCE = 2  # a seed: one repetition and three swaps
 FIRST, SECOND = (f"pick up the correct cube for the {i} time" for i in ("first", "second"))

@@ -16,9 +16,9 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks, make_env, make_task
 from mme_vla.envs.metadata import TASK_NAMES, step_limit
-from mme_vla.envs.recording.recorder import Recorder
-from mme_vla.envs.scene.motions import COVER_STEPS
-from mme_vla.envs.scene.placement import Draws, rotated_anchors
+from mme_vla.envs.robomme.recording.recorder import Recorder
+from mme_vla.envs.robomme.scene.motions import COVER_STEPS
+from mme_vla.envs.robomme.scene.placement import Draws, rotated_anchors
 from mme_vla.envs.task import Task
 from mme_vla.errors import UserError
 

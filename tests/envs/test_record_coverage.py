@@ -16,8 +16,8 @@ from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import MORE, TASK_NAMES, EpisodeSpec
-from mme_vla.envs.recording import coverage
-from mme_vla.envs.recording.outputs import RecordingPlan
+from mme_vla.envs.robomme.recording import coverage
+from mme_vla.envs.robomme.recording.outputs import RecordingPlan
 
 
 def test_more_episodes_have_seeds_that_no_split_has() -> None:

@@ -19,9 +19,9 @@ from mme_vla.data.hdf5 import EpisodeRef, open_episode
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.make import make_task
 from mme_vla.envs.observations import RenderRequest
-from mme_vla.envs.recording.frames import FrameChoice
-from mme_vla.envs.recording.outputs import Job
-from mme_vla.envs.recording.recorder import RecordedStep, Recorder
+from mme_vla.envs.robomme.recording.frames import FrameChoice
+from mme_vla.envs.robomme.recording.outputs import Job
+from mme_vla.envs.robomme.recording.recorder import RecordedStep, Recorder
 from mme_vla.errors import UserError
 
 POSES = [np.full(7, float(i), np.float32) for i in range(3)]

@@ -8,7 +8,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_env, make_task
-from mme_vla.envs.recording.recorder import RecordedStep, Recorder
+from mme_vla.envs.robomme.recording.recorder import RecordedStep, Recorder
 from mme_vla.envs.subtasks import NO_RECORD
 
 VIDEOS = [

@@ -12,10 +12,15 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from scipy.spatial.transform import Rotation
 from trimesh.creation import box
 
-from mme_vla.envs.scene.arithmetic import fused_multiply_add, matrix_product, norm, square_root
-from mme_vla.envs.scene.bounding_box import smallest_box
-from mme_vla.envs.scene.objects import quaternion_about_z
-from mme_vla.envs.scene.placement import Draws
+from mme_vla.envs.robomme.scene.arithmetic import (
+    fused_multiply_add,
+    matrix_product,
+    norm,
+    square_root,
+)
+from mme_vla.envs.robomme.scene.bounding_box import smallest_box
+from mme_vla.envs.robomme.scene.objects import quaternion_about_z
+from mme_vla.envs.robomme.scene.placement import Draws
 
 RNG = np.random.default_rng(7)
 ONES = [np.float32(x) for x in np.linspace(0.001, 16, 4000)]

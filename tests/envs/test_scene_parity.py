@@ -25,7 +25,7 @@ from mme_vla.envs import make_env
 from mme_vla.envs.base import Hold
 from mme_vla.envs.make import make_task
 from mme_vla.envs.observations import RenderRequest
-from mme_vla.envs.recording.recorder import RecordedStep, Recorder
+from mme_vla.envs.robomme.recording.recorder import RecordedStep, Recorder
 from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
 
 FOLDER = Path(

@@ -17,7 +17,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks, make_env, make_task
 from mme_vla.envs.metadata import TASK_NAMES
-from mme_vla.envs.scene.placement import SceneError
+from mme_vla.envs.robomme.scene.placement import SceneError
 from mme_vla.envs.task import Task
 from mme_vla.errors import UserError
 

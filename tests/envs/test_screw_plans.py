@@ -18,8 +18,8 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 import sapien
 
 from helpers.env_scenes import Scene
-from mme_vla.envs.robot.kinematics import Arm, matrix_of
-from mme_vla.envs.robot.planning import CONTROL_STEP, goal_in_base, plan_screw
+from mme_vla.envs.robomme.robot.kinematics import Arm, matrix_of
+from mme_vla.envs.robomme.robot.planning import CONTROL_STEP, goal_in_base, plan_screw
 
 FILE = "screw_plans.json.gz"
 KEPT = Path(__file__).resolve().parents[1] / "data" / FILE

@@ -7,9 +7,9 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_tasks import Hand, push_down, released, wait
-from mme_vla.envs.tasks.pick_highlight import PickHighlight
-from mme_vla.envs.tasks.pick_xtimes import PickXtimes
-from mme_vla.envs.tasks.swing_xtimes import SwingXtimes
+from mme_vla.envs.robomme.tasks.pick_highlight import PickHighlight
+from mme_vla.envs.robomme.tasks.pick_xtimes import PickXtimes
+from mme_vla.envs.robomme.tasks.swing_xtimes import SwingXtimes
 
 LOW = 0.11
 SCENES = {

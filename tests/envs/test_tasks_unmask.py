@@ -13,12 +13,12 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_scenes import replay, setup
 from helpers.env_tasks import lift, make, push_down, released, under, wait
-from mme_vla.envs.scene.motions import COVER_STEPS
-from mme_vla.envs.scene.things import Thing, distance_xy
-from mme_vla.envs.tasks.button_unmask import ButtonUnmask
-from mme_vla.envs.tasks.button_unmask_swap import ButtonUnmaskSwap
-from mme_vla.envs.tasks.video_unmask import VideoUnmask
-from mme_vla.envs.tasks.video_unmask_swap import VideoUnmaskSwap
+from mme_vla.envs.robomme.scene.motions import COVER_STEPS
+from mme_vla.envs.robomme.scene.things import Thing, distance_xy
+from mme_vla.envs.robomme.tasks.button_unmask import ButtonUnmask
+from mme_vla.envs.robomme.tasks.button_unmask_swap import ButtonUnmaskSwap
+from mme_vla.envs.robomme.tasks.video_unmask import VideoUnmask
+from mme_vla.envs.robomme.tasks.video_unmask_swap import VideoUnmaskSwap
 
 SEEDS = {VideoUnmask: 6300, ButtonUnmask: 8300, VideoUnmaskSwap: 5300, ButtonUnmaskSwap: 7300}
 STILL, SWAPPING = (VideoUnmask, ButtonUnmask), (VideoUnmaskSwap, ButtonUnmaskSwap)

@@ -442,7 +442,7 @@ def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task(
     """
     pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
     from mme_vla.envs.interface import RoboMMEEnv
-    from mme_vla.evaluation.rollouts import rollouts
+    from mme_vla.extras.trajectories.rollouts import rollouts
 
     built = build_policy(
         "framesamp_modul",

@@ -16,9 +16,9 @@ from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks
 from mme_vla.envs.metadata import TASK_NAMES
+from mme_vla.envs.robomme.tasks.pick_xtimes import PickXtimes
 from mme_vla.envs.subtasks import OPERATIONS, ProcessScore, Progress, SubTask, process_score
 from mme_vla.envs.task import Task
-from mme_vla.envs.tasks.pick_xtimes import PickXtimes
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord

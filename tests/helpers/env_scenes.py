@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 from sapien.physx import PhysxArticulationLinkComponent, PhysxCollisionShapeBox
 
-from mme_vla.envs.scene.articulated import build_button, build_peg
-from mme_vla.envs.scene.objects import (
+from mme_vla.envs.robomme.scene.articulated import build_button, build_peg
+from mme_vla.envs.robomme.scene.objects import (
     build_aperture_box,
     build_board,
     build_container,
@@ -22,7 +22,7 @@ from mme_vla.envs.scene.objects import (
     build_obstacle,
     build_sphere,
 )
-from mme_vla.envs.scene.placement import Draws
+from mme_vla.envs.robomme.scene.placement import Draws
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 

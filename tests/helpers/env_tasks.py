@@ -9,11 +9,11 @@ import sapien
 
 from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks
-from mme_vla.envs.recording.recorder import demonstrate
-from mme_vla.envs.robot.demonstrator import Demonstrator
-from mme_vla.envs.scene.articulated import Button
-from mme_vla.envs.scene.objects import H
-from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.robomme.recording.recorder import demonstrate
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
+from mme_vla.envs.robomme.scene.articulated import Button
+from mme_vla.envs.robomme.scene.objects import H
+from mme_vla.envs.robomme.scene.things import Thing
 from mme_vla.envs.task import Task
 from mme_vla.registry import TASKS
 

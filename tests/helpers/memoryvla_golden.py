@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from mme_vla import build_policy
+from mme_vla.extras.methods.memoryvla.action_head import DitConfig
+from mme_vla.extras.methods.memoryvla.model import MemoryVlaConfig, MemoryVlaCore
+from mme_vla.extras.methods.memoryvla.policy import MemoryVlaPolicy
+from mme_vla.extras.methods.memoryvla.weights import memoryvla_piece, memoryvla_table
+from mme_vla.extras.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
 from mme_vla.memory.extensions.bank import MemoryBank
-from mme_vla.methods.memoryvla.action_head import DitConfig
-from mme_vla.methods.memoryvla.model import MemoryVlaConfig, MemoryVlaCore
-from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
-from mme_vla.methods.memoryvla.weights import memoryvla_piece, memoryvla_table
-from mme_vla.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
 from mme_vla.testing.small import unit_stats
 from mme_vla.weights.tables import read
 

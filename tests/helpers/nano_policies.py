@@ -4,7 +4,7 @@ import numpy as np
 
 from mme_vla import build_policy
 from mme_vla.data.waypoints import Motions
-from mme_vla.nano.demonstrations import Demonstration
+from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
 
 EVERY_EIGHTH = {"budget": 256, "grid": 8, "every": 8}

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from helpers.baselines import rule_weight
-from mme_vla.methods.openvla_oft.model import OpenVlaBackbone
-from mme_vla.methods.openvla_oft.weights import VLA, openvla_name
+from mme_vla.extras.methods.openvla_oft.model import OpenVlaBackbone
+from mme_vla.extras.methods.openvla_oft.weights import VLA, openvla_name
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.types import Batch, HistoryTokens

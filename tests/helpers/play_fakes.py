@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.envs.metadata import EpisodeSpec
-from mme_vla.play import ChoiceSession
+from mme_vla.extras.play import ChoiceSession
 
 OPTIONS = [
     {"label": "a", "action": "press the block", "need_parameter": True},

@@ -12,12 +12,12 @@ from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.scripted_env import make_moving_env
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.envs import Job
-from mme_vla.evaluation.recordings import Recording
+from mme_vla.extras.probing.arms import Arm, read_arm, read_arms
+from mme_vla.extras.probing.lines import Line
+from mme_vla.extras.probing.offline import OfflineSettings, probe_offline
+from mme_vla.extras.probing.probed import ProbedPolicy
+from mme_vla.extras.probing.recordings import Recording
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.probing.arms import Arm, read_arm, read_arms
-from mme_vla.probing.lines import Line
-from mme_vla.probing.offline import OfflineSettings, probe_offline
-from mme_vla.probing.probed import ProbedPolicy
 
 SIDE = 64
 

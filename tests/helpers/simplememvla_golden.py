@@ -11,10 +11,10 @@ import numpy as np
 from torch import Tensor
 
 from helpers import baselines
-from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
-from mme_vla.methods.simplememvla.processor import SimpleMemVlaProcessor
-from mme_vla.methods.simplememvla.video import Window
-from mme_vla.methods.simplememvla.weights import backbone_section, processor_section
+from mme_vla.extras.methods.simplememvla.policy import SimpleMemVlaPolicy
+from mme_vla.extras.methods.simplememvla.processor import SimpleMemVlaProcessor
+from mme_vla.extras.methods.simplememvla.video import Window
+from mme_vla.extras.methods.simplememvla.weights import backbone_section, processor_section
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.weights.load import load_weights
 

@@ -9,8 +9,8 @@ import torch
 
 from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, build_policy
+from mme_vla.extras.probing.channels import WritableChannel, channel_of
 from mme_vla.policy.caching import CachingEpisode
-from mme_vla.probing.channels import WritableChannel, channel_of
 from mme_vla.testing.small import open_gates, random_batch, unit_stats
 from mme_vla.types import KeysValues, stack_noise
 

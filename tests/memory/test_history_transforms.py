@@ -17,7 +17,10 @@ from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.dataset import GroupDataset, TrainingDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.data.statistics import compute_norm_stats
-from mme_vla.evaluation.feed import Feed
+from mme_vla.extras.nano.learning import Decisions, statistics
+from mme_vla.extras.probing.arms import options_of, read_arm
+from mme_vla.extras.probing.feed import Feed
+from mme_vla.extras.probing.lines import MomentLine
 from mme_vla.memory.history import CachedHistory, StorageSpec
 from mme_vla.memory.transforms import (
     DropFrames,
@@ -29,9 +32,6 @@ from mme_vla.memory.transforms import (
     build_transforms,
     map_frames,
 )
-from mme_vla.nano.learning import Decisions, statistics
-from mme_vla.probing.arms import options_of, read_arm
-from mme_vla.probing.lines import MomentLine
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.registry import HISTORY_TRANSFORMS

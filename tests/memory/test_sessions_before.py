@@ -14,14 +14,14 @@ from helpers.scripted_env import ScriptedEnv, make_moving_env
 from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.feed import with_sessions
 from mme_vla.evaluation.results.curves import stress_curves
 from mme_vla.evaluation.rollout.evaluation import evaluate
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.probing.arms import read_arm
-from mme_vla.probing.offline import OfflineSettings
-from mme_vla.probing.probed import ProbedEpisode, ProbedPolicy
-from mme_vla.probing.run import ProbePlan, run_probe
+from mme_vla.extras.probing.arms import read_arm
+from mme_vla.extras.probing.feed import with_sessions
+from mme_vla.extras.probing.offline import OfflineSettings
+from mme_vla.extras.probing.probed import ProbedEpisode, ProbedPolicy
+from mme_vla.extras.probing.run import ProbePlan, run_probe
 
 SPLIT = "stress:sessions=2"
 JOBS = [Job("VideoUnmask", SPLIT, 0), Job("PickXtimes", SPLIT, 1)]

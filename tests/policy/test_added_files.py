@@ -14,8 +14,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.methods.diffusion_policy.weights import read_diffusion_stats
-from mme_vla.methods.openvla_oft.weights import merged, read_dataset_statistics, with_heads
+from mme_vla.extras.methods.diffusion_policy.weights import read_diffusion_stats
+from mme_vla.extras.methods.openvla_oft.weights import merged, read_dataset_statistics, with_heads
 from mme_vla.policy.tensor_files import (
     INDEX,
     WEIGHTS,

@@ -8,7 +8,7 @@ import torch
 
 from mme_vla import MMEPolicy, UserError
 from mme_vla.cli.weights import convert
-from mme_vla.config.composition import compose, config_dir
+from mme_vla.config.composition import compose, library_files
 from mme_vla.policy.finetune import apply_finetuning, merge_adapters, warn_of_frozen_random_weights
 from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 from mme_vla.weights import load_weights
@@ -150,7 +150,7 @@ def test_adapters_are_not_put_on_twice() -> None:
 def test_each_config_file_is_what_the_function_takes(name: str) -> None:
     if name == "lora":
         pytest.importorskip("peft", reason="LoRA needs the extra 'vlm'")
-    assert (config_dir() / "finetune" / f"{name}.yaml").is_file()
+    assert name in library_files("finetune")
     settings = compose("policy", [f"+finetune={name}"]).finetune
     assert settings.mode == name
     apply_finetuning(small_policy("framesamp_modul"), **settings)

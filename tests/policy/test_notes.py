@@ -8,7 +8,7 @@ import torch
 
 from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.evaluation.feed import FedPolicy, Feed
+from mme_vla.extras.probing.feed import FedPolicy, Feed
 from mme_vla.testing.small import open_gates, unit_stats
 from mme_vla.training.data import SplitData, prepare_data
 

@@ -95,7 +95,7 @@ def test_a_server_refuses_a_request_without_a_goal(goal: Any) -> None:
 
 
 def test_simplememvla_spells_alike() -> None:
-    from mme_vla.methods.simplememvla.processor import PromptSettings, SimpleMemVlaProcessor
+    from mme_vla.extras.methods.simplememvla.processor import PromptSettings, SimpleMemVlaProcessor
 
     robot = own_robot(horizon=20)
     goal_text, lower = (

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mme_vla import MMEPolicy
-from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
+from mme_vla.extras.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.testing.small import random_batch, small_policy
 
 

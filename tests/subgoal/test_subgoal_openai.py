@@ -16,7 +16,7 @@ from PIL import Image
 from helpers.chat_server import ChatServer, chat_server, failure, says
 from helpers.subgoal_fakes import frames
 from mme_vla.errors import UserError
-from mme_vla.play import OpenAIPlayer
+from mme_vla.extras.play import OpenAIPlayer
 from mme_vla.subgoal import OpenAI, build_predictor
 from mme_vla.subgoal.models.connection import OpenAISettings
 

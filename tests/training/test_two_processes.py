@@ -10,7 +10,8 @@ import torch
 from torch.func import functional_call
 
 from helpers import commands
-from mme_vla.cli import COMMANDS, READING, SHARED, check_launcher
+from mme_vla import cli
+from mme_vla.cli import check_launcher
 from mme_vla.cli.train import check_processes
 from mme_vla.errors import UserError
 from mme_vla.model import MMEModel
@@ -88,26 +89,26 @@ def test_processes_that_would_train_apart_are_refused(monkeypatch: pytest.Monkey
     check_processes(1)
 
 
-ALONE = {module for module, _ in COMMANDS.values()} - SHARED - READING
+ALONE = {name for name, command in cli.commands().items() if command.processes == "one"}
 
 
-@pytest.mark.parametrize("module", sorted(ALONE))
+@pytest.mark.parametrize("name", sorted(ALONE))
 def test_commands_that_share_no_work_are_refused_under_a_launcher(
-    module: str, monkeypatch: pytest.MonkeyPatch
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(UserError, match="would do all of this command"):
-        check_launcher(module)
+        check_launcher(name)
     monkeypatch.setenv("WORLD_SIZE", "1")
-    check_launcher(module)
+    check_launcher(name)
 
 
-@pytest.mark.parametrize("module", sorted(SHARED | READING))
+@pytest.mark.parametrize("name", sorted(set(cli.commands()) - ALONE))
 def test_commands_that_share_their_work_or_only_read_start_under_a_launcher(
-    module: str, monkeypatch: pytest.MonkeyPatch
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WORLD_SIZE", "8")
-    check_launcher(module)
+    check_launcher(name)
 
 
 @pytest.mark.parametrize("world", ["two", "0", "-1", ""])

@@ -221,7 +221,7 @@ def amount_of(task: str, split: str, key: EpisodeKey, scene: str | None = None) 
     None where the scene cannot be built, or is another one here than the one with the digest
     `scene`.
     """
-    from mme_vla.envs.scene.placement import SceneError
+    from mme_vla.envs.robomme.scene.placement import SceneError
 
     spec = metadata.episode(task, split, key.episode)
     values: dict[str, Any] = dict(spec.row["spec"]) if spec.row is not None else {}

@@ -1,0 +1,229 @@
+"""What the two VideoPlace tasks share: a cube is carried over targets in the video; put it on one
+of them again.
+"""
+
+from abc import abstractmethod
+from collections.abc import Collection, Mapping
+from typing import ClassVar
+
+import sapien
+
+from mme_vla.envs.robomme.scene.motions import Cue, Swap, active_motions, under
+from mme_vla.envs.robomme.scene.objects import Cube, Disc, H
+from mme_vla.envs.robomme.scene.placement import Avoid, Draws, Region
+from mme_vla.envs.robomme.scene.predicates import any_picked_up, dropped, dropped_onto
+from mme_vla.envs.robomme.scene.things import Thing
+from mme_vla.envs.robomme.tasks.families.stages import (
+    add_button,
+    add_cube,
+    add_target,
+    check_colour,
+    choices_made,
+    cube_names,
+    delay,
+    end_video,
+    go_home,
+    pick,
+    press,
+    sample_colours,
+    wait,
+)
+from mme_vla.envs.subtasks import Choice, SubTask
+from mme_vla.envs.task import Task
+
+CUBES = {"easy": 1, "medium": 3, "hard": 3}
+TARGET_RADIUS = 0.04
+TABLE_Z = 0.01
+SUNK_Z = -0.05
+GO_HOME_STEPS, SWAP_STAGE_STEPS = 20, 60
+SWAP_LANE = 0.1
+
+
+class Place(Thing):
+    """Where an object stood at first: a place without a body."""
+
+    def __init__(self, thing: Thing) -> None:
+        self.name, self._at = f"{thing.name}_home", thing.initial_pose
+
+    @property
+    def pose(self) -> sapien.Pose:
+        return self._at
+
+
+class VideoPlace(Task):
+    """The cube visits targets, then a spot of the table; in hard episodes two targets then change
+    places.
+    """
+
+    dials = frozenset({"delay"})
+    spot_radius: ClassVar[float]
+    """How far the spot where the video puts the cube at its end stays from the edge of
+    its region.
+    """
+    target_counts: ClassVar[dict[str, int]]
+    operation: ClassVar[str] = "which"
+    """What is mistaken by who puts the cube on another target."""
+
+    def build(self, draws: Draws) -> None:
+        values, table = self.values, Region((0, 0), 0.2)
+        region = Region((-0.1, 0), 0.1)
+        self.spot = add_target(
+            self, draws, "spot", "layout.goal_xy", region, self.spot_radius, [], gap=H
+        )
+        self.button = add_button(self, draws, (0.1, 0), (0.05, 0.3))
+        colours = sample_colours(self, draws, ("red", "blue", "green"))[: CUBES[self.difficulty]]
+        avoid: list[Avoid] = [self.spot, self.button]
+        self.cubes: list[Cube] = []
+        for name in cube_names(self, "layout.cubes", colours):
+            colour, value = name.split("_")[0], f"layout.cubes.{name}"
+            self.cubes.append(
+                add_cube(self, draws, f"cube_{colour}", colour, table, avoid, value=value)
+            )
+            avoid.append(self.cubes[-1])
+        self.targets: list[Disc] = []
+        count = (
+            values.count("layout.targets")
+            if values.specified
+            else self.target_counts[self.difficulty]
+        )
+        for i in range(count):
+            value = f"layout.targets.{i}"
+            self.targets.append(
+                add_target(self, draws, f"target_{i}", value, table, TARGET_RADIUS, avoid, gap=H)
+            )
+            avoid.append(self.targets[-1])
+        if count < 2:
+            raise values.error("layout.targets", f"has {count} targets; expected at least 2")
+        spot = values.find("layout.goal_xy")
+        self.spot.set_home(sapien.Pose([*spot, SUNK_Z], self.spot.pose.q))
+        n_cubes = len(self.cubes)
+        self.demonstrated = values.indices(
+            "objects.demo_ids", lambda: [draws.integer(0, n_cubes)], n_cubes
+        )
+        if not self.demonstrated:
+            raise values.error("objects.demo_ids", "is empty; expected the cubes of the video")
+        self.cube = self.cubes[self.demonstrated[0]]
+        hard = self.difficulty == "hard"
+        swapped = values.indices(
+            "objects.swap_pair_ids", lambda: draws.permutation(count) if hard else [], count
+        )
+        self._swapped = [self.targets[i] for i in swapped[:2]]
+        if len(self._swapped) == 1:
+            raise values.error("objects.swap_pair_ids", "has one target; expected two, or none")
+        self.draw_script(draws)
+        check_colour(self, self.cube.colour)
+
+    @abstractmethod
+    def draw_script(self, draws: Draws) -> None:
+        """Sample what the video shows and where the cube belongs."""
+
+    @abstractmethod
+    def visits(self) -> list[SubTask]:
+        """The video's sub-tasks up to where the cube goes back to the table."""
+
+    @property
+    @abstractmethod
+    def goal_target(self) -> Disc:
+        """Where the cube belongs."""
+
+    def start_episode(self, draws: Draws) -> None:
+        self._homes = {cube: Place(cube) for cube in self.cubes}
+        self._swap: Swap | None = None
+        self._swap_due = False
+
+    def before_physics(self, k: int) -> None:
+        if self._swap_due and self._swap is None:
+            first, second = self._swapped
+            self._swap = Swap(first, self.targets, start=k, lane=SWAP_LANE, partner=second)
+        if self._swap is not None:
+            self._swap.apply(k)
+
+    def cues(self) -> list[Cue]:
+        return [under(self.goal_target)]
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        swap = [] if self._swap is None else [self._swap]
+        return choices_made(ended, "bc", video=True) | active_motions(swap)
+
+    def failure(self) -> bool:
+        """Notes whether the swap may begin, one step after its stage is entered; the rules belong
+        to the stages.
+        """
+        self._swap_due = bool(self._swapped) and self.progress.current is self._swap_stage
+        return False
+
+    def subtasks(self) -> list[SubTask]:
+        self._swap_stage = wait(self, SWAP_STAGE_STEPS)
+        drop = SubTask(
+            "drop the cube onto table",
+            done=lambda: dropped(self, self.cube),
+            run=lambda demo: demo.place_on(self.spot, TABLE_Z),
+            video=True,
+        )
+        leave = [] if self.tier else [self.show_pick(), drop]
+        after = [go_home(self, GO_HOME_STEPS + delay(self)), self._swap_stage, end_video(self)]
+        return [*self.visits(), *leave, *after, *self._execution()]
+
+    def put_back(self, cube: Cube) -> list[SubTask]:
+        """Pick the cube up in the video and put it where it stood at first, as in RoboMME-OOD."""
+        home = self._homes[cube]
+        put = SubTask(
+            "put the cube back to its original position",
+            done=lambda: dropped_onto(self, cube, home),
+            run=lambda demo: demo.place_on(home),
+            video=True,
+        )
+        return [self.show_pick(cube), put]
+
+    def show_pick(self, cube: Cube | None = None) -> SubTask:
+        """The video's picking up of a cube, by default the one to be placed."""
+        return pick(self, cube or self.cube, "pick up the cube", grounded="", video=True)
+
+    def show_drop(self, target: Disc, cube: Cube | None = None) -> SubTask:
+        """The video's dropping of a cube on a target."""
+        shifted = cube or self.cube
+        return SubTask(
+            "drop the cube onto target",
+            done=lambda: dropped_onto(self, shifted, target),
+            run=lambda demo: demo.place_on(target),
+            targets=[target],
+            choice="b",
+            video=True,
+        )
+
+    def show_press(self) -> SubTask:
+        """The video's press of the button."""
+        return press(self.button, "press the button", "c", grounded="", video=True)
+
+    def _execution(self) -> list[SubTask]:
+        cube, target = self.cube, self.goal_target
+        other_cubes = [c for c in self.cubes if c is not cube]
+        other_targets = [t for t in self.targets if t is not target]
+        return [
+            pick(
+                self,
+                cube,
+                "pick up the cube",
+                failed=lambda: any_picked_up(self, other_cubes),
+                pick=True,
+            ),
+            SubTask(
+                "place the cube onto the correct target",
+                done=lambda: dropped_onto(self, cube, target),
+                run=lambda demo: demo.place_on(target),
+                grounded="place the cube onto the correct target at <>",
+                failed=lambda: any(dropped_onto(self, cube, other) for other in other_targets),
+                targets=[target],
+                choice="b",
+                operation=self.operation,
+            ),
+        ]
+
+    def choices(self) -> list[Choice]:
+        return [
+            Choice("a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
+            Choice(
+                "b", "drop onto", lambda demo, target: demo.place_on(target), lambda: self.targets
+            ),
+            Choice("c", "press the button", lambda demo, _: demo.press(self.button)),
+        ]

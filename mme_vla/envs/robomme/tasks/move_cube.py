@@ -1,0 +1,261 @@
+"""MoveCube (Imitation): the video moves a cube to a target in one of three manners; move it in the
+same manner.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sapien
+
+from mme_vla.envs.robomme.scene.articulated import PEG_COLOUR, build_peg
+from mme_vla.envs.robomme.scene.objects import H, at, build_cube, build_disc, cube_pose
+from mme_vla.envs.robomme.scene.placement import Draws, Region, SceneError, draw_cube, draw_disc
+from mme_vla.envs.robomme.scene.predicates import dropped_onto, gripper_open, picked_up, pushed_onto
+from mme_vla.envs.robomme.tasks import register_task
+from mme_vla.envs.robomme.tasks.families.stages import delay, end_video, pick, wait
+from mme_vla.envs.subtasks import Choice, SubTask
+from mme_vla.envs.task import Task
+
+if TYPE_CHECKING:
+    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
+
+MANNERS = ("hook", "push", "grasp")
+MANNER_TEXTS = {
+    "hook": "hook the cube with the peg",
+    "push": "push the cube with the closed gripper",
+    "grasp": "pick up the cube and place it",
+}
+PEG_LENGTH, PEG_RADIUS = 0.1, 0.01
+TARGET_RADIUS = 0.04
+CUBE_FROM_TARGET = 5 * H
+CUBE_GAP = 0.005
+TRIES = 128
+PARTS = ("demo", "execution")
+HOLD_STEPS = {"hook": 30, "push": 60, "grasp": 60}
+MORE_TRIES = 2  # where the cube did not stay on the target
+
+
+@register_task
+class MoveCube(Task):
+    """Hook it with a peg, push it with the closed gripper, or pick and place it; the difficulty
+    changes nothing.
+    """
+
+    shared_draws = True
+    dials = frozenset({"delay"})
+
+    def build(self, draws: Draws) -> None:
+        for _ in range(2):
+            draws.uniform()  # part of the official stream, without effect
+        video_peg, peg = (self._place_peg(draws, part) for part in PARTS)
+        for _ in range(2):
+            draws.integer(0, 2)
+        video_goal = self.values.place("layout.demo.goal_xy", lambda: self._draw_goal(draws, 0.15))
+        goal = self.values.place("layout.execution.goal_xy", lambda: self._draw_goal(draws, 0.1))
+        self.peg = self.add(
+            build_peg(
+                self,
+                "peg",
+                PEG_LENGTH,
+                PEG_RADIUS,
+                PEG_COLOUR,
+                PEG_COLOUR,
+                video_peg[:2],
+                video_peg[2],
+            )
+        )
+        self.target = self.add(
+            build_disc(self, "target", TARGET_RADIUS, 0.005, "purple", video_goal)
+        )
+        xy, yaw = self._place_cube(draws, PARTS[0], video_goal, [])
+        self.cube = self.add(build_cube(self, "cube", "red", xy, yaw))
+        xy, yaw = self._place_cube(draws, PARTS[1], goal, [self.cube])
+        self._execution_poses = {
+            self.peg: at(peg[:2], 0, peg[2]),
+            self.target: sapien.Pose([*goal, self.target.position[2]], self.target.pose.q),
+            self.cube: cube_pose(xy, yaw),
+        }
+
+    def _place_peg(self, draws: Draws, part: str) -> tuple[float, float, float]:
+        """Place and yaw of the peg in the video or in the execution."""
+        if not self.values.specified:
+            x, y, yaw = self._draw_peg(draws)
+            self.values.note(f"layout.{part}.peg_offsets", [0.0, x, y])
+            self.values.note(f"layout.{part}.peg_yaw", yaw)
+            return x, y, yaw
+        _, x, y = self.values.place(f"layout.{part}.peg_offsets", list, size=3)
+        return x, y, self.values.number(f"layout.{part}.peg_yaw", float)
+
+    def _place_cube(
+        self, draws: Draws, part: str, goal: Any, avoid: list
+    ) -> tuple[tuple[float, float], float]:
+        """Place and yaw of the cube in the video or in the execution."""
+
+        def sample() -> list[float]:
+            xy, yaw = self._draw_cube(draws, goal, avoid)
+            return [*xy, yaw]
+
+        name = f"layout.{part}.cube_pose"
+        x, y, yaw = self.values.place(name, sample, size=3)
+        if self.values.specified and math.dist((x, y), goal) <= H:
+            raise self.values.error(name, f"overlaps spec.layout.{part}.goal_xy")
+        return (x, y), yaw
+
+    @staticmethod
+    def _draw_peg(draws: Draws) -> tuple[float, float, float]:
+        side = -0.2 if draws.coin() else 0.2
+        x, y = -0.05 + 0.1 * draws.uniform(), side - 0.05 + 0.1 * draws.uniform()
+        return x, y, math.radians(-45 + 90 * draws.uniform())
+
+    def _draw_goal(self, draws: Draws, half: float) -> np.ndarray:
+        xy = draw_disc(draws, Region((0, 0), half), TARGET_RADIUS, [], gap=0)
+        assert xy is not None
+        return xy
+
+    def _draw_cube(self, draws: Draws, goal: Any, avoid: list) -> tuple[np.ndarray, float]:
+        """A place near a point that is not near the goal."""
+        for _ in range(TRIES):
+            centre = (-0.1 + 0.2 * draws.uniform(), -0.1 + 0.2 * draws.uniform())
+            if math.dist(centre, goal) > CUBE_FROM_TARGET:
+                place = draw_cube(draws, Region(centre, 0.05), avoid, gap=CUBE_GAP)
+                if place is not None:
+                    return place
+                break
+        raise SceneError(
+            f"MoveCube, seed {self.seed}: the cube finds no place away from the target."
+        )
+
+    def start_episode(self, draws: Draws) -> None:
+        self.manner = MANNERS[
+            self.values.integer("initializations.way_idx", lambda: draws.integer(0, 3), most=2)
+        ]
+
+    def after_step(self, k: int) -> None:
+        if self.reset_in_progress:
+            for thing, pose in self._execution_poses.items():
+                thing.displace(pose)
+
+    def subtasks(self) -> list[SubTask]:
+        between = [wait(self, HOLD_STEPS[self.manner] + delay(self)), end_video(self)]
+        moves = {"hook": self._hook, "push": self._push, "grasp": self._grasp}[self.manner]
+        return [*moves(video=True), *between, *moves(video=False)]
+
+    def _demonstrate_hook(self, demo: "Demonstrator") -> None:
+        demo.hook(self.cube, self.target, self._side())
+        for _ in range(MORE_TRIES if self.second_tries else 0):
+            if not self._pushed():
+                demo.withdraw()
+                demo.grasp_peg(self.peg, "tail")
+                demo.hook(self.cube, self.target, self._side())
+
+    def _demonstrate_push(self, demo: "Demonstrator") -> None:
+        demo.push(self.cube, self.target)
+        for _ in range(MORE_TRIES if self.second_tries else 0):
+            if not self._pushed():
+                demo.withdraw()
+                demo.push(self.cube, self.target)
+
+    def _on_target(self) -> bool:
+        return pushed_onto(self.cube, self.target)
+
+    def _pushed(self) -> bool:
+        return self._on_target() and gripper_open(self)
+
+    def _holds_peg(self) -> bool:
+        return any(picked_up(self, end) for end in (self.peg.head, self.peg.tail))
+
+    def _holds_cube(self) -> bool:
+        return picked_up(self, self.cube)
+
+    def _hook(self, video: bool) -> list[SubTask]:
+        return [
+            SubTask(
+                "Pick up the peg",
+                done=self._holds_peg,
+                run=lambda demo: demo.grasp_peg(self.peg, "tail"),
+                grounded="Pick up the peg at <>",
+                failed=lambda: self._holds_cube() or self._on_target(),
+                targets=[self.peg.tail],
+                choice="a",
+                video=video,
+                operation="how",
+            ),
+            SubTask(
+                "Hook the cube to the target with the peg",
+                done=self._pushed,
+                run=self._demonstrate_hook,
+                grounded="Hook the cube at <> to the target at <> with the peg",
+                targets=[self.cube, self.target],
+                choice="b",
+                video=video,
+            ),
+        ]
+
+    def _side(self) -> int:
+        """From which side the peg reaches around the cube."""
+        return 1 if self.cube.position[1] > self.target.position[1] else -1
+
+    def _push(self, video: bool) -> list[SubTask]:
+        return [
+            SubTask(
+                "Close the gripper and push the cube to the target",
+                done=self._pushed,
+                run=self._demonstrate_push,
+                grounded="Close the gripper and push the cube at <> to the target at <>",
+                failed=lambda: self._holds_cube() or self._holds_peg(),
+                targets=[self.cube, self.target],
+                choice="c",
+                video=video,
+                operation="how",
+            )
+        ]
+
+    def _grasp(self, video: bool) -> list[SubTask]:
+        def misplaced() -> bool:
+            return self._on_target() or self._holds_peg()
+
+        return [
+            pick(
+                self,
+                self.cube,
+                "Pick up the cube",
+                "d",
+                failed=misplaced,
+                video=video,
+                operation="how",
+            ),
+            SubTask(
+                "place the cube onto the target",
+                done=lambda: dropped_onto(self, self.cube, self.target),
+                run=lambda demo: demo.place_on(self.target),
+                grounded="place the cube onto the target at <>",
+                targets=[self.target],
+                choice="e",
+                video=video,
+            ),
+        ]
+
+    def choices(self) -> list[Choice]:
+        return [
+            Choice("a", "pick up the peg", lambda demo, _: demo.grasp_peg(self.peg, "tail")),
+            Choice(
+                "b",
+                "hook the cube to the target with the peg",
+                lambda demo, _: demo.hook(self.cube, self.target, self._side()),
+            ),
+            Choice(
+                "c",
+                "close gripper and push the cube to the target",
+                lambda demo, _: demo.push(self.cube, self.target),
+            ),
+            Choice("d", "pick up the cube", lambda demo, _: demo.pick(self.cube)),
+            Choice(
+                "e", "place the cube onto the target", lambda demo, _: demo.place_on(self.target)
+            ),
+        ]
+
+    def goals(self) -> list[str]:
+        goal = "watch the video carefully, then move the cube to the target in the same manner"
+        manner = f": {MANNER_TEXTS[self.manner]}" if self.in_view else ""
+        return [f"{goal} as before{manner}", f"{goal} shown in the video{manner}"]

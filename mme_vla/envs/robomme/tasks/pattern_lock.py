@@ -1,0 +1,213 @@
+"""PatternLock (Imitation): the video traces a path over a grid of discs with the stick; trace it
+again.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mme_vla.envs.robomme.scene.motions import Mark, Trace, build_mark
+from mme_vla.envs.robomme.scene.objects import Disc, build_disc
+from mme_vla.envs.robomme.scene.placement import Draws, SceneError
+from mme_vla.envs.robomme.scene.predicates import over
+from mme_vla.envs.robomme.scene.things import distance_xy
+from mme_vla.envs.robomme.tasks import register_task
+from mme_vla.envs.robomme.tasks.families.stages import end_stick_video
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
+from mme_vla.envs.task import Task
+
+if TYPE_CHECKING:
+    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
+
+GRID = {"easy": 3, "medium": 4, "hard": 5}
+PATH_LENGTH = {"easy": (2, 4), "medium": (3, 5), "hard": (4, 8)}
+CENTRE, SPACING = (-0.1, 0.0), 0.1
+NEIGHBOURS = ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1))  # (row, column)
+MARK_RADIUS, MARK_STEPS = 0.02004, 40
+TRIES = 1000
+DIRECTIONS = {
+    "forward": (1, 0),
+    "backward": (-1, 0),
+    "left": (0, 1),
+    "right": (0, -1),
+    "forward-left": (1, 1),
+    "forward-right": (1, -1),
+    "backward-left": (-1, 1),
+    "backward-right": (-1, -1),
+}
+"""Signs of the way in x and y, as the robot sees them."""
+REACH = 0.2  # how far away the disc a direction means may lie
+
+
+@register_task
+class PatternLock(Task):
+    """Rows of the grid run along x, columns along y."""
+
+    stick = True
+    dials = frozenset({"path"})
+
+    def build(self, draws: Draws) -> None:
+        n = GRID[self.difficulty]
+        middle = (n - 1) / 2
+        places = [
+            (CENTRE[0] + (r - middle) * SPACING, CENTRE[1] + (c - middle) * SPACING)
+            for r, c in np.ndindex(n, n)
+        ]
+        self.discs = [
+            self.add(build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy))
+            for i, xy in enumerate(places)
+        ]
+        nodes = self.values.indices("actions.path_nodes", lambda: self._draw_path(draws, n), n * n)
+        steps = [np.subtract(divmod(a, n), divmod(b, n)) for a, b in itertools.pairwise(nodes)]
+        if len(nodes) < 2 or any(np.abs(step).max() > 1 for step in steps):
+            raise self.values.error(
+                "actions.path_nodes", f"is {nodes}; expected a path over neighbours, {n} a row"
+            )
+        self.path = [self.discs[i] for i in nodes]
+        self._marks = [
+            build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(n * n)
+        ]
+        self._trace = Trace(self)
+
+    def _draw_path(self, draws: Draws, n: int) -> list[int]:
+        low, high = (length + self.turned("path") for length in PATH_LENGTH[self.difficulty])
+        for _ in range(TRIES):
+            start, goal = draws.permutation(n * n)[:2]
+            path = search(draws, n, start, goal, {start})
+            if path is not None and low <= len(path) <= high:
+                return path
+        raise SceneError(
+            f"PatternLock, seed {self.seed}: no path of {low} to {high} discs in {TRIES} tries."
+        )
+
+    def start_episode(self, draws: Draws) -> None:
+        self.marks = [
+            Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)
+        ]
+        self._trace.restart()
+        self.visited: list[Disc] = []
+
+    def after_step(self, k: int) -> None:
+        tcp = self.tcp_pose.p
+        for mark, disc in zip(self.marks, self.discs, strict=True):
+            mark.update(k, over(tcp, disc))
+        self._trace.update(k)
+
+    def failure(self) -> bool:
+        """Remembers which discs were visited; the rules belong to the moves."""
+        tcp = self.tcp_pose.p
+        if self._executing:
+            self.visited += [d for d in self.discs if over(tcp, d) and self.visited[-1:] != [d]]
+        return False
+
+    @property
+    def _executing(self) -> bool:
+        current = self.progress.current
+        return current is None or not current.video
+
+    def success(self) -> bool:
+        return self.progress.succeeded and self.visited[-len(self.path) :] == self.path
+
+    def subtasks(self) -> list[SubTask]:
+        first = self.path[0]
+        approach = SubTask(
+            NO_RECORD,
+            done=lambda: over(self.tcp_pose.p, first),
+            run=lambda demo: demo.stick_to(first, store=True),
+            video=True,
+        )
+        return [
+            approach,
+            *self._moves(video=True),
+            *end_stick_video(self),
+            *self._moves(video=False),
+        ]
+
+    def _moves(self, video: bool) -> list[SubTask]:
+        return [self._move(a, b, video) for a, b in zip(self.path, self.path[1:], strict=False)]
+
+    def _move(self, previous: Disc, goal: Disc, video: bool) -> SubTask:
+        others = [disc for disc in self.discs if disc is not previous and disc is not goal]
+        word = direction(goal.position - previous.position)
+        return SubTask(
+            f"move {word}",
+            done=lambda: over(self.tcp_pose.p, goal),
+            run=lambda demo: demo.stick_to(goal),
+            failed=lambda: any(over(self.tcp_pose.p, disc) for disc in others),
+            choice="abcdefgh"[list(DIRECTIONS).index(word)],
+            video=video,
+            operation="order",
+        )
+
+    def choices(self) -> list[Choice]:
+        return [
+            self._choice(letter, word) for letter, word in zip("abcdefgh", DIRECTIONS, strict=True)
+        ]
+
+    def _choice(self, letter: str, word: str) -> Choice:
+        return Choice(letter, f"move {word}", lambda demo, _: self._go(demo, word))
+
+    def _go(self, demo: "Demonstrator", word: str) -> None:
+        tcp = self.tcp_pose.p
+        here = min(self.discs, key=lambda disc: distance_xy(disc.position, tcp))
+        goal = self.disc_towards(here, word)
+        if goal is not None:
+            demo.stick_to(goal)
+
+    def disc_towards(self, here: Disc, word: str) -> Disc | None:
+        """The disc within reach that lies in a direction: the best aligned, then the
+        nearest one.
+        """
+        signs = np.array(DIRECTIONS[word])
+        way = signs / np.linalg.norm(signs)
+
+        def preference(disc: Disc) -> tuple[float, float]:
+            step = disc.position[:2] - here.position[:2]
+            length = float(np.linalg.norm(step))
+            return round(-float(step @ way) / length, 6), length
+
+        def fits(disc: Disc) -> bool:
+            step = disc.position[:2] - here.position[:2]
+            on_side = all(s == 0 or s * d > 1e-6 for s, d in zip(signs, step, strict=True))
+            return disc is not here and on_side and float(np.linalg.norm(step)) <= REACH + 1e-6
+
+        return min(filter(fits, self.discs), key=preference, default=None)
+
+    def goals(self) -> list[str]:
+        goal = (
+            "watch the video carefully, then use the stick attached to the robot to retrace the"
+            " same pattern"
+        )
+        if self.in_view:
+            moves = [
+                direction(b.position - a.position)
+                for a, b in zip(self.path, self.path[1:], strict=False)
+            ]
+            goal = f"{goal}: {', then '.join(f'move {word}' for word in moves)}"
+        return [goal, f"{goal} shown in the video"]
+
+
+def search(draws: Draws, n: int, node: int, goal: int, visited: set[int]) -> list[int] | None:
+    """A path over the 8-neighbourhood of an n × n grid by depth-first search in random order."""
+    if node == goal:
+        return [node]
+    row, column = divmod(node, n)
+    places = [
+        (row + r, column + c) for r, c in NEIGHBOURS if 0 <= row + r < n and 0 <= column + c < n
+    ]
+    for i in draws.permutation(len(places)):
+        following = places[i][0] * n + places[i][1]
+        if following not in visited:
+            visited.add(following)
+            path = search(draws, n, following, goal, visited)
+            if path is not None:
+                return [node, *path]
+    return None
+
+
+def direction(way: Sequence[float] | np.ndarray) -> str:
+    """The compass word of a way [2 or more]: +x is forward, +y is left."""
+    signs = tuple(0 if abs(d) < 1e-6 else int(np.sign(d)) for d in way[:2])
+    return next(word for word, s in DIRECTIONS.items() if s == signs)

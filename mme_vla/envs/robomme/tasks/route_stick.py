@@ -1,0 +1,218 @@
+"""RouteStick (Imitation): the video winds around obstacles from disc to disc; follow the same
+route.
+"""
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from mme_vla.envs.robomme.robot.demonstrator import arc
+from mme_vla.envs.robomme.scene.motions import Cue, Mark, Place, Trace, build_mark, on_table
+from mme_vla.envs.robomme.scene.objects import Disc, build_disc, build_obstacle
+from mme_vla.envs.robomme.scene.placement import Draws
+from mme_vla.envs.robomme.scene.predicates import over
+from mme_vla.envs.robomme.scene.things import distance_xy
+from mme_vla.envs.robomme.tasks import register_task
+from mme_vla.envs.robomme.tasks.families.stages import end_stick_video
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
+from mme_vla.envs.task import Task
+
+if TYPE_CHECKING:
+    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
+
+PLACES, SPACING, CENTRE_X = 9, 0.07, -0.1
+MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}
+REACH_RADIUS, REACH_HEIGHT = 0.03, 0.15
+MARK_RADIUS, MARK_STEPS = 0.02004, 40
+HOME_STEPS = 200
+CUE_RADIUS, DOT_RADIUS = 0.04, 0.01
+DOTS = range(8, 40, 7)  # of an arc's 45 points
+Direction = Literal["clockwise", "counterclockwise"]
+TURNS = dict.fromkeys(("clockwise", "counterclockwise"))
+SIDES: tuple[tuple[str, Direction], ...] = (
+    ("left", "clockwise"),
+    ("right", "clockwise"),
+    ("left", "counterclockwise"),
+    ("right", "counterclockwise"),
+)
+
+
+@register_task
+class RouteStick(Task):
+    """Five discs in a row with an obstacle between each two; left is the larger y."""
+
+    stick = True
+    latch_failure = True
+
+    def build(self, draws: Draws) -> None:
+        angle = math.radians(
+            self.values.number("layout.rotation_deg", lambda: -30 + 60 * draws.uniform())
+        )
+        cos, sin = math.cos(angle), math.sin(angle)
+        row = [(i - PLACES // 2) * SPACING for i in range(PLACES)]
+        places = [np.array([cos * CENTRE_X - sin * y, sin * CENTRE_X + cos * y]) for y in row]
+        self.all_discs = [
+            self.add(
+                build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy, z=-0.01 if i % 2 else 0.01)
+            )
+            for i, xy in enumerate(places)
+        ]
+        for i in range(1, PLACES, 2):
+            colour = self.values.colour(
+                f"layout.obstacle_rgb.{i // 2}", lambda: draws.uniforms(3).tolist()
+            )
+            self.add(build_obstacle(self, f"obstacle_{i // 2}", places[i], angle, colour))
+        self.discs = self.all_discs[::2]
+        self._draw_route(draws)
+        self._marks = [build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(5)]
+        self._dots = Trace(self)
+
+    def _draw_route(self, draws: Draws) -> None:
+        """The row's route and turns, or random ones."""
+        values, count = self.values, len(self.discs)
+        route = values.indices(
+            "actions.route", lambda: self._sample_route(draws), count, distinct=False
+        )
+        if len(route) < 2 or any(abs(a - b) != 1 for a, b in itertools.pairwise(route)):
+            raise values.error(
+                "actions.route", f"is {route}; expected a way from disc to neighbouring disc"
+            )
+        moves = len(route) - 1
+
+        def sample() -> list[str]:
+            return ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
+
+        self.route = [self.discs[i] for i in route]
+        self.directions: list[Direction] = values.words("actions.turns", sample, TURNS)  # type: ignore[assignment]
+        if len(self.directions) != moves:
+            raise values.error(
+                "actions.turns", f"has {len(self.directions)} turns for {moves} moves"
+            )
+
+    def _sample_route(self, draws: Draws) -> list[int]:
+        low, high = MOVES[self.difficulty]
+        moves = draws.integer(low, high + 1)
+        route = [draws.integer(0, len(self.discs))]
+        for _ in range(moves):
+            nearby = [i for i in (route[-1] - 1, route[-1] + 1) if 0 <= i < len(self.discs)]
+            if self.difficulty != "hard" and len(route) > 1 and len(nearby) > 1:
+                nearby.remove(route[-2])
+            route.append(nearby[draws.integer(0, len(nearby))])
+        return route
+
+    def cues(self) -> list[Cue]:
+        """Of the next move: a disc under its target, and smaller ones along its arc."""
+
+        def point(i: int) -> Callable[[], Place | None]:
+            def place() -> Place | None:
+                move = len(self.directions) - len(self.progress.to_come)
+                if not 0 <= move < len(self.directions):  # in the video, or at the end
+                    return None
+                start, end = (disc.position for disc in self.route[move : move + 2])
+                return on_table(arc(start, end, self.directions[move])[i])
+
+            return place
+
+        return [
+            Cue("yellow", point(-1), CUE_RADIUS),
+            *(Cue("yellow", point(i), DOT_RADIUS) for i in DOTS),
+        ]
+
+    def start_episode(self, draws: Draws) -> None:
+        self.marks = [
+            Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)
+        ]
+        self._dots.restart()
+        self._way: list[np.ndarray] = []
+        self._way_of: SubTask | None = None
+
+    def after_step(self, k: int) -> None:
+        tcp = self.tcp_pose.p
+        for mark, disc in zip(self.marks, self.discs, strict=True):
+            mark.update(k, over(tcp, disc, REACH_RADIUS, REACH_HEIGHT))
+        self._dots.update(k)
+
+    def failure(self) -> bool:
+        """Remembers the way of the tool since the last visit; the rules belong to the moves."""
+        if self.progress.current is not self._way_of:
+            self._way_of, self._way = self.progress.current, []
+        self._way.append(np.asarray(self.tcp_pose.p[:2], np.float64))
+        return False
+
+    def _turned(self, previous: Disc, goal: Disc) -> Direction:
+        """How the tool went around what lies between two discs: on which side of the chord it was
+        on average.
+        """
+        way = np.mean(self._way, axis=0) - previous.position[:2]
+        chord = goal.position[:2] - previous.position[:2]
+        return "clockwise" if chord[0] * way[1] - chord[1] * way[0] > 0 else "counterclockwise"
+
+    def subtasks(self) -> list[SubTask]:
+        first = self.route[0]
+        approach = SubTask(
+            NO_RECORD,
+            done=lambda: over(self.tcp_pose.p, first),
+            run=lambda demo: demo.stick_to(first, store=True),
+            video=True,
+        )
+        return [
+            approach,
+            *self._moves(video=True),
+            *end_stick_video(self, HOME_STEPS),
+            *self._moves(video=False),
+        ]
+
+    def _moves(self, video: bool) -> list[SubTask]:
+        legs = zip(self.route, self.route[1:], self.directions, strict=False)
+        return [self._move(previous, goal, direction, video) for previous, goal, direction in legs]
+
+    def _move(self, previous: Disc, goal: Disc, direction: Direction, video: bool) -> SubTask:
+        others = [disc for disc in self.all_discs if disc is not previous and disc is not goal]
+        side = "left" if goal.position[1] > previous.position[1] else "right"
+
+        def there() -> bool:
+            return over(self.tcp_pose.p, goal, REACH_RADIUS, REACH_HEIGHT)
+
+        def failed() -> bool:
+            astray = any(over(self.tcp_pose.p, disc) for disc in others)
+            return astray or (there() and self._turned(previous, goal) != direction)
+
+        return SubTask(
+            self._text(side, direction),
+            done=there,
+            run=lambda demo: demo.stick_arc(goal, direction),
+            failed=failed,
+            choice="abcd"[SIDES.index((side, direction))],
+            video=video,
+            operation=lambda: "how" if there() else "order",
+        )
+
+    @staticmethod
+    def _text(side: str, direction: Direction) -> str:
+        return f"move to the nearest {side} target by circling around the stick {direction}"
+
+    def choices(self) -> list[Choice]:
+        return [
+            self._choice(letter, side, direction)
+            for letter, (side, direction) in zip("abcd", SIDES, strict=True)
+        ]
+
+    def _choice(self, letter: str, side: str, direction: Direction) -> Choice:
+        return Choice(
+            letter, self._text(side, direction), lambda demo, _: self._go(demo, side, direction)
+        )
+
+    def _go(self, demo: "Demonstrator", side: str, direction: Direction) -> None:
+        tcp = self.tcp_pose.p
+        here = min(range(len(self.discs)), key=lambda i: distance_xy(self.discs[i].position, tcp))
+        there = here + (1 if side == "left" else -1)
+        if 0 <= there < len(self.discs):
+            demo.stick_arc(self.discs[there], direction)
+
+    def goals(self) -> list[str]:
+        around = "use the stick attached to the robot to navigate around the sticks on the table"
+        goal = f"watch the video carefully, then {around}, following the same path"
+        return [goal, f"{goal} shown in the video"]

@@ -1,0 +1,82 @@
+"""VideoPlaceOrder (Reference): put the cube on the first, second, … target it was placed on in the
+video.
+"""
+
+from typing import ClassVar
+
+from mme_vla.envs.robomme.scene.objects import Disc
+from mme_vla.envs.robomme.scene.placement import Draws
+from mme_vla.envs.robomme.tasks import register_task
+from mme_vla.envs.robomme.tasks.families.video_place import VideoPlace
+from mme_vla.envs.subtasks import SubTask, ordinal
+
+
+@register_task
+class VideoPlaceOrder(VideoPlace):
+    """The video visits some of the targets in random order; a press of the button
+    comes in between.
+    """
+
+    shared_draws = True
+    recovery_sampled_per_episode = True
+    spot_radius = 0.1
+    operation = "order"
+    target_counts: ClassVar[dict[str, int]] = {"easy": 4, "medium": 4, "hard": 4}
+
+    def draw_script(self, draws: Draws) -> None:
+        values, targets = self.values, len(self.targets)
+
+        def sample() -> list[int]:
+            count = draws.integer(2, 5)
+            return draws.permutation(4)[:count]
+
+        rows = max(values.count("objects.visit_ids_by_object"), 1)
+        if rows != len(self.demonstrated):
+            raise values.error(
+                "objects.visit_ids_by_object",
+                f"has {rows} lists for {len(self.demonstrated)} cubes",
+            )
+        visits = [
+            values.indices(f"objects.visit_ids_by_object.{i}", sample, targets) for i in range(rows)
+        ]
+        requested = values.integer("objects.answer_demo_index", lambda: 0, most=rows - 1)
+        total = sum(map(len, visits))
+        self.cube = self.cubes[self.demonstrated[requested]]
+        self._visits = [
+            (self.cubes[cube], [self.targets[i] for i in ids])
+            for cube, ids in zip(self.demonstrated, visits, strict=True)
+        ]
+        self.visited = self._visits[requested][1]
+        count = len(self.visited)
+        self.rank = values.integer(
+            "objects.which_in_subset", lambda: draws.integer(1, count + 1), least=1, most=count
+        )
+        self.press_after = values.integer(
+            "objects.button_after_visit_index", lambda: draws.integer(0, count), most=total - 1
+        )
+
+    @property
+    def goal_target(self) -> Disc:
+        return self.visited[self.rank - 1]
+
+    def visits(self) -> list[SubTask]:
+        steps, done = [], 0
+        for cube, targets in self._visits:
+            for target in targets:
+                steps += [self.show_pick(cube), self.show_drop(target, cube)]
+                if done == self.press_after:
+                    steps.append(self.show_press())
+                done += 1
+            if self.tier:
+                steps += self.put_back(cube)
+        return steps
+
+    def goals(self) -> list[str]:
+        cube, which = (
+            f"place the {self.cube.colour} cube on the",
+            f"{ordinal(self.rank - 1)} target",
+        )
+        return [
+            f"watch the video carefully, then {cube} {which} it was previously placed on",
+            f"watch the video carefully and {cube} {which} where it was placed",
+        ]

@@ -1,0 +1,265 @@
+"""VideoRepick (Reference): the video picks up a cube; pick the same one up again, wherever it is
+now.
+"""
+
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING
+
+from mme_vla.envs.robomme.scene.motions import (
+    SWAP_STEPS,
+    Cue,
+    Swap,
+    active_motions,
+    planned_swaps,
+    row,
+    sequential_swaps,
+    tally,
+    under,
+)
+from mme_vla.envs.robomme.scene.objects import COLOURS, RGB, Cube
+from mme_vla.envs.robomme.scene.placement import ANCHOR_HALF, Draws, Region, rotated_anchors
+from mme_vla.envs.robomme.scene.predicates import StaticFor, any_picked_up, dropped, pressed
+from mme_vla.envs.robomme.tasks import register_task
+from mme_vla.envs.robomme.tasks.families.stages import (
+    add_button,
+    add_cube,
+    choices_made,
+    delay,
+    end_video,
+    go_home,
+    pick,
+    press,
+    wait,
+)
+from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
+from mme_vla.envs.task import Task
+
+if TYPE_CHECKING:
+    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
+
+SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
+ROUNDS = 5  # of the three colours, in hard episodes
+GO_HOME_STEPS = 20
+VIDEO_RELEASE_Z, RELEASE_Z = 0.03, 0.01
+TABLE = Region((-0.1, 0), (0.2, 0.25))
+PRESS_PUNISHED = (50, 500)  # steps since the kind of stage was first entered
+
+
+@register_task
+class VideoRepick(Task):
+    """Three cubes of one colour that change places, or fifteen that do not."""
+
+    shared_draws = True
+    latch_failure = True
+    recovery_sampled_per_episode = True
+    dials = frozenset({"count", "delay"})
+
+    def plan(self, draws: Draws) -> None:
+        self.repetitions = self.values.integer(
+            "objects.num_repeats", lambda: draws.integer(1, 4) + self.turned("count"), least=1
+        )
+        low, high = SWAPS[self.difficulty]
+        self.swap_count = draws.integer(low, high + 1)
+
+    def build(self, draws: Draws) -> None:
+        self.button = add_button(self, draws, (-0.2, 0), (0.1, 0.1))
+        self.cubes: list[Cube] = []
+        target, initiators = (
+            self._draw_cubes(draws) if not self.values.specified else self._read_cubes(draws)
+        )
+        count = len(self.cubes)
+        self.cube = self.cubes[
+            self.values.integer("objects.target", lambda: target, most=count - 1)
+        ]
+        self.pairs = self.values.pairs("actions.swap_pairs", count)
+        if self.pairs is None:
+            initiators = self.values.indices("actions.swap_initiators", lambda: initiators, count)
+        self.initiators = [self.cubes[i] for i in initiators]
+        swaps = len(initiators if self.pairs is None else self.pairs)
+        self.swap_count = self.values.integer("objects.n_swaps", lambda: swaps)
+        if self.swap_count != swaps:
+            raise self.values.error(
+                "objects.n_swaps", f"is {self.swap_count}, and actions has {swaps} swaps"
+            )
+
+    def _read_cubes(self, draws: Draws) -> tuple[int, list[int]]:
+        """Add the row's cubes, all of one colour or each of its own."""
+        count = self.values.count("layout.cubes")
+        if count < 1:
+            raise self.values.error("layout.cubes", "is missing or empty")
+        one_colour = self.values.find("objects.color_rgb") is not None
+        for i in range(count):
+            colour: str | RGB = (
+                self.values.colour("objects.color_rgb", list)
+                if one_colour
+                else self.values.word(f"objects.colors.{i}", str, COLOURS)
+            )
+            self._add_cube(draws, colour, TABLE)
+        return 0, []
+
+    def _draw_cubes(self, draws: Draws) -> tuple[int, list[int]]:
+        """Add cubes at random places; indices of the target and of those that begin a swap."""
+        if self.difficulty == "hard":
+            for _ in range(ROUNDS):
+                for i in draws.permutation(3):
+                    self._add_cube(draws, ("red", "blue", "green")[i], TABLE)
+            return draws.integer(0, len(self.cubes)), []
+        colour = ("red", "blue", "green")[draws.integer(0, 3)]
+        draws.permutation(4)  # part of the official stream, without effect
+        for anchor in rotated_anchors(draws, 3):
+            self._add_cube(draws, colour, Region(anchor, ANCHOR_HALF))
+        target = draws.permutation(3)[0]
+        others = [i for i in range(len(self.cubes)) if i != target]
+        return target, [target, *(others[i] for i in draws.permutation(2))][: self.swap_count]
+
+    def _add_cube(self, draws: Draws, colour: str | RGB, region: Region) -> None:
+        i, avoid = len(self.cubes), [self.button, *self.cubes]
+        if not self.values.specified:
+            self.values.note(f"objects.colors.{i}", colour)
+        self.cubes.append(
+            add_cube(self, draws, f"cube_{i}", colour, region, avoid, value=f"layout.cubes.{i}")
+        )
+
+    def start_episode(self, draws: Draws) -> None:
+        self.swaps: list[Swap] = []
+        self._swaps_due = False
+        self._entered: dict[str, int] = {}
+
+    def before_physics(self, k: int) -> None:
+        if self._swaps_due and not self.swaps:
+            self.swaps = (
+                planned_swaps(self.pairs, self.cubes, start=k)
+                if self.pairs is not None
+                else sequential_swaps(self.initiators, self.cubes, start=k)
+            )
+        for swap in self.swaps:
+            swap.apply(k)
+
+    def cues(self) -> list[Cue]:
+        def left() -> int:
+            return sum(step.choice == "b" and not step.video for step in self.progress.to_come)
+
+        return [under(self.cube), *tally(row(self.repetitions), left)]
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        ended_choices = choices_made(ended, "a", video=True) | choices_made(ended, "b", video=False)
+        return ended_choices | active_motions(self.swaps)
+
+    def failure(self) -> bool:
+        """Notes whether the swaps may begin, one step after their stage is entered; the rules
+        belong to the stages.
+        """
+        self._swaps_due = self._swap_stage is not None and self.progress.current is self._swap_stage
+        return False
+
+    def _pressed_early(self, kind: str, i: int) -> bool:
+        """Whether the button is down in the window of a stage; in RoboMME-OOD each round has one of
+        its own.
+        """
+        first, last = PRESS_PUNISHED
+        if self.tier and i:
+            kind, first = f"{kind} {i}", 0
+        waited = self.steps_done - self._entered.setdefault(kind, self.steps_done)
+        return first <= waited <= last and pressed(self.button)
+
+    def subtasks(self) -> list[SubTask]:
+        return [*self._video(), *self._execution()]
+
+    def _video(self) -> list[SubTask]:
+        cube = self.cube
+        drop = SubTask(
+            "drop the cube on the table",
+            done=lambda: dropped(self, cube),
+            run=lambda demo: demo.put_down(VIDEO_RELEASE_Z),
+            targets=[cube],
+            choice="b",
+            video=True,
+        )
+        swaps = [self._swap_wait(i) for i in range(self.swap_count)]
+        self._swap_stage = swaps[0] if swaps else None
+        first = pick(self, cube, "pick up the cube", grounded="", video=True)
+        longer = delay(self)
+        home = [go_home(self, GO_HOME_STEPS + longer)] if swaps or longer else []
+        return [first, drop, *home, *swaps, end_video(self)]
+
+    def _swap_wait(self, i: int) -> SubTask:
+        """Hold still for a swap; in RoboMME-OOD until it ends."""
+        if not self.tier:
+            return wait(self, SWAP_STEPS)
+        still = StaticFor(self, 1)
+
+        def run(demo: "Demonstrator") -> None:
+            if not self.swaps:
+                demo.hold(SWAP_STEPS)
+            while self.swaps and self.steps_done < self.swaps[i].end:
+                demo.open()
+
+        def done() -> bool:
+            at_rest = still()
+            return at_rest and bool(self.swaps) and self.steps_done >= self.swaps[i].end
+
+        return SubTask("static", done, run, video=True)
+
+    def _execution(self) -> list[SubTask]:
+        stop = {"failed": lambda: any_picked_up(self, self.cubes), "operation": "how many"}
+        steps = [step for i in range(self.repetitions) for step in (self._pick(i), self._put(i))]
+        return [*steps, press(self.button, "press the button to finish", "c", **stop)]
+
+    def _pick(self, i: int) -> SubTask:
+        def strayed() -> bool:
+            return self._other_picked_up() or self._pressed_early("pick", i)
+
+        text = f"pick up the correct cube for the {ordinal(i)} time"
+        return pick(self, self.cube, text, failed=strayed, pick=True, operation=self._mistaken)
+
+    def _put(self, i: int) -> SubTask:
+        return SubTask(
+            "put it down",
+            done=lambda: dropped(self, self.cube),
+            run=lambda demo: demo.put_down(RELEASE_Z),
+            failed=lambda: self._other_picked_up() or self._pressed_early("put", i),
+            targets=[self.cube],
+            choice="b",
+            operation=self._mistaken,
+        )
+
+    def _mistaken(self) -> str:
+        return "which" if self._other_picked_up() else "how many"
+
+    def _other_picked_up(self) -> bool:
+        return any_picked_up(self, [cube for cube in self.cubes if cube is not self.cube])
+
+    def choices(self) -> list[Choice]:
+        return [
+            Choice("a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
+            Choice("b", "put it down", lambda demo, _: demo.put_down(RELEASE_Z)),
+            Choice("c", "press the button to finish", lambda demo, _: demo.press(self.button)),
+        ]
+
+    def goals(self) -> list[str]:
+        watch, same_cube = (
+            "watch the video carefully",
+            "pick up the same cube that was previously picked up",
+        )
+        same_block = "the same block that was previously picked up"
+        if self.repetitions == 1:
+            return [
+                (
+                    f"{watch}, then pick up {same_block} again, finally put it down and press the"
+                    " button to stop"
+                ),
+                f"{watch}, then {same_cube} again, finally press the button to stop",
+            ]
+        times = f"{number(self.repetitions)} times"
+        short = "twice" if self.repetitions == 2 else times
+        return [
+            (
+                f"{watch}, then repeatedly pick up and put down {same_block} for {times}, finally"
+                " put it down and press the button to stop"
+            ),
+            f"{watch}, then {same_cube} {short}, and finally press the button to stop",
+            (
+                f"{watch}, identify the cube that was picked up, then pick up and place down the"
+                f" same cube {short}, finally press the button to stop"
+            ),
+        ]

@@ -1,0 +1,37 @@
+"""VideoUnmask (Permanence): cubes lie open in the video, containers then cover them; pick up the
+right container.
+"""
+
+from mme_vla.envs.robomme.scene.motions import COVER_STEPS
+from mme_vla.envs.robomme.scene.placement import Draws
+from mme_vla.envs.robomme.tasks import register_task
+from mme_vla.envs.robomme.tasks.families.containers import (
+    Unmask,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
+from mme_vla.envs.robomme.tasks.families.stages import delay, wait
+from mme_vla.envs.subtasks import Choice, SubTask
+
+
+@register_task
+class VideoUnmask(Unmask):
+    """Containers cover three cubes during the conditioning video."""
+
+    dials = frozenset({"containers", "delay"})
+
+    def build(self, draws: Draws) -> None:
+        self.build_containers(draws, [])
+
+    def subtasks(self) -> list[SubTask]:
+        picks = container_picks(self, self.targets, self.all_containers)
+        return [wait(self, COVER_STEPS + delay(self)), *picks]
+
+    def choices(self) -> list[Choice]:
+        return container_choices(self.containers)
+
+    def goals(self) -> list[str]:
+        return [
+            f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.targets])}"
+        ]

@@ -1,0 +1,1 @@
+"""Prior methods that the benchmark was measured with, each in a folder."""

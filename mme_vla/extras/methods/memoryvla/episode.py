@@ -1,0 +1,131 @@
+"""An episode of MemoryVLA: what its banks hold, and which moments of the conditioning video enter
+them.
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.extras.methods.memoryvla.model import BankStates, MemoryVlaCore
+from mme_vla.memory.extensions.bank import BankState
+from mme_vla.policy.capabilities import MemoryEntries
+from mme_vla.policy.episode import Episode, Host
+from mme_vla.types import FrameBatch
+
+VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, but for its last one
+
+
+class Writer(Host, Protocol):
+    """What such an episode asks of its policy besides."""
+
+    @property
+    def banked(self) -> MemoryVlaCore: ...
+
+    def write(
+        self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]
+    ) -> BankStates: ...
+
+    def store(self, banks: BankStates, cognition: Tensor, features: Tensor) -> BankStates: ...
+
+
+class MemoryVlaEpisode(Episode):
+    """Banks beside the current view.
+
+    Of the video every `VIDEO_STRIDE`-th frame is written; of the execution, each frame at which a
+    chunk was chosen. The latter is written when the next frames arrive, so that choosing twice at
+    one frame gives the same chunk.
+    """
+
+    def __init__(self, policy: Writer, goal: str, seed: int = 0) -> None:
+        super().__init__(policy, goal, seed)
+        self._writer = policy
+        self._banks = policy.banked.init_state()
+        self._moments: list[np.ndarray] = []
+        self.pending: tuple[Tensor, Tensor] | None = None
+        """The moment at which the last chunk was chosen: its cognition token [1, d] and vision
+        features [p, c].
+        """
+        self._due: np.ndarray | None = None
+
+    @property
+    def banks(self) -> BankStates:
+        """What the banks hold. Moments of the video are read with the goal, so they are written
+        once it is needed.
+        """
+        if self._moments:
+            self._banks = self._writer.write(self._banks, np.stack(self._moments), self.prompt)
+            self._moments = []
+        return self._banks
+
+    @banks.setter
+    def banks(self, banks: BankStates) -> None:
+        self._banks, self._moments = banks, []
+
+    def _take(
+        self,
+        frames: FrameBatch,
+        demo: np.ndarray,
+        executed: np.ndarray,
+        states: np.ndarray | None = None,
+    ) -> None:
+        if self.pending is not None:
+            self.banks = self._writer.store(self.banks, *self.pending)
+            self.pending = None
+        moments = []
+        for i in range(len(demo)):
+            if (
+                self._due is not None and demo[i]
+            ):  # a later frame of the video shows that it was not the last one
+                moments.append(self._due)
+            if self._due is not None and (demo[i] or not self._video_over):
+                self._due = None
+            if demo[i] and (self.n_observed_frames + i) % VIDEO_STRIDE == 0:
+                image = frames.image(i)
+                assert image is not None, "all frames are rendered for banks"
+                self._due = image.copy()
+        super()._take(frames, demo, executed, states)
+        self._moments = [*self._moments, *moments]  # a twin of this episode has its own list
+
+    # Writable memory (`policy/capabilities.py`)
+
+    memory_clock = "moments"
+
+    def writable_memory(self) -> tuple[MemoryEntries, ...]:
+        """The entries of both banks, each with its times."""
+        named = (("cognition", self.banks.cognition), ("perceptual", self.banks.perceptual))
+        return tuple(
+            MemoryEntries(
+                name, tuple(zip(bank.times.tolist(), bank.entries, strict=True)), self.banks.count
+            )
+            for name, bank in named
+        )
+
+    def with_entries(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
+        twin, banks = copy.copy(self), self.banks
+        cognition, perceptual = stores
+        twin.banks = replace(
+            banks,
+            cognition=_bank(cognition, banks.cognition),
+            perceptual=_bank(perceptual, banks.perceptual),
+        )
+        return twin
+
+    def resume_from(self, twin: Episode) -> None:
+        assert isinstance(twin, MemoryVlaEpisode)
+        self.pending = twin.pending
+
+
+def _bank(entries: Sequence[tuple[int, Tensor]], like: BankState) -> BankState:
+    contents = torch.stack([content for _, content in entries]) if entries else like.entries[:0]
+    return BankState(contents, like.times.new_tensor([time for time, _ in entries]))
+
+
+def words(prompts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Prompts as a batch: ids [b, l] and mask [b, l]."""
+    ids, masks = zip(*prompts, strict=True)
+    return torch.stack(ids), torch.stack(masks)

@@ -1,0 +1,431 @@
+"""`MemoryVlaPolicy`: a VLM's cognition token and vision features, two banks or any memory, a
+diffusion head.
+"""
+
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.backbone.building import shapes_only
+from mme_vla.config.sections import read_section
+from mme_vla.embodiment.robomme import embodiment_of
+from mme_vla.errors import UserError, require
+from mme_vla.extras.methods.memoryvla.episode import MemoryVlaEpisode, words
+from mme_vla.extras.methods.memoryvla.model import (
+    BankStates,
+    Core,
+    MemoryVlaConfig,
+    MemoryVlaCore,
+    build_core,
+    read_moments,
+)
+from mme_vla.extras.methods.memoryvla.processor import GroupBatch, MemoryVlaProcessor
+from mme_vla.extras.methods.openvla_oft.processor import augment, centre_cut, draw_changes
+from mme_vla.extras.methods.prismatic import IMAGENET, Prismatic
+from mme_vla.memory.base import Memory, full_history
+from mme_vla.model import masked_mean
+from mme_vla.policy.build import build_memory, check_past
+from mme_vla.policy.episode import Episode
+from mme_vla.policy.finetune import FineTuneSpec
+from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
+from mme_vla.policy.saving import policy_options
+from mme_vla.processing.base import PolicyProcessor
+from mme_vla.processing.images import to_unit_range
+from mme_vla.registry import POLICIES
+from mme_vla.speed import Recompute
+from mme_vla.speed.sharding import ShardGroup
+from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
+
+
+@POLICIES.register("memoryvla")
+class MemoryVlaPolicy(NetworkPolicy):
+    """MemoryVLA: what a moment means (one token of a Llama) and what it looks like (tokens of two
+    towers), each with a bank of past moments that is read, fused and written. A diffusion
+    transformer predicts the chunk.
+
+    Training sees groups of moments of one episode, each group in banks of its own; acting writes
+    moment by moment. A memory of the library may replace the banks: each moment then reads its own
+    history's tokens.
+    """
+
+    acts_in_bfloat16 = True
+    finetune_spec = FineTuneSpec(
+        components={
+            "vision": r"vlm\.vision\.",
+            "vlm": r"vlm\.",
+            "memory": r"memory\.|core\.((cognition|perceptual)_(bank|retrieval)|compression)\.",
+            "action": "",
+        },
+        lora_targets=(
+            "attn.qkv",
+            "attn.proj",
+            "q_proj",
+            "k_proj",
+            "v_proj",
+            "o_proj",
+            "gate_proj",
+            "up_proj",
+            "down_proj",
+        ),
+        full_train=("core",),
+        lora_exclude=r"^core\.",
+    )
+
+    def __init__(
+        self,
+        vlm: Prismatic,
+        core: Core,
+        memory: Memory | None = None,
+        processor: MemoryVlaProcessor | None = None,
+        config: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> None:
+        """Put the parts together; `processor`, `config` and `options` as for `NetworkPolicy`.
+
+        Args:
+            core: with banks, or for a memory (`build_core`).
+        """
+        super().__init__(processor, config, **options)
+        self.vlm, self.core, self.memory = vlm, core, memory
+        self.sizes = core.config
+        self.horizon, self.action_dim = core.config.horizon, core.config.action_dim
+        self.sample_steps = core.config.ddim_steps
+
+    @classmethod
+    def from_config(
+        cls,
+        config: Mapping[str, Any],
+        processor: PolicyProcessor | None = None,
+        *,
+        fresh_backbone: bool = True,
+    ) -> Self:
+        section = {key: value for key, value in config["backbone"].items() if key != "name"}
+        sizes = read_section(MemoryVlaConfig, section, "backbone")
+        embodiment_of(config).check_network(sizes.action_dim, sizes.horizon)
+        if config.get("integration"):
+            raise UserError(
+                f"MemoryVLA has no place for the integration {config['integration'].get('name')!r}:"
+                " its own retrieval reads a memory, in place of its banks. Set integration=none."
+            )
+        processor = processor_for(
+            MemoryVlaProcessor, processor, "memoryvla, or memoryvla_tiny to try it"
+        )
+        require(
+            not (
+                processor is not None
+                and processor.samples.group_size == 1
+                and not config.get("memory")
+            ),
+            "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other;"
+            " give groups of 2 or more, or a memory in place of the banks (memory=framesamp).",
+        )
+        with nullcontext() if fresh_backbone else shapes_only():
+            vlm = Prismatic(sizes.vision, sizes.vlm, sizes.vocab_size, IMAGENET)
+        if not fresh_backbone:
+            vlm.to_empty(device=torch.get_default_device())
+        # Drawn in any case: OpenVLA, to start from, has none.
+        core = build_core(sizes, recalls=bool(config.get("memory")))
+        memory: Memory | None = None
+        if config.get("memory"):
+            memory = build_memory(
+                config["memory"], sizes.vision.width, sizes.vision.grid, sizes.perceptual_width
+            )
+            check_past(config, memory, frozenset())
+        return cls(vlm, core, memory, processor, config, **policy_options(cls, config))
+
+    # Moments
+
+    def _of_batch(
+        self, batch: GroupBatch, changes: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Moments of a batch without its padding, and the places of each group among them.
+
+        Args:
+            changes: [g, m', 6] of the images, m' ≥ m; by default the middle is cut out.
+        """
+        images = batch.images[batch.valid]
+        if changes is None:
+            cropped = centre_cut(images)
+        else:
+            cropped = augment(images, changes[:, : batch.valid.shape[1]][batch.valid])
+        with self.autocast():
+            prompt = (batch.prompt[batch.valid], batch.prompt_mask[batch.valid])
+            cognition, features = read_moments(self.vlm, to_unit_range(cropped), *prompt)
+        counts = batch.valid.sum(1).tolist()
+        return cognition, features, list(torch.arange(sum(counts)).split(counts))
+
+    @property
+    def banked(self) -> MemoryVlaCore:
+        """The core, where it has banks of its own."""
+        assert isinstance(self.core, MemoryVlaCore)
+        return self.core
+
+    # Training
+
+    @property
+    def group_size(self) -> int:
+        """Moments of a training sample: its processor's, else its configuration's."""
+        return (
+            self.config["processor"]["group_size"]
+            if self.processor is None
+            else self.processor.samples.group_size
+        )
+
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        """Of `count` groups: `noise` [n, r, m, h, a], `steps` and `drop` [n, r, m], for r copies of
+        m moments.
+        """
+        shape = (count, self.sizes.repeats, self.group_size)
+        return {
+            "noise": torch.randn(*shape, self.horizon, self.action_dim, generator=generator),
+            "steps": torch.randint(len(self.core.schedule), shape, generator=generator),
+            "drop": torch.rand(shape, generator=generator),
+        }
+
+    def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
+        """While training with augmentation `changes` [n, m, 6]: what happens to the images of
+        `count` groups.
+        """
+        if not (self.training and self.augment):
+            return {}
+        size = self.group_size
+        return {"changes": draw_changes(count * size, generator).unflatten(0, (count, size))}
+
+    def forward(
+        self, batch: GroupBatch, noise: Mapping[str, Tensor] | None = None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The mean squared error of the predicted noise over all moments, copies and numbers.
+
+        Args:
+            batch: with `actions`. noise: of `training_noise` and `augmentation_params`; fresh ones
+                by default.
+        """
+        if batch.actions is None:
+            raise ValueError(
+                "forward() computes a loss: batch.actions must hold the recorded chunks (it is"
+                " None)."
+            )
+        values = dict(noise or self.training_noise(len(batch.images), torch.default_generator))
+        if "changes" not in values:
+            values |= self.augmentation_params(len(batch.images), torch.default_generator)
+        changes = values.pop("changes", None)
+        copies = batch.valid.shape[1]
+
+        def repeat_batch(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
+            return value[:, :, :copies].transpose(0, 1)[:, batch.valid].flatten(0, 1)
+
+        sampled = map_noise(values, lambda value: repeat_batch(value.to(self.device)))
+        memory = self.encode_memory(batch.histories())
+        cognition, features, groups = self._of_batch(
+            batch, None if changes is None else changes.to(self.device)
+        )
+        with self.autocast():
+            read, perceptual = self.core.through(
+                cognition, features, batch.times[batch.valid], groups, memory
+            )
+            losses = self.core.noise_error(
+                batch.actions[batch.valid], read, perceptual, sampled
+            )  # r·m h
+        counted = None
+        if batch.action_mask is not None:
+            of_moments = batch.action_mask[batch.valid]
+            counted = of_moments.repeat(len(losses) // len(of_moments), 1)
+        loss = masked_mean(losses, counted)
+        reported = {} if memory is None else memory.metrics
+        return loss, {
+            "loss": loss.detach(),
+            **{f"memory/{name}": value for name, value in reported.items()},
+        }
+
+    def recompute(self, mode: Recompute) -> None:
+        self.vlm.recompute(mode)
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        full_modules = (self.vlm.vision, self.vlm.language.model.embed_tokens)
+        layers = (*self.vlm.language.model.layers, *self.core.head.blocks)
+        return [
+            *(ShardGroup(module, full=True) for module in full_modules),
+            *map(ShardGroup, layers),
+        ]
+
+    def compile(self, **options: Any) -> None:
+        """Compile the towers, the language model's layers and the head's blocks, each by itself."""
+        towers, layers = (
+            (self.vlm.vision.dino, self.vlm.vision.siglip),
+            self.vlm.language.model.layers,
+        )
+        for module in (*towers, *layers, *self.core.head.blocks):
+            module.compile(**options)
+        if self.memory is not None:
+            self.memory.compile(**options)
+
+    # Sampling
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        """The starting `noise` [h, a]."""
+        return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
+
+    @torch.no_grad()
+    def sample_actions(
+        self,
+        batch: GroupBatch,
+        noise: Mapping[str, Tensor] | None = None,
+        steps: int | None = None,
+        memory: MemoryTokens | None = None,
+    ) -> Tensor:
+        """A normalised chunk [g, h, a] for the last moment of every group: through those before it,
+        or its own memory.
+
+        Args:
+            memory: memory tokens of the last moments, encoded beforehand.
+        """
+        if noise is None:
+            noise = stack_noise(
+                [self.sampling_noise(torch.default_generator) for _ in range(len(batch.images))]
+            )
+        if self.memory is not None:
+            batch = batch.last()
+            memory = self.encode_memory(batch.history) if memory is None else memory
+        cognition, features, groups = self._of_batch(batch)
+        with self.autocast():
+            read, perceptual = self.core.through(
+                cognition, features, batch.times[batch.valid], groups, memory
+            )
+            last = [int(group[-1]) for group in groups]
+            return self.core.sample(
+                noise["noise"].to(self.device), read[last], perceptual[last], steps
+            )
+
+    # Episodes
+
+    def start_episode(self, goal: str, seed: int = 0) -> Episode:
+        """Begin an episode with empty banks, or an empty memory."""
+        return (
+            MemoryVlaEpisode(self, goal, seed)
+            if self.memory is None
+            else super().start_episode(goal, seed)
+        )
+
+    def observation(self, episodes: Sequence[Episode]) -> GroupBatch:
+        """The current moments of running episodes, each a group of one; only banks know what number
+        theirs has.
+        """
+        images = self.require_processor().prepare_images(
+            torch.stack([episode.images for episode in episodes])
+        )
+        ids, masks = words([episode.prompt for episode in episodes])
+        times = torch.tensor(
+            [
+                0 if self.memory is not None else _memoryvla_episode(episode).banks.count
+                for episode in episodes
+            ]
+        )
+        valid = torch.ones(len(episodes), 1, dtype=torch.bool)
+        return GroupBatch(images[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(
+            self.device
+        )
+
+    def predict_chunk(
+        self,
+        batch: GroupBatch,
+        episodes: Sequence[Episode],
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
+    ) -> Tensor:
+        """A chunk for what `observation` saw, through the episodes' memories, or their banks, which
+        it leaves alone.
+        """
+        if self.memory is not None:
+            return self.sample_actions(batch, noise, steps, self.encode_memories(episodes))
+        with torch.no_grad():
+            cognition, features, _ = self._of_batch(batch)
+            with self.autocast():
+                read, perceptual = self.banked.read_banks(
+                    [_memoryvla_episode(episode).banks for episode in episodes], cognition, features
+                )
+                chunk = self.core.sample(noise["noise"].to(self.device), read, perceptual, steps)
+        for i, episode in enumerate(episodes):
+            _memoryvla_episode(episode).pending = (cognition[i], features[i])
+        return chunk
+
+    @torch.no_grad()
+    def write(
+        self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]
+    ) -> BankStates:
+        """Banks after further frames [n, H, W, 3] uint8 of the camera that the policy looks
+        through.
+        """
+        processor = self.require_processor()
+        images = processor.resized(frames).to(self.device)
+        ids, mask = (part.to(self.device).expand(len(frames), -1) for part in prompt)
+        with self.autocast():
+            cognition, features = read_moments(
+                self.vlm, to_unit_range(centre_cut(images)), ids, mask
+            )
+            for i in range(len(frames)):
+                banks = self.banked.store(banks, cognition[i], features[i])
+        return banks
+
+    @torch.no_grad()
+    def store(self, banks: BankStates, cognition: Tensor, features: Tensor) -> BankStates:
+        """Banks after the moment at which a chunk was chosen, [1, d] and [p, c]."""
+        with self.autocast():
+            return self.banked.store(banks, cognition, features)
+
+    def require_processor(self) -> MemoryVlaProcessor:
+        processor = super().require_processor()
+        assert isinstance(processor, MemoryVlaProcessor)
+        return processor
+
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
+        processor, sizes = self.require_processor(), self.sizes
+        return {
+            "image_size": (processor.image_size, sizes.vision.image_size),
+            "action_dim": (processor.action_dim, sizes.action_dim),
+            "horizon": (processor.embodiment.action.horizon, sizes.horizon),
+        }
+
+    @property
+    def memory_tower(self) -> MemoryTower:
+        vlm = self.vlm
+        processor = self.processor
+        image_format = (
+            processor.memory_image_format if isinstance(processor, MemoryVlaProcessor) else ""
+        )
+        settings = (image_format, str(vlm.vision.dino_standard))
+        return MemoryTower(vlm.vision, vlm.pooled_tokens, self.sizes.vision.width, settings)
+
+    # Costs
+
+    def full_batch(self, device: torch.device | str = "cpu") -> GroupBatch:
+        """A group of one moment without content, with the longest prompt and a full memory.
+
+        Where the moment is, is known on meta too.
+        """
+        size, length = self.sizes.vision.image_size, int(self.config["processor"]["prompt_length"])
+        length += self.embodiment.action.options_length
+        known = "cpu" if torch.device(device).type == "meta" else device
+        return GroupBatch(
+            images=torch.zeros(1, 1, 3, size, size, dtype=torch.uint8, device=device),
+            prompt=torch.full((1, 1, length), 5, device=device),
+            prompt_mask=torch.ones(1, 1, length, dtype=torch.bool, device=device),
+            times=torch.zeros(1, 1, dtype=torch.int64, device=known),
+            valid=torch.ones(1, 1, dtype=torch.bool, device=known),
+            actions=torch.zeros(1, 1, self.horizon, self.action_dim, device=device),
+            history=None
+            if self.memory is None
+            else full_history(self.memory, self.sizes.vision.width, device),
+        )
+
+    def warm_up_vision(self) -> None:
+        size = self.sizes.vision.image_size
+        self.vlm.encode_images(torch.zeros(1, 3, size, size, device=self.device))
+
+
+def _memoryvla_episode(episode: Episode) -> MemoryVlaEpisode:
+    assert isinstance(episode, MemoryVlaEpisode)
+    return episode

@@ -1,0 +1,185 @@
+"""What stands between raw data and MemoryVLA: one camera, words that end, clipped quantiles, groups
+of one episode.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.config.sections import read_section
+from mme_vla.embodiment.robomme import embodiment_of
+from mme_vla.errors import check_integer, require
+from mme_vla.extras.methods.memoryvla.model import MemoryVlaConfig
+from mme_vla.extras.methods.openvla_oft.processor import ClippedQuantiles, OpenVlaProcessor
+from mme_vla.memory.base import stack_history
+from mme_vla.processing.base import Sample, SampleSpec, StatsSpec
+from mme_vla.registry import PROCESSORS
+from mme_vla.types import HistoryTokens, TensorStruct
+
+
+@dataclass
+class GroupBatch(TensorStruct):
+    """Groups of moments, each of one episode in the order of time, padded behind.
+
+    images: [g, m, 3, s, s] uint8. prompt: [g, m, l] ids; prompt_mask: [g, m, l] bool. times: [g, m]
+    int64. valid: [g, m] bool; False on padding. actions: [g, m, h, a] normalised; None when
+    sampling. action_mask: [g, m, h] bool; None counts all actions.
+    history: a memory's selections [g, m, n, …] of all moments, or [g, n, …] of each group's last
+    one alone; None where
+        banks remember.
+    """
+
+    images: Tensor
+    prompt: Tensor
+    prompt_mask: Tensor
+    times: Tensor
+    valid: Tensor
+    actions: Tensor | None = None
+    action_mask: Tensor | None = None
+    history: HistoryTokens | None = None
+
+    def histories(self) -> HistoryTokens | None:
+        """The selections of all moments without padding, one after the other, [k, n, …]."""
+        return self._histories(self.valid)
+
+    def last(self) -> "GroupBatch":
+        """The last moments, each a group of one, with a history [g, n, …]."""
+        here = self.valid & (self.valid.cumsum(1) == self.valid.sum(1, keepdim=True))
+        alone = replace(self, history=None)._map(lambda x: x[here][:, None])
+        return replace(alone, history=self._histories(here))
+
+    def _histories(self, index: Tensor) -> HistoryTokens | None:
+        if self.history is None or self.history.mask.ndim == 2:
+            return self.history
+        return self.history.rows(index)
+
+
+GROUP_SIZE = 16
+
+
+@PROCESSORS.register("memoryvla")
+class MemoryVlaProcessor(OpenVlaProcessor):
+    """As OpenVLA's, but for the prompt's end, the numbers that are commanded as −1 or 1, and
+    groups.
+    """
+
+    stats_spec = StatsSpec(horizon=1, every=True, extremes=True, exact=True, video=True)
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """As `OpenVlaProcessor.from_config`, with `group_size` beside the other settings."""
+        size = config.get("group_size", GROUP_SIZE)
+        check_integer("processor.group_size", size)
+        built = super().from_config(
+            {key: value for key, value in config.items() if key != "group_size"}
+        )
+        built.samples = SampleSpec(group_size=size, cameras=(built.embodiment.memory_camera,))
+        return built
+
+    @classmethod
+    def from_sections(cls, sections: Mapping[str, Any]) -> Self:
+        """As `Processor.from_sections`, at the sizes of the section `backbone`, which is no
+        `Backbone` here.
+        """
+        of_network = {key: value for key, value in sections["backbone"].items() if key != "name"}
+        sizes = read_section(MemoryVlaConfig, of_network, "backbone")
+        options = {"image_size": sizes.vision.image_size, "action_dim": sizes.action_dim}
+        built = cls.from_config(
+            {**sections["processor"], **options, "embodiment": embodiment_of(sections).to_dict()}
+        )
+        require(
+            built.tokenizer.vocab_size <= sizes.vocab_size,
+            f"The tokenizer {built.tokenizer.spec!r} has {built.tokenizer.vocab_size} entries but"
+            f" backbone.vocab_size={sizes.vocab_size}: choose the processor that goes with the"
+            " backbone.",
+        )
+        return built
+
+    def prompt(self, *args: Any, **named: Any) -> tuple[Tensor, Tensor]:
+        """As `OpenVlaProcessor.prompt`, with the end-of-sequence token behind the piece `▁`."""
+        ids, mask = super().prompt(*args, **named)
+        place = min(int(mask.sum()), len(ids) - 1)
+        ids[place - 1], ids[place] = self.tokenizer.piece("▁"), self.tokenizer.end
+        mask[place] = True
+        return ids, mask
+
+    def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
+        """As `OpenVlaProcessor.actions`; numbers that are commanded as −1 or 1 stay as they are."""
+        raw = self.embodiment.action.to_relative(
+            *(torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state))
+        )
+        return self._quantiles().normalize(raw)
+
+    def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
+        """As `OpenVlaProcessor.absolute_actions`, of chunks that are clipped to ±1 first."""
+        raw = self._quantiles().unnormalize(chunk.float().clamp(-1, 1))
+        return self.embodiment.action.to_absolute(raw, state.to(raw))
+
+    def _quantiles(self) -> ClippedQuantiles:
+        stats = self.require_stats().actions
+        scaled = np.ones(len(stats), bool)
+        scaled[list(self.embodiment.action.binary)] = False
+        return ClippedQuantiles.of(stats, scaled)
+
+    def resized(self, frames: np.ndarray) -> Tensor:
+        """Frames [..., H, W, 3] uint8 of that camera as images [..., 3, s, s] uint8."""
+        return torch.from_numpy(np.ascontiguousarray(np.moveaxis(self._resized(frames), -1, -3)))
+
+    def prepare_images(self, images: Tensor) -> Tensor:
+        """Of images [..., v, 3, s, s] those of the one camera this policy looks through."""
+        robot = self.embodiment
+        return images[..., robot.camera_names.index(robot.memory_camera), :, :, :]
+
+    def item(self, sample: Sample) -> dict[str, Any]:
+        """One moment: its image [3, s, s], prompt [l] and actions [h, a]."""
+        state, camera = sample.states[-1], self.embodiment.memory_camera
+        prompt, mask = self.prompt(sample.goal, subgoal=sample.subgoal)
+        return {
+            "images": self.resized(sample.views[camera][-1]),
+            "prompt": prompt,
+            "prompt_mask": mask,
+            "actions": self.actions(sample.actions, state),
+        }
+
+    def collate(self, items: Sequence[dict[str, Any]]) -> GroupBatch:  # type: ignore[override]
+        """Groups side by side, the shorter ones filled up with their last moment; a single step is
+        a group of one.
+        """
+        groups = [item.get("moments", [item]) for item in items]
+        times = [torch.as_tensor(item.get("times", item["place"][-1:])) for item in items]
+        longest = max(map(len, groups))
+        rows = [np.minimum(np.arange(longest), len(group) - 1).tolist() for group in groups]
+
+        def stack(name: str) -> Tensor:
+            return torch.stack(
+                [
+                    torch.stack([group[i][name] for i in at])
+                    for group, at in zip(groups, rows, strict=True)
+                ]
+            )
+
+        history = None
+        if "history" in groups[0][0]:
+            every = [
+                group[i]["history"] for group, at in zip(groups, rows, strict=True) for i in at
+            ]
+            history = stack_history(every)._map(lambda x: x.unflatten(0, (len(groups), longest)))
+        mask = stack("prompt_mask")
+        length = int(mask.sum(-1).max())
+        return GroupBatch(
+            images=stack("images"),
+            prompt=stack("prompt")[..., :length],
+            prompt_mask=mask[..., :length],
+            times=torch.stack([of[at] for of, at in zip(times, rows, strict=True)]),
+            valid=torch.stack([torch.arange(longest) < len(group) for group in groups]),
+            actions=stack("actions"),
+            action_mask=stack("action_mask") if "action_mask" in groups[0][0] else None,
+            history=history,
+        )
+
+    def to_config(self) -> dict[str, Any]:
+        return {**super().to_config(), "name": "memoryvla", "group_size": self.samples.group_size}

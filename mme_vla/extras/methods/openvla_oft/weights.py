@@ -1,0 +1,250 @@
+"""Checkpoints of OpenVLA and of OpenVLA-OFT's runs, whose adapters are merged: safetensors, with
+head and state token in `.pt` files beside them, and statistics in `dataset_statistics.json`.
+"""
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.extras.methods.memoryvla.policy import MemoryVlaPolicy
+from mme_vla.extras.methods.openvla_oft.policy import OpenVlaPolicy
+from mme_vla.policy.base import Policy
+from mme_vla.policy.tensor_files import WEIGHTS, cast, read_files
+from mme_vla.processing.normalise import NormStats, QuantileStats
+from mme_vla.utils import check_sums, checked_file, read_json
+from mme_vla.weights.tables import Adapter, Piece
+from mme_vla.weights.torch_files import read_torch_file
+
+VLA, HEAD, STATE = "vla/", "action_head/", "proprio_projector/"
+
+_RULES = tuple(
+    (re.compile(target), source)
+    for target, source in (
+        (
+            r"^backbone\.vlm\.vision\.dino\.(.*)\.gamma$",
+            rf"{VLA}vision_backbone.featurizer.\1.scale_factor",
+        ),
+        (r"^backbone\.vlm\.vision\.dino\.(.*)$", rf"{VLA}vision_backbone.featurizer.\1"),
+        (r"^backbone\.vlm\.vision\.siglip\.(.*)$", rf"{VLA}vision_backbone.fused_featurizer.\1"),
+        (r"^backbone\.vlm\.projector\.(.*)$", rf"{VLA}projector.\1"),
+        (r"^backbone\.vlm\.language\.(.*)$", rf"{VLA}language_model.\1"),
+        (r"^backbone\.head\.input_norm\.(.*)$", rf"{HEAD}model.layer_norm1.\1"),
+        (r"^backbone\.head\.input\.(.*)$", rf"{HEAD}model.fc1.\1"),
+        (
+            r"^backbone\.head\.blocks\.(\d+)\.norm\.(.*)$",
+            rf"{HEAD}model.mlp_resnet_blocks.\1.ffn.0.\2",
+        ),
+        (
+            r"^backbone\.head\.blocks\.(\d+)\.linear\.(.*)$",
+            rf"{HEAD}model.mlp_resnet_blocks.\1.ffn.1.\2",
+        ),
+        (r"^backbone\.head\.output_norm\.(.*)$", rf"{HEAD}model.layer_norm2.\1"),
+        (r"^backbone\.head\.output\.(.*)$", rf"{HEAD}model.fc2.\1"),
+        (r"^backbone\.state_token\.(.*)$", rf"{STATE}\1"),
+    )
+)
+
+
+def openvla_name(target: str) -> str | None:
+    """What a tensor of ours is called there, adapters included; None where it has no name.
+
+    The same model under another policy of ours (MemoryVLA's `vlm.…`) has the same names.
+    """
+    target = f"backbone.{target}" if target.startswith("vlm.") else target
+    for pattern, replacement in _RULES:
+        if pattern.match(target):
+            return pattern.sub(replacement, target)
+    return None
+
+
+FOLDER, FILE, SETTINGS = "lora_adapter", "adapter_model.safetensors", "adapter_config.json"
+_BEFORE, _DOWN, _UP = "base_model.model.", ".lora_A.weight", ".lora_B.weight"
+
+
+def has_adapters(folder: Path) -> bool:
+    """Whether a run's adapters lie in it."""
+    return (folder / FOLDER / FILE).is_file()
+
+
+def named_base(folder: Path) -> str:
+    """The base model that a run names; for messages only."""
+    name = _settings(folder).get("base_model_name_or_path")
+    return name if isinstance(name, str) and name else "its base model"
+
+
+def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
+    """The base's tensors (behind `vla/`) with a run's adapters folded in: W + (alpha /
+    rank)·B·A.
+    """
+    settings, file = _settings(folder), folder / FOLDER / FILE
+    rank, alpha = settings.get("r"), settings.get("lora_alpha")
+    require(
+        isinstance(rank, int) and isinstance(alpha, int | float) and rank >= 1,
+        f"{folder / FOLDER / SETTINGS} has r={brief(rank)}, lora_alpha={brief(alpha)}: no LoRA's.",
+    )
+    if other := [
+        name
+        for name in ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern")
+        if settings.get(name)
+    ]:
+        raise UserError(
+            f"{folder / FOLDER / SETTINGS} sets {listed(other)}, which are not read: merge it with"
+            " peft."
+        )
+    check_sums(folder, [f"{FOLDER}/{FILE}"])
+    adapters = read_files(folder / FOLDER, (file,))
+    downs = [name for name in adapters if name.startswith(_BEFORE) and name.endswith(_DOWN)]
+    odd = sorted(set(adapters) - set(downs) - {name.removesuffix(_DOWN) + _UP for name in downs})
+    require(
+        not odd and downs,
+        f"{file} holds {listed(odd or list(adapters))}, no adapters of OpenVLA-OFT.",
+    )
+    out = dict(base)
+    for name in downs:
+        target = VLA + name.removeprefix(_BEFORE).removesuffix(_DOWN) + ".weight"
+        up = adapters.get(name.removesuffix(_DOWN) + _UP)
+        down = adapters[name].float().flatten(1)
+        if target not in out or up is None or up.shape[1:2] != down.shape[:1] or len(down) != rank:
+            raise UserError(
+                f"{file}: {name} fits no matrix of the base model: it was trained on another base."
+            )
+        # A convolution's A is [r, in, k, k] and its B [out, r, 1, 1]: the product of their rows and
+        # columns.
+        product = up.float().flatten(1) @ down
+        weight = out[target]
+        require(
+            product.shape == weight.flatten(1).shape,
+            f"{file}: {name} makes {list(product.shape)} of {list(weight.shape)}: another base's.",
+        )
+        out[target] = (weight.float() + alpha / rank * product.view_as(weight)).to(weight.dtype)
+    return out
+
+
+def _settings(folder: Path) -> dict[str, Any]:
+    place = checked_file(folder, f"{FOLDER}/{SETTINGS}", "adapters")
+    settings: dict[str, Any] = read_json(place, "a LoRA's settings", limit=2**20)
+    return settings
+
+
+STATISTICS = "dataset_statistics.json"
+DATASET = "robomme"
+_FEATURES = {"state": "proprio", "actions": "action"}
+_WRAPPED = "module."  # what data parallelism puts before the names of head and state token
+
+
+def is_openvla(names: Iterable[str]) -> bool:
+    """Whether tensors are named as in OpenVLA's own files."""
+    present = set(names)
+    return "vision_backbone.featurizer.cls_token" in present and "projector.fc1.weight" in present
+
+
+def openvla_adapter(policy: Policy) -> Adapter:
+    """OpenVLA's names of this policy's tensors; a memory has none, and OpenVLA itself no head and
+    no state token.
+
+    Of MemoryVLA the VLM alone has names: banks and head are new where it starts from OpenVLA.
+    """
+    if not isinstance(policy, OpenVlaPolicy | MemoryVlaPolicy):
+        raise UserError(
+            f"This format holds OpenVLA and OpenVLA-OFT; {policy.config.get('name', 'this')} is a "
+            f"{type(policy).__name__}. Set model=openvla_oft, or "
+            "start model=memoryvla from it (init_from=…)."
+        )
+    names = [
+        name for name in policy.state_dict() if ".lora_" not in name and ".base_layer." not in name
+    ]
+    table = {name: [Piece(source)] for name in names if (source := openvla_name(name)) is not None}
+    return Adapter(
+        table, fresh=frozenset(n for n in names if policy.finetune_spec.component_of(n) == "action")
+    )
+
+
+def with_heads(tensors: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
+    """The model's tensors, and those of the newest head and state token beside it, each behind its
+    module's name.
+    """
+    known = tuple(f"{module.rstrip('/')}--" for module in (HEAD, STATE))
+    unknown = sorted(
+        file.name for file in folder.glob("*?--*_checkpoint.pt") if not file.name.startswith(known)
+    )
+    if unknown:
+        raise UserError(
+            f"{folder} holds {listed(unknown)}: model=openvla_oft has no place for these weights,"
+            " and would act differently without them. Read are"
+            f" {', '.join(f'{name}*_checkpoint.pt' for name in known)}. A vision_backbone is of a"
+            " run with FiLM (use_film), a noisy_action_projector of one with a diffusion head"
+            " (use_diffusion): use a run without them."
+        )
+    merged = {f"{VLA}{name}": tensor for name, tensor in tensors.items()}
+    for module in (HEAD, STATE):
+        files = sorted(folder.glob(f"{module.rstrip('/')}--*_checkpoint.pt"), key=_step)
+        if files:
+            heads = read_torch_file(checked_file(folder, files[-1].name, "weights"))
+            merged |= {
+                f"{module}{name.removeprefix(_WRAPPED)}": tensor for name, tensor in heads.items()
+            }
+    return merged
+
+
+def _step(file: Path) -> tuple[int, str]:
+    number = file.name.split("--")[1].split("_")[0]
+    return (int(number) if number.isdigit() else -1, file.name)
+
+
+def read_dataset_statistics(folder: Path) -> NormStats | None:
+    """The statistics of `dataset_statistics.json`, where it is of one dataset that has states."""
+    if not (folder / STATISTICS).is_file():
+        return None
+    data = read_json(
+        checked_file(folder, STATISTICS, "statistics"), "normalisation statistics", limit=2**24
+    )
+    of = next(iter(data.values())) if len(data) == 1 else None
+    if not isinstance(of, dict) or not all(
+        isinstance(of.get(source_name), dict) for source_name in _FEATURES.values()
+    ):
+        return None
+    keys = ("mean", "std", "q01", "q99", "min", "max")
+    known = {
+        name: {key: of[name][key] for key in keys if key in of[name]} for name in _FEATURES.values()
+    }
+    return NormStats(
+        **{part: QuantileStats.from_dict(known[name], name) for part, name in _FEATURES.items()}
+    )
+
+
+def write_openvla(
+    policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None
+) -> None:
+    """A merged run as OpenVLA-OFT's evaluation reads it: one safetensors file, head, state token,
+    statistics.
+    """
+    from safetensors.torch import save_file
+
+    released = openvla_adapter(policy).export(policy.state_dict())
+    ready = {
+        name: cast(tensor.detach(), dtype).cpu().contiguous() for name, tensor in released.items()
+    }
+
+    def of(module: str, before: str = "") -> dict[str, Tensor]:
+        return {
+            before + name.removeprefix(module): x
+            for name, x in ready.items()
+            if name.startswith(module)
+        }
+
+    save_file(of(VLA), folder / WEIGHTS, metadata={"format": "pt"})
+    for module in (HEAD, STATE):
+        if tensors := of(module, _WRAPPED):
+            torch.save(tensors, folder / f"{module.rstrip('/')}--0_checkpoint.pt")
+    if stats is not None:
+        statistics = {
+            released: getattr(stats, target_name).to_dict()
+            for target_name, released in _FEATURES.items()
+        }
+        (folder / STATISTICS).write_text(json.dumps({DATASET: statistics}, indent=2) + "\n")

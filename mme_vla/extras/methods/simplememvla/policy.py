@@ -1,0 +1,552 @@
+"""`SimpleMemVlaPolicy`: a video-language model generates the sub-task; its words' hidden states
+condition a flow.
+"""
+
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mme_vla.backbone.building import shapes_only
+from mme_vla.backbone.flow import EULER_STEPS
+from mme_vla.backbone.siglip import pool_grid
+from mme_vla.embodiment.robomme import embodiment_of
+from mme_vla.errors import UserError
+from mme_vla.extras.methods.simplememvla.config import SimpleMemVlaSizes
+from mme_vla.extras.methods.simplememvla.episode import VideoEpisode
+from mme_vla.extras.methods.simplememvla.head import ActionHead, Condition
+from mme_vla.extras.methods.simplememvla.model import (
+    Prefill,
+    VideoLanguageModel,
+    WordIds,
+    response_condition,
+    words_loss,
+)
+from mme_vla.extras.methods.simplememvla.processor import (
+    PromptSettings,
+    SimpleMemVlaProcessor,
+    VideoBatch,
+)
+from mme_vla.extras.methods.simplememvla.prompt import (
+    IMAGE,
+    MEMORY,
+    TEXT,
+    VIDEO,
+    CameraTokens,
+    Tokens,
+    rope_positions,
+)
+from mme_vla.extras.methods.simplememvla.video import TEMPORAL, Window, augment, augmentation_draw
+from mme_vla.memory.base import MemoryModule, full_history
+from mme_vla.policy.build import build_memory, check_past
+from mme_vla.policy.episode import Episode
+from mme_vla.policy.finetune import FineTuneSpec
+from mme_vla.policy.network import MemoryTower, NetworkPolicy
+from mme_vla.policy.saving import policy_options
+from mme_vla.processing.base import PolicyProcessor
+from mme_vla.registry import POLICIES
+from mme_vla.speed import Recompute
+from mme_vla.speed.sharding import ShardGroup
+from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
+
+_STAMP_TOKENS, _REQUEST_TOKENS, _RESPONSE_TOKENS = 9, 105, 12
+"""Text tokens of a timestamp, of a prompt's remaining text and of a response, where costs are
+counted.
+"""
+
+
+@POLICIES.register("simplememvla")
+class SimpleMemVlaPolicy(NetworkPolicy):
+    """SimpleMemVLA: no memory module but a time-stamped video in the prompt, sub-task words, and a
+    flow head on them.
+
+    A memory of the library may replace the video: its tokens, projected, stand where the video's
+    would.
+    """
+
+    acts_in_bfloat16 = True
+    finetune_spec = FineTuneSpec(
+        components={
+            "vision": r"backbone\.model\.visual\.",
+            "vlm": r"backbone\.",
+            "memory": r"memory\.|memory_proj\.",
+            "action": "",
+        },
+        lora_targets=(
+            "q_proj",
+            "k_proj",
+            "v_proj",
+            "o_proj",
+            "in_proj_qkv",
+            "in_proj_z",
+            "linear_attn.out_proj",
+            "gate_proj",
+            "up_proj",
+            "down_proj",
+        ),
+        full_train=("action_head",),
+        lora_exclude=r"^action_head\.",
+    )
+
+    def __init__(
+        self,
+        sizes: SimpleMemVlaSizes,
+        memory: MemoryModule | None = None,
+        processor: SimpleMemVlaProcessor | None = None,
+        config: Mapping[str, Any] | None = None,
+        *,
+        fresh_backbone: bool = True,
+        **options: Any,
+    ) -> None:
+        """Build the network; `processor`, `config` and `options` as for `NetworkPolicy`.
+
+        Args:
+            memory: in the video's place. fresh_backbone: initialise the language model's weights.
+        """
+        super().__init__(processor, config, **options)
+        with nullcontext() if fresh_backbone else shapes_only():
+            self.backbone = VideoLanguageModel(sizes.qwen)
+        if not fresh_backbone:
+            self.backbone.to_empty(device=torch.get_default_device())
+            self.backbone.reset_buffers()
+        head = (sizes.width, sizes.action_dim, sizes.horizon, sizes.state_dim)
+        self.action_head = ActionHead(sizes.head, *head)
+        self.memory, self.sizes = memory, sizes
+        self.memory_proj = None if memory is None else nn.Linear(sizes.memory_width, sizes.width)
+        self.horizon, self.action_dim, self.sample_steps = (
+            sizes.horizon,
+            sizes.action_dim,
+            EULER_STEPS,
+        )
+
+    @classmethod
+    def from_config(
+        cls,
+        config: Mapping[str, Any],
+        processor: PolicyProcessor | None = None,
+        *,
+        fresh_backbone: bool = True,
+    ) -> Self:
+        sizes, robot = SimpleMemVlaSizes.from_dict(config["backbone"]), embodiment_of(config)
+        robot.check_network(sizes.action_dim, sizes.horizon)
+        if sizes.state_dim not in (0, robot.state.width):
+            raise UserError(
+                f"backbone.state_dim={sizes.state_dim} must be {robot.state.width}, or 0 for no"
+                " state."
+            )
+        if config.get("integration"):
+            raise UserError(
+                "SimpleMemVLA has no place for the integration"
+                f" {config['integration'].get('name')!r}: a memory's tokens stand in the prompt, in"
+                " place of the video. Set integration=none."
+            )
+        if processor is not None and not isinstance(processor, SimpleMemVlaProcessor):
+            raise UserError(
+                "SimpleMemVLA needs its own processor: set processor=simplememvla, or"
+                " simplememvla_tiny."
+            )
+        memory: MemoryModule | None = None
+        if config.get("memory"):
+            grid = sizes.image_size // sizes.factor
+            memory = build_memory(config["memory"], sizes.width, grid, sizes.memory_width)
+            check_past(config, memory, frozenset())
+            if not memory.budget:
+                raise UserError(
+                    f"The memory {config['memory']['name']!r} has no tokens with these settings."
+                )
+        options = policy_options(cls, config)
+        return cls(sizes, memory, processor, config, fresh_backbone=fresh_backbone, **options)
+
+    # The network
+
+    def embed(
+        self, batch: VideoBatch, memory: MemoryTokens | None = None, changes: Tensor | None = None
+    ) -> Tensor:
+        """Embeddings [b, L, D] of prompts, with images and memory tokens in them.
+
+        Args:
+            changes: [b, 7] uniform numbers that augment the images of each row.
+        """
+        video, images = batch.video, batch.images
+        if changes is not None:
+            video, images = _augmented(video, images, batch.patches, changes)
+        pairs = images.flatten(0, 1)[:, None].expand(-1, TEMPORAL, -1, -1, -1)
+        replaced = (
+            [(batch.kinds == IMAGE, self.backbone.encode_patches(pairs).flatten(0, 1))]
+            if len(pairs)
+            else []
+        )
+        features = batch.features
+        if features is None and video is not None and len(video):
+            features = self.backbone.encode_patches(video)
+        if features is not None:
+            replaced.append((batch.kinds == VIDEO, features.flatten(0, 1)))
+        if memory is not None:
+            replaced.append((batch.kinds == MEMORY, self._projected(memory).flatten(0, 1)))
+        return self.backbone.embed(batch.ids, *replaced)
+
+    def _projected(self, memory: MemoryTokens) -> Tensor:
+        """Memory tokens [b, n, D] for the language model; empty ones are zero before the
+        projection.
+        """
+        assert self.memory_proj is not None
+        tokens: Tensor = self.memory_proj(
+            torch.where(memory.mask[..., None], memory.tokens.float(), 0.0)
+        )
+        return tokens
+
+    # Training
+
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        """`noise` [n, h, a] and flow times `time` [n] of Beta(alpha, 1), 1 = noise."""
+        uniform = torch.rand(count, generator=generator)
+        noise = torch.randn(count, self.horizon, self.action_dim, generator=generator)
+        return {"noise": noise, "time": uniform ** (1 / self.sizes.head.time_alpha)}
+
+    def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
+        """While training with augmentation `changes` [n, 7]: uniform numbers for the images of
+        `count` samples.
+        """
+        return (
+            {"changes": torch.rand(count, 7, generator=generator)}
+            if self.training and self.augment
+            else {}
+        )
+
+    def forward(
+        self, batch: VideoBatch, noise: Mapping[str, Tensor] | None = None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The flow's loss and the cross entropy of the sub-task's words, weighted and added.
+
+        Args:
+            batch: with responses and `actions`. noise: of `training_noise` and
+                `augmentation_params`.
+        """
+        if batch.actions is None:
+            raise ValueError(
+                "forward() computes a loss: batch.actions must hold the recorded chunk (it is"
+                " None)."
+            )
+        values = dict(noise or self.training_noise(len(batch.ids), torch.default_generator))
+        if "changes" not in values:
+            values |= self.augmentation_params(len(batch.ids), torch.default_generator)
+        values = map_noise(values, lambda value: value.to(self.device))
+        changes = values.pop("changes", None)
+        memory = self.encode_memory(batch.history)
+        with self.autocast():
+            embedded = self.embed(batch, memory, changes)
+            hidden = self.backbone.hidden(embedded, batch.positions)
+            words, right = words_loss(self.backbone, hidden, batch.ids, batch.spans)
+            condition = response_condition(hidden, embedded, batch.positions, batch.spans)
+            action = self.action_head.loss(
+                batch.actions,
+                condition,
+                self._state(batch),
+                values["noise"],
+                values["time"],
+                batch.action_mask,
+            )
+        loss = self.sizes.action_weight * action + self.sizes.words_weight * words
+        reported = (
+            {}
+            if memory is None
+            else {f"memory/{name}": value for name, value in memory.metrics.items()}
+        )
+        metrics = {
+            "loss": loss.detach(),
+            "action": action.detach(),
+            "words": words.detach(),
+            "words_right": right,
+        }
+        return loss, metrics | reported
+
+    def _state(self, batch: VideoBatch) -> Tensor | None:
+        return batch.state if self.sizes.state_dim else None
+
+    def recompute(self, mode: Recompute) -> None:
+        self.backbone.recompute(mode)
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """The vision tower, every layer of the language model, and every block of the head,
+        gathered in float32.
+
+        Decay rates of delta nets are not rounded.
+        """
+        tower, layers = self.backbone.model.visual, self.backbone.model.language_model.layers
+        return [
+            ShardGroup(module, full=True) for module in (tower, *layers, *self.action_head.blocks)
+        ]
+
+    # Sampling
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        """The starting `noise` [h, a]."""
+        return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
+
+    @torch.no_grad()
+    def sample_actions(
+        self,
+        batch: VideoBatch,
+        noise: Mapping[str, Tensor] | None = None,
+        steps: int | None = None,
+        memory: MemoryTokens | None = None,
+    ) -> Tensor:
+        """A normalised chunk [b, h, a] under words that the policy generates; responses in the
+        batch are not read.
+
+        Args:
+            memory: memory tokens encoded beforehand.
+        """
+        if noise is None:
+            noise = stack_noise(
+                [self.sampling_noise(torch.default_generator) for _ in range(len(batch.ids))]
+            )
+        memory = self.encode_memory(batch.history) if memory is None else memory
+        _, condition = self.generate(batch, memory)
+        return self._sample(batch, condition, noise, steps)
+
+    def _sample(
+        self,
+        batch: VideoBatch,
+        condition: Condition,
+        noise: Mapping[str, Tensor],
+        steps: int | None,
+    ) -> Tensor:
+        with self.autocast():
+            start = noise["noise"].to(self.device)
+            return self.action_head.sample(
+                start, condition, self._state(batch), steps or self.sample_steps
+            )
+
+    @torch.no_grad()
+    def generate(
+        self, batch: VideoBatch, memory: MemoryTokens | None = None, prefill: Prefill | None = None
+    ) -> tuple[list[list[int]], Condition]:
+        """The ids of the sub-tasks that the policy generates, and their hidden states.
+
+        Args:
+            prefill: the beginning of the one prompt of the batch.
+        """
+        with self.autocast():
+            embedded = self.embed(batch, memory)
+            longest, start = max(batch.prompts), 0 if prefill is None else prefill.length
+            rows = [
+                functional.pad(e[:n], (0, 0, longest - n, 0))
+                for e, n in zip(embedded, batch.prompts, strict=True)
+            ]
+            places = [
+                functional.pad(p[:, :n], (longest - n, 0))
+                for p, n in zip(batch.positions, batch.prompts, strict=True)
+            ]
+            mask = None
+            if min(batch.prompts) < longest:
+                lengths = torch.tensor(batch.prompts, device=embedded.device)
+                mask = torch.arange(longest, device=embedded.device) >= (longest - lengths)[:, None]
+            ids, limit = self._word_settings(batch)
+            return self.backbone.generate(
+                torch.stack(rows)[:, start:],
+                torch.stack(places)[..., start:],
+                ids,
+                limit,
+                mask,
+                prefill,
+                batch.words,
+            )
+
+    def _word_settings(self, batch: VideoBatch) -> tuple[WordIds, int]:
+        """Ids that end a response, and its most words; of words that are known, any."""
+        if batch.words is not None:
+            return WordIds(0, 0), max(map(len, batch.words))
+        processor = self.require_processor()
+        return processor.word_ids, processor.settings.max_words
+
+    # Episodes
+
+    def start_episode(self, goal: str, seed: int = 0) -> Episode:
+        """Begin an episode; without a memory it keeps the frames that the video may show."""
+        return VideoEpisode(self, goal, seed)
+
+    def observation(self, episodes: Sequence[Episode]) -> VideoBatch:
+        """The prompts and current images of running episodes, without the tokens of
+        their videos.
+        """
+        processor, robot = self.require_processor(), self.embodiment
+        others = [i for i, name in enumerate(robot.camera_names) if name != robot.memory_camera]
+        tokens = [self._tokens(_video_episode(episode)) for episode in episodes]
+        images = [episode.images[others] for episode in episodes]
+        states = processor.states(torch.stack([episode.state for episode in episodes]))
+        return processor.batch(tokens, images, states).to(self.device)
+
+    def _tokens(self, episode: VideoEpisode, step: int | None = None) -> Tokens:
+        """The prompt of an episode, now or at a later step."""
+        processor = self.require_processor()
+        pairs = episode.pairs(episode.step if step is None else step)
+        shape = episode.images_of(episode.pairs(episode.step)[-1:]).shape
+        size, current = (shape[-2], shape[-1]), (episode.images.shape[-2], episode.images.shape[-1])
+        return processor.tokens(episode.prompt, len(pairs), size, current)
+
+    @torch.no_grad()
+    def predict_chunk(
+        self,
+        batch: VideoBatch,
+        episodes: Sequence[Episode],
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
+    ) -> Tensor:
+        """A chunk for each episode; prompts that were read ahead are continued one by one, the
+        others in one batch.
+        """
+        running = [_video_episode(episode) for episode in episodes]
+        with self.autocast():
+            features = [
+                episode.encode(self.backbone, episode.pairs(episode.step)) for episode in running
+            ]
+        memory = self.encode_memories(episodes)
+        prefills = [episode.take_prefill(self._tokens(episode)) for episode in running]
+        alone = [[i] for i, prefill in enumerate(prefills) if prefill is not None]
+        together = [i for i, prefill in enumerate(prefills) if prefill is None]
+        chunks: dict[int, Tensor] = {}
+        for group in [*alone, *([together] if together else [])]:
+            index = torch.tensor(group)
+            here = index.to(self.device)
+            part = replace(batch.rows(here), features=torch.cat([features[i] for i in group]))
+            responses, condition = self.generate(
+                part, None if memory is None else memory.rows(here), prefills[group[0]]
+            )
+            chunk = self._sample(part, condition, {"noise": noise["noise"][index]}, steps)
+            chunks |= dict(zip(group, chunk, strict=True))
+            for i, words in zip(group, responses, strict=True):
+                running[i].subtask = self.require_processor().tokenizer.decode(words).strip()
+        return torch.stack([chunks[i] for i in range(len(running))])
+
+    @torch.no_grad()
+    def prepare(self, episode: Episode) -> bool:
+        """Read some of the prompt at the next decision, or what the memory reads; return whether
+        more remains.
+        """
+        processor = self.require_processor()
+        if not processor.shows_video:
+            return super().prepare(episode)
+        running = _video_episode(episode)
+        if not running.n_observed_frames:
+            return False
+        step = running.step + self.embodiment.action.execute
+        if self.embodiment.action.frames is None:
+            return False  # the next decision may be at any frame
+        with self.autocast():
+            if running.video.ahead is None or running.video.ahead.step != step:
+                running.video.ahead = None
+                if not running.plan(step, self._tokens(running, step), self.backbone):
+                    return False
+            return running.advance(self.backbone)
+
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray:
+        """Frames of the video, or those that the memory reads."""
+        processor = self.require_processor()
+        if self.memory is not None:
+            return self.memory.frames_read(steps, exec_start)
+        if not processor.shows_video or not len(steps):
+            return np.zeros(0, np.int64)
+        return np.unique(np.concatenate([processor.frames(int(step)) for step in steps]))
+
+    def require_processor(self) -> SimpleMemVlaProcessor:
+        processor = super().require_processor()
+        assert isinstance(processor, SimpleMemVlaProcessor)
+        return processor
+
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
+        processor, sizes = self.require_processor(), self.sizes
+        return {
+            "factor": (processor.factor, sizes.factor),
+            "image_side": (processor.image_side, sizes.image_size),
+            "memory_tokens": (
+                processor.memory_tokens,
+                0 if self.memory is None else self.memory.budget,
+            ),
+            "horizon": (processor.embodiment.action.horizon, sizes.horizon),
+        }
+
+    @property
+    def memory_tower(self) -> MemoryTower:
+        self.require_memory()
+        return MemoryTower(
+            self.backbone.model.visual, self._pooled_tokens, self.sizes.width, ("one image",)
+        )
+
+    def _pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
+        pairs = images[:, None].expand(-1, TEMPORAL, -1, -1, -1)
+        return pool_grid(self.backbone.encode_patches(pairs), grid, pooling)
+
+    # Costs
+
+    def full_batch(self, device: torch.device | str = "cpu") -> VideoBatch:
+        """A batch of one without content: a full video, or a full memory, and a response of a usual
+        length.
+        """
+        sizes, robot, section = self.sizes, self.embodiment, dict(self.config["processor"])
+        settings = PromptSettings(**{key: value for key, value in section.items() if key != "name"})
+        window = Window(settings.seconds, settings.fps, settings.native_fps)
+        patches = window.length // TEMPORAL if self.memory is None and settings.video else 1
+        side = settings.side or sizes.image_size
+        grid = (side // sizes.factor, side // sizes.factor)
+        stamped = [*[TEXT] * _STAMP_TOKENS, *[VIDEO] * (grid[0] * grid[1])]
+        image = [TEXT, *[IMAGE] * (grid[0] * grid[1])] * (len(robot.cameras) - 1)
+        memory = [MEMORY] * (0 if self.memory is None else self.memory.budget)
+        kinds = np.array(
+            [
+                TEXT,
+                *memory,
+                *stamped * patches,
+                *image,
+                *[TEXT] * (_REQUEST_TOKENS + _RESPONSE_TOKENS),
+            ]
+        )
+        cameras = [
+            CameraTokens("front", grid, [0.0] * patches),
+            *[CameraTokens("wrist", grid)] * (len(robot.cameras) - 1),
+        ]
+        length = len(kinds)
+        return VideoBatch(
+            ids=torch.zeros(1, length, dtype=torch.int64, device=device),
+            kinds=torch.from_numpy(kinds)[None].to(device),
+            positions=torch.from_numpy(rope_positions(kinds, cameras))[None].to(device),
+            prompts=(length - _RESPONSE_TOKENS,),
+            lengths=(length,),
+            patches=(patches,),
+            state=torch.zeros(1, robot.state.width, device=device),
+            images=torch.zeros(
+                1, len(robot.cameras) - 1, 3, side, side, dtype=torch.uint8, device=device
+            ),
+            video=torch.zeros(patches, TEMPORAL, 3, side, side, dtype=torch.uint8, device=device),
+            actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
+            history=None if self.memory is None else full_history(self.memory, sizes.width, device),
+            words=((1,) * (_RESPONSE_TOKENS - 2),),
+        )
+
+    def warm_up_vision(self) -> None:
+        side = self.sizes.image_size
+        image = torch.zeros(1, 3, side, side, dtype=torch.uint8, device=self.device)
+        self.backbone.encode_patches(image[:, None].expand(-1, TEMPORAL, -1, -1, -1))
+
+
+def _augmented(
+    video: Tensor | None, images: Tensor, patches: Sequence[int], changes: Tensor
+) -> tuple[Tensor | None, Tensor]:
+    """The video [K, 2, 3, H, W] and the images [b, c, 3, H, W] of each row, all changed alike."""
+    draws = [augmentation_draw(row) for row in changes.tolist()]
+    if video is not None:
+        parts = zip(video.split(list(patches)), draws, strict=True)
+        video = torch.cat(
+            [augment(part.flatten(0, 1), draw).unflatten(0, (-1, TEMPORAL)) for part, draw in parts]
+        )
+    return video, torch.stack([augment(row, draw) for row, draw in zip(images, draws, strict=True)])
+
+
+def _video_episode(episode: Episode) -> VideoEpisode:
+    assert isinstance(episode, VideoEpisode)
+    return episode

@@ -1,0 +1,602 @@
+"""The board of nanoMME: rows in the order of their success, and what the differences between them
+are worth.
+
+Scenes are the same for all rows. Means are over tasks. Intervals come from a bootstrap over scenes,
+with the noise between trainings that the rows show together. P values are of the trained policies,
+on these scenes.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations, pairwise
+from math import factorial, prod
+from typing import Literal
+
+import numpy as np
+
+from mme_vla.errors import require
+from mme_vla.evaluation.results import paper
+from mme_vla.evaluation.results.aggregate import (
+    Figure,
+    Interval,
+    Method,
+    aggregate,
+    percentiles,
+    resampled_means,
+    wilson,
+)
+from mme_vla.evaluation.results.compare import (
+    Comparison,
+    compare,
+    compare_all,
+    compare_unpaired,
+    holm,
+    pair_methods,
+)
+from mme_vla.evaluation.results.paper import PaperMethod
+from mme_vla.evaluation.results.scopes import PAPER_ORDER, Protocol, scopes
+from mme_vla.extras.nano.rows import CHOICES, Trained, Training
+
+SAMPLES = 2000
+"""Of the bootstrap."""
+PERMUTATIONS = 9999
+MATCHED = "present_modul"
+"""The floor with as many parameters as policies with memory, and tokens of the current
+frame alone.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A row of the board.
+
+    facts: of its first training. is_local: whether it is the user's. recordings: digests of the
+    data that its trainings learned from.
+    """
+
+    name: str
+    facts: Trained
+    method: Method
+    is_local: bool = False
+    recordings: frozenset[str] = frozenset()
+
+    @property
+    def kind(self) -> str:
+        """A `policy` with memory, a `floor` or a `ceiling`, as one is that reads the simulator's
+        subgoals.
+        """
+        if self.method.subgoal == "oracle":
+            return "ceiling"
+        lacks_memory = (
+            self.facts.trained and self.facts.budget is None and self.method.subgoal is None
+        )
+        return (
+            "floor"
+            if lacks_memory or self.name.partition(" ")[0].partition("@")[0] == MATCHED
+            else self.facts.kind
+        )
+
+    @property
+    def average(self) -> Figure:
+        return self.method.average
+
+    @property
+    def budget(self) -> str:
+        """The memory tokens in the row's name; empty for the default."""
+        return self.name.partition(" ")[0].partition("@")[2]
+
+    @property
+    def paper(self) -> PaperMethod | None:
+        """The published method that the row is, at its default budget."""
+        known = None if self.budget else paper.paper_method(self.name, self.method.subgoal)
+        return (
+            known
+            if known and known.name in {line["method"] for line in paper.paper_table("suites")}
+            else None
+        )
+
+    def outcomes(self, task: str) -> np.ndarray:
+        """Success of a task [scenes, trainings], averaged over the noise seeds of a training."""
+        trainings = [
+            [run.successes(task) for run in training] for training in self.method.trainings
+        ]
+        return np.stack([np.mean(np.array(runs, np.float64), 0) for runs in trainings], 1)
+
+    def mean(self, tasks: Sequence[str]) -> np.ndarray:
+        """Success over tasks in percent, of each training."""
+        return 100 * np.mean([self.outcomes(task).mean(0) for task in tasks], 0)
+
+
+@dataclass(frozen=True)
+class Separation:
+    """Whether memories differ on a task at a budget; success in percent.
+
+    memories: how many. lowest, mean, highest: of their success. deviation: standard one between
+    memories, less what trainings add. noise: between trainings of one memory, None with one
+    training each. floor, ceiling: of the best floor and of the best ceiling. p: of `homogeneity` of
+    all policies. repeated: how many memories have several trainings. p_repeated: of these over
+    trainings, None where they are too few for a p below 0.05. Both are corrected by Holm over the
+    tasks of the budget.
+    """
+
+    budget: str
+    task: str
+    memories: int
+    lowest: float
+    mean: float
+    highest: float
+    deviation: float
+    noise: float | None
+    floor: float | None
+    ceiling: float | None
+    p: float
+    repeated: int
+    p_repeated: float | None
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Rank correlations of so many methods with the published ranking, over the tasks
+    of a scope.
+    """
+
+    scope: str
+    methods: int
+    spearman: float
+    spearman_interval: Interval
+    kendall: float
+    kendall_interval: Interval
+
+
+@dataclass(frozen=True)
+class Target:
+    """A number that the benchmark aims at. reached: None where a row of it was not run."""
+
+    name: str
+    measured: str = "not run yet"
+    interval: str = ""
+    test: str = ""
+    reached: bool | None = None
+
+
+class Board:
+    """All rows, best first."""
+
+    def __init__(self, rows: Mapping[str, Sequence[Training]], samples: int = SAMPLES) -> None:
+        """Make the figures. rows: as `read_rows` gives them."""
+        require(rows, "There are no rows: train one with model=…, or name folders with rows=….")
+        scenes = next(iter(rows.values()))[0].scenes
+        names = dict.fromkeys(key.task for key in scenes)
+        tasks = [
+            *(task for task in PAPER_ORDER if task in names),
+            *(task for task in names if task not in PAPER_ORDER),
+        ]
+        counts = {sum(key.task == task for key in scenes) for task in tasks}
+        require(
+            len(counts) == 1,
+            f"Tasks have {sorted(counts)} scenes: a board has as many of each task.",
+        )
+        self.protocol = Protocol(tuple(tasks), counts.pop(), samples=samples)
+        self.split, self.action_space = (
+            next(iter(scenes.values()))[0],
+            next(iter(rows.values()))[0].action_space,
+        )
+        self._once = replace(
+            self.protocol, samples=1
+        )  # where intervals are of `draws`, and no others are read
+        made = [_row(name, trainings, self._once) for name, trainings in rows.items()]
+        self.rows = sorted(made, key=lambda row: -self.success(row))
+
+    def of_kind(self, kind: str) -> list[Row]:
+        """The rows that are a `policy`, a `floor` or a `ceiling`."""
+        return [row for row in self.rows if row.kind == kind]
+
+    @property
+    def ranked(self) -> list[Row]:
+        """The rows that have a place: all but ceilings."""
+        return [row for row in self.rows if row.kind != "ceiling"]
+
+    def success(self, row: Row, tasks: Sequence[str] = ()) -> float:
+        """A row's success over tasks, by default all, in percent."""
+        return round(
+            float(row.mean(tasks or self.protocol.tasks).mean()), 9
+        )  # equal counts, equal figures
+
+    def noise(self, tasks: Sequence[str] = ()) -> float | None:
+        """Standard deviation of success between trainings of one row, over all rows; None where
+        none has two.
+        """
+        return pooled([row.mean(tasks or self.protocol.tasks) for row in self.rows])
+
+    def draws(self, rows: Sequence[Row], tasks: Sequence[str]) -> np.ndarray:
+        """Bootstrap of the rows' success over tasks [rows, samples], in percent, on the same scenes
+        for all.
+
+        The mean of n trainings has normal noise of 1/√n of the deviation between trainings: of all
+        rows, or the row's own where that is larger, without the variance of single episodes, which
+        the sampled scenes have already.
+        """
+        values = {
+            task: [row.outcomes(task).mean(1, keepdims=True) for row in rows] for task in tasks
+        }
+        means = 100 * resampled_means(values, self.protocol.samples, self.protocol.seed)
+        rng, shared = (
+            np.random.default_rng([self.protocol.seed, 2]),
+            self._training_deviation(self.rows, tasks),
+        )
+        for row, sampled in zip(rows, means, strict=True):
+            if row.facts.trained:
+                deviation = max(shared, self._training_deviation([row], tasks))
+                sampled += rng.normal(0, deviation / len(row.method.trainings) ** 0.5, len(sampled))
+        return means.clip(0, 100).round(9)
+
+    def _training_deviation(self, rows: Sequence[Row], tasks: Sequence[str]) -> float:
+        """Deviation of success between trainings of one row, without the variance of single
+        episodes.
+        """
+        repeated = [row for row in rows if len(row.method.trainings) > 1]
+        if not repeated:
+            return 0.0
+        noise = pooled([row.mean(tasks) for row in repeated]) or 0.0
+        variances = [
+            sum(row.outcomes(task).var(1, ddof=1).sum() for task in tasks) for row in repeated
+        ]
+        degrees = [len(row.method.trainings) - 1 for row in repeated]
+        of_episodes = (
+            np.average(variances, weights=degrees)
+            * (100 / len(tasks) / self.protocol.episodes) ** 2
+        )
+        return float(max(0.0, noise**2 - of_episodes) ** 0.5)
+
+    @cached_property
+    def sampled(self) -> dict[str, np.ndarray]:
+        """`draws` over all tasks by row."""
+        return dict(
+            zip(
+                [row.name for row in self.rows],
+                self.draws(self.rows, self.protocol.tasks),
+                strict=True,
+            )
+        )
+
+    def interval(self, row: Row) -> Interval:
+        """Of a row's success over all tasks, in percent; Wilson's where no draw differs."""
+        interval = percentiles(self.sampled[row.name])
+        if interval.low < interval.high:
+            return interval
+        scenes = len(self.protocol.tasks) * self.protocol.episodes
+        return Interval(*(100 * end for end in wilson(self.success(row) / 100, scenes)))
+
+    @cached_property
+    def places(self) -> dict[str, tuple[int, Interval]]:
+        """Place of each ranked row, equal rows sharing the better one, and an interval of it
+        (`draws`).
+        """
+        means = np.array([self.success(row) for row in self.ranked])
+        draws = np.array([self.sampled[row.name] for row in self.ranked])
+        return {
+            row.name: (1 + int((means > mean).sum()), percentiles(1 + (draws > sampled).sum(0)))
+            for row, mean, sampled in zip(self.ranked, means, draws, strict=True)
+        }
+
+    def neighbours(self) -> list[Comparison]:
+        """Each row and the next; of a user's rows, with those beside them, the best and the trained
+        floors.
+
+        P values are corrected for the number of these comparisons. Intervals are of `draws`.
+        """
+        ranked = self.ranked
+        pairs = list(pairwise(ranked))
+        if local := [row for row in ranked if row.is_local]:
+            pairs = [pair for pair in pairs if pair[0].is_local or pair[1].is_local]
+            floors = [row for row in ranked if row.kind == "floor" and row.facts.trained]
+            pairs += [
+                (other, row) for row in local for other in (ranked[0], *floors) if other is not row
+            ]
+        unique = {frozenset(row.name for row in pair): pair for pair in pairs}
+        return self._compared(list(unique.values()))
+
+    def variants(self, part: Literal["memory", "integration"]) -> list[Comparison]:
+        """Pairs of `<memory>_<integration>` at the default budget that differ in this part alone.
+
+        Of memories with several integrations. P values and intervals as in `neighbours`.
+        """
+        rows = [row for row in self.of_kind("policy") if not row.budget and not row.is_local]
+        parts = {row.name: row.name.rpartition("_")[::2] for row in rows}
+        count = Counter(memory for memory, _ in parts.values())
+        rows = [row for row in rows if parts[row.name][0] and count[parts[row.name][0]] > 1]
+        varied = ("memory", "integration").index(part)
+        rows.sort(key=lambda row: parts[row.name][1 - varied])
+        pairs = []
+        for first, second in combinations(rows, 2):
+            mine, other = parts[first.name], parts[second.name]
+            if mine[varied] != other[varied] and mine[1 - varied] == other[1 - varied]:
+                pairs.append((first, second))
+        return self._compared(pairs)
+
+    def _compared(self, pairs: Sequence[tuple[Row, Row]]) -> list[Comparison]:
+        made = compare_all(
+            [(first.method, second.method) for first, second in pairs], self._once, _compare
+        )
+        return [
+            replace(c, interval=percentiles(self.sampled[c.first] - self.sampled[c.second]))
+            for c in made
+        ]
+
+    @cached_property
+    def apart(self) -> list[Row]:
+        """The rows whose scenes are not known to be those of the board's own rows: compared by
+        score, unpaired.
+        """
+        reference = next((row for row in self.rows if not row.is_local), self.rows[0])
+        return [row for row in self.rows if pair_methods(row.method, reference.method).left_out]
+
+    @cached_property
+    def separations(self) -> list[Separation]:
+        """Of each budget that several memories have, and each task."""
+        made = []
+        for budget in sorted(
+            {row.budget for row in self.rows}, key=lambda budget: (len(budget), budget)
+        ):
+            # Outcomes change places within a scene, so all must be of the same one.
+            rows = [
+                row
+                for row in self.of_kind("policy")
+                if row.budget == budget and row not in self.apart
+            ]
+            if len(rows) > 1:
+                tasks = [self._separation(budget, task, rows) for task in self.protocol.tasks]
+                over_policies = holm([separation.p for separation in tasks])
+                repeated = [
+                    separation.p_repeated
+                    for separation in tasks
+                    if separation.p_repeated is not None
+                ]
+                over_trainings = holm(repeated) if repeated else [None] * len(tasks)
+                corrected = zip(tasks, over_policies, over_trainings, strict=True)
+                made += [
+                    replace(separation, p=p, p_repeated=nested)
+                    for separation, p, nested in corrected
+                ]
+        return made
+
+    def _separation(self, budget: str, task: str, rows: Sequence[Row]) -> Separation:
+        trainings = [row.mean([task]) for row in rows]
+        means, noise = np.array([of_row.mean() for of_row in trainings]), pooled(trainings)
+        variance = means.var(ddof=1) - (noise or 0) ** 2 * np.mean(
+            [1 / len(of_row) for of_row in trainings]
+        )
+        floor, ceiling = (
+            max((self.success(row, [task]) for row in self.of_kind(kind)), default=None)
+            for kind in ("floor", "ceiling")
+        )
+        outcomes = [row.outcomes(task) for row in rows]
+        repeated = [of_row for of_row in outcomes if of_row.shape[1] > 1]
+        testable = (
+            smallest_p([of_row.shape[1] for of_row in repeated]) * len(self.protocol.tasks) < 0.05
+        )
+        return Separation(
+            budget,
+            task,
+            len(rows),
+            float(means.min()),
+            float(means.mean()),
+            float(means.max()),
+            float(max(0, variance)) ** 0.5,
+            noise,
+            floor,
+            ceiling,
+            homogeneity(outcomes),
+            len(repeated),
+            homogeneity(repeated, over_trainings=True) if testable else None,
+        )
+
+    @property
+    def published(self) -> list[tuple[Row, PaperMethod]]:
+        """The rows that the paper reports, its best first; none on a board of other tasks."""
+        if not set(self.protocol.tasks) <= set(PAPER_ORDER):
+            return []
+        known = [(row, method) for row in self.rows if (method := row.paper) is not None]
+        return sorted(known, key=lambda pair: -published_success(pair[1], PAPER_ORDER))
+
+    def agreements(self) -> list[Agreement]:
+        """Rank correlations with the published success over all tasks, of memories alone, by suite
+        and by task.
+
+        Scopes with fewer than three rows, or where all are equal, are left out. Intervals are of
+        `draws`. Published figures are fixed.
+        """
+        memories = [(row, method) for row, method in self.published if row.kind == "policy"]
+        named = [
+            (s.kind, s.name, s.tasks)
+            for s in scopes(self.protocol)
+            if s.kind in ("average", "suite", "task")
+        ]
+        named.sort(key=lambda scope: ("average", "suite", "task").index(scope[0]))
+        compared = [(name, tasks, self.published) for _, name, tasks in named]
+        compared.insert(1, ("average, memories alone", self.protocol.tasks, memories))
+        made = []
+        for name, tasks, pairs in compared:
+            rows = [row for row, _ in pairs]
+            means = np.array([self.success(row, tasks) for row in rows])
+            reported = np.array([published_success(method, tasks) for _, method in pairs])
+            if len(rows) > 2 and np.ptp(means) and np.ptp(reported):
+                draws = self.draws(rows, tasks).T
+                made.append(
+                    Agreement(
+                        name,
+                        len(rows),
+                        float(spearman(means, reported)),
+                        percentiles(spearman(draws, reported)),
+                        float(kendall(means, reported)),
+                        percentiles(kendall(draws, reported)),
+                    )
+                )
+        return made
+
+    def targets(self) -> list[Target]:
+        """What the best policy is to reach by choices, and its advantage over the floor of as many
+        parameters.
+        """
+        if self.action_space != CHOICES:
+            return []
+        names = (
+            "best memory solves at least 60 % of all episodes",
+            f"{MATCHED} solves at most half of that",
+        )
+        best, matched = (
+            next(iter(self.of_kind("policy")), None),
+            [row for row in self.rows if row.name == MATCHED],
+        )
+        if best is None:
+            return [Target(name) for name in names]
+        success, (low, high) = self.success(best), self.interval(best)
+        first = Target(
+            names[0],
+            f"{success:.1f} % ({best.name})",
+            f"[{low:.1f}, {high:.1f}]",
+            reached=success >= 60,
+        )
+        if not matched or not success:
+            return [first, Target(names[1])]
+        ratios = self.sampled[MATCHED] / self.sampled[best.name]
+        share, (low, high) = self.success(matched[0]) / success, percentiles(ratios)
+        second = Target(
+            names[1],
+            f"{100 * share:.0f} % of it",
+            f"[{100 * low:.0f}, {100 * high:.0f}]",
+            reached=share <= 0.5,
+        )
+        suites = [
+            (suite, tuple(self.protocol.choose("suite", suite))) for suite in self.protocol.suites
+        ]
+        compared = [
+            _compare(best.method, matched[0].method, replace(self._once, tasks=tasks))
+            for _, tasks in suites
+        ]
+        intervals = [
+            percentiles(np.subtract(*self.draws([best, matched[0]], tasks))) for _, tasks in suites
+        ]
+        advantages = [
+            Target(
+                f"significant advantage in {suite}",
+                f"{c.difference:+.1f} points",
+                f"[{low:+.1f}, {high:+.1f}]",
+                f"{c.better_worse}, p = {p:.4f}",
+                reached=p < 0.05 and low > 0,
+            )
+            for (suite, _), c, (low, high), p in zip(
+                suites, compared, intervals, holm([c.p for c in compared]), strict=True
+            )
+        ]
+        return [first, second, *advantages]
+
+
+def _row(name: str, trainings: Sequence[Training], protocol: Protocol) -> Row:
+    data = trainings[
+        0
+    ].facts.data  # of all: in a row other data are another recording, not another method
+    records = [
+        replace(record, training=record.training and replace(record.training, data=data))
+        for training in trainings
+        for record in training.records
+    ]
+    methods = aggregate(records, protocol).methods
+    require(
+        len(methods) == 1,
+        f"The row {name} holds {len(methods)} methods: {', '.join(m.label for m in methods)}.",
+    )
+    methods[0].label = name
+    recordings = frozenset(training.facts.data for training in trainings if training.facts.data)
+    return Row(name, trainings[0].facts, methods[0], trainings[0].is_local, recordings)
+
+
+def published_success(method: PaperMethod, tasks: Sequence[str]) -> float:
+    """A method's published success over tasks, in percent."""
+    return float(np.mean([paper.per_task(method.name)[task].mean for task in tasks]))
+
+
+def pooled(groups: Sequence[np.ndarray]) -> float | None:
+    """Standard deviation within groups; None where none has two values."""
+    degrees = sum(len(group) - 1 for group in groups)
+    squares = sum(float(((group - group.mean()) ** 2).sum()) for group in groups)
+    return (squares / degrees) ** 0.5 if degrees else None
+
+
+def smallest_p(sizes: Sequence[int]) -> float:
+    """The smallest p that memories of so many trainings can have: 1 / the number of ways to deal
+    out the trainings.
+    """
+    alike = [
+        factorial(count) for count in Counter(sizes).values()
+    ]  # memories of as many trainings may change places
+    return prod(map(factorial, sizes)) * prod(alike) / factorial(sum(sizes))
+
+
+def _compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
+    """Scene by scene where all scenes are the same, else by score."""
+    if pair_methods(first, second).left_out:
+        return compare_unpaired(first, second, protocol)
+    return compare(first, second, protocol)
+
+
+def homogeneity(
+    groups: Sequence[np.ndarray],
+    permutations: int = PERMUTATIONS,
+    seed: int = 0,
+    over_trainings: bool = False,
+) -> float:
+    """P that memories which do not differ would differ as much: a permutation test of the variance
+    between them.
+
+    groups: of each memory, outcomes [scenes, trainings]. over_trainings: trainings change places
+    between memories: they are what another training would change. Otherwise outcomes do within each
+    scene, which tests these policies alone.
+    """
+    outcomes = np.concatenate(groups, 1)  # scenes × trainings of all memories
+    sizes = [group.shape[1] for group in groups]
+    starts = np.cumsum([0, *sizes[:-1]])
+    rng = np.random.default_rng(seed)
+
+    def variance(means: np.ndarray) -> np.ndarray:
+        """Of the memories' means, from trainings' means [..., trainings]."""
+        return (np.add.reduceat(means, starts, -1) ** 2 / sizes).sum(-1)
+
+    if over_trainings:
+        permuted = rng.permuted(np.tile(outcomes.mean(0), (permutations, 1)), axis=1)
+    else:
+        permuted = np.zeros((permutations, outcomes.shape[1]))
+        for scene in outcomes:
+            permuted += rng.permuted(np.tile(scene, (permutations, 1)), axis=1) / len(outcomes)
+    return float(
+        (1 + (variance(permuted) >= variance(outcomes.mean(0)) - 1e-12).sum()) / (1 + permutations)
+    )
+
+
+def spearman(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Spearman's rank correlation of each row of values [..., n] with reference [n]; NaN where all
+    are equal.
+    """
+    from scipy.stats import rankdata
+
+    first, second = (
+        ranks - ranks.mean(-1, keepdims=True)
+        for ranks in (rankdata(values, axis=-1), rankdata(reference))
+    )
+    return _ratio((first * second).sum(-1), (first**2).sum(-1) * (second**2).sum())
+
+
+def kendall(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Kendall's tau-b of each row of values [..., n] with reference [n]; NaN where all
+    are equal.
+    """
+    first, second = (np.sign(x[..., :, None] - x[..., None, :]) for x in (values, reference))
+    return _ratio((first * second).sum((-1, -2)), (first**2).sum((-1, -2)) * (second**2).sum())
+
+
+def _ratio(product: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    return np.divide(
+        product, np.sqrt(squares), out=np.full(np.shape(product), np.nan), where=squares > 0
+    )

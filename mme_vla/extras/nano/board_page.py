@@ -1,0 +1,392 @@
+"""The tables and figures of the board, in the terminal, in Markdown, and as one page with sortable
+tables.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mme_vla.errors import listed
+from mme_vla.evaluation.results.compare import show_p
+from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
+from mme_vla.evaluation.results.report import Section, html_page
+from mme_vla.evaluation.results.tables import Table, comparison_table, show, span
+from mme_vla.extras.nano.board import Board, Row, published_success
+from mme_vla.extras.nano.rows import CHOICES
+
+PAINT = {"policy": COLOURS[0], "floor": FAINT, "ceiling": COLOURS[2]}
+LOCAL = COLOURS[1]
+
+
+def ranking(board: Board, brief: bool = False) -> Table:
+    """Place, success by suite, and costs of every row; without costs where `brief`."""
+    suites = board.protocol.suites
+    columns = ["row", "place", "trainings", "success (%)", "95 %", *suites]
+    columns += (
+        []
+        if brief
+        else ["parameters", "GFLOPs an update", "seconds an update", "CPU minutes of a training"]
+    )
+    rows: list[list[str]] = []
+    strong: set[int] = set()
+    for row in board.rows:
+        place, at = board.places.get(row.name), ""
+        if place is not None:
+            low, high = place[1]
+            at = f"{place[0]} [{low:.0f}, {high:.0f}]"
+        trainings = str(len(row.method.trainings)) if row.facts.trained else "–"
+        cells = [
+            f"{board.success(row, board.protocol.choose('suite', suite)):.1f}" for suite in suites
+        ]
+        facts = row.facts
+        gflops = None if facts.update_flops is None else facts.update_flops / 1e9
+        numbers = [
+            (facts.parameters, ",.0f"),
+            (gflops, ".2f"),
+            (facts.update_s, ".3f"),
+            (facts.cpu_minutes, ".1f"),
+        ]
+        costs = [] if brief else [_cell(value, spec) for value, spec in numbers]
+        strong |= {len(rows)} if row.is_local else set()
+        rows.append(
+            [
+                row.name,
+                at,
+                trainings,
+                success(board, row),
+                span(board.interval(row)),
+                *cells,
+                *costs,
+            ]
+        )
+    return Table(f"Ranking, split {board.split}", columns, rows, strong=strong)
+
+
+def success(board: Board, row: Row) -> str:
+    """A row's success over all tasks ± the deviation between its trainings, in percent."""
+    return show(
+        replace(row.average, mean=board.success(row))
+    )  # rounded, so that equal rows read alike
+
+
+def tasks(board: Board) -> Table:
+    """Success of every row on every task."""
+    names = board.protocol.tasks
+    rows = [
+        [row.name, *(f"{board.success(row, [task]):.0f}" for task in names)] for row in board.rows
+    ]
+    return Table("Success by task (%)", ["row", *names], rows)
+
+
+def trainings(board: Board) -> Table:
+    """Scenes that each training solves, of rows with several: in all, by suite and by task."""
+    suites = [tuple(board.protocol.choose("suite", suite)) for suite in board.protocol.suites]
+    scopes = [board.protocol.tasks, *suites, *((task,) for task in board.protocol.tasks)]
+    rows: list[list[str]] = []
+    for row in board.rows:
+        seeds = [runs[0].key.training.seed for runs in row.method.trainings if runs[0].key.training]
+        if len(seeds) > 1:
+            solved = [
+                sum(row.outcomes(task).sum(0) for task in scope) for scope in scopes
+            ]  # each [trainings]
+            for seed, *counts in zip(seeds, *solved, strict=True):
+                rows.append([row.name, str(seed), *(f"{count:g}" for count in counts)])
+    columns = ["row", "training seed", "all", *board.protocol.suites, *board.protocol.tasks]
+    return Table("Scenes solved by each training", columns, rows)
+
+
+def separations(board: Board) -> Table:
+    """Tasks and budgets at which memories differ, the clearest first."""
+    rows = []
+    for s in sorted(board.separations, key=lambda s: (s.p, -s.deviation)):
+        above, below = (None if end is None else abs(s.mean - end) for end in (s.floor, s.ceiling))
+        over_trainings = "–" if s.p_repeated is None else f"{show_p(s.p_repeated)} ({s.repeated})"
+        rows.append(
+            [
+                s.task,
+                s.budget or "default",
+                str(s.memories),
+                f"{s.lowest:.0f} … {s.mean:.0f} … {s.highest:.0f}",
+                f"{s.deviation:.1f}",
+                _cell(s.noise, ".1f"),
+                show_p(s.p),
+                over_trainings,
+                _cell(above, ".0f"),
+                _cell(below, ".0f"),
+            ]
+        )
+    columns = [
+        "task",
+        "tokens",
+        "memories",
+        "lowest … mean … highest (%)",
+        "spread",
+        "noise",
+        "p",
+        "p over trainings",
+        "above the floor",
+        "below the ceiling",
+    ]
+    return Table("Whether memories differ on a task", columns, rows)
+
+
+def separating(board: Board) -> list[str]:
+    """How many tasks separate memories, a sentence a budget."""
+    made = board.separations
+    sentences = []
+    for budget in dict.fromkeys(s.budget for s in made):
+        here = [s for s in made if s.budget == budget]
+        tokens = f"At {budget} tokens" if budget else "At the default budgets"
+        separated = [s.task for s in here if s.p < 0.05]
+        names = f": {', '.join(separated)}" if separated else ""
+        sentence = (
+            f"{tokens} the {here[0].memories} trained policies differ in {len(separated)} of"
+            f" {len(here)} tasks "
+        )
+        sentence += f"(p < 0.05){names}."
+        if here[0].p_repeated is not None:
+            separated = [s.task for s in here if s.p_repeated is not None and s.p_repeated < 0.05]
+            names = f": {', '.join(separated)}" if separated else ""
+            sentence += (
+                f" Tested over trainings, the {here[0].repeated} with several differ in"
+                f" {len(separated)}{names}."
+            )
+        sentences.append(sentence)
+    return sentences
+
+
+def published(board: Board) -> Table:
+    """Success and place of each published method here and in the paper, over all tasks and by
+    suite.
+    """
+    scopes = [
+        ("all", board.protocol.tasks),
+        *((s, board.protocol.choose("suite", s)) for s in board.protocol.suites),
+    ]
+    rows = [[row.name] for row, _ in board.published]
+    columns = ["row"]
+    for name, of_scope in scopes:
+        here = np.array([board.success(row, of_scope) for row, _ in board.published])
+        there = np.array([published_success(method, of_scope) for _, method in board.published])
+        columns += [f"{name}, here", f"{name}, paper"]
+        for cells, mine, its in zip(rows, here, there, strict=True):
+            cells += [
+                f"{mine:.1f} ({1 + (here > mine).sum()})",
+                f"{its:.1f} ({1 + (there > its).sum()})",
+            ]
+    return Table("Beside the published ranking: success in percent (place)", columns, rows)
+
+
+def agreements(board: Board) -> Table:
+    """Rank correlations with the published ranking."""
+    rows = [
+        [
+            a.scope,
+            str(a.methods),
+            f"{a.spearman:+.2f}",
+            "[{:+.2f}, {:+.2f}]".format(*a.spearman_interval),
+            f"{a.kendall:+.2f}",
+            "[{:+.2f}, {:+.2f}]".format(*a.kendall_interval),
+        ]
+        for a in board.agreements()
+    ]
+    return Table(
+        "Rank correlation with the published success",
+        ["", "methods", "Spearman", "95 %", "Kendall", "95 %"],
+        rows,
+    )
+
+
+def targets(board: Board) -> Table:
+    """The benchmark's targets, reached or not."""
+    words = {None: "", True: "yes", False: "no"}
+    rows = [[t.name, t.measured, t.interval, t.test, words[t.reached]] for t in board.targets()]
+    return Table("Targets", ["target", "measured", "95 %", "better : worse", "reached"], rows)
+
+
+def notes(board: Board) -> list[str]:
+    """What a reader of the tables has to know."""
+    noise = board.noise()
+    single = sum(row.facts.trained and len(row.method.trainings) == 1 for row in board.rows)
+    actions = (
+        ""
+        if board.action_space == CHOICES
+        else f" Actions are `{board.action_space}`, not choices."
+    )
+    lines = [
+        f"{len(board.protocol.tasks)} tasks × {board.protocol.episodes} scenes of split"
+        f" `{board.split}`, the same for all rows.{actions}"
+    ]
+    if noise is None:
+        lines.append(
+            "No row has two trainings: the noise between trainings is unknown, and intervals are"
+            " too narrow."
+        )
+    else:
+        lines.append(
+            f"Another training of a row changes its success by {noise:.1f} points (standard"
+            f" deviation). Intervals are over scenes and trainings. Rows of one training: {single}."
+        )
+    if board.apart:
+        lines.append(
+            f"{listed(row.name for row in board.apart)}: not known to be of the same scenes as the"
+            " other rows, since only some records name their scene, or they name different ones."
+            " These rows have the same tasks, numbers and seeds, and are compared by score,"
+            " unpaired."
+        )
+    for row in board.rows:
+        if errors := sum(run.outcomes["error"] for run in row.method.runs):
+            lines.append(f"{row.name}: {errors} episodes ended in an error and count as failures.")
+    recordings = frozenset[str]().union(*(row.recordings for row in board.rows))
+    if len(recordings) > 1:
+        several = sum(len(row.recordings) > 1 for row in board.rows)
+        lines.append(
+            f"{len(recordings)} recordings of the demonstrations (digests"
+            f" {listed(sorted(recordings))}). Rows with trainings on more than one: {several}"
+            " (`data` of `trained.json`)."
+        )
+    return lines
+
+
+def standing(board: Board) -> list[str]:
+    """The place of each of the user's rows, a sentence a row."""
+    lines = []
+    for row in board.ranked:
+        place, (low, high) = board.places[row.name]
+        if row.is_local:
+            lines.append(
+                f"{row.name}: place {place} of {len(board.ranked)}, between {low:.0f} and"
+                f" {high:.0f} with {100 * board.protocol.confidence:g} % confidence, with"
+                f" {success(board, row)} % {span(board.interval(row))}."
+            )
+    return lines
+
+
+def success_figure(board: Board) -> str:
+    """Success of every row with its interval."""
+    rows = board.rows[::-1]
+    with figure((7.2, 0.26 * len(rows) + 1.0)) as (canvas, (axes,)):
+        for at, row in enumerate(rows):
+            low, high = board.interval(row)
+            mean, colour = board.success(row), LOCAL if row.is_local else PAINT[row.kind]
+            axes.plot([low, high], [at, at], color=colour, lw=1.6)
+            axes.plot(mean, at, "o", color=colour, ms=6)
+            axes.plot(
+                row.mean(board.protocol.tasks),
+                np.full(len(row.method.trainings), at),
+                "|",
+                color=INK,
+                ms=7,
+            )
+        axes.set_yticks(range(len(rows)), [row.name for row in rows])
+        axes.set_xlim(0, 100)
+        axes.set_xlabel("success over all tasks (%); strokes: trainings")
+        axes.grid(True, axis="x", color="#e3e6ec")
+        return svg(canvas)
+
+
+def budget_figure(board: Board) -> str:
+    """Success over memory tokens, of the models that have rows of several budgets;
+    empty without.
+    """
+    models: dict[str, list[Row]] = {}
+    for row in board.of_kind("policy"):
+        if row.facts.budget is not None:
+            models.setdefault(row.name.partition("@")[0], []).append(row)
+    several = {model: rows for model, rows in models.items() if len(rows) > 1}
+    if not several:
+        return ""
+    with figure((5.6, 3.6)) as (canvas, (axes,)):
+        for number, (model, rows) in enumerate(several.items()):
+            points = sorted(
+                (row.facts.budget or 0, board.success(row), board.interval(row)) for row in rows
+            )
+            gaps = np.array([(mean - low, high - mean) for _, mean, (low, high) in points]).T
+            axes.errorbar(
+                [b for b, *_ in points],
+                [m for _, m, _ in points],
+                np.maximum(gaps, 0),
+                fmt="-o",
+                ms=5,
+                capsize=3,
+                color=COLOURS[number % len(COLOURS)],
+                label=model,
+            )
+        axes.set_xscale("log", base=2)
+        axes.set_xlabel("memory tokens")
+        axes.set_ylabel("success (%)")
+        axes.set_ylim(bottom=0)
+        legend(canvas, axes, 3)
+        return svg(canvas)
+
+
+def published_figure(board: Board) -> str:
+    """Success here over the published success, a point a method; empty without two."""
+    if len(board.published) < 2:
+        return ""
+    with figure((5.6, 3.9)) as (canvas, (axes,)):
+        for row, method in board.published:
+            x, y = published_success(method, board.protocol.tasks), board.success(row)
+            axes.plot(x, y, "o", color=PAINT[row.kind], ms=5)
+            axes.annotate(row.name, (x, y), (4, 3), textcoords="offset points", fontsize=7)
+        axes.set_xlabel("published success (%)")
+        axes.set_ylabel("success here (%)")
+        axes.grid(True, axis="both", color="#e3e6ec")
+        return svg(canvas)
+
+
+def variants(board: Board) -> list[Table]:
+    """Integrations of one memory, and memories with one integration, where there are several."""
+    integrations, memories = (
+        comparison_table(board.variants(part)) for part in ("integration", "memory")
+    )
+    tables = [
+        replace(integrations, title="Integrations of a memory, percentage points"),
+        replace(memories, title="Memories with an integration, percentage points"),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def all_tables(board: Board) -> list[Table]:
+    """Every table of the board that has rows."""
+    pairs = comparison_table(board.neighbours())
+    tables = [
+        ranking(board),
+        targets(board),
+        pairs,
+        *variants(board),
+        tasks(board),
+        trainings(board),
+        separations(board),
+        published(board),
+        agreements(board),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def page(board: Board) -> str:
+    """The board as one page of HTML, which loads nothing."""
+    corrected = "P values are corrected by Holm for the number of pairs of a table."
+    sections = [
+        Section("Ranking", success_figure(board), [ranking(board)], paragraphs=notes(board)),
+        Section("Targets", tables=[targets(board)]),
+        Section("Neighbours", tables=[comparison_table(board.neighbours())], caption=corrected),
+        Section("Memory and integration", tables=variants(board), headed=True, caption=corrected),
+        Section("Tasks", tables=[tasks(board)]),
+        Section("Trainings", tables=[trainings(board)]),
+        Section(
+            "Do memories differ?",
+            budget_figure(board),
+            [separations(board)],
+            paragraphs=separating(board),
+        ),
+    ]
+    sections = [section for section in sections if any(table.rows for table in section.tables)]
+    if board.published:
+        beside = [published(board), agreements(board)]
+        sections.append(Section("Beside the published ranking", published_figure(board), beside))
+    return html_page("nanoMME-16", sections, f"{len(board.rows)} rows", sortable=True)
+
+
+def _cell(value: float | None, spec: str) -> str:
+    return "–" if value is None else format(value, spec)

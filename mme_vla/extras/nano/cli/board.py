@@ -1,0 +1,139 @@
+"""`mme-vla nano board`: the ranking of nanoMME's rows, with rows of your own from folders or from a
+new training.
+
+Words of `mme-vla nano` train and evaluate a row first, as far as it is not there: `model=` names
+it.
+"""
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mme_vla.cli.errors import print_user_errors
+from mme_vla.cli.help import argument_parser
+from mme_vla.config.composition import compose, resolved
+from mme_vla.errors import printable, require
+from mme_vla.utils import require_replaceable
+
+SHIPPED = Path(__file__).resolve().parents[4] / "benchmarks" / "nano16"
+"""The rows of the repository, a folder for each split."""
+EXAMPLES = (
+    "", "rows=outputs/nano16/further --html board.html",
+    "--config-dir configs model=mine_modul '+memories.mine={budget: 32, grid: 1}'",
+)  # fmt: skip
+
+
+def main(
+    words: Sequence[str],
+    nano: Callable[[], None],
+    with_settings: Callable[[Sequence[str]], list[str]],
+) -> None:
+    """Train where a model is named, read the rows, print and write the board.
+
+    nano: `mme-vla nano`, with the words of `sys.argv`. with_settings: these words with what they
+    imply.
+    """
+    parser = argument_parser("mme-vla nano board", __doc__, EXAMPLES)
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="rows=FOLDER: rows of your own, repeatable; others: of mme-vla nano",
+    )
+    parser.add_argument(
+        "--config-dir", type=Path, help="folder of your own models, as of mme-vla nano"
+    )
+    parser.add_argument(
+        "--html", type=Path, help="write the board as one page with sortable tables and plots"
+    )
+    parser.add_argument("--samples", type=int, help="of the bootstrap")
+    with print_user_errors():
+        args = parser.parse_intermixed_args(words)
+        if args.html:
+            require_replaceable(args.html, ".html", ".htm")
+        words = [word for word in args.words if not word.startswith("rows=")]
+        trees = [args.config_dir] if args.config_dir else []
+        config = compose("nano", with_settings(words), extra_dirs=trees)
+        trained: list[Path] = []
+        if any(word.startswith("model=") for word in words):
+            trained = row_folders(
+                resolved(compose("nano", with_settings(alone(words)), extra_dirs=trees)), trees
+            )
+            sys.argv[1:] = alone(words) + [
+                word for tree in trees for word in ("--config-dir", str(tree))
+            ]
+            nano()
+        run(args, str(config.split), trained)
+
+
+def row_folders(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
+    """The folders of the rows that a run trains; others in its output may be unfinished.
+
+    Raises:
+        UserError: rows of these settings would not fit those of the repository.
+    """
+    from mme_vla.envs.episodes import choose_episodes
+    from mme_vla.extras.nano.rows import TRAINED, read_training, rules_text, table_of
+    from mme_vla.extras.nano.runs import compose_rows, rules_of
+
+    rows, rules, split = compose_rows(config, trees), rules_of(config), config["split"]
+    actions = rows.robot.action.answers or rows.robot.name
+    shipped = SHIPPED / table_of(split, actions)
+    if folder := next((file.parent for file in sorted(shipped.rglob(TRAINED))), None):
+        other = read_training(folder)
+        specs = choose_episodes(config["task"], config["episodes"], split)
+        compared = {
+            "episodes": tuple(
+                dict(Counter(scene.task for scene in scenes)) for scenes in (specs, other.records)
+            ),
+            "max_steps": (rules.steps, other.records[0].max_steps),
+            "rules": (rules_text(actions, rules.max_choices, rules.only_possible), other.rules),
+        }
+        for name, (value, expected) in compared.items():
+            require(
+                value == expected,
+                f"A row with {name} {value} does not fit those of {shipped}: they have {expected}.",
+            )
+    return [Path(config["output"]) / split / row for row in rows.composed]
+
+
+def alone(words: Sequence[str]) -> list[str]:
+    """Words for the models that they name and no other rows, with one training each if they do not
+    say otherwise.
+    """
+    typed = {word.partition("=")[0] for word in words}
+    others = ("beside=[]", "planner=false", "oracle=null", "floors=false", "trainings=1")
+    return [*words, *(word for word in others if word.partition("=")[0] not in typed)]
+
+
+def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
+    """Read the rows, print the board, and write it where a file is named. trained: folders beside
+    those of `rows=`.
+    """
+    from mme_vla.evaluation.results.tables import comparison_table, print_table
+    from mme_vla.extras.nano import board_page
+    from mme_vla.extras.nano.board import SAMPLES, Board
+    from mme_vla.extras.nano.rows import read_rows
+
+    folders = [Path(word.removeprefix("rows=")) for word in args.words if word.startswith("rows=")]
+    local = read_rows([], local=[*folders, *trained])
+    shipped = SHIPPED / next((row[0].table for row in local.values()), split)
+    rows = read_rows([shipped], local=[*folders, *trained]) if shipped.is_dir() else local
+    board = Board(rows, samples=args.samples or SAMPLES)
+    pairs = comparison_table(board.neighbours())
+    for table in (board_page.ranking(board, brief=True), board_page.targets(board), pairs):
+        if table.rows:
+            print_table(table, 120)
+    for line in [
+        *board_page.notes(board),
+        *board_page.separating(board),
+        *board_page.standing(board),
+    ]:
+        print(printable(line))
+    if args.html:
+        args.html.parent.mkdir(parents=True, exist_ok=True)
+        args.html.write_text(board_page.page(board), encoding="utf-8")
+        print(f"wrote {args.html}")

@@ -1,0 +1,95 @@
+"""`python -m mme_vla.nano`: from nothing to rows of results, for all sixteen tasks or for one, on
+two cores.
+"""
+
+import logging
+import re
+import sys
+from collections.abc import Sequence
+
+from omegaconf import DictConfig
+
+from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.config.composition import command_trees, library_files, resolved
+from mme_vla.errors import brief, require
+
+ALL_TASKS = "nano16"
+"""The file of configs/nano for a command that names no task."""
+KEYS = {"model": "with_memory", "backbone": "with_backbone", "embodiment": "with_embodiment"}
+"""Words that would choose a file for the whole tree, and the keys of `configs/nano.yaml`
+that they set here.
+"""
+
+
+def main() -> None:
+    """Run the command with the task's own settings, where it has a file of them."""
+    if sys.argv[1:2] == ["board"]:  # a command of its own, which runs this one to add a row
+        from mme_vla.extras.nano.cli import board
+
+        return board.main(sys.argv[2:], main, with_settings)
+    sys.argv[1:] = with_settings(sys.argv[1:])
+    command()
+
+
+def with_settings(words: Sequence[str]) -> list[str]:
+    """The words of a command line, and the choice of the task's file in configs/nano; what is typed
+    counts more.
+
+    A command that names no task is for all sixteen: `nano=nano16`. `nano=null` does without a file.
+    `model=…` would be a choice for a tree that holds one model; here it names the first of several,
+    and leaves out the further models of the task's file. `backbone=…` and `embodiment=…` are those
+    of all models. `model=a,b` and `budget=4,16` are lists of one run, which shares demonstrations
+    and has one table. Other lists of values are sweeps of `--multirun`.
+    """
+    named = any(word.startswith("model=") for word in words)
+    if named and not any(word.startswith("also=") for word in words):
+        words = [*words, "also=[]"]
+    words = _as_lists(
+        [
+            f"{KEYS.get(key, key)}{equals}{value}"
+            for key, equals, value in (word.partition("=") for word in words)
+        ]
+    )
+    if "nano=null" in words:  # without the task's file; Hydra takes no null for a group
+        return [word for word in words if word != "nano=null"]
+    tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
+    name = tasks[-1] if tasks else ALL_TASKS
+    if name not in library_files("nano") or any(word.startswith("nano=") for word in words):
+        return list(words)
+    return [f"nano={name}", *words]
+
+
+def _as_lists(words: Sequence[str]) -> list[str]:
+    """The words with `with_memory=a,b` and `budget=4,16` as lists, without `--multirun` where
+    nothing else is swept.
+    """
+    lists = []
+    for word in words:
+        key, _, value = word.partition("=")
+        several = key in ("with_memory", "budget") and "," in value and not value.startswith("[")
+        lists.append(f"{key}=[{value}]" if several else word)
+    swept = [word for word in lists if "," in re.sub(r"[\[{(].*[\]})]", "", word.partition("=")[2])]
+    return [
+        word for word in lists if swept or lists == list(words) or word not in ("--multirun", "-m")
+    ]
+
+
+@cli("nano")
+def command(cfg: DictConfig) -> None:
+    """Record, train, evaluate and write the page, each as far as it is not there."""
+    from mme_vla.envs.episodes import choose_tasks
+    from mme_vla.envs.make import check_names, require_simulator
+    from mme_vla.extras.nano.runs import run
+
+    config = resolved(cfg)
+    log_to_terminal(logging.getLogger("mme_vla.nano"))
+    for task in choose_tasks(config["task"]):
+        check_names(task, "waypoint", None, None)
+    for key in ("trainings", "also_trainings", "workers"):
+        value = config[key]
+        require(
+            isinstance(value, int) and value >= 1,
+            f"{key}={brief(value)}: must be a whole number from 1 on.",
+        )
+    require_simulator()
+    run(config, command_trees()[1:])

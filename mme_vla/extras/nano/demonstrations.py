@@ -1,0 +1,392 @@
+"""Demonstrations rendered only at their decisions, and at the frames that memories read there.
+
+An episode of planned motions has a handful of decisions, known when it is over. The poses of every
+frame are kept; then the required frames are restored and rendered. That takes a second where
+rendering all takes ten.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mme_vla.data.waypoints import Motions
+from mme_vla.embodiment.action_space import Option, read_options
+from mme_vla.embodiment.robomme import CAMERAS, benchmark_action, benchmark_state
+from mme_vla.envs.make import make_task
+from mme_vla.envs.observations import RenderRequest, capture, read_images
+from mme_vla.errors import require
+from mme_vla.subgoal.oracle import online_subgoal
+from mme_vla.utils import parse_json, write_atomically
+
+if TYPE_CHECKING:
+    from mme_vla.embodiment.action_space import ActionSpace
+    from mme_vla.envs.robomme.recording.frames import FrameChoice
+    from mme_vla.envs.robomme.recording.recorder import RecordedStep
+    from mme_vla.envs.task import Task
+
+
+SUBGOALS = ("simple", "grounded")
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode of a task, with images of some frames.
+
+    length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its
+    decisions. subgoals: `simple` and `grounded` → what the simulator says at each decision, as it
+    says it at test time. images: camera → frame → [256, 256, 3] uint8. boundaries: frames at which
+    a sub-task begins, of the video too; None in files of earlier versions. carried_out: whether its
+    motions were carried out one by one, see `record`.
+    """
+
+    task: str
+    seed: int
+    difficulty: str
+    goal: str
+    length: int
+    exec_start: int
+    states: np.ndarray
+    motions: Motions
+    images: dict[str, dict[int, np.ndarray]]
+    subgoals: dict[str, list[str]] = field(default_factory=dict)
+    boundaries: np.ndarray | None = None
+    carried_out: bool = False
+
+    def save(self, path: Path) -> None:
+        """Write it as one file, which appears whole or not at all."""
+        names = (
+            "task",
+            "seed",
+            "difficulty",
+            "goal",
+            "length",
+            "exec_start",
+            "subgoals",
+            "carried_out",
+        )
+        about = {name: getattr(self, name) for name in names}
+        arrays = {
+            "states": self.states,
+            "decisions": self.motions.decisions,
+            "targets": self.motions.targets,
+        }
+        if self.boundaries is not None:
+            arrays["boundaries"] = self.boundaries
+        for camera, taken in self.images.items():
+            arrays[f"{camera}_frames"] = np.array(list(taken), np.int64)
+            arrays[f"{camera}_pictures"] = np.stack(list(taken.values()))
+        with write_atomically(path) as draft, draft.open("wb") as file:
+            np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
+
+    @classmethod
+    def load(cls, path: Path, images: bool = True) -> "Demonstration":
+        """Read what `save` wrote, or what of it is no image."""
+        with np.load(path) as file:
+            loaded_images = {
+                camera: dict(
+                    zip(file[f"{camera}_frames"].tolist(), file[f"{camera}_pictures"], strict=True)
+                )
+                for camera in CAMERAS
+                if images and f"{camera}_frames" in file
+            }
+            motions = Motions(file["decisions"], file["targets"])
+            about = parse_json(str(file["about"]), str(path))
+            boundaries = file.get("boundaries")
+            return cls(
+                **about,
+                states=file["states"],
+                motions=motions,
+                images=loaded_images,
+                boundaries=boundaries,
+            )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene to demonstrate, and the folder of what comes of it.
+
+    cameras: those that render. choices: at which frames, for each memory that will train on it.
+    carried_out, acts: see `record`.
+    """
+
+    task: str
+    seed: int
+    difficulty: str
+    folder: Path
+    cameras: tuple[str, ...]
+    choices: tuple["FrameChoice", ...]
+    carried_out: bool = False
+    acts: "ActionSpace | None" = None
+
+    @property
+    def path(self) -> Path:
+        """The demonstration's file."""
+        return self.folder / f"{self.difficulty}-{self.seed}.npz"
+
+    @property
+    def failed(self) -> Path:
+        """A file that is there where the demonstrator did not succeed."""
+        return self.path.with_suffix(".failed")
+
+    @property
+    def made(self) -> bool:
+        """Whether its demonstration is there; one that failed later, for other frames, does not
+        count.
+        """
+        return self.path.is_file() and not self.failed.is_file()
+
+    @property
+    def tried(self) -> bool:
+        """Whether there is nothing left to do: it failed, or is there with every required frame.
+
+        Raises:
+            UserError: its file is of other actions, or of motions that were not carried out alike.
+        """
+        return self.failed.is_file() or (self.made and self._complete())
+
+    def _complete(self) -> bool:
+        with np.load(self.path) as file:
+            about = parse_json(str(file["about"]), str(self.path))
+            carried_out, width = about.get("carried_out", False), file["targets"].shape[1]
+            required = width if self.acts is None else self.acts.width
+            require(
+                (carried_out, width) == (self.carried_out, required),
+                f"{self.path} holds actions of {width} numbers with carried_out={carried_out}, and"
+                f" this command records {required} with carried_out={self.carried_out}: choose"
+                " another output.",
+            )
+            decisions = [file["decisions"][:: choice.every] for choice in self.choices]
+            read = [
+                choice.read(at, about["exec_start"])
+                for choice, at in zip(self.choices, decisions, strict=True)
+            ]
+            for camera in self.cameras:
+                rendered = set(file.get(f"{camera}_frames", np.zeros(0, np.int64)).tolist())
+                if not set().union(*(read if camera == "front" else decisions)) <= rendered:
+                    return False
+            return True
+
+
+def demonstrated(scene: Scene) -> bool:
+    """Demonstrate a scene into its file; whether the demonstrator succeeded."""
+    made = record(
+        scene.task,
+        scene.seed,
+        scene.difficulty,
+        scene.choices,
+        scene.cameras,
+        scene.carried_out,
+        scene.acts,
+    )
+    if made is None:
+        scene.failed.touch()
+        return False
+    made.save(scene.path)
+    return True
+
+
+def record(
+    task: str,
+    seed: int,
+    difficulty: str,
+    choices: Sequence["FrameChoice"],
+    cameras: Sequence[str] = ("front", "wrist"),
+    carried_out: bool = False,
+    acts: "ActionSpace | None" = None,
+) -> Demonstration | None:
+    """Demonstrate an episode; None where the demonstrator does not succeed.
+
+    Args:
+        choices: what the memories that will train on it read; these cameras render the frames of
+            all of them.
+        carried_out: render the frames while the demonstration's motions are carried out one by one,
+            as a policy's are; None too where that does not succeed. The demonstrator makes more
+            steps between some of its motions.
+        acts: of the robot that will learn from it. Where it chooses among options, the choices
+            stand in place of motions, and the options behind the goal; None: motions.
+    """
+    from mme_vla.envs.robomme.scene.placement import SceneError
+
+    try:
+        env = make_task(task, render=True, seed=seed, difficulty=difficulty)
+    except SceneError:
+        return None
+    taken = _Taken(env)
+    try:
+        chooser = acts if acts is not None and acts.choice else None
+        motions = _demonstrate(taken, choosing=chooser is not None)
+        if carried_out and motions is not None:
+            env.close()
+            env = make_task(task, render=True, seed=seed, difficulty=difficulty)
+            taken = _Taken(env)
+            motions = _carry_out(taken, motions.targets, chooser)
+        if motions is None:
+            return None
+        frame_lists = [motions.decisions[:: choice.every] for choice in choices] or [
+            motions.decisions
+        ]
+        at = {frame for frames in frame_lists for frame in frames.tolist()}
+        read = at.union(
+            *(
+                choice.read(frames, taken.video)
+                for choice, frames in zip(choices, frame_lists, strict=False)
+            )
+        )
+        required = {camera: read if camera == "front" else at for camera in cameras}
+        images: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
+        for frame in sorted(set().union(*required.values())):
+            taken.put_back(frame)
+            rendered = [camera for camera in cameras if frame in required[camera]]
+            capture(env, rendered)
+            for camera in rendered:
+                images[camera][frame] = read_images(env, camera, rgb=True)["rgb"]
+        goal = (
+            env.goals()[0].lower()
+            if chooser is None
+            else chooser.worded(env.goals()[0].lower(), _options(env, chooser))
+        )
+        subgoals = {kind: _subgoal_texts(taken.texts, motions.decisions, kind) for kind in SUBGOALS}
+        return Demonstration(
+            type(env).__name__,
+            seed,
+            difficulty,
+            goal,
+            len(taken.states),
+            taken.video,
+            np.stack(taken.states),
+            motions,
+            images,
+            subgoals,
+            _boundaries(taken.texts),
+            carried_out,
+        )
+    finally:
+        env.close()
+
+
+class _Taken:
+    """What is noted of every frame of an episode; `video` of them come before its execution.
+
+    A snapshot of the scene is read from the simulator's own objects, without velocities: that takes
+    a tenth of what `get_state_dict` takes, and brings back marks and traces, which belong to no
+    thing of the task.
+    """
+
+    def __init__(self, env: "Task") -> None:
+        self.env, self.video = env, 0
+        self.states: list[np.ndarray] = []
+        self.texts: list[Mapping[str, Any]] = []
+        self._snapshots: list[tuple[list[Any], list[float], list[tuple[Any, Any]]]] = []
+
+    def add(self, observed: Mapping[str, Any], info: Mapping[str, Any], in_video: bool) -> None:
+        if not self._snapshots:
+            self._find_objects()  # of the scene as its episode begins
+        self.texts.append(info)
+        self.states.append(benchmark_state(observed["joint_state"], observed["gripper_state"]))
+        self.video += in_video
+        self._snapshots.append((
+            [entity.pose for entity in self._entities],
+            [body.visibility for body in self._bodies],
+            [(each.root_pose, each.qpos) for each in self._articulations],
+        ))  # fmt: skip
+
+    def _find_objects(self) -> None:
+        from sapien.render import RenderBodyComponent
+
+        scene = self.env.scene
+        self._entities = [
+            actor._objs[0] for actor in scene.actors.values() if actor.px_body_type != "static"
+        ]
+        bodies = [entity.find_component_by_type(RenderBodyComponent) for entity in self._entities]
+        self._bodies = [body for body in bodies if body is not None]
+        self._articulations = [each._objs[0] for each in scene.articulations.values()]
+
+    def put_back(self, frame: int) -> None:
+        """Make the scene stand as it did in a frame."""
+        poses, visibilities, joints = self._snapshots[frame]
+        for entity, pose in zip(self._entities, poses, strict=True):
+            entity.pose = pose
+        for body, visibility in zip(self._bodies, visibilities, strict=True):
+            body.visibility = visibility
+        for each, (root, qpos) in zip(self._articulations, joints, strict=True):
+            each.root_pose = root
+            each.qpos = qpos
+
+
+def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
+    """What a task offers to choose from."""
+    options = [
+        Option(choice.label, choice.action, choice.needs_point).to_dict()
+        for choice in env.choices()
+    ]
+    return read_options(options, len(chooser.choice))
+
+
+def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
+    """The motions of a demonstration, or its choices, if it succeeds."""
+    from mme_vla.envs.robomme.recording.frames import choices_of, motions_of
+    from mme_vla.envs.robomme.recording.recorder import Recorder
+
+    steps: list[RecordedStep] = []
+
+    def take(step: "RecordedStep") -> None:
+        steps.append(step)
+        taken.add(step.obs, step.info, step.info["is_video_demo"])
+
+    result = Recorder(taken.env, on_step=take, render_request=RenderRequest(now=())).record()
+    if not result.success:
+        return None
+    return choices_of(steps) if choosing else motions_of(steps)
+
+
+def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None") -> Motions | None:
+    """Carry out motions [m, 7], or choices [m, 10], from the start to success; those it took, None
+    if it fails.
+    """
+    from mme_vla.envs.interface import RoboMMEEnv
+
+    env = RoboMMEEnv(taken.env, "waypoint" if chooser is None else "multi_choice")
+    env.render_request = RenderRequest(now=())
+    env.on_frame = taken.add
+    env.reset()
+    decisions = []
+    for number, target in enumerate(targets, 1):
+        decisions.append(len(taken.states) - 1)
+        _, _, ended, _, info = env.step(
+            target if chooser is None else benchmark_action(chooser, target)
+        )
+        if ended:
+            done = info["status"] == "success"
+            return Motions(np.array(decisions, np.int64), targets[:number]) if done else None
+    return None
+
+
+def _subgoal_texts(
+    texts: Sequence[Mapping[str, Any]], decisions: np.ndarray, kind: str
+) -> list[str]:
+    """The subgoal at each decision; where the simulator names none, the last one stays.
+
+    At the frame that ends a video the simulator may name none yet. The next one stands there, which
+    an environment reports after its reset.
+    """
+    named = [online_subgoal(text, kind) for text in texts]
+    result: list[str] = []
+    for frame in decisions:
+        result.append(
+            named[frame] or (result[-1] if result else next(filter(None, named[frame:]), ""))
+        )
+    return result
+
+
+def _boundaries(texts: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    """Frames at which a sub-task begins: where the recorded subgoal changes, as in
+    `data.columns`.
+    """
+    subgoals = [text.get("simple_subgoal", text.get("simple_subgoal_online")) for text in texts]
+    return np.array(
+        [i for i, text in enumerate(subgoals) if not i or text != subgoals[i - 1]], np.int64
+    )

@@ -1,0 +1,414 @@
+"""A run of nanoMME: demonstrations, tokens, trainings and evaluations of all rows, each as far as
+it is not there.
+"""
+
+import logging
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain, count, islice, zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mme_vla.envs.episodes import choose_episodes, choose_tasks
+from mme_vla.envs.rows import DIFFICULTIES
+from mme_vla.errors import UserError, brief, check_choice, require
+from mme_vla.utils import read_json, write_json
+
+if TYPE_CHECKING:
+    from mme_vla.embodiment import Embodiment
+    from mme_vla.envs.metadata import EpisodeSpec
+    from mme_vla.envs.robomme.recording.frames import FrameChoice
+    from mme_vla.evaluation.records import EpisodeRecord
+    from mme_vla.extras.nano.demonstrations import Scene
+    from mme_vla.extras.nano.evaluating import Rules
+    from mme_vla.extras.nano.fitting import Training
+
+logger = logging.getLogger("mme_vla.nano")
+SEEDS_APART = 100_000  # first seeds of two difficulties
+RETRIES = 20  # scenes in a row that no demonstration succeeds in
+STAGES = ("record", "tokens", "train", "evaluate", "all")
+
+
+def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
+    """All stages of a run, up to `stage`; the path of its page, or of the folder that holds what
+    was made.
+
+    config: as `configs/nano.yaml`. extra_dirs: trees of the user's own models, as
+    `--config-dir` adds them.
+    """
+    from mme_vla.envs.robomme.recording.processes import carry_out
+    from mme_vla.extras.nano.fitting import train_in_process
+    from mme_vla.extras.nano.page import write_page
+    from mme_vla.extras.nano.tokens import TokenStore
+
+    check_choice("stage", config["stage"], STAGES)
+    until = STAGES.index(config["stage"])
+    folder, workers = Path(config["output"]), config["workers"]
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = compose_rows(config, extra_dirs)
+    minutes = Minutes(folder / "clock.json")
+    with minutes.of("demonstrations"):
+        files = record_all(config, folder / "demonstrations", rows.choices, rows.robot)
+    if until < STAGES.index("tokens"):
+        return folder / "demonstrations"
+    store = TokenStore.of(folder / "tokens", list(rows.composed.values()))
+    with minutes.of("tokens"):
+        for _ in carry_out(files, store.make, workers):
+            pass
+    if until < STAGES.index("train"):
+        return store.folder
+    jobs = trainings_of(config, rows.composed, folder / "training", files, store)
+    with minutes.of("training"):
+        todo = [job for job in chain(*jobs.values()) if not job.done]
+        for _ in carry_out(todo, train_in_process, workers):
+            pass
+    if until < STAGES.index("evaluate"):
+        return folder / "training"
+    results = folder / config["split"]
+    with minutes.of("evaluation"):
+        records = evaluate_all(config, results, jobs, files, rows.robot)
+    if config["shard"] is not None or len(choose_tasks(config["task"])) > 1:
+        for row, of_row in records.items():
+            logger.info(
+                "%s: %d of %d episodes", row, sum(record.success for record in of_row), len(of_row)
+            )
+        return results
+    with minutes.of("videos"):
+        videos = videos_of(config, jobs, records, folder / "videos")
+    page = write_page(
+        folder,
+        config,
+        records,
+        rows.blind,
+        minutes.spent,
+        videos,
+        {row: [job.folder for job in of_row] for row, of_row in jobs.items()},
+        len(files),
+    )
+    print(page)
+    return page
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The models of a run. composed: row → its configuration. choices: at which frames memories
+    read demonstrations.
+
+    blind: the row that all others are compared with.
+    """
+
+    composed: Mapping[str, Mapping[str, Any]]
+    choices: Sequence["FrameChoice"]
+    robot: "Embodiment"
+    blind: str | None
+
+
+def compose_rows(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Rows:
+    """Every model at every budget."""
+    from mme_vla.embodiment import Embodiment
+    from mme_vla.envs.robomme.recording.frames import DECISIONS, FrameChoice
+    from mme_vla.extras.nano.board import MATCHED
+    from mme_vla.extras.nano.fitting import compose_policy
+    from mme_vla.extras.nano.learning import check_reflection
+
+    words = [
+        f"backbone={config['with_backbone']}",
+        f"embodiment={config['with_embodiment']}",
+        "policy.augment=false",
+    ]
+    words += [f"seed={config['seed']}", *config["overrides"]]
+    how = (config["memories"], words, extra_dirs, config["plugins"])
+    models = list(
+        dict.fromkeys([*as_list(config["with_memory"]), *config["beside"], *config["also"]])
+    )
+    require(models, "No row is to be trained: name one, such as model=framesamp_modul.")
+    composed: dict[str, dict[str, Any]] = {}
+    for model in models:
+        # The floor that reads the current frame alone has the tokens of that frame, at any budget.
+        for budget in [None] if model == MATCHED else as_list(config["budget"]):
+            each = compose_policy(model, *how, budget=budget)
+            composed[model if budget is None or each["memory"] is None else f"{model}@{budget}"] = (
+                each
+            )
+    others = [
+        compose_policy(model, *how) for model in config["rendered_for"] if model not in models
+    ]
+    robot = Embodiment.from_dict(next(iter(composed.values()))["embodiment"])
+    for vision in (each["backbone"].get("vision") for each in composed.values()):
+        layout = vision.get("layout") if isinstance(vision, Mapping) else None
+        check_reflection(config["learning"]["reflect"], robot.action, layout)
+    memories = [each["memory"] for each in (*composed.values(), *others) if each["memory"]]
+    choices = [FrameChoice(DECISIONS, memory, robot.action.execute) for memory in [None, *memories]]
+    blind = [
+        row for row, each in composed.items() if each["memory"] is None and not each["subgoal_text"]
+    ]
+    return Rows(composed, choices, robot, next(iter(blind), None))
+
+
+def as_list(value: Any) -> list[Any]:
+    """A value of a configuration that may be one or several."""
+    return list(value) if isinstance(value, list | tuple) else [value]
+
+
+def trainings_of(
+    config: Mapping[str, Any],
+    composed: Mapping[str, Mapping[str, Any]],
+    folder: Path,
+    files: Sequence[Path],
+    store: Any,
+) -> dict[str, list["Training"]]:
+    """Row → its trainings, with consecutive seeds."""
+    from mme_vla.extras.nano.fitting import Training
+
+    seed, jobs = int(config["seed"]), {}
+    for row, each in composed.items():
+        numbers = range(
+            seed, seed + (config["also_trainings"] if of_also(config, row) else config["trainings"])
+        )
+        jobs[row] = [
+            Training(
+                row,
+                {**each, "seed": number},
+                config["train"],
+                config["learning"],
+                folder / row / str(number),
+                files,
+                store,
+                seed,
+            )
+            for number in numbers
+        ]
+    return jobs
+
+
+def of_also(config: Mapping[str, Any], row: str) -> bool:
+    """Whether a row is one of `also`, which have fewer trainings and episodes."""
+    return row.partition("@")[0] in config["also"]
+
+
+def evaluate_all(
+    config: Mapping[str, Any],
+    folder: Path,
+    jobs: Mapping[str, Sequence["Training"]],
+    files: Sequence[Path],
+    robot: "Embodiment",
+) -> dict[str, list["EpisodeRecord"]]:
+    """Row → the records of all its trainings; a row's folder is
+    `<folder>/<row>/<training seed>`.
+    """
+    from mme_vla.extras.nano.evaluating import (
+        DEMONSTRATOR,
+        FREQUENT,
+        ORACLE_FRAMES,
+        PLANNER,
+        RANDOM,
+        evaluate_row,
+        frequent_moves,
+        play_all,
+    )
+
+    rules, specs = rules_of(config), episodes_of(config, folder)
+    records: dict[str, list[EpisodeRecord]] = {}
+    for row, of_row in jobs.items():
+        selected = (
+            episodes_of(config, folder, config["also_episodes"]) if of_also(config, row) else specs
+        )
+        model, at, budget = row.partition("@")
+        oracle = f"{ORACLE_FRAMES}{at}{budget}" if model == config["oracle"] else None
+        for name in [row] if oracle is None else [row, oracle]:
+            records[name] = []
+            for job in of_row:
+                place, ceiling = (
+                    folder / name / str(job.config["seed"]),
+                    None if name == row else oracle,
+                )
+                records[name] += evaluate_row(
+                    job.folder, job.checkpoint, place, selected, rules, ceiling
+                )
+    if config["shard"] is None:
+        by_choice = bool(robot.action.choice)
+        moves = frequent_moves(files, robot.action) if by_choice else {}
+        ceilings = [DEMONSTRATOR if by_choice else PLANNER] if config["planner"] else []
+        for name in ceilings + ([RANDOM, FREQUENT] if config["floors"] else []):
+            records[name] = play_all(name, folder / name / "0", specs, rules, moves)
+    return records
+
+
+def rules_of(config: Mapping[str, Any]) -> "Rules":
+    """How the run's episodes are run."""
+    from mme_vla.extras.nano.evaluating import Rules
+
+    names = ("split", "max_steps", "max_choices", "only_possible", "workers", "shard")
+    return Rules(seed=config["policy_seed"], **{name: config[name] for name in names})
+
+
+def episodes_of(
+    config: Mapping[str, Any], folder: Path, episodes: Any = None
+) -> list["EpisodeSpec"]:
+    """The episodes of the run; with `replace` scenes that cannot be built are replaced by later
+    ones.
+    """
+    from mme_vla.extras.nano.evaluating import built_scenes
+
+    selected = config["episodes"] if episodes is None else episodes
+    if not config["replace"]:
+        return choose_episodes(config["task"], selected, config["split"])
+    specs, left_out = built_scenes(
+        folder / "scenes.json", config["task"], config["split"], selected, config["workers"]
+    )
+    for line in left_out:
+        logger.info("left out: %s", line)
+    return specs
+
+
+def videos_of(
+    config: Mapping[str, Any],
+    jobs: Mapping[str, Sequence["Training"]],
+    records: Mapping[str, Sequence[Any]],
+    folder: Path,
+) -> list[Path]:
+    """Videos of a success and a failure of the first row's first training."""
+    from mme_vla.extras.nano.evaluating import record_videos
+
+    if not config["videos"]:
+        return []
+    row, of_row = next(iter(jobs.items()))
+    first = records[row][: len(records[row]) // len(of_row)]
+    return record_videos(of_row[0].checkpoint, folder, first, rules_of(config))
+
+
+# Demonstrations -----------------------------------------------------------------------------------
+
+
+def counts_of(config: Mapping[str, Any]) -> dict[tuple[str, str], int]:
+    """How many demonstrations of each task and difficulty."""
+    counts: dict[tuple[str, str], int] = {}
+    for task in choose_tasks(config["task"]):
+        amounts = {**config["demonstrations"], **(config["demonstrations_of"] or {}).get(task, {})}
+        fits = set(amounts) <= set(DIFFICULTIES) and all(
+            isinstance(n, int) and n >= 0 for n in amounts.values()
+        )
+        require(
+            fits,
+            f"demonstrations={brief(amounts)}: write how many of each difficulty"
+            f" ({', '.join(DIFFICULTIES)}), such as {{easy: 100}}.",
+        )
+        counts |= {(task, level): n for level, n in amounts.items()}
+    require(
+        sum(counts.values()) >= 2,
+        f"demonstrations={brief(config['demonstrations'])}: it takes two, to learn from and to"
+        " measure by.",
+    )
+    return counts
+
+
+def record_all(
+    config: Mapping[str, Any], folder: Path, choices: "Sequence[FrameChoice]", robot: "Embodiment"
+) -> list[Path]:
+    """Demonstrate until there are as many as wanted, each in a file of its own; the files, task by
+    task.
+
+    choices: what the memories that will train on them read. robot: the one that does.
+    """
+    from mme_vla.extras.nano.demonstrations import Scene
+
+    groups, how = (
+        [],
+        (tuple(robot.camera_names), tuple(choices), config["carried_out"], robot.action),
+    )
+    for (task, level), required in counts_of(config).items():
+        (folder / task).mkdir(parents=True, exist_ok=True)
+        first = int(config["first_seed"]) + DIFFICULTIES.index(level) * SEEDS_APART
+        scene = Scene(task, first, level, folder / task, *how)
+        groups.append(Group(map(partial(_with_seed, scene), count(first)), required))
+    return demonstrate(groups, config["workers"])
+
+
+def _with_seed(scene: "Scene", seed: int) -> "Scene":
+    return replace(scene, seed=seed)
+
+
+@dataclass
+class Group:
+    """Scenes of one task and difficulty, of which so many are to be demonstrated. files: those that
+    are.
+    """
+
+    scenes: Iterator["Scene"]
+    required: int
+    files: list[Path] = field(default_factory=list)
+    failed: int = 0
+    """Scenes in a row that no demonstration succeeded in."""
+
+    def next(self) -> list["Scene"]:
+        """The scenes to try now."""
+        return list(
+            islice(self.scenes, min(RETRIES - self.failed, self.required - len(self.files)))
+        )
+
+    def take(self, tried: Sequence["Scene"]) -> None:
+        """Note what came of them."""
+        new = [scene.path for scene in tried if scene.made]
+        for scene in tried:
+            if not scene.made:
+                logger.info("left out: %s, seed %d, %s", scene.task, scene.seed, scene.difficulty)
+        self.files += new
+        self.failed = 0 if new else self.failed + len(tried)
+        if self.failed >= RETRIES:
+            last = tried[-1]
+            raise UserError(
+                f"{last.task}: {self.failed} {last.difficulty} scenes in a row, to seed"
+                f" {last.seed}, cannot be demonstrated."
+            )
+
+
+def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
+    """The files of the first demonstrations of each group that succeed; existing ones are not made
+    again.
+    """
+    from mme_vla.data.console import progress
+    from mme_vla.envs.robomme.recording.processes import carry_out
+    from mme_vla.extras.nano.demonstrations import demonstrated
+
+    with progress(
+        "record", sum(group.required for group in groups), unit="demonstrations"
+    ) as advance:
+        while lacking := [group for group in groups if len(group.files) < group.required]:
+            tried = [group.next() for group in lacking]
+            # In turn, so that an interrupted run has some of every group.
+            alternating = [
+                scene for scenes in zip_longest(*tried) for scene in scenes if scene is not None
+            ]
+            missing = [scene for scene in alternating if not scene.tried]
+            advance(sum(scene.made for scene in alternating if scene.tried))
+            for made in carry_out(missing, demonstrated, workers):
+                advance(int(made))
+            for group, scenes in zip(lacking, tried, strict=True):
+                group.take(scenes)
+    return [file for group in groups for file in group.files]
+
+
+class Minutes:
+    """Minutes of each stage on the clock, added up over interrupted runs."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @property
+    def spent(self) -> dict[str, float]:
+        """Stage → minutes; other runs of the command may add to them meanwhile."""
+        return read_json(self._path, "minutes of a run") if self._path.is_file() else {}
+
+    @contextmanager
+    def of(self, stage: str) -> Iterator[None]:
+        """Time what happens inside; a stage that had nothing to do counts its moment."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            minutes = (time.perf_counter() - begun) / 60
+            spent = self.spent
+            write_json(self._path, {**spent, stage: spent.get(stage, 0.0) + minutes})

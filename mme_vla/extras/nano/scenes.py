@@ -1,0 +1,293 @@
+"""Images of the sixteen tasks with what is where in them: what the small vision tower learns to see
+from.
+
+A scene is demonstrated once, and rendered at steps of every state that occurs: something held,
+pressed, marked or highlighted. Then its objects, the arm and the gripper are put somewhere else for
+each further image, without simulation. Labels come from the simulator's poses, and from its
+segmentation, which says what is visible.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from mme_vla.embodiment.robomme import SIDE
+from mme_vla.envs.grounding import project
+from mme_vla.envs.make import make_task
+from mme_vla.envs.observations import RenderRequest, capture, read_images
+from mme_vla.extras.nano.tower import CLASSES
+from mme_vla.processing.images import resize_with_pad_uint8
+from mme_vla.utils import write_atomically
+
+if TYPE_CHECKING:
+    from mme_vla.envs.task import Task
+
+CLEAR_COLOUR = 0.35
+"""How far the strongest channel of a cube's colour (0 … 1) stands out where the cube counts as red,
+green or blue.
+"""
+VISIBLE_PIXELS = 16
+"""Of a 256 × 256 image: with fewer an object counts as hidden."""
+IN_HAND, GRASP = 0.03, (0.004, 0.03)
+"""Metres from the tool's centre to a held object's, and between which a finger is then."""
+UNDER_MARK = 0.01  # metres between a disc and the mark that covers it, at most
+FIRST_STEP = 3  # of a state, at which it is rendered; then at twice the step before
+STATES = frozenset(
+    name for name in CLASSES if name.startswith(("pressed", "mark", "highlight")) or "held" in name
+)
+
+
+class Place(NamedTuple):
+    """One object in a scene: the number of its class, its centre in the world [3], and its ids in a
+    segmentation.
+    """
+
+    number: int
+    centre: np.ndarray
+    ids: Sequence[int]
+
+
+def find_places(env: "Task") -> list[Place]:
+    """The class and the place of everything in a scene, visible or not."""
+    return [
+        Place(CLASSES.index(name), np.asarray(centre, np.float64), ids)
+        for name, centre, ids in _named_places(env)
+    ]
+
+
+def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
+    from mme_vla.envs.robomme.scene.articulated import Button, Peg
+    from mme_vla.envs.robomme.scene.predicates import pressed
+
+    yield "hand", env.tcp_pose.p, [int(link.per_scene_id[0]) for link in env.agent.robot.links]
+    lit = list(_lit_discs(env))
+    for thing in env.things:
+        name = _class_of(thing)
+        for item in (thing.head, thing.tail) if isinstance(thing, Peg) else (thing,):
+            where, ids = item.position, _visible_ids(item, [disc for _, disc in lit])
+            yield name, where, ids
+            if isinstance(thing, Button) and pressed(thing):
+                yield "pressed button", where, ids
+            if _in_gripper(env, name, where):
+                yield (
+                    f"held {name}" if f"held {name}" in CLASSES else "other held object",
+                    where,
+                    ids,
+                )
+    for name, disc in lit:
+        yield name, disc.position, disc.segmentation_ids
+
+
+def _visible_ids(thing: Any, lit: Sequence[Any]) -> list[int]:
+    """The ids of what shows where a thing is: of a button both parts, of a disc also the mark that
+    covers it.
+    """
+    from mme_vla.envs.robomme.scene.articulated import Button
+    from mme_vla.envs.robomme.scene.objects import Disc
+    from mme_vla.envs.robomme.scene.things import distance_xy
+
+    ids: list[int] = thing.segmentation_ids
+    if isinstance(thing, Button):
+        return ids + [int(link.per_scene_id[0]) for link in thing.articulation.links]
+    if isinstance(thing, Disc):
+        marks = [mark for mark in lit if distance_xy(mark.position, thing.position) < UNDER_MARK]
+        return ids + [number for mark in marks for number in mark.segmentation_ids]
+    return ids
+
+
+def _class_of(thing: Any) -> str:
+    from mme_vla.envs.robomme.scene.articulated import Button, Peg
+    from mme_vla.envs.robomme.scene.objects import COLOURS, Board, Container, Cube, Disc
+
+    if isinstance(thing, Cube):
+        colour = np.array(COLOURS[thing.colour] if isinstance(thing.colour, str) else thing.colour)
+        second, first = np.sort(colour)[-2:]
+        is_clear = first - second > CLEAR_COLOUR
+        name = ("red", "green", "blue")[colour.argmax()] if is_clear else "other"
+        return f"{name} cube"
+    if isinstance(thing, Disc):
+        return "disc" if thing.name.startswith("disc") else "target"
+    types = {Container: "container", Button: "button", Board: "board", Peg: "peg end"}
+    return types.get(type(thing)) or thing.name.partition("_")[0]  # box, obstacle
+
+
+def _lit_discs(env: "Task") -> Iterator[tuple[str, Any]]:
+    """The discs that mark or highlight something now; they are no things of a task."""
+    from mme_vla.envs.robomme.scene.things import UNDER_THE_FLOOR, Thing
+
+    for name, actor in env.scene.actors.items():
+        kind = "highlight" if name.startswith("highlight") else "mark"
+        if name.startswith(("highlight", "mark", "disc_red")):
+            disc = Thing(name, actor)
+            if disc.position[2] > UNDER_THE_FLOOR:
+                yield kind, disc
+
+
+def _in_gripper(env: "Task", name: str, centre: np.ndarray) -> bool:
+    finger = float(env.fingers.mean())
+    near = float(np.linalg.norm(centre - env.tcp_pose.p)) < IN_HAND
+    return name.endswith(("cube", "container", "peg end")) and near and GRASP[0] < finger < GRASP[1]
+
+
+def visible_places(places: Sequence[Place], segmentation: np.ndarray) -> np.ndarray:
+    """The places [m, 4] (class, x, y, z) whose objects show enough pixels in an image that holds
+    their centre.
+    """
+    counts = np.bincount(
+        segmentation.ravel(), minlength=1 + max(max(place.ids) for place in places)
+    )
+    rows = []
+    for number, centre, ids in places:
+        pixel = project(centre)
+        if (
+            counts[list(set(ids))].sum() >= VISIBLE_PIXELS
+            and (pixel >= 0).all()
+            and (pixel < SIDE).all()
+        ):
+            rows.append([number, *centre])
+    return np.array(rows, np.float32).reshape(-1, 4)
+
+
+class Renders:
+    """Images of one scene, and the visible places of each."""
+
+    def __init__(self, env: "Task", size: int) -> None:
+        self._env, self._size = env, size
+        self.images: list[np.ndarray] = []
+        self.places: list[np.ndarray] = []  # frame, class, x, y, z
+        self._steps: Counter[tuple[int, ...]] = Counter()
+        self._next: dict[tuple[int, ...], int] = {}
+
+    def take(self, places: Sequence[Place] | None = None) -> None:
+        """Render the scene as it is now."""
+        capture(self._env, ["front"])
+        taken = read_images(self._env, "front", rgb=True, segmentation=True)
+        visible = visible_places(places or find_places(self._env), taken["segmentation"][..., 0])
+        self.places.append(np.insert(visible, 0, len(self.images), axis=1))
+        self.images.append(resize_with_pad_uint8(taken["rgb"], self._size))
+
+    def step(self, *_: object) -> None:
+        """Render a step of a demonstration, if its state has not been seen for so many steps."""
+        places = find_places(self._env)
+        state = tuple(sorted(place.number for place in places if CLASSES[place.number] in STATES))
+        self._steps[state] += 1
+        if self._steps[state] >= self._next.get(state, FIRST_STEP):
+            self._next[state] = 2 * self._steps[state]
+            self.take(places)
+
+
+def record_scene(
+    folder: Path, task: str, seed: int, difficulty: str, arrangements: int, size: int
+) -> Path:
+    """Render a scene into `folder`, unless it is there already; the path of its file.
+
+    The file has `images` [n, size, size, 3] uint8 and `places` [m, 5]: the image, the class and the
+    centre (metres in the world) of every visible object.
+
+    Args:
+        arrangements: images with everything put elsewhere, behind those of the demonstration.
+    """
+    from mme_vla.envs.robomme.recording.recorder import Recorder
+    from mme_vla.envs.robomme.robot.kinematics import Arm
+
+    path = folder / f"{task}-{difficulty}-{seed}.npz"
+    if path.is_file():
+        return path
+    env = make_task(task, render=True, seed=seed, difficulty=difficulty)
+    try:
+        renders = Renders(env, size)
+        Recorder(
+            env, on_step=renders.step, render_request=RenderRequest(now=(), grounded=False)
+        ).record()
+        if arrangements:
+            env.reset()
+        arm, rng = Arm(env.agent), np.random.default_rng(seed)
+        for _ in range(arrangements):
+            _arrange(env, arm, rng)
+            renders.take()
+        with write_atomically(path) as draft, draft.open("wb") as file:
+            np.savez_compressed(
+                file, images=np.stack(renders.images), places=np.concatenate(renders.places)
+            )
+    finally:
+        env.close()
+    return path
+
+
+def _arrange(env: "Task", arm: Any, rng: np.random.Generator) -> None:
+    """Put what can be put elsewhere, mark and highlight some of it, and move the arm, perhaps with
+    something held.
+    """
+    import torch
+
+    for thing in env.things:
+        _relocate(thing, rng)
+    _light(env, rng)
+    near = [thing for thing in env.things if np.abs(thing.position).max() < 0.5]
+    place = np.array([rng.uniform(-0.25, 0.2), rng.uniform(-0.28, 0.28), rng.uniform(0.03, 0.35)])
+    over = near[rng.integers(len(near))] if near and rng.random() < 0.6 else None
+    if over is not None:
+        place = over.position + np.array([0, 0, rng.uniform(0.01, 0.2)])
+    joints = arm.ik(
+        _pose(place) * _yaw_pose(rng.uniform(-0.8, 0.8)) * _pose(q=(0, 1, 0, 0)), env.qpos
+    )
+    if joints is None:
+        return
+    grasped = not env.stick and over is not None and rng.random() < 0.5
+    grasped = grasped and _class_of(over).endswith(("cube", "container"))
+    fingers = (
+        [] if env.stick else [rng.uniform(0.014, 0.021) if grasped else rng.uniform(0.03, 0.04)] * 2
+    )
+    env.agent.robot.set_qpos(torch.as_tensor(np.append(joints, fingers), dtype=torch.float32)[None])
+    if grasped and over is not None:
+        over.move_to(_pose(env.tcp_pose.p, over.pose.q))
+
+
+def _relocate(thing: Any, rng: np.random.Generator) -> None:
+    """Turned and, three times of ten, where it was; now and then lifted; containers out of the way
+    half of the time.
+    """
+    name, home = _class_of(thing), thing.initial_pose
+    if name == "container" and rng.random() < 0.5:
+        return thing.move_away()
+    if rng.random() < 0.3:
+        return thing.move_to(home)
+    lifted = rng.uniform(0, 0.15) if "cube" in name and rng.random() < 0.2 else 0.0
+    place = (rng.uniform(-0.25, 0.2), rng.uniform(-0.28, 0.28), home.p[2] + lifted)
+    thing.move_to(_pose(place, (_yaw_pose(rng.uniform(-np.pi, np.pi)) * _pose(q=home.q)).q))
+
+
+def _light(env: "Task", rng: np.random.Generator) -> None:
+    """Marks over some targets and discs, highlights under some cubes; the others out of the way."""
+    from mme_vla.envs.robomme.scene.motions import Highlight
+    from mme_vla.envs.robomme.scene.objects import BELOW_TABLE
+    from mme_vla.envs.robomme.scene.things import Thing
+
+    bases: dict[str, list[Thing]] = {"highlight": [], "mark": []}
+    for thing in env.things:
+        name = _class_of(thing)
+        if "cube" in name or name in ("target", "disc"):
+            bases["highlight" if "cube" in name else "mark"].append(thing)
+    for name, actor in env.scene.actors.items():
+        among = bases.get(name.partition("_")[0])
+        if among:
+            disc, lit = Thing(name, actor), rng.random() > 0.6
+            below = (
+                among[rng.integers(len(among))].position - [0, 0, Highlight.DEPTH]
+                if lit
+                else BELOW_TABLE
+            )
+            disc.move_to(_pose(below, disc.pose.q))
+
+
+def _pose(p: Any = (0, 0, 0), q: Any = (1, 0, 0, 0)) -> Any:
+    import sapien
+
+    return sapien.Pose(p, q)
+
+
+def _yaw_pose(yaw: float) -> Any:
+    return _pose(q=(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)))

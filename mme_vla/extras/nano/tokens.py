@@ -1,0 +1,235 @@
+"""Tokens of the frames of demonstrations: the tower reads each frame once, for all memories and
+trainings.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from mme_vla.errors import require
+from mme_vla.extras.nano.demonstrations import Demonstration
+from mme_vla.memory.base import frames_scored, make_scorer
+from mme_vla.memory.history import FrameScores
+from mme_vla.policy.build import build_from_config
+from mme_vla.policy.mme import MMEPolicy, mme_of
+from mme_vla.registry import MEMORIES
+from mme_vla.utils import write_atomically
+
+if TYPE_CHECKING:
+    from mme_vla.memory.base import Memory
+
+_SOME_WIDTH = 64  # what a scorer gives does not depend on the width of tokens
+
+
+@dataclass(frozen=True)
+class FrameTokens:
+    """What the tower made of a demonstration's frames.
+
+    frames: camera → its rendered frames [n] int64, ascending. tokens: camera → [n, patches, d]
+    float16. scores: key of a frame scorer → the rows it gave for the memory camera.
+    """
+
+    frames: dict[str, np.ndarray]
+    tokens: dict[str, Tensor]
+    scores: dict[str, FrameScores] = field(default_factory=dict)
+
+    def at(self, camera: str, frames: Sequence[int] | np.ndarray) -> Tensor:
+        """The tokens [n, patches, d] of these frames."""
+        known, numbers = self.frames[camera], np.asarray(frames, np.int64)
+        missing = sorted(set(numbers.tolist()) - set(known.tolist()))
+        require(
+            not missing,
+            f"The demonstration holds no tokens of frames {missing[:5]}: they were not rendered.",
+        )
+        return self.tokens[camera][torch.from_numpy(np.searchsorted(known, numbers))]
+
+    def save(self, path: Path, stamp: str) -> None:
+        """Write one file, which appears whole or not at all. stamp: of the demonstration
+        (`stamp_of`).
+        """
+        from safetensors.torch import save_file
+
+        tensors = {f"tokens/{name}": value for name, value in self.tokens.items()}
+        tensors |= {
+            f"frames/{name}": torch.from_numpy(value) for name, value in self.frames.items()
+        }
+        for key, rows in self.scores.items():
+            tensors |= {
+                f"scored/{key}": torch.from_numpy(rows.frames),
+                f"scores/{key}": torch.from_numpy(rows.values),
+            }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with write_atomically(path) as draft:
+            save_file(
+                {name: value.contiguous() for name, value in tensors.items()},
+                draft,
+                {"stamp": stamp},
+            )
+
+    @classmethod
+    def load(cls, path: Path) -> "FrameTokens":
+        """Read what `save` wrote."""
+        from safetensors.torch import load_file
+
+        parts: dict[str, dict[str, Tensor]] = {
+            "tokens": {},
+            "frames": {},
+            "scored": {},
+            "scores": {},
+        }
+        for name, value in load_file(path).items():
+            part, _, key = name.partition("/")
+            parts[part][key] = value
+        scores = {
+            key: FrameScores(parts["scored"][key].numpy(), rows.numpy())
+            for key, rows in parts["scores"].items()
+        }
+        return cls(
+            {name: value.numpy() for name, value in parts["frames"].items()},
+            parts["tokens"],
+            scores,
+        )
+
+
+@torch.no_grad()
+def tokenize(
+    policy: MMEPolicy, demonstration: Demonstration, memories: Iterable["Memory"] = ()
+) -> FrameTokens:
+    """Encode all rendered frames of a demonstration.
+
+    policy: with the tower. memories: those whose scorers rate its frames, beside the policy's own.
+    """
+    processor = policy.require_processor()
+    frames: dict[str, np.ndarray] = {}
+    tokens: dict[str, Tensor] = {}
+    for camera in policy.embodiment.camera_names:
+        taken = demonstration.images[camera]
+        frames[camera] = np.array(sorted(taken), np.int64)
+        parts = []
+        for some in np.array_split(frames[camera], -(-len(frames[camera]) // 32)):
+            views = processor.images(
+                [np.stack([taken[int(k)] for k in some])] * len(policy.embodiment.camera_names)
+            )
+            parts.append(policy.backbone.encode_images(views[:, 0].float() / 255 * 2 - 1).half())
+        tokens[camera] = torch.cat(parts)
+    readers = [*memories] if policy.memory is None else [policy.memory, *memories]
+    images = demonstration.images.get(policy.embodiment.memory_camera, {})
+    scores = {
+        memory.storage.scorer: _scores(memory, images)
+        for memory in readers
+        if memory.storage.scorer
+    }
+    return FrameTokens(frames, tokens, scores)
+
+
+def _scores(memory: "Memory", images: Mapping[int, np.ndarray]) -> FrameScores:
+    """The scores of these frames by the memory's scorer, as in an episode."""
+    scorer = make_scorer(memory)
+    assert scorer is not None
+    read = frames_scored(memory, max(images) + 1).tolist()
+    scored_rows = {frame: scorer(frame, images[frame]) for frame in read if frame in images}
+    rows = {frame: values for frame, values in scored_rows.items() if values is not None}
+    if not rows:
+        return FrameScores.empty(memory.storage.grid**2)
+    return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
+
+
+def stamp_of(file: Path) -> str:
+    """Twelve letters that name a demonstration's content and which of its frames are rendered."""
+    with np.load(file) as stored:
+        names = [name for name in stored if not name.endswith("_pictures")]
+        parts = b"".join(
+            name.encode() + np.ascontiguousarray(stored[name]).tobytes() for name in names
+        )
+    return hashlib.sha256(parts).hexdigest()[:12]
+
+
+@dataclass(frozen=True)
+class TokenStore:
+    """The tokens of demonstrations by one tower, a file each, in a folder that is named after the
+    tower.
+
+    config: of a policy with the tower, as JSON. folder: of all towers' tokens. memories: sections,
+    as JSON, of those whose scorers rate frames.
+    """
+
+    config: str
+    folder: Path
+    memories: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, folder: Path, configs: Sequence[Mapping[str, Any]]) -> "TokenStore":
+        """The store of rows that share a tower: their composed configurations."""
+        sections = {
+            json.dumps(config["memory"], sort_keys=True) for config in configs if config["memory"]
+        }
+        scored = sorted(text for text in sections if _memory(text).storage.scorer)
+        return cls(json.dumps(dict(configs[0])), folder, tuple(scored))
+
+    @property
+    def tower(self) -> str:
+        """Twelve letters that name the tower."""
+        return _policy(self.config).vision_fingerprint()[:12]
+
+    def path(self, file: Path) -> Path:
+        """Where the tokens of a demonstration are."""
+        return self.folder / self.tower / file.parent.name / f"{file.stem}.safetensors"
+
+    def read(self, file: Path) -> FrameTokens:
+        """The tokens of a demonstration, made now if they are not there."""
+        self.make(file)
+        return FrameTokens.load(self.path(file))
+
+    def make(self, file: Path) -> None:
+        """Encode a demonstration unless its tokens are there, of all its frames and with every
+        score.
+        """
+        stamp = stamp_of(file)
+        if not self._is_made(file, stamp):
+            scored = map(_memory, self.memories)
+            tokenize(_policy(self.config), Demonstration.load(file), scored).save(
+                self.path(file), stamp
+            )
+
+    def _is_made(self, file: Path, stamp: str) -> bool:
+        from safetensors import safe_open
+
+        path = self.path(file)
+        if not path.is_file():
+            return False
+        with safe_open(path, "pt") as tensors:
+            scored = {
+                name.removeprefix("scores/")
+                for name in tensors.keys()  # noqa: SIM118
+                if name.startswith("scores/")
+            }
+            required = {_memory(text).storage.scorer for text in self.memories}
+            widths = {
+                tensors.get_slice(name).get_shape()[-1]
+                for name in tensors.keys()  # noqa: SIM118
+                if name.startswith("tokens/")
+            }
+            complete = widths == {_policy(self.config).backbone.vision_width} and required <= scored
+            return bool(tensors.metadata().get("stamp") == stamp) and complete
+
+
+@cache
+def _policy(config: str) -> MMEPolicy:
+    return mme_of(build_from_config(OmegaConf.create(json.loads(config))), "nanoMME").eval()
+
+
+@cache
+def _memory(section: str) -> "Memory":
+    import mme_vla.memory  # noqa: F401  (registers what ships)
+
+    memory: Memory = MEMORIES.build(json.loads(section), d_vision=_SOME_WIDTH, width=_SOME_WIDTH)
+    return memory

@@ -1,0 +1,166 @@
+"""`python -m mme_vla.play tasks=… episodes=…`: play the tasks yourself, or let a model play
+(configs/play.yaml).
+"""
+
+import logging
+import sys
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.config.composition import resolved
+from mme_vla.config.sections import PositiveInt, read_section
+from mme_vla.envs.base import environment
+from mme_vla.envs.episodes import choose_episodes, named_tasks
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.errors import UserError
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.store import INDIFFERENT
+from mme_vla.extras.play.game import ChoiceSession
+from mme_vla.extras.play.run import Identity, PlayRun, make_session
+
+log = logging.getLogger("mme_vla.play")
+HUMAN = "human"
+
+
+@dataclass(frozen=True)
+class PlaySettings:
+    """The keys of `configs/play.yaml` that decide the outcomes, beside the player."""
+
+    split: str
+    env: str
+    max_steps: PositiveInt
+    max_choices: PositiveInt
+
+
+@cli("play")
+def main(cfg: DictConfig) -> None:
+    """Play the episodes that are not played yet, on the page or by a model, and compare with the
+    paper.
+    """
+    from mme_vla.envs.rendering import render_backend
+    from mme_vla.extras.play import build_player
+    from mme_vla.extras.play.desk import Desk
+    from mme_vla.extras.play.web import require_page, serve
+
+    config = resolved(cfg)
+    log_to_terminal(log, clock=True)
+    player: dict[str, Any] = config["player"]
+    specs = choose_episodes(named_tasks(config), config["episodes"], config["split"], config["env"])
+    if config["max_steps"] is None:
+        config["max_steps"] = environment(config["env"]).step_limit(config["split"])
+    settings: dict[str, Any] = asdict(read_section(PlaySettings, config, others=True))
+    settings["player"] = {key: value for key, value in player.items() if key not in INDIFFERENT}
+    human = player["name"] == HUMAN
+    built = None if human else build_player(player)
+    if human:
+        require_page()
+    needs_images = built is None or built.needs_images
+    environment(config["env"]).check_installed()
+    if config["env"] == "mme_vla" and needs_images:
+        render_backend()
+    name, who = (HUMAN, str(player["participant"])) if built is None else (built.model, 0)
+    identity = Identity(name, who, player.get("seed", 0), config["max_steps"], settings)
+    limits = {limit: config[limit] for limit in ("max_steps", "max_choices")}
+    make = partial(make_session, env=config["env"], **limits, images=needs_images)
+    folder = Path(str(config["output"])).expanduser()
+    try:
+        with PlayRun(folder, specs, identity, make, config["retry_errors"]) as run:
+            if built is None:
+                serve(Desk(run, str(who)), str(config["host"]), config["port"])
+                played = len(run.episodes) - len(run.todo)
+                of = f"{played} of {len(run.episodes)} episodes played"
+                log.info("ended · %s; the same command continues with the others", of)
+            else:
+                _by_itself(run, built)
+            print_summary(run)
+    finally:
+        if built is not None:
+            built.close()
+
+
+def _by_itself(run: PlayRun, player: Any) -> None:
+    todo = list(run.todo)
+    log.info("%d episodes to play, %d played before", len(todo), len(run.episodes) - len(todo))
+    for number, which in enumerate(todo, 1):
+        log.info("%d/%d %s", number, len(todo), line(_play_one(run, which, player)))
+
+
+def _play_one(run: PlayRun, which: EpisodeSpec, player: Any) -> EpisodeRecord:
+    """Play and record one episode; what breaks in it ends it with an error, but not the run."""
+    from mme_vla.extras.play.players import play
+
+    session: ChoiceSession | None = None
+    try:
+        session = run.make(which)
+        play(session, player)
+        return run.save(session, **player.notes())
+    except UserError:  # the next episode would only meet it again
+        raise
+    except Exception as error:
+        log.warning("%s, episode %d broke", which.task, which.episode, exc_info=True)
+        # A player that has not begun still has the notes of the episode before.
+        notes = player.notes() if session is not None and session.reveals else {}
+        return run.save_error(which, f"{type(error).__name__}: {error}", session, **notes)
+    finally:
+        if session is not None:
+            try:
+                session.close()
+            except Exception:  # after a crash there may be nothing left to close
+                log.warning("the simulator could not be closed", exc_info=True)
+
+
+def line(record: EpisodeRecord) -> str:
+    """One episode in one line."""
+    choices = " ".join(
+        decision["choice"]
+        + ("" if decision["point"] is None else "({:.0f},{:.0f})".format(*decision["point"]))
+        for decision in record.extra["decisions"]
+    )
+    reason = record.error or record.extra.get("ended_by", "")
+    took = f"{record.steps} steps, {record.seconds.total:.0f} s"
+    return (
+        f"{record.task} {record.episode}: {record.outcome} · {choices or 'no choice'} · {took}"
+        + (f" · {reason}" if reason else "")
+    )
+
+
+def print_summary(run: PlayRun) -> None:
+    """Print the success rates beside the paper's oracle-planner table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    rows = run.summary()
+    if not rows:
+        return
+    methods = list(rows[0][3])  # empty for the user's own tasks, which come last
+    table = Table(
+        "task", "episodes", run.identity.model, *(f"{method} (paper)" for method in methods)
+    )
+    for task, successes, count, paper in rows:
+        table.add_row(
+            task,
+            str(count),
+            f"{100 * successes / count:.1f}",
+            *(f"{paper[m]:.0f}" if paper else "–" for m in methods),
+        )
+    rates = [100 * successes / count for _, successes, count, _ in rows]
+    if len(rows) > 1:
+        reported = [paper for *_, paper in rows if paper]
+        means = [sum(paper[m] for paper in reported) / len(reported) for m in methods]
+        table.add_section()
+        table.add_row(
+            "mean of tasks",
+            str(sum(count for _, _, count, _ in rows)),
+            f"{sum(rates) / len(rates):.2f}",
+            *(f"{mean:.2f}" for mean in means),
+        )
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    console.print(table)
+    console.print(
+        f"records: {run.folder / 'episodes.jsonl'}", markup=False, highlight=False, soft_wrap=True
+    )

@@ -1,0 +1,157 @@
+"""A run of episodes: which ones, where their records go, which are still to be played, and how they
+compare.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.scene_hash import NOT_BUILT
+from mme_vla.evaluation.records import EpisodeRecord, finished, merge
+from mme_vla.evaluation.results.paper import paper_table
+from mme_vla.evaluation.results.scopes import PAPER_ORDER
+from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
+from mme_vla.extras.play.game import ChoiceSession
+
+
+def make_session(
+    episode: EpisodeSpec, env: str, max_steps: int, max_choices: int, images: bool = True
+) -> ChoiceSession:
+    """The simulator for one episode.
+
+    episode: which one. env: name of the environment. max_steps, max_choices: when it has timed out.
+    images: whether the player reads them; the official environment renders in any case.
+    """
+    from mme_vla.envs import make_env
+
+    render = images or env == "official"
+    which = (episode.task, episode.split, episode.episode)
+    made = make_env(*which, "multi_choice", max_steps=max_steps, env=env, render=render)
+    try:
+        return ChoiceSession(made, episode, max_choices, images)
+    except BaseException:
+        made.close()
+        raise
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Under which name a run's records are kept. settings: all that decides its outcomes."""
+
+    model: str
+    checkpoint: int | str
+    model_seed: int
+    max_steps: int
+    settings: Mapping[str, Any]
+
+
+class PlayRun:
+    """The episodes of one run and its folder. A context manager; resumes what is there.
+
+    Args:
+        folder: of `episodes.jsonl` and `run.json`.
+        episodes: to play, in order. identity: of the records.
+        make: makes the session of an episode.
+        retry_errors: play episodes again that ended in an error.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        episodes: Sequence[EpisodeSpec],
+        identity: Identity,
+        make: Callable[[EpisodeSpec], ChoiceSession],
+        retry_errors: bool = False,
+    ) -> None:
+        self.folder, self.identity, self.make = folder, identity, make
+        claim_run(folder, identity.settings)
+        self._log = RecordLog(folder / RECORDS)
+        self.episodes = list(episodes)
+        keys = {(which.task, which.episode) for which in self.episodes}
+        # Folders below hold runs of their own.
+        there = [
+            record
+            for path in sorted(folder.glob("episodes*.jsonl"))
+            for record in read_records(path)
+        ]
+        self.records = [
+            record for record in merge(there, "last") if (record.task, record.episode) in keys
+        ]
+        done = finished(self.records, retry_errors)
+        self.todo = [which for which in self.episodes if (which.task, which.episode) not in done]
+
+    def save(self, session: ChoiceSession, **extra: Any) -> EpisodeRecord:
+        """Write the record of a session that is over."""
+        identity = self.identity
+        return self._keep(
+            session.episode,
+            session.record(
+                identity.model,
+                identity.checkpoint,
+                identity.model_seed,
+                identity.max_steps,
+                **extra,
+            ),
+        )
+
+    def save_error(
+        self, which: EpisodeSpec, reason: str, session: ChoiceSession | None = None, **extra: Any
+    ) -> EpisodeRecord:
+        """Write that an episode could not be played to its end.
+
+        which: the episode. reason: what broke. session: as far as it came; None where it could not
+        even be made. extra: more to keep with the record.
+        """
+        if session is not None:
+            if not session.over:
+                session.give_up("error", reason)
+            return self.save(session, **extra)
+        identity = self.identity
+        record = EpisodeRecord(
+            model=identity.model,
+            checkpoint=identity.checkpoint,
+            model_seed=identity.model_seed,
+            max_steps=identity.max_steps,
+            action_space="multi_choice",
+            task=which.task,
+            episode=which.episode,
+            seed=which.seed,
+            difficulty=which.difficulty,
+            split=which.split,
+            outcome="error",
+            steps=0,
+            error=reason,
+            scene=NOT_BUILT,
+            extra={"decisions": [], "ended_by": reason, **extra},
+        )
+        return self._keep(which, record)
+
+    def _keep(self, which: EpisodeSpec, record: EpisodeRecord) -> EpisodeRecord:
+        self._log.append(record)
+        self.records.append(record)
+        if which in self.todo:
+            self.todo.remove(which)
+        return record
+
+    def summary(self) -> list[tuple[str, int, int, dict[str, float]]]:
+        """(task, successes, episodes, the paper's rates by method in percent), tasks in the paper's
+        order.
+
+        The user's own tasks come last, without rates.
+        """
+        known = {row["method"]: row for row in paper_table("oracle_planner")}
+        rows = []
+        for task in dict.fromkeys((*PAPER_ORDER, *(record.task for record in self.records))):
+            played = [record for record in merge(self.records, "last") if record.task == task]
+            if played:
+                paper = {method: float(row[task]) for method, row in known.items() if task in row}
+                rows.append((task, sum(record.success for record in played), len(played), paper))
+        return rows
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._log.close()

@@ -1,0 +1,97 @@
+"""What a model costs: FLOPs and parameters, counted on the meta device, so that full size needs no
+memory.
+
+FLOPs are those of PyTorch's `FlopCounterMode` over the real code: two for each multiply-add of
+linear layers, convolutions, matrix products and attention (on meta its kernel is taken apart into
+counted products; `count_model` makes sure of that). Elementwise work, norms, softmax and embedding
+look-ups are not counted. Batch 1, two cameras, every prompt as long as its model's config allows, a
+full memory; recurrent memories read a full window. Past frames arrive as stored tokens, as they do
+in training; what the vision tower spends on them in an episode is a number of its own.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from mme_vla.config.composition import compose, library_files
+from mme_vla.errors import UserError
+from mme_vla.evaluation.results.paper import REPLAN, ModelCost
+from mme_vla.memory.recurrent import RecurrentMemory
+from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_policy
+from mme_vla.policy.capabilities import CountsCost
+
+
+def count_model(model: str, budget: int | None = None, backbone: str | None = None) -> ModelCost:
+    """Count a model at a memory budget (None: its own).
+
+    backbone: a file of `configs/backbone`; by default the one that is the model's full size.
+    """
+    _check_attention_is_counted()
+    policy = on_meta(model, budget, backbone)
+    assert isinstance(policy, CountsCost)
+    batch, memory = policy.full_batch("meta"), policy.memory
+    return ModelCost(
+        model=model,
+        prompt=policy.config["processor"].get("prompt_length", 0),
+        parameters=sum(p.numel() for p in policy.parameters()),
+        forward=flops(lambda: policy(batch)),
+        chunk=flops(lambda: policy.sample_actions(batch)),
+        memory=0 if memory is None else flops(lambda: memory(batch.history)),
+        streamed=_streamed(policy, batch),
+        frames=_frames(policy),
+    )
+
+
+def flops(work: Callable[[], object]) -> int:
+    """FLOPs of a call, forward only."""
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        work()
+    return counter.get_total_flops()
+
+
+def on_meta(model: str, budget: int | None = None, backbone: str | None = None) -> Policy:
+    """A model on the meta device."""
+    if backbone is None:
+        backbone = str(compose("policy", [f"model={model}"]).full_size)
+    policy = build_policy(model, backbone=backbone, device="meta")
+    if budget is None:
+        return policy
+    if policy.memory is None:
+        raise UserError(f"{model} has no memory, so no budget of {budget} tokens.")
+    return build_policy(model, backbone=backbone, device="meta", memory={"budget": budget})
+
+
+def all_models() -> list[str]:
+    """The models that ship, by name."""
+    return list(library_files("model"))
+
+
+def _check_attention_is_counted() -> None:
+    q, k = torch.empty(1, 8, 20, 32, device="meta"), torch.empty(1, 8, 50, 32, device="meta")
+    mask = torch.zeros(1, 1, 20, 50, device="meta")
+    counted = flops(lambda: nn.functional.scaled_dot_product_attention(q, k, k, attn_mask=mask))
+    if counted != 2 * (2 * 8 * 20 * 50 * 32):
+        raise UserError(
+            f"This PyTorch ({torch.__version__}) counts {counted} FLOPs for an attention of"
+            " 1,024,000."
+        )
+
+
+def _streamed(policy: Policy, batch: Any) -> int | None:
+    memory = policy.memory
+    if not isinstance(memory, RecurrentMemory):
+        return None
+    history, last = batch.history, slice(-(memory.storage.grid**2), None)
+    frame: Any = history.features[:, last], history.positions[:, last], history.mask[:, last]
+    return flops(lambda: memory.read(memory.update(memory.init_state(1), *frame)))
+
+
+def _frames(policy: Policy) -> int:
+    if policy.memory is None or not isinstance(policy, CountsCost):
+        return 0
+    n_encoded = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
+    return n_encoded * flops(policy.warm_up_vision)

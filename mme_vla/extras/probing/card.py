@@ -1,0 +1,489 @@
+"""The report card of a checkpoint: is its memory more than a clock, and how does it recover from a
+wrong one?
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mme_vla.envs.base import environment
+from mme_vla.envs.make import make_env
+from mme_vla.errors import UserError, require
+from mme_vla.evaluation.pairing import pair
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
+from mme_vla.evaluation.results.report import Section, html_page
+from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.tables import Table, to_markdown
+from mme_vla.evaluation.rollout.evaluation import evaluate
+from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.extras.probing import lines
+from mme_vla.extras.probing.arms import UNPROBED, lacking, read_arm, slug
+from mme_vla.extras.probing.channels import channel_of
+from mme_vla.extras.probing.evidence import record_evidence
+from mme_vla.extras.probing.lines import MomentLine
+from mme_vla.extras.probing.report import Findings
+from mme_vla.extras.probing.run import OFFLINE, ONLINE, ProbePlan, run_probe
+from mme_vla.extras.probing.writing import required_frames, score_writing
+from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import with_vision_memory
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.subgoal import SubgoalPredictor
+from mme_vla.utils import to_json, write_atomically, write_json
+
+TIME, CONTENT, WRONG_SCENE = "time-shifted", "content-swapped", "wrong scene first"
+ARMS = {
+    TIME: "delay:64", "order-broken": "shuffle", CONTENT: "swap", WRONG_SCENE: "distract:1",
+    "nothing remembered": "drop:all", "oracle frames": "oracle",
+}  # fmt: skip
+"""What a card measures in closed loop beside the matched run, and the interventions that do it."""
+NEGLIGIBLE = 0.01
+"""Change of a chunk, in normalised actions, that misleads no policy: one without noise has a spread
+of 0.
+"""
+AGAIN, PAGE, FIGURES = "again", "card.html", "card.json"
+_SAMPLES, _TAILS = 10_000, (0.025, 0.975)
+_HOW = (
+    (
+        "Every arm runs the scenes of the matched run with its noise. A loss is the matched success"
+        " minus the arm's, with a 95 % interval (paired bootstrap over scenes). It is beyond noise"
+        " if the interval lies above 0 and the loss exceeds the share of scenes that end otherwise"
+        " when the matched run is repeated with other noise."
+    ),
+    (
+        "The memory-or-clock score is the loss under time shift / (that loss + the loss under"
+        " content swap): 1 where a policy reads only time, 0 where it reads only content. It is"
+        " undefined where both losses lie within noise."
+    ),
+    (
+        "Recovery counts, on recorded episodes before which another scene is seen, the decisions"
+        " until the chunk never again changes by more than the policy's own spread, or"
+        f" {NEGLIGIBLE} where the spread is less."
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What an arm costs. success: share of the scenes that it solves, 0 to 1. loss: the matched
+    share minus it.
+
+    low, high: 95 % interval of the loss. lost, gained: scenes that only the matched run solves, or
+    only the arm.
+    """
+
+    success: float
+    loss: float
+    low: float
+    high: float
+    lost: int
+    gained: int
+    beyond_noise: bool
+
+
+@dataclass(frozen=True)
+class ClockScore:
+    """The memory-or-clock score, 0 to 1, and its 95 % interval; None, with the reason, where it is
+    undefined.
+    """
+
+    score: float | None = None
+    low: float | None = None
+    high: float | None = None
+    undefined: str | None = None
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """Decisions until a policy that saw another scene first acts as without it, on recorded
+    episodes.
+
+    A recording has recovered at the first decision from which on the chunk never changes by more
+    than the policy's own spread, or `NEGLIGIBLE` where that is more. median: over the recordings;
+    None where at least half of them do not recover. recovered: those that do. decisions: mean
+    number of decisions of a recording.
+    """
+
+    median: float | None
+    recovered: int
+    recordings: int
+    decisions: float
+
+
+@dataclass(frozen=True)
+class Card:
+    """Everything a card shows. noise: share of scenes that end otherwise in an equal run with other
+    noise.
+
+    suites: the memory-or-clock score of each suite's scenes, where they are of several. writing:
+    score of writing (writing.py). references: success of other runs on the same
+    scenes.
+    """
+
+    model: str
+    checkpoint: int | str
+    scenes: int
+    matched: float
+    noise: float
+    arms: dict[str, Loss]
+    memory_or_clock: ClockScore
+    suites: Mapping[str, ClockScore] = field(default_factory=dict)
+    recovery: Recovery | None = None
+    writing: dict[str, Any] | None = None
+    references: dict[str, float] | None = None
+    notes: Sequence[str] = ()
+
+
+Outcomes = Mapping[EpisodeKey, float]
+"""Success of each scene."""
+
+
+def run_card(
+    policy: Policy,
+    plan: ProbePlan,
+    folder: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    *,
+    references: Mapping[str, str] | None = None,
+    subgoals: SubgoalPredictor | None = None,
+    base: Callable[..., Any] = make_env,
+    show_progress: bool = True,
+) -> Card:
+    """Run what the folder lacks of a card, and write `card.html` and `card.json`.
+
+    Args:
+        plan: its jobs are the scenes, its recordings those that recovery is measured on, `lend`
+            those to take contents from. references: name → folder of records, floors and ceilings
+            such as `{"demonstrator": "outputs/…"}`.
+    """
+    channel, in_simulation = channel_of(policy), base is make_env and settings.env == "mme_vla"
+    arms = {label: read_arm(word) for label, word in ARMS.items()}
+    reasons = {label: lacking(arm, policy, channel, len(plan.lend), boundaries=in_simulation)
+               for label, arm in arms.items()}  # fmt: skip
+    notes = [
+        f"{label} ({ARMS[label]}) was left out: it needs {why}."
+        for label, why in reasons.items()
+        if why
+    ]
+    others = {name: _reference(name, place, plan) for name, place in (references or {}).items()}
+    possible = [label for label, why in reasons.items() if why is None]
+    how: dict[str, Any] = {"subgoals": subgoals, "base": base, "show_progress": show_progress}
+    plan = replace(plan, arms=[ARMS[label] for label in possible], events=())
+    run_probe(policy, replace(plan, recordings=()), folder, facts, settings, **how)
+    again = replace(settings, seed=settings.seed + 1)
+    renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
+    evaluate(
+        policy,
+        plan.jobs,
+        folder / AGAIN,
+        renamed,
+        again,
+        shard=plan.shard,
+        source=plan.source,
+        **how,
+    )
+    recovered = None
+    if plan.recordings and len(plan.lend) > 1 and WRONG_SCENE in possible:
+        offline = replace(plan.offline, moments=None, scan=False)
+        wrong = replace(plan, arms=[ARMS[WRONG_SCENE]], jobs=(), offline=offline)
+        run_probe(policy, wrong, folder, facts, settings, show_progress=show_progress)
+        recovered = recovery(Findings.of(lines.read_all(folder / OFFLINE)).moments)
+    writing = _writing(policy, plan) if in_simulation and channel.chooses else None
+    if isinstance(writing, str):
+        notes.append(writing)
+    unprobed, equal = (
+        _scenes(folder / ONLINE / slug(UNPROBED.name), plan),
+        _scenes(folder / AGAIN, plan),
+    )
+    probed = {label: _scenes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
+    same = pair([unprobed, equal, *probed.values()])
+    notes += same.gaps("The arms")
+    require(same.keys or not same.left_out, " ".join(same.gaps("The arms")))
+    shown = {}
+    for name, records in others.items():
+        beside = pair([unprobed, records])
+        notes += beside.notes(f"references.{name}")
+        if beside.keys:
+            shown[name] = _mean(_success(records, beside.keys))
+    matched, repeated = (_success(side, same.keys) for side in (unprobed, equal))
+    outcomes = {label: _success(side, same.keys) for label, side in probed.items()}
+    suite_of = environment(settings.env).suite_of
+    suites = {job.task: suite for job in plan.jobs if (suite := suite_of(job.task))}
+    card = replace(
+        grade(matched, outcomes, repeated),
+        model=facts.model,
+        checkpoint=facts.checkpoint,
+        suites=clock_scores(matched, outcomes, repeated, suites),
+        recovery=recovered,
+        references=shown,
+        notes=notes,
+        writing=writing if isinstance(writing, dict) else None,
+    )
+    write_card(card, folder)
+    return card
+
+
+def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> Card:
+    """A card from outcomes in closed loop.
+
+    Args:
+        matched: of the run without an intervention. arms: label → outcomes on the same scenes.
+            again: of an equal run with other noise.
+    """
+    keys = [
+        key
+        for key in matched
+        if key in again and all(key in outcomes for outcomes in arms.values())
+    ]
+    require(
+        keys,
+        "No scene ended in every arm: each ended in an error somewhere. Repeat the command to try"
+        " them again.",
+    )
+    noise = _mean({key: abs(matched[key] - again[key]) for key in keys})
+    table = {
+        label: {key: matched[key] - outcomes[key] for key in keys}
+        for label, outcomes in arms.items()
+    }
+    sampled = dict(zip(table, _bootstrap(list(table.values())), strict=True))
+    losses = {}
+    for label, differences in table.items():
+        loss, (low, high) = _mean(differences), np.quantile(sampled[label], _TAILS)
+        signs = np.sign(list(differences.values()))
+        losses[label] = Loss(
+            _mean({key: arms[label][key] for key in keys}),
+            loss,
+            float(low),
+            float(high),
+            int((signs > 0).sum()),
+            int((signs < 0).sum()),
+            bool(low > 0 and loss > noise),
+        )
+    score = clock_score(losses, sampled)
+    return Card("", "", len(keys), _mean({key: matched[key] for key in keys}), noise, losses, score)
+
+
+def clock_score(losses: Mapping[str, Loss], sampled: Mapping[str, np.ndarray]) -> ClockScore:
+    """The memory-or-clock score. sampled: the losses of each arm on the same resampled scenes,
+    [samples].
+    """
+    if missing := [label for label in (TIME, CONTENT) if label not in losses]:
+        return ClockScore(undefined=f"{' and '.join(missing)} could not be measured")
+    if not any(losses[label].beyond_noise for label in (TIME, CONTENT)):
+        return ClockScore(undefined="neither loss is beyond noise")
+
+    def share(time: Any, content: Any) -> Any:
+        time, content = np.maximum(time, 0.0), np.maximum(content, 0.0)
+        known = time + content > 0
+        return time[known] / (time + content)[known]
+
+    low, high = np.quantile(share(sampled[TIME], sampled[CONTENT]), _TAILS)
+    score = share(np.array([losses[TIME].loss]), np.array([losses[CONTENT].loss]))
+    return ClockScore(float(score[0]), float(low), float(high))
+
+
+def clock_scores(
+    matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes, task_suites: Mapping[str, str]
+) -> dict[str, ClockScore]:
+    """The memory-or-clock score of each suite's scenes; none where all are of one.
+
+    task_suites: task → suite, of environments that are not RoboMME. The rest is as `grade` has it.
+    """
+
+    def select(outcomes: Outcomes, tasks: Sequence[str]) -> Outcomes:
+        return {key: value for key, value in outcomes.items() if key.task in tasks}
+
+    others = (again, *arms.values())
+    names = dict.fromkeys(
+        key.task for key in matched if all(key in outcomes for outcomes in others)
+    )
+    protocol = Protocol(tuple(names), task_suites=task_suites)
+    suites = {suite: protocol.choose("suite", suite) for suite in protocol.suites}
+    if len(suites) < 2:
+        return {}
+    return {
+        suite: grade(
+            select(matched, tasks),
+            {label: select(arm, tasks) for label, arm in arms.items()},
+            select(again, tasks),
+        ).memory_or_clock
+        for suite, tasks in suites.items()
+    }
+
+
+def recovery(moments: Sequence[MomentLine]) -> Recovery | None:
+    """How long the wrong scene has an effect. moments: of one arm, at every decision of each
+    recording.
+    """
+    misled: dict[str, list[bool]] = {}
+    for line in sorted(moments, key=lambda line: line.step):
+        misled.setdefault(line.recording, []).append(line.change > max(line.spread, NEGLIGIBLE))
+    if not misled:
+        return None
+    last = [max(np.flatnonzero(flags), default=-1) for flags in misled.values()]
+    lengths = [len(flags) for flags in misled.values()]
+    after = [i + 1 if i + 1 < n else np.inf for i, n in zip(last, lengths, strict=True)]
+    median = float(np.median(after))
+    return Recovery(
+        median if np.isfinite(median) else None,
+        int(np.isfinite(after).sum()),
+        len(after),
+        float(np.mean(lengths)),
+    )
+
+
+def outcomes_of(records: Iterable[EpisodeRecord]) -> dict[EpisodeKey, float]:
+    """Success of each scene, averaged where it was run several times; scenes that ended in an error
+    are left out.
+    """
+    runs: dict[EpisodeKey, list[float]] = {}
+    for record in records:
+        if record.outcome != "error":
+            runs.setdefault(record.key, []).append(float(record.success))
+    return {key: float(np.mean(values)) for key, values in runs.items()}
+
+
+Scenes = dict[EpisodeKey, list[EpisodeRecord]]
+"""The records of each scene that ended by itself."""
+
+
+def _success(records: Scenes, keys: Iterable[EpisodeKey]) -> dict[EpisodeKey, float]:
+    """Success of these scenes."""
+    return outcomes_of(record for key in keys for record in records[key])
+
+
+def _scenes(folder: Path, plan: ProbePlan) -> Scenes:
+    """Records of the card's scenes in a folder; those that ended in an error are left out."""
+    scenes = {(job.task, job.split, job.episode) for job in plan.jobs}
+    records = read_folders(path for path in find_records([folder]) if path.parent == folder)
+    found: Scenes = {}
+    for record in records:
+        if record.outcome != "error" and (record.task, record.split, record.episode) in scenes:
+            found.setdefault(record.key, []).append(record)
+    return found
+
+
+def _reference(name: str, place: str, plan: ProbePlan) -> Scenes:
+    """Records of another run on the scenes of the card."""
+    records = _scenes(Path(place).expanduser(), plan)
+    require(
+        records,
+        f"references.{name}={place} holds no record of the card's scenes: evaluate it on the same"
+        " ones.",
+    )
+    return records
+
+
+def _mean(values: Outcomes) -> float:
+    """Mean over tasks of the means over their scenes."""
+    tasks = dict.fromkeys(key.task for key in values)
+    means = [
+        np.mean([value for key, value in values.items() if key.task == task]) for task in tasks
+    ]
+    return float(np.mean(means))
+
+
+def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
+    """Means over tasks of scenes resampled within each task, the same ones for all columns:
+    [columns, samples].
+    """
+    rng, keys = np.random.default_rng(0), list(columns[0]) if columns else []
+    tasks = dict.fromkeys(key.task for key in keys)
+    means = np.zeros((len(columns), _SAMPLES))
+    for task in tasks:
+        values = np.array([[column[key] for key in keys if key.task == task] for column in columns])
+        means += values[:, rng.integers(0, values.shape[1], (_SAMPLES, values.shape[1]))].mean(-1)
+    return means / max(len(tasks), 1)
+
+
+def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any] | str:
+    """The score of writing on demonstrations of the card's scenes, or why there is none."""
+    memory, env = with_vision_memory(policy).require_memory(), environment("mme_vla")
+    try:
+        frames = required_frames(memory)
+        specs = (env.episode(job.task, job.split, job.episode) for job in plan.jobs)
+        episodes = [
+            episode for spec in specs if (episode := record_evidence(spec, frames)) is not None
+        ]
+        encoder = policy if isinstance(policy, MMEPolicy) else None
+        scores: dict[str, Any] = score_writing(memory, episodes, encoder).to_dict()
+    except UserError as error:
+        return f"No score of writing: {error}"
+    return (
+        scores
+        if scores["tasks"]
+        else "No score of writing: no scene has a fact that a frame shows."
+    )
+
+
+def tables_of(card: Card) -> list[Table]:
+    """The card as tables."""
+    after = card.recovery
+    rows = [["memory-or-clock score", _score(card.memory_or_clock)]]
+    rows += [
+        [f"memory-or-clock score, {suite}", _score(score)] for suite, score in card.suites.items()
+    ]
+    rows.append(["noise: scenes that end otherwise in an equal run", _percent(card.noise)])
+    if after is not None:
+        median = "no" if after.median is None else f"{after.median:g} decisions"
+        text = (
+            f"{median} (median); {after.recovered} of {after.recordings} within"
+            f" {after.decisions:.0f} decisions"
+        )
+        rows.append(["recovery after another scene", text])
+    if card.writing is not None:
+        mean = card.writing["mean"]
+        rows.append(["score of writing", f"{mean['score']:.2f} (chance {mean['chance']:.2f})"])
+    arms = [["matched", "", _percent(card.matched), "", "", "", ""]]
+    for label, loss in card.arms.items():
+        arms.append([
+            label, ARMS[label], _percent(loss.success), _percent(loss.loss),
+            f"[{100 * loss.low:.0f}, {100 * loss.high:.0f}]", f"{loss.lost} : {loss.gained}",
+            "yes" if loss.beyond_noise else "no",
+        ])  # fmt: skip
+    arms += [
+        [name, "", _percent(rate), "", "", "", ""] for name, rate in (card.references or {}).items()
+    ]
+    columns = (
+        "history",
+        "intervention",
+        "success",
+        "loss",
+        "95 %",
+        "lost : gained",
+        "beyond noise",
+    )
+    return [Table("In short", ("", ""), rows), Table("Histories in closed loop", columns, arms)]
+
+
+def write_card(card: Card, folder: Path) -> None:
+    """Write the page and the JSON."""
+    write_json(folder / FIGURES, to_json(asdict(card)))
+    sections = [Section(table.title, tables=[table]) for table in tables_of(card)]
+    sections.append(Section("How the numbers are made", paragraphs=_HOW))
+    title, subtitle = (
+        f"Report card of {card.model}",
+        f"checkpoint {card.checkpoint}, {card.scenes} scenes",
+    )
+    with write_atomically(folder / PAGE) as draft:
+        draft.write_text(html_page(title, sections, subtitle, card.notes), encoding="utf-8")
+
+
+def card_text(card: Card) -> str:
+    """The card in Markdown."""
+    return "\n".join([*map(to_markdown, tables_of(card)), *card.notes])
+
+
+def _score(score: ClockScore) -> str:
+    if score.undefined is not None:
+        return f"undefined: {score.undefined}"
+    return f"{score.score:.2f} [{score.low:.2f}, {score.high:.2f}]"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"

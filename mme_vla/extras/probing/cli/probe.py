@@ -1,0 +1,120 @@
+"""`python -m mme_vla.probe checkpoint=…`: what a policy takes from its memory
+(configs/probe.yaml).
+"""
+
+import logging
+import sys
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.cli.evaluate import choose_subgoals, report_usage
+from mme_vla.cli.loading import load_policy
+from mme_vla.config.composition import resolved
+from mme_vla.config.devices import process_device
+from mme_vla.config.sections import read_section
+from mme_vla.errors import UserError, require
+
+logger = logging.getLogger("mme_vla.probe")
+
+
+def main() -> None:
+    """Run the command; the first word `card` means `card=true`."""
+    if sys.argv[1:2] == ["card"]:
+        sys.argv[1] = "card=true"
+    probe()
+
+
+@cli("probe")
+def probe(cfg: DictConfig) -> None:
+    """Probe what has no result yet, and write the page."""
+    from mme_vla.data.sources import open_sources
+    from mme_vla.envs.base import environment
+    from mme_vla.envs.episodes import choose_numbers, named_tasks
+    from mme_vla.evaluation.rollout.evaluation import choose_episodes, choose_shard, facts_of
+    from mme_vla.evaluation.rollout.events import event_arms
+    from mme_vla.evaluation.rollout.settings import RolloutSettings
+    from mme_vla.extras.probing.card import PAGE, card_text, run_card
+    from mme_vla.extras.probing.offline import OfflineSettings
+    from mme_vla.extras.probing.recordings import all_recordings
+    from mme_vla.extras.probing.report import table_of
+    from mme_vla.extras.probing.run import (
+        IN_CLOSED_LOOP,
+        NO_DATA,
+        ProbePlan,
+        probed_folder,
+        run_probe,
+    )
+    from mme_vla.utils import safe_name
+
+    values = resolved(cfg)
+    if (folders := values["compare"]) is not None:
+        listed = [folders] if isinstance(folders, str) else list(folders)
+        print(table_of({folder: probed_folder(Path(folder)) for folder in listed}))
+        return
+    card = values["card"]
+    if not (values["offline"] or values["online"] or card):
+        raise UserError(
+            "offline=false online=false leaves nothing to probe: set one of them to true."
+        )
+    if values["offline"] and values["recordings"] is None and not card:
+        raise UserError(NO_DATA)
+    events = event_arms(values["event"])
+    require(values["online"] or not events, IN_CLOSED_LOOP)
+    settings = RolloutSettings.from_config({**values, "event": None})
+    offline = read_section(OfflineSettings, values, others=True)
+    jobs = []
+    if values["online"] or card:
+        jobs = choose_episodes(
+            named_tasks(values), values["episodes"], settings.split, settings.env
+        )
+    shard = choose_shard(values["shard"])
+    if jobs:
+        environment(settings.env).check_installed()
+    log_to_terminal(logger)
+    device = process_device(str(cfg.device))
+    policy, name, source = load_policy(cfg, "probe", logger, device)
+    data = values["recordings"]
+    recordings = [] if data is None else all_recordings(open_sources(data, policy.embodiment))
+    numbers = (
+        choose_numbers(values["recorded"], len(recordings), "the data") if values["offline"] else []
+    )
+    probed = [recordings[i] for i in numbers]
+    subgoals = (
+        choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
+        if jobs
+        else None
+    )
+    predictor = None if subgoals is None else str(values["subgoal"]["name"])
+    facts = facts_of(policy, name, source, settings, predictor)
+    folder = Path(
+        "outputs",
+        "card" if card else "probe",
+        safe_name(name, "the policy's name"),
+        str(facts.checkpoint),
+    )
+    folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
+    logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
+    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source, events)
+    try:
+        if card:
+            graded = run_card(
+                policy.eval(),
+                plan,
+                folder,
+                facts,
+                settings,
+                references=values["references"],
+                subgoals=subgoals,
+            )
+            text, page = card_text(graded), folder / PAGE
+        else:
+            page = run_probe(policy.eval(), plan, folder, facts, settings, subgoals=subgoals).page
+            text = (folder / "table.md").read_text(encoding="utf-8")
+    finally:
+        if subgoals is not None:
+            report_usage(subgoals.usage)
+            subgoals.close()
+    print(text)
+    print(page)

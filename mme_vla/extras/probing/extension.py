@@ -1,0 +1,25 @@
+"""What probes and analyses add: names alone."""
+
+from pathlib import Path
+
+from mme_vla.registry import Command, Extension
+
+EXTENSION = Extension(
+    parts={"split_policy": {"sessions": "mme_vla.extras.probing.feed"}},
+    commands={
+        "analyse": Command(
+            "mme_vla.extras.probing.cli.analyse",
+            "what a memory attends to, selects, modulates and costs",
+            usage="python -m mme_vla.analyse",
+            processes="any",
+        ),
+        "probe": Command(
+            "mme_vla.extras.probing.cli.probe",
+            "what a policy takes from its memory, on recorded episodes and in closed loop",
+            "probe",
+            "python -m mme_vla.probe",
+            "shared",
+        ),
+    },
+    configs=Path(__file__).parent / "configs",
+)

@@ -1,0 +1,310 @@
+"""A whole probe: on recorded episodes, in closed loop, and the page about both. Repeated, it
+resumes.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from mme_vla.config.sections import read_section
+from mme_vla.data.console import progress
+from mme_vla.data.sources import open_sources
+from mme_vla.envs.base import environment
+from mme_vla.envs.make import make_env
+from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import UserError, require
+from mme_vla.evaluation.api import load
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.results.aggregate import aggregate
+from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
+from mme_vla.evaluation.results.events import idle_events
+from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.rollout.evaluation import (
+    Shard,
+    choose_episodes,
+    evaluate,
+    evaluate_events,
+    facts_of,
+    predictor_of,
+)
+from mme_vla.evaluation.rollout.events import event_arms
+from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.store import claim_run, find_records, fingerprint, read_folders
+from mme_vla.extras.probing import lines
+from mme_vla.extras.probing.arms import UNPROBED, Arm, choose_arms, options_of, slug
+from mme_vla.extras.probing.channels import channel_of
+from mme_vla.extras.probing.offline import OfflineSettings, probe_offline
+from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
+from mme_vla.extras.probing.recordings import Recording, all_recordings
+from mme_vla.extras.probing.report import Findings, write_images, write_page
+from mme_vla.policy.base import Policy
+from mme_vla.subgoal import SubgoalPredictor
+
+OFFLINE, ONLINE = "offline", "online"  # Folders of the lines and of the closed loop
+NO_DATA = (
+    "A probe on recorded episodes needs some: recordings=<dataset>. Those of the benchmark are made"
+    " by `mme-vla record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false"
+    " online=true probes in closed loop alone."
+)
+
+
+IN_CLOSED_LOOP = (
+    "event=…: events act in closed loop: add online=true to the command, or tasks=… in Python."
+)
+
+
+@dataclass(frozen=True)
+class ProbePlan:
+    """What is probed.
+
+    arms: as in `with`; None for `DEFAULT_ARMS`. recordings: episodes to probe; lend: to take from.
+    jobs: episodes of the closed loop, none for none. source: where the weights are from.
+    events: further arms of the closed loop, in the simulation.
+    """
+
+    arms: Any = None
+    recordings: Sequence[Recording] = ()
+    lend: Sequence[Recording] = ()
+    jobs: Sequence[Job] = ()
+    offline: OfflineSettings = field(default_factory=OfflineSettings)
+    shard: Shard = field(default_factory=Shard)
+    source: str | None = None
+    events: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Probe:
+    """The results of a probe. notes: what a reader has to know, such as arms that were left out."""
+
+    findings: Findings
+    comparisons: list[Comparison]
+    notes: list[str]
+    page: Path
+
+
+def run_probe(
+    policy: Policy,
+    plan: ProbePlan,
+    folder: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    *,
+    subgoals: SubgoalPredictor | None = None,
+    base: Callable[..., Any] = make_env,
+    show_progress: bool = True,
+) -> Probe:
+    """Run the parts of the plan that the folder lacks, and write the page."""
+    channel, notes = channel_of(policy), list[str]()
+    if plan.recordings:
+        has_boundaries = all(recording.tells_subtasks for recording in plan.recordings)
+        names = {recording.name for recording in plan.lend}
+        n_donors = len(names) - any(
+            recording.name in names for recording in plan.recordings
+        )  # never the probed one
+        arms, notes = choose_arms(plan.arms, policy, channel, n_donors, boundaries=has_boundaries)
+        _on_recordings(policy, arms, plan, folder / OFFLINE, facts, show_progress)
+    if plan.jobs:
+        has_boundaries = base is make_env and settings.env == "mme_vla"
+        arms, left_out = choose_arms(
+            plan.arms, policy, channel, len(plan.lend), boundaries=has_boundaries
+        )
+        notes += [f"In closed loop {note}" for note in left_out if note not in notes]
+        donors = DonorEpisodes(policy, channel, plan.lend) if plan.lend else None
+        for arm in [UNPROBED, *arms]:
+            probed = (
+                policy if arm is UNPROBED else ProbedPolicy(policy, arm, plan.lend, donors).eval()
+            )
+            evaluate(
+                probed,
+                plan.jobs,
+                folder / ONLINE / slug(arm.name),
+                replace(facts, model=named(facts.model, arm)),
+                settings,
+                subgoals=subgoals,
+                shard=plan.shard,
+                source=plan.source,
+                base=base,
+                notes={"arm": arm.name},
+                show_progress=show_progress,
+            )
+        if plan.events:
+            evaluate_events(
+                policy,
+                plan.jobs,
+                folder / ONLINE / slug(UNPROBED.name),
+                facts,
+                settings,
+                plan.events,
+                subgoals=subgoals,
+                shard=plan.shard,
+                source=plan.source,
+                base=base,
+                notes={"arm": UNPROBED.name},
+                show_progress=show_progress,
+            )
+    findings = Findings.of(lines.read_all(folder / OFFLINE))
+    records = read_folders(find_records([folder / ONLINE])) if (folder / ONLINE).is_dir() else []
+    comparisons = _paired(records, facts.split, facts.model)
+    notes += idle_events(records)
+    notes += [note for comparison in comparisons for note in comparison.gaps]
+    write_images(findings, plan.recordings, folder)
+    return Probe(
+        findings, comparisons, notes, write_page(folder, facts.model, findings, comparisons, notes)
+    )
+
+
+def _on_recordings(
+    policy: Policy,
+    arms: Sequence[Arm],
+    plan: ProbePlan,
+    folder: Path,
+    facts: RunFacts,
+    show_progress: bool,
+) -> None:
+    policy.require_processor().require_stats()
+    claim_run(folder, _settings(policy, plan, facts, arms))
+    shard = plan.shard
+    local = list(plan.recordings)[shard.index :: shard.count]
+    path = folder / (
+        "offline.jsonl" if shard.count == 1 else f"offline-{shard.index}of{shard.count}.jsonl"
+    )
+    with (
+        progress("probe", len(local), unit="episodes")
+        if show_progress
+        else nullcontext(lambda _: None) as advance
+    ):
+        probe_offline(policy, arms, local, plan.lend, path, plan.offline, advance)
+
+
+def _settings(
+    policy: Policy, plan: ProbePlan, facts: RunFacts, arms: Sequence[Arm]
+) -> dict[str, Any]:
+    """What decides the lines, as `run.json` keeps it."""
+    sources = {id(r.source): r.source for r in [*plan.recordings, *plan.lend]}
+    return {
+        "model": facts.model,
+        "checkpoint": facts.checkpoint,
+        "policy": fingerprint(dict(policy.config)),
+        "arms": {arm.name: options_of(arm) for arm in arms},
+        "data": {source.name: source.fingerprint for source in sources.values()},
+        "recordings": [recording.name for recording in plan.recordings],
+        **asdict(plan.offline),
+    }
+
+
+def probed_folder(folder: Path) -> Findings:
+    """What a finished probe's folder holds."""
+    findings = Findings.of(lines.read_all(folder / OFFLINE))
+    if not findings.moments:
+        raise UserError(
+            f"{folder} holds no probe on recorded episodes: no {OFFLINE}/offline.jsonl with lines"
+            " in it."
+        )
+    return findings
+
+
+def probe(
+    policy: Policy | str | Path,
+    recordings: Any = None,
+    arms: Sequence[Any] | None = None,
+    *,
+    output: str | Path,
+    tasks: str | Sequence[str] | None = None,
+    episodes: int | Sequence[int] | None = None,
+    seed: int = 42,
+    draws: int = 8,
+    moments: int | None = 8,
+    subgoal: str | SubgoalPredictor | None = None,
+    name: str | None = None,
+    base: Callable[..., Any] = make_env,
+    show_progress: bool = True,
+    event: str | Sequence[str] | None = None,
+    **settings: Any,
+) -> Probe:
+    """Measure what a policy takes from its memory; what `output` holds already is not run again.
+
+    Args:
+        policy: one with statistics; or a folder or hub repository to load one from.
+        recordings: recorded episodes: folders of datasets, as for the command. Without them the
+            closed loop is probed.
+        arms: interventions, such as `["shuffle", "drop:2", "nodemo+delay:64"]`; by default all that
+            are possible.
+        output: the probe's folder, for its lines and its page.
+        tasks, episodes: of the closed loop, as for `evaluate`; None leaves it out.
+        seed: of noise and of random choices.
+        draws: chunks sampled at each step. moments: most steps of an episode.
+        subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
+        name: what lines and records call the policy. base: makes an environment with the
+            benchmark's interface.
+        show_progress: whether a progress bar is shown. event: further arms of the closed loop, as
+            for `evaluate`.
+        settings: of `RolloutSettings`, such as `workers=2`.
+
+    Returns:
+        Its findings, the paired comparisons of the closed loop, notes, and the path of the page.
+
+    >>> probe("outputs/mine/latest", "outputs/val", output="outputs/probe").page  # doctest: +SKIP
+    """
+    run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
+    if recordings is None and tasks is None:
+        raise UserError(f"probe() needs recordings=…, tasks=…, or both. {NO_DATA}")
+    arms_of_events = event_arms(event)
+    require(tasks is not None or not arms_of_events, IN_CLOSED_LOOP)
+    loaded, source = load(policy)
+    recorded = (
+        [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
+    )
+    jobs = (
+        []
+        if tasks is None
+        else choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
+    )
+    if jobs and base is make_env:
+        environment(run_settings.env).check_installed()
+    predictor = predictor_of(loaded, subgoal)
+    facts = facts_of(
+        loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None
+    )
+    offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
+    plan = ProbePlan(arms, recorded, recorded, jobs, offline, source=source, events=arms_of_events)
+    folder = Path(output).expanduser()
+    return run_probe(
+        loaded.eval(),
+        plan,
+        folder,
+        facts,
+        run_settings,
+        subgoals=predictor,
+        base=base,
+        show_progress=show_progress,
+    )
+
+
+def named(model: str, arm: Arm) -> str:
+    """What records call a model under an arm; unprobed it keeps its name."""
+    return model if arm is UNPROBED else f"{model} · {arm.name}"
+
+
+def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Comparison]:
+    """Each arm against the unprobed run, over the episodes that both have, corrected for their
+    number.
+
+    model: the unprobed one's name.
+    """
+    tasks = tuple(dict.fromkeys(record.task for record in records))
+    if not tasks:
+        return []
+    protocol = Protocol(tasks, episodes=1 + max(record.episode for record in records))
+    methods = aggregate(records, protocol, split).methods
+    baseline = next(
+        (method for method in methods if method.model == model and method.event is None), None
+    )
+    if baseline is None:
+        return []
+    return compare_all(
+        [(m, baseline) for m in methods if m is not baseline and common_episodes(m, baseline)],
+        protocol,
+    )

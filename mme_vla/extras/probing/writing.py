@@ -1,0 +1,361 @@
+"""Score of writing: whether the frames that a memory keeps are those that show what an episode's
+outcome depends on.
+
+Nothing is trained and no policy acts: the memory selects along demonstrated episodes
+(`evidence.py`).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import comb
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from mme_vla.data.statistics import normalised_states
+from mme_vla.errors import UserError
+from mme_vla.extras.probing.evidence import EvidenceEpisode
+from mme_vla.memory.base import MemoryModule, frames_scored, make_scorer, stack_history
+from mme_vla.memory.history import CachedHistory, FrameScores, History
+from mme_vla.processing.normalise import normalize
+
+if TYPE_CHECKING:
+    from mme_vla.policy.mme import MMEPolicy
+
+LONGEST = 4000
+"""Frames of an episode that are rendered for a memory at most."""
+STRIDE = 4
+"""Frames between two steps at which a memory selects: the resolution of the lag."""
+FRAMES = 32
+"""Frames that the reference selections keep: as many as FrameSamp."""
+Selection = Callable[[int], np.ndarray]
+"""The frames kept at a step, ascending."""
+
+
+class TokensReadError(UserError):
+    """A memory reads vision tokens to choose, and there are none."""
+
+
+# Definitions --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class EpisodeWriting:
+    """What a memory kept along one episode, against the frames that show its facts.
+
+    precision: share of the kept frames that show a fact. recall: share of the facts so far of which
+    a frame is kept. Both are means over the steps of the execution. chance_precision,
+    chance_recall: the expectation for as many frames at random. lags: of each fact that was kept at
+    some step, frames from its first frame to the first such step.
+    """
+
+    precision: float
+    recall: float
+    chance_precision: float
+    chance_recall: float
+    lags: Sequence[int]
+    facts: int
+
+    @property
+    def score(self) -> float:
+        """The harmonic mean of precision and recall."""
+        return harmonic_mean(self.precision, self.recall)
+
+    @property
+    def chance(self) -> float:
+        """The score of as many frames at random."""
+        return harmonic_mean(self.chance_precision, self.chance_recall)
+
+
+def harmonic_mean(a: float, b: float) -> float:
+    """2ab / (a + b); 0 where both are 0."""
+    return 2 * a * b / (a + b) if a + b else 0.0
+
+
+def score_episode(
+    selection: Selection,
+    facts: Mapping[str, np.ndarray],
+    length: int,
+    exec_start: int,
+    stride: int = STRIDE,
+) -> EpisodeWriting | None:
+    """Score a selection along one episode; None where no fact has been visible at any step of the
+    execution.
+
+    Args:
+        selection: the frames selected at a step. facts: name → frames that show it, ascending.
+        length: of the episode. exec_start: its first execution frame. stride: frames between two
+            steps.
+    """
+    visible = np.zeros((len(facts), length), bool)
+    for row, frames in zip(visible, facts.values(), strict=True):
+        row[frames] = True
+    first = visible.argmax(1) if len(facts) else np.zeros(0, np.int64)
+    retained = np.full(len(facts), -1)
+    rows = []
+    for step in range(0, length, stride):
+        begun = first <= step
+        if not begun.any():
+            continue
+        frames, past = selection(step), visible[:, : step + 1]
+        selected = past[:, frames]
+        retained[(retained < 0) & selected.any(1)] = step
+        if step >= exec_start:
+            count = len(frames)
+            shows = float(selected.any(0).mean()) if count else 0.0
+            missed = [
+                comb(step + 1 - int(row.sum()), count) / comb(step + 1, count)
+                for row in past[begun]
+            ]
+            rows.append(
+                (shows, selected[begun].any(1).mean(), past.any(0).mean(), 1 - np.mean(missed))
+            )
+    if not rows:
+        return None
+    lags = (retained - first)[retained >= 0].tolist()
+    precision, recall, chance_precision, chance_recall = np.mean(np.asarray(rows), axis=0).tolist()
+    return EpisodeWriting(precision, recall, chance_precision, chance_recall, lags, len(facts))
+
+
+@dataclass
+class Writing:
+    """The scores of one memory: task → its episodes."""
+
+    tasks: dict[str, list[EpisodeWriting]] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """`tasks` and `mean`: rows of `precision`, `recall`, `score`, `chance`, `lag`, `held`,
+        `facts` and `episodes`.
+
+        lag: mean, in frames; None where no fact was kept. held: share of the facts that were kept
+        at some step.
+        """
+        rows = {task: _row(episodes) for task, episodes in self.tasks.items()}
+        mean: dict[str, Any] = {}
+        for name in next(iter(rows.values()), {}):
+            values = [row[name] for row in rows.values() if row[name] is not None]
+            total = (
+                sum(values)
+                if name in ("facts", "episodes")
+                else float(np.mean(values))
+                if values
+                else None
+            )
+            mean[name] = total
+        return {"tasks": rows, "mean": mean}
+
+
+def _row(episodes: Sequence[EpisodeWriting]) -> dict[str, Any]:
+    names = ("precision", "recall", "score", "chance")
+    means = {
+        name: float(np.mean([getattr(episode, name) for episode in episodes])) for name in names
+    }
+    lags, facts = (
+        [lag for episode in episodes for lag in episode.lags],
+        sum(episode.facts for episode in episodes),
+    )
+    lag = float(np.mean(lags)) if lags else None
+    return means | {
+        "lag": lag,
+        "held": len(lags) / facts,
+        "facts": facts,
+        "episodes": len(episodes),
+    }
+
+
+# Selections ---------------------------------------------------------------------------------------
+
+
+def oracle_selection(episode: EvidenceEpisode) -> Selection:
+    """The first frame of each fact so far, at most `FRAMES`: the ceiling."""
+    first = np.unique([frames[0] for frames in episode.facts.values()]).astype(np.int64)
+    return lambda step: first[first <= step][-FRAMES:]
+
+
+def random_selection(episode: EvidenceEpisode) -> Selection:
+    """`FRAMES` frames at random, anew at each step: chance."""
+
+    def selection(step: int) -> np.ndarray:
+        rng = np.random.default_rng([episode.episode, step])
+        return np.sort(rng.choice(step + 1, min(FRAMES, step + 1), replace=False))
+
+    return selection
+
+
+def boundary_selection(episode: EvidenceEpisode) -> Selection:
+    """The frames at which sub-tasks begin, and the newest: what the probe's `oracle` lets a memory
+    choose from.
+    """
+    return lambda step: np.union1d(episode.boundaries[episode.boundaries <= step], [step])[-FRAMES:]
+
+
+REFERENCES = {
+    "oracle": oracle_selection,
+    "random": random_selection,
+    "boundaries": boundary_selection,
+}
+"""Selections without a memory, by name."""
+
+
+class TokenlessHistory(CachedHistory):
+    """An episode without vision tokens, for memories that choose without them."""
+
+    def gather(self, indices: np.ndarray) -> torch.Tensor:
+        raise TokensReadError(
+            "This memory reads vision tokens to choose its frames: name a checkpoint that has it"
+            " with --checkpoint."
+        )
+
+
+def selected_frames(memory: MemoryModule, history: History, step: int) -> np.ndarray:
+    """The frames that a memory keeps at a step, ascending: those of its selection.
+
+    Where `forward` chooses among the selected tokens, those of its memory tokens.
+
+    Raises:
+        UserError: memory tokens belong to no frame, as a recurrent memory's.
+    """
+    if not memory.timed:
+        raise UserError(
+            f"{type(memory).__name__} makes a state of all frames that it reads and keeps none:"
+            " score one that selects."
+        )
+    if memory.capacity <= memory.budget:
+        return np.unique(memory.select(history, step)[:, 0])
+    tokens = memory(stack_history([memory.gather_selection(history, step)]))
+    ages = tokens.ages[tokens.mask].cpu().numpy()
+    return np.unique(step - ages[ages == ages.round()].astype(np.int64))
+
+
+def reads_tokens(memory: MemoryModule) -> bool:
+    """Whether a memory reads vision tokens to choose its frames, tried on an episode of `LONGEST`
+    frames.
+    """
+    stored = memory.storage.stored_frames(LONGEST)
+    history = TokenlessHistory(memory.storage, np.zeros(0), stored, LONGEST)
+    history.motion, history.state_width = torch.zeros(LONGEST, 8).__getitem__, 8
+    try:
+        selected_frames(memory, history, LONGEST - 1)
+    except TokensReadError:
+        return True
+    return False
+
+
+def required_frames(memory: MemoryModule) -> frozenset[int]:
+    """The frames that have to be rendered for a memory to select: scored ones, and all stored if it
+    reads tokens.
+    """
+    frames = frames_scored(memory, LONGEST)
+    if reads_tokens(memory):
+        frames = np.union1d(frames, memory.storage.stored_frames(LONGEST))
+    return frozenset(frames.tolist())
+
+
+def memory_selection(
+    memory: MemoryModule,
+    episode: EvidenceEpisode,
+    states: torch.Tensor,
+    policy: "MMEPolicy | None" = None,
+) -> Selection:
+    """What a memory keeps along an episode.
+
+    Args:
+        states: of the robot, normalised [t, s]. policy: makes the tokens; None where the memory
+            reads none to choose.
+    """
+    stored, scorer = memory.storage.stored_frames(episode.length), make_scorer(memory)
+    rows = (
+        {} if scorer is None else {t: scorer(t, episode.images[t]) for t in sorted(episode.images)}
+    )
+    values = {t: row for t, row in rows.items() if row is not None}
+    scores = (
+        FrameScores(np.array(list(values)), np.stack(list(values.values()))) if values else None
+    )
+    context = memory.storage, stored, episode.length, scores, episode.exec_start
+    history: CachedHistory
+    if policy is None:
+        history = TokenlessHistory(context[0], np.zeros(0), *context[1:])
+    else:
+        tokens = policy.encode_frames(
+            np.stack([episode.images[t] for t in stored.tolist()])
+        ).float()
+        history = CachedHistory(context[0], tokens.cpu().numpy(), *context[1:])
+    history.motion, history.state_width = states.__getitem__, states.shape[1]
+    return lambda step: selected_frames(memory, history, step)
+
+
+@torch.no_grad()
+def score_writing(
+    selector: MemoryModule | str,
+    episodes: Sequence[EvidenceEpisode],
+    policy: "MMEPolicy | None" = None,
+    stride: int = STRIDE,
+) -> Writing:
+    """Score what a memory keeps along demonstrated episodes.
+
+    Args:
+        selector: a memory, or a name of `REFERENCES`.
+        episodes: with the images of `required_frames`.
+        policy: the memory's own. Its statistics normalise states, and its vision tower makes tokens
+            where the memory reads them to choose. Without it the statistics are those of the
+            episodes.
+        stride: frames between two steps.
+
+    Raises:
+        UserError: the memory keeps no frames, or reads tokens and there is no policy.
+    """
+    writing = Writing()
+    if not episodes:
+        return writing
+    raw = np.concatenate([episode.states for episode in episodes])
+    if policy is None:
+        normalised = normalised_states(raw)
+    else:
+        normalised = normalize(
+            torch.from_numpy(raw), policy.require_processor().require_stats().state
+        )
+    states = normalised.split([episode.length for episode in episodes])
+    tower = policy if isinstance(selector, MemoryModule) and reads_tokens(selector) else None
+    for episode, motion in zip(episodes, states, strict=True):
+        if isinstance(selector, str):
+            selection = REFERENCES[selector](episode)
+        else:
+            selection = memory_selection(selector, episode, motion, tower)
+        score = score_episode(selection, episode.facts, episode.length, episode.exec_start, stride)
+        if score is not None:
+            writing.tasks.setdefault(episode.task, []).append(score)
+    return writing
+
+
+def writing_table(results: Mapping[str, Writing]) -> str:
+    """Two Markdown tables: the means of each memory, and the score of each in every task with
+    chance behind it.
+
+    Memories that were scored on no episode are left out.
+    """
+    rows = {name: writing.to_dict() for name, writing in results.items() if writing.tasks}
+    lines = [
+        "| memory | score | chance | precision | recall | lag | held |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for name, row in rows.items():
+        mean = row["mean"]
+        shares = " | ".join(
+            f"{mean[key]:.2f}" for key in ("score", "chance", "precision", "recall")
+        )
+        lag = "" if mean["lag"] is None else f"{mean['lag']:.0f}"
+        lines.append(f"| `{name}` | {shares} | {lag} | {mean['held']:.2f} |")
+    tasks = list(dict.fromkeys(task for row in rows.values() for task in row["tasks"]))
+    lines += [
+        "",
+        f"| task | {' | '.join(f'`{name}`' for name in rows)} |",
+        "|---|" + "---:|" * len(rows),
+    ]
+    for task in tasks:
+        cells = [row["tasks"].get(task) for row in rows.values()]
+        texts = (
+            "" if cell is None else f"{cell['score']:.2f} ({cell['chance']:.2f})" for cell in cells
+        )
+        lines.append(f"| {task} | {' | '.join(texts)} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,443 @@
+"""`rollouts`: episodes as data to learn from, with what the policy saw, what it sampled, and what
+came of it.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from mme_vla.backbone.choice import ChoiceHead
+from mme_vla.backbone.flow import HasFlowHead
+from mme_vla.config.sections import read_section
+from mme_vla.envs.make import make_env
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.vector.pool import Job, Reply, VecEnv
+from mme_vla.errors import UserError, check_known, require
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.rollout.environment import make_rollout_env
+from mme_vla.evaluation.rollout.episode import RunningEpisode
+from mme_vla.evaluation.rollout.local import LocalEnvs
+from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.extras.trajectories.log_prob import SamplePath, log_prob, sample_path
+from mme_vla.memory.base import stack_history
+from mme_vla.policy.acting import choose_actions
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.registry import REWARDS
+from mme_vla.types import Batch, HistoryTokens, Labels, TensorStruct
+
+KEEP = ("observations", "rewards", "log_probs", "oracle")
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One episode, decision by decision; t decisions. What `keep` leaves out is None.
+
+    job: which episode. outcome: `success`, `fail`, `timeout` or `error`. steps: control steps.
+    error: of an episode that an error ended, its message. Before the first decision t is 0, and
+    there are no rows. chunks: [t, h, a], sampled, in the network's units. actions: float32 [n, w]
+    of each decision, executed. observations: rows of what the policy saw, with the memory's
+    selection; `actions` are the executed ones in the
+        network's units, `action_mask` marks them.
+    rewards: [t], of the actions of each decision.
+    log_probs: [t], of the executed choices (`log_prob`) or of the sampled path (`path_log_prob`).
+    paths: of a flow with `backbone.head.deviation`, the states [t, k + 1, h, a] from noise to
+    chunk. oracle: `observations` of the decisions at which the oracle had an action, with its
+    actions as `actions`.
+    """
+
+    job: Job
+    outcome: str
+    steps: int
+    chunks: Tensor
+    actions: tuple[np.ndarray, ...]
+    observations: Batch | None = None
+    rewards: Tensor | None = None
+    log_probs: Tensor | None = None
+    paths: Tensor | None = None
+    oracle: Batch | None = None
+    error: str | None = None
+
+    @property
+    def success(self) -> bool:
+        return self.outcome == "success"
+
+    @property
+    def total_reward(self) -> float:
+        """The sum of all rewards."""
+        require(self.rewards is not None, 'This trajectory has no rewards: add "rewards" to keep.')
+        assert self.rewards is not None
+        return float(self.rewards.sum())
+
+
+def rollouts(
+    policy: MMEPolicy,
+    env: str | Callable[..., Any],
+    jobs: Sequence[Job],
+    keep: Sequence[str] = ("observations", "rewards"),
+    *,
+    reward: str = "sparse",
+    oracle_share: float = 0.0,
+    workers: int = 0,
+    env_options: Mapping[str, Any] | None = None,
+    **settings: Any,
+) -> Iterator[Trajectory]:
+    """Run episodes with a policy, and yield each as a trajectory when it ends.
+
+    Every job yields one. An episode that an error ended is tried again `retries` times first.
+
+    Args:
+        policy: with statistics; its weights may change between two calls, not during one.
+        env: a name as `env=` of the commands, or a function that makes an environment with the
+            benchmark's interface from `task`, `split`, `episode` and `max_steps`. It may have a
+            method `oracle()` (`mme_vla.envs.oracle`).
+        jobs: the episodes, `Job(task, split, episode)`.
+        keep: of `observations`, `rewards`, `log_probs` and `oracle`.
+        reward: a name in `REWARDS`, for env="mme_vla"; functions return rewards of their own.
+        oracle_share: share of the decisions at which the oracle acts in place of the policy, 0 to
+            1.
+        workers: processes that simulate; 0 simulates in this process, without starting any.
+        env_options: further arguments of the environment, such as
+            `{"seed": 7, "difficulty": "easy"}`.
+        settings: of `RolloutSettings`, such as `seed` of the policy's noise, `max_steps`,
+            `max_batch`.
+
+    Raises:
+        UserError: an unknown name, or something to keep that this policy or environment does not
+            have.
+    """
+    require(
+        len(set(jobs)) == len(jobs), "jobs has an episode twice: run it again with another seed=…."
+    )
+    for name in keep:
+        check_known("part of a trajectory", name, KEEP)
+    require(0 <= oracle_share <= 1, f"oracle_share={oracle_share} must lie between 0 and 1.")
+    if not isinstance(policy, MMEPolicy):
+        raise UserError(
+            f"rollouts() needs a policy of kind mme, and this is a {type(policy).__name__}."
+        )
+    if "log_probs" in keep:
+        check_log_prob(policy)
+        require(
+            not oracle_share,
+            "log_probs are of the policy's own choices: keep none with oracle_share.",
+        )
+    run_settings = read_section(
+        RolloutSettings, settings if callable(env) else {**settings, "env": env}
+    )
+    oracle = "oracle" in keep or oracle_share > 0
+    require(
+        not oracle or policy.embodiment.action.choice,
+        "The oracle chooses among options: use embodiment=robomme_choice, or keep no oracle.",
+    )
+    options = _env_options(policy, env, run_settings, reward, oracle) | dict(env_options or {})
+    envs: Any = (
+        VecEnv([], workers, make_rollout_env, options, run_settings.timeout_s)
+        if workers
+        else LocalEnvs(options)
+    )
+    facts = RunFacts(
+        "rollouts", "rollouts", run_settings.seed, run_settings.split, run_settings.max_steps
+    )
+    collector = _Collector(
+        policy,
+        envs,
+        facts,
+        run_settings,
+        lambda record: None,
+        keep=tuple(keep),
+        oracle_share=oracle_share,
+    )
+    with envs:
+        for _ in collector.rounds(list(jobs)):
+            while collector.finished:
+                yield collector.finished.pop(0)
+        yield from collector.finished
+
+
+def check_log_prob(policy: MMEPolicy) -> None:
+    """Make sure that what this policy samples has a probability."""
+    head = policy.backbone.head if isinstance(policy.backbone, HasFlowHead) else None
+    require(
+        head is not None and (isinstance(head, ChoiceHead) or head.deviation > 0),
+        'keep="log_probs": this policy samples without a density. Set backbone.head.name=choice, or'
+        " backbone.head.deviation=0.1 of a flow.",
+    )
+
+
+def join(batches: Sequence[Batch]) -> Batch:
+    """The rows of several batches as one, prompts padded to the longest.
+
+    Raises:
+        UserError: some batches have a field that others lack. Where None counts all rows alike
+            (`weight`, `action_mask`, `options`) it becomes ones instead.
+    """
+    require(batches, "There are no rows to join.")
+    require(
+        all(batch is not None for batch in batches),
+        "None has no rows to join: leave out trajectories that an error ended before their first"
+        " decision.",
+    )
+    require(
+        len({tuple(batch.labels) for batch in batches}) == 1,
+        "The batches to join have different labels.",
+    )
+    length = max(batch.prompt.shape[1] for batch in batches)
+    joined: dict[str, Any] = {}
+    for name in (member.name for member in fields(Batch)):
+        values = [getattr(batch, name) for batch in batches]
+        known = [value for value in values if value is not None]
+        if name in ("prompt", "prompt_mask"):
+            values = [functional.pad(value, (0, length - value.shape[1])) for value in values]
+        elif known and name in ("weight", "action_mask", "options"):
+            ones = [known[0].new_ones(len(batch.prompt), *known[0].shape[1:]) for batch in batches]
+            values = [
+                one if value is None else value for value, one in zip(values, ones, strict=True)
+            ]
+        elif len(known) not in (0, len(values)):
+            raise UserError(
+                f"{len(known)} of {len(values)} batches to join have {name!r}: give it to all, or"
+                " to none."
+            )
+        joined[name] = _cat(values)
+    return Batch(**joined)
+
+
+def _cat(values: Sequence[Any]) -> Any:
+    """Tensors, labels or structs of tensors as one; of anything else the first."""
+    first = values[0]
+    if isinstance(first, HistoryTokens):
+        return stack_history([row for value in values for row in _unbatched(value)])
+    if isinstance(first, Labels):
+        return Labels({name: torch.cat([value[name] for value in values]) for name in first})
+    if isinstance(first, TensorStruct):
+        members = [member.name for member in fields(first)]  # type: ignore[arg-type]
+        return type(first)(
+            **{name: _cat([getattr(value, name) for value in values]) for name in members}
+        )
+    return torch.cat(list(values)) if isinstance(first, Tensor) else first
+
+
+@torch.no_grad()
+def with_view_tokens(policy: MMEPolicy, batch: Batch, size: int = 32) -> Batch:
+    """The rows with the vision tower's tokens, so that a tower that does not learn runs once for
+    each row.
+    """
+    tokens = []
+    with policy.autocast():
+        for start in range(0, len(batch.prompt), size):
+            images = policy.prepare_images(
+                batch.rows(slice(start, start + size)).to(policy.device)
+            ).images
+            tokens.append(
+                policy.backbone.encode_images(images.flatten(0, 1)).unflatten(0, images.shape[:2])
+            )
+    return replace(batch, view_tokens=torch.cat(tokens))
+
+
+def _unbatched(history: HistoryTokens) -> list[HistoryTokens]:
+    return [history._map(lambda x, i=i: x[i]) for i in range(len(history.mask))]
+
+
+def _env_options(
+    policy: MMEPolicy,
+    env: str | Callable[..., Any],
+    settings: RolloutSettings,
+    reward: str,
+    oracle: bool,
+) -> dict[str, Any]:
+    robot = policy.embodiment
+    options: dict[str, Any] = {"max_steps": settings.max_steps, "robot": robot, "oracle": oracle}
+    if callable(env):
+        return options | {"base": env}
+    check_known("reward", reward, REWARDS)
+    options |= {"base": make_env, "env": env, "render": settings.render, "reward": reward}
+    options["action_space"] = robot.action.space
+    return options | {f"include_{name}": True for name in robot.readings}
+
+
+@dataclass
+class _Decision:
+    """One decision of a running episode."""
+
+    row: Batch | None
+    state: Tensor
+    chunk: Tensor
+    actions: np.ndarray
+    log_prob: Tensor | None
+    path: Tensor | None
+    oracle: np.ndarray | None
+    reward: float = 0.0
+
+
+@dataclass
+class _Collector(Rollout):
+    """A rollout that keeps every decision.
+
+    keep, oracle_share: as for `rollouts`. finished: trajectories that were not yielded yet.
+    """
+
+    keep: tuple[str, ...] = ()
+    oracle_share: float = 0.0
+    finished: list[Trajectory] = field(default_factory=list)
+    _decisions: dict[RunningEpisode, list[_Decision]] = field(default_factory=dict)
+    _oracle: dict[RunningEpisode, np.ndarray | None] = field(default_factory=dict)
+
+    def _take(self, reply: Reply) -> None:
+        running = self._running[reply.worker]
+        self._oracle[running] = reply.info.get("oracle")
+        decisions = self._decisions.setdefault(running, [])
+        if reply.reward is not None and decisions:
+            decisions[-1].reward += float(reply.reward)
+            if running.events.holding is None:
+                decisions[-1].actions = decisions[-1].actions[: int(reply.info.get("executed", 0))]
+        super()._take(reply)
+
+    @torch.no_grad()
+    def _choose(self, batch: list[RunningEpisode]) -> np.ndarray:
+        policy, episodes = self.policy, [running.episode for running in batch]
+        assert isinstance(policy, MMEPolicy)
+        rows: list[Batch] = []
+        path: SamplePath | None = None
+
+        def predict(observation: Batch, noise: Mapping[str, Tensor]) -> Tensor:
+            nonlocal path
+            rows.append(_with_memory(policy, observation, batch))
+            if "increments" in noise and "log_probs" in self.keep:
+                deviation = policy.backbone.head.deviation  # type: ignore[union-attr]
+                path = sample_path(policy, rows[0], deviation, **noise)  # type: ignore[arg-type]
+                return path.chunk
+            return policy.predict_chunk(observation, episodes, noise, self.settings.flow_steps)
+
+        selection = choose_actions(policy, episodes, predict)
+        execute = self.settings.execute or policy.embodiment.action.execute
+        log_probs = None if path is None else path.log_prob
+        if "log_probs" in self.keep and path is None:
+            log_probs = log_prob(policy, rows[0], selection.chunk, execute=execute)
+        actions = selection.actions.copy()
+        for i, running in enumerate(batch):
+            oracle = self._oracle.get(running)
+            if self.oracle_share and oracle is not None and self._oracle_acts(running):
+                actions[i] = oracle
+                running.episode.acted(actions[i])
+            row = (
+                rows[0].rows(slice(i, i + 1)).to("cpu")
+                if {"observations", "oracle"} & set(self.keep)
+                else None
+            )
+            log = None if log_probs is None else log_probs[i].cpu()
+            states = None if path is None else path.states[i].cpu()
+            decision = _Decision(
+                row,
+                running.episode.state,
+                selection.chunk[i],
+                actions[i][:execute],
+                log,
+                states,
+                oracle,
+            )
+            self._decisions[running].append(decision)
+        return actions
+
+    def _oracle_acts(self, running: RunningEpisode) -> bool:
+        """Whether the oracle takes this decision; a function of seed, episode and number of the
+        decision.
+        """
+        job, number = running.job, len(self._decisions[running])
+        rng = np.random.default_rng([self.settings.seed, job.episode, number, *job.task.encode()])
+        return bool(rng.random() < self.oracle_share)
+
+    def _spec(self, job: Job) -> tuple[EpisodeSpec, str | None]:
+        return EpisodeSpec(
+            job.task, job.split, job.episode, 0, ""
+        ), None  # of any environment; no record is written
+
+    def _finish(
+        self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True
+    ) -> None:
+        records: list[EpisodeRecord] = []
+        decisions = self._decisions.pop(running, [])
+        self._oracle.pop(running, None)
+        self.record = records.append
+        tries = self._tries[running.job]
+        super()._finish(running, status, error, retry)
+        (record,) = records
+        tried_again = record.outcome == "error" and retry and tries <= self.settings.retries
+        if not tried_again:
+            self.finished.append(self._trajectory(running.job, record, decisions))
+
+    def _trajectory(
+        self, job: Job, record: EpisodeRecord, decisions: list[_Decision]
+    ) -> Trajectory:
+        keep = self.keep
+        rows = [d.row for d in decisions if d.row is not None]
+        executed = [
+            self._labelled(d.row, d.state, d.actions) for d in decisions if d.row is not None
+        ]
+        targets = [
+            (d.row, d.state, d.oracle[None])
+            for d in decisions
+            if d.row is not None and d.oracle is not None
+        ]
+        log_probs = [d.log_prob for d in decisions if d.log_prob is not None]
+        paths = [d.path for d in decisions if d.path is not None]
+        return Trajectory(
+            job,
+            record.outcome,
+            record.steps,
+            torch.stack([d.chunk for d in decisions])
+            if decisions
+            else torch.zeros(0, *self._chunk_shape),
+            tuple(d.actions for d in decisions),
+            join(executed) if "observations" in keep and rows else None,
+            torch.tensor([d.reward for d in decisions]) if "rewards" in keep else None,
+            torch.stack(log_probs) if log_probs else None,
+            torch.stack(paths) if paths else None,
+            join([self._labelled(*target) for target in targets])
+            if "oracle" in keep and targets
+            else None,
+            record.error,
+        )
+
+    @property
+    def _chunk_shape(self) -> tuple[int, int]:
+        return self.policy.horizon, self.policy.action_dim
+
+    def _labelled(self, row: Batch, state: Tensor, actions: np.ndarray) -> Batch:
+        """A row with these actions [n, w] in the network's units, repeated to a chunk, of which
+        they alone count.
+        """
+        processor, horizon = self.policy.require_processor(), self.policy.horizon
+        before, count = processor.samples.window - 1, len(actions)
+        last = (
+            actions[-1:]
+            if count
+            else np.zeros((1, self.policy.embodiment.action.width), np.float32)
+        )
+        chunk = np.concatenate(
+            [last.repeat(before, 0), actions, last.repeat(horizon - before - count, 0)]
+        )
+        mask = torch.zeros(1, horizon, dtype=torch.bool)
+        mask[:, before : before + count] = True
+        return replace(row, actions=processor.actions(chunk, state)[None], action_mask=mask)
+
+
+def _with_memory(policy: MMEPolicy, observation: Batch, batch: Sequence[RunningEpisode]) -> Batch:
+    """The observation with the memory's selection and the options, as a row of training data has
+    them.
+    """
+    history, options = None, None
+    if policy.memory is not None:
+        history = stack_history(
+            [running.episode.gather_selection() for running in batch], policy.device
+        )
+    if letters := len(policy.embodiment.action.choice):
+        options = torch.zeros(len(batch), letters, dtype=torch.bool, device=policy.device)
+        for i, running in enumerate(batch):
+            options[i, [option.number for option in running.episode.options]] = True
+    return replace(observation, history=history, options=options)

@@ -1,6 +1,0 @@
-"""`python -m mme_vla.nano`: the command is mme_vla/cli/nano.py."""
-
-from mme_vla.cli import run
-
-if __name__ == "__main__":
-    run("nano")

@@ -1,0 +1,39 @@
+"""Demonstrations carried out motion by motion show what a policy meets; and noise that hides last
+digits.
+"""
+
+import numpy as np
+import pytest
+
+from mme_vla.embodiment.robomme import benchmark_state
+from mme_vla.envs import metadata
+from mme_vla.envs.make import make_env
+from mme_vla.extras.nano.demonstrations import record
+from mme_vla.extras.nano.evaluating import replay
+
+SCENE = {"seed": 3_000_001, "difficulty": "easy"}
+
+
+def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand(renderer: str) -> None:
+    made = record("SwingXtimes", choices=[], cameras=[], carried_out=True, **SCENE)  # type: ignore[arg-type]
+    assert made is not None
+    env = make_env("SwingXtimes", action_space="waypoint", render=False, **SCENE)  # type: ignore[arg-type]
+    observation, _ = env.reset()
+    for number, (frame, target) in enumerate(
+        zip(made.motions.decisions, made.motions.targets, strict=True)
+    ):
+        now = benchmark_state(
+            observation["joint_state_list"][-1], observation["gripper_state_list"][-1]
+        )
+        assert np.allclose(made.states[frame], now, atol=1e-3), number
+        observation, _, ended, _, info = env.step(target)
+    env.close()
+    assert ended and info["status"] == "success"
+
+
+def test_what_the_demonstrator_does_solves_an_episode_through_the_actions_of_policies() -> None:
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    spec = metadata.episode("VideoUnmask", "val", 0)
+    record = replay(spec, max_steps=500)
+    assert (record.model, record.outcome, record.seed) == ("planner", "success", spec.seed)
+    assert replay(spec, max_steps=record.steps // 2).outcome == "timeout"

@@ -1,0 +1,124 @@
+"""A probe in closed loop: paired with the unprobed run, gone on with after a stop, on one page with
+the offline one.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.probe_fakes import JOBS, actions, made_up
+from helpers.rollout_fakes import FACTS, quick_policy, use_inline_envs
+from helpers.scripted_env import make_moving_env
+from mme_vla.errors import UserError
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.extras.probing.arms import read_arm
+from mme_vla.extras.probing.lines import LINES
+from mme_vla.extras.probing.offline import OfflineSettings
+from mme_vla.extras.probing.report import Findings, table_of
+from mme_vla.extras.probing.run import Probe, ProbePlan, named, probed_folder, run_probe
+
+
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [
+        ("framesamp_modul", "recent:8"),
+        ("framesamp_modul", "nodemo+drop:1"),
+        ("tokendrop_expert", "pause:8"),
+        ("tokendrop_expert", "distract:1"),
+        ("ttt_context", "pause:8"),
+        ("ttt_context", "distract:1"),
+    ],
+)
+def test_images_on_demand_are_all_that_an_arm_reads(name: str, word: str) -> None:
+    policy = quick_policy(name, 8).eval()
+    for few, every in zip(actions(policy, word), actions(policy, word, draw="all"), strict=True):
+        assert np.array_equal(few, every)
+
+
+def probe_both(folder: Path) -> Probe:
+    policy = quick_policy("framesamp_modul").eval()
+    recordings = made_up()
+    offline = OfflineSettings(1, 2, 1, True, 2)
+    events = ["pause:4", "pause:4@step:99"]
+    request = ProbePlan(
+        ["shuffle", "nodemo"], recordings[:1], recordings, JOBS, offline, events=events
+    )
+    settings = RolloutSettings(max_steps=24, flow_steps=2, workers=1, max_batch=1)
+    return run_probe(
+        policy, request, folder, FACTS, settings, base=make_moving_env, show_progress=False
+    )
+
+
+def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_inline_envs(monkeypatch)
+    findings = probe_both(tmp_path)
+    arms = {named("tiny", read_arm(w)) for w in ("shuffle", "nodemo")}
+    assert {c.first for c in findings.comparisons} == {
+        *arms,
+        "tiny · pause:4",
+        "tiny · pause:4@step:99",
+    }
+    assert all(c.second == "tiny" and c.episodes == 2 for c in findings.comparisons)
+    assert findings.notes == [
+        "event=pause:4@step:99 did not act in 2 episodes: its place never came."
+    ]
+    assert set(findings.findings.arms()) == {"shuffle", "nodemo"}
+    page = findings.page.read_text()
+    for words in (
+        "Decay with distance",
+        "In closed loop",
+        "tiny · shuffle",
+        "data:image/webp;base64,",
+    ):
+        assert words in page
+    assert "<script" not in page and 'src="http' not in page and 'href="http' not in page
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")}
+    assert len(before) == 6
+    again = probe_both(tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")} == before
+    assert again.findings == findings.findings
+    assert "| tiny |" in table_of({"tiny": probed_folder(tmp_path)}) and isinstance(
+        findings.findings, Findings
+    )
+
+
+def test_shards_of_a_probe_meet_in_one_page(tmp_path: Path) -> None:
+    from mme_vla.evaluation.rollout.evaluation import Shard
+
+    policy, recordings = quick_policy("framesamp_modul").eval(), made_up()
+    for index in range(2):
+        request = ProbePlan(
+            ["drop:all"],
+            recordings,
+            recordings,
+            (),
+            OfflineSettings(1, 2, 1, False, 2),
+            Shard(index, 2),
+        )
+        findings = run_probe(
+            policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False
+        )
+    assert len(list((tmp_path / "offline").glob(LINES))) == 2
+    assert {line.recording for line in findings.findings.moments} == {
+        "made-up/0",
+        "made-up/1",
+        "made-up/2",
+    }
+
+
+def test_a_folder_of_another_probe_is_refused(tmp_path: Path) -> None:
+    policy, recordings = quick_policy("framesamp_modul").eval(), made_up()
+    for words in (["drop:all"], ["drop:1"]):
+        request = ProbePlan(
+            words, recordings[:1], recordings, (), OfflineSettings(1, 2, 1, False, 2)
+        )
+        if words == ["drop:all"]:
+            run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False)
+        else:
+            with pytest.raises(UserError, match="holds a run with other settings"):
+                run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False)
+    with pytest.raises(UserError, match="holds no probe on recorded episodes"):
+        probed_folder(tmp_path / "elsewhere")
