@@ -9,11 +9,12 @@ names is an untrusted word: it is imported only where the user says `trust_plugi
 import importlib
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.registry import installed_extensions
 
 TRUST_FLAG, TRUST_WORD = "--trust-plugins", "trust_plugins=true"
 """How one says on a command line that the plugins of a checkpoint may be imported; every command
@@ -73,7 +74,8 @@ def import_trusted(config: Any, source: str, trust: bool) -> None:
     has said that what it names may run here.
     """
     names = plugins_of(config, source)
-    strange = [name for name in names if name not in sys.modules]
+    installed = [module for module in _installed_parts(config) if module not in names]
+    strange = [name for name in [*names, *installed] if name not in sys.modules]
     require(
         not strange or trust,
         f"{source} needs the plugin {listed(strange)}: code that the checkpoint names and that"
@@ -82,6 +84,33 @@ def import_trusted(config: Any, source: str, trust: bool) -> None:
         " with it installed.",
     )
     import_plugins(names)
+
+
+def _installed_parts(config: Any) -> list[str]:
+    """Modules of installed packages that a configuration's names would import.
+
+    Every text counts, wherever it is: the kind of a part is known only when it is built.
+    """
+    modules = {
+        name: module
+        for extension in installed_extensions()
+        for parts in extension.parts.values()
+        for name, module in parts.items()
+    }
+    if not modules:
+        return []
+    return list(dict.fromkeys(modules[text] for text in _texts(config) if text in modules))
+
+
+def _texts(values: Any) -> Iterator[str]:
+    if isinstance(values, str):
+        yield values
+    elif isinstance(values, Mapping):
+        for value in values.values():
+            yield from _texts(value)
+    elif isinstance(values, Sequence):
+        for value in values:
+            yield from _texts(value)
 
 
 def trust_as_override(words: Iterable[str]) -> list[str]:

@@ -1,0 +1,99 @@
+"""Extensions: names that extras and installed packages add, without being imported."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mme_vla import build_policy, cli, registry
+from mme_vla.config.composition import library_files
+from mme_vla.config.plugins import import_trusted
+from mme_vla.errors import UserError
+from mme_vla.registry import Command, Extension, Registry
+
+SOURCE = """
+from mme_vla.memory.framesamp import FrameSamp
+from mme_vla.registry import register
+
+
+@register("memory", "fading")
+class Fading(FrameSamp):
+    pass
+
+
+def main():
+    print("faded")
+"""
+PACKAGE = "package_of_a_fading_memory"
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An installed package that adds a memory, a model of it and a command."""
+    (tmp_path / f"{PACKAGE}.py").write_text(SOURCE)
+    (tmp_path / "configs" / "model").mkdir(parents=True)
+    (tmp_path / "configs" / "memory").mkdir()
+    (tmp_path / "configs" / "model" / "fading_modul.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - /memory: fading\n  - /integration: modulator\n"
+        "name: fading_modul\n"
+    )
+    shipped = library_files("memory")["framesamp"].read_text()
+    (tmp_path / "configs" / "memory" / "fading.yaml").write_text(
+        shipped.replace("name: framesamp", "name: fading")
+    )
+    extension = Extension(
+        parts={"memory": {"fading": PACKAGE}},
+        commands={"fade": Command(PACKAGE, "fade")},
+        configs=tmp_path / "configs",
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(registry, "installed_extensions", lambda: (extension,))
+    monkeypatch.setattr("mme_vla.config.plugins.installed_extensions", lambda: (extension,))
+    yield tmp_path
+    sys.modules.pop(PACKAGE, None)
+    registry.MEMORIES._entries.pop("fading", None)
+
+
+def test_an_installed_package_adds_a_memory_and_its_files(package: Path) -> None:
+    assert "fading" in registry.MEMORIES and PACKAGE not in sys.modules
+    policy = build_policy("fading_modul", backbone="tiny", device="meta")
+    assert type(policy.memory).__name__ == "Fading" and PACKAGE in sys.modules
+
+
+def test_an_installed_package_adds_a_command(
+    package: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["mme-vla fade"])
+    cli.run("fade")
+    assert capsys.readouterr().out == "faded\n"
+
+
+def test_a_checkpoint_that_names_a_part_of_a_package_needs_trust(package: Path) -> None:
+    config = {"name": "fading_modul", "memory": {"name": "fading"}}
+    with pytest.raises(UserError, match=f"needs the plugin {PACKAGE}.*--trust-plugins"):
+        import_trusted(config, "a checkpoint", trust=False)
+    assert PACKAGE not in sys.modules
+    import_trusted(config, "a checkpoint", trust=True)
+
+
+def test_an_entry_point_that_is_no_extension_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Entry:
+        name, value = "broken", "broken_package:EXTENSION"
+
+        def load(self) -> object:
+            raise ImportError("no module named broken_package")
+
+    monkeypatch.setattr(registry, "entry_points", lambda group: [Entry()])
+    with pytest.raises(UserError, match=r"'broken'.*broken_package.*uninstall"):
+        registry.installed_extensions.__wrapped__()
+    monkeypatch.setattr(Entry, "load", lambda self: "text")
+    with pytest.raises(UserError, match=r"is no mme_vla\.registry\.Extension"):
+        registry.installed_extensions.__wrapped__()
+
+
+def test_a_name_of_the_core_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    extension = Extension(parts={"shape": {"dot": "elsewhere"}})
+    monkeypatch.setattr(registry, "extensions", lambda: (extension,))
+    shapes: Registry[object] = Registry("shape", {"dot": "collections"})
+    assert shapes._shipped == {"dot": "collections"}
