@@ -11,7 +11,7 @@ from mme_vla import UserError
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.card import model_card
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.policy.run_folders import SHIPPED, find_run
+from mme_vla.policy.run_folders import find_run, shipped_checkpoints
 from mme_vla.testing.small import small_policy, unit_stats
 
 
@@ -68,7 +68,7 @@ def test_the_example_of_a_card_runs_to_an_action(
     assert space["chunk"].shape[-1] == saved.embodiment.action.width
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", shipped_checkpoints())
 def test_the_example_of_a_shipped_card_runs_to_an_action(name: str) -> None:
     (block,) = re.findall(
         r"```python\n(.*?)```", (find_run(Path(name)) / "README.md").read_text(), re.DOTALL

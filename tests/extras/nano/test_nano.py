@@ -21,7 +21,7 @@ from mme_vla.extras.nano.runs import counts_of
 from mme_vla.extras.nano.tower import CLASSES, by_class, summarise
 from mme_vla.memory.transforms import RepeatFrame
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.policy.run_folders import SHIPPED, resolve_checkpoint
+from mme_vla.policy.run_folders import resolve_checkpoint, shipped_checkpoints
 from mme_vla.testing import check_backbone
 from mme_vla.types import Batch
 
@@ -148,10 +148,8 @@ def test_demonstrations_are_counted_by_difficulty(counts: object, words: str) ->
 def test_a_tasks_settings_come_with_its_name_unless_others_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "nano").mkdir()
-    (tmp_path / "nano" / "StopCube.yaml").touch()
-    (tmp_path / "nano" / "nano16.yaml").touch()
-    monkeypatch.setattr(nano_command, "config_dir", lambda: tmp_path)
+    files = {name: tmp_path / f"{name}.yaml" for name in ("StopCube", "nano16")}
+    monkeypatch.setattr(nano_command, "library_files", lambda group: files)
     assert with_settings(["task=StopCube", "seed=1"]) == [
         "nano=StopCube",
         "task=StopCube",
@@ -175,7 +173,7 @@ def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:
     assert policy.act(episode).shape == (4, 7)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", shipped_checkpoints())
 def test_shipped_checkpoints_are_small_and_whole(name: str) -> None:
     folder = resolve_checkpoint(Path(name))
     lines = [line.split() for line in (folder / "SHA256SUMS").read_text().splitlines()]
