@@ -28,7 +28,6 @@ from mme_vla.config.composition import (
     join_plugins,
     library_trees,
     local_hydra,
-    name_under_hydra,
     parse,
 )
 from mme_vla.config.naming import join_memories, several_memories
@@ -61,8 +60,6 @@ def cli[T](
                 join_plugins(
                     cfg, str(hydra_cfg.job.config_name), command_trees(), hydra_cfg.overrides.task
                 )
-                if {"name", "memory"} <= set(cfg):
-                    cfg.name = name_under_hydra(_root_=cfg)
                 import_plugins(cfg)
                 return main(cfg)
 

@@ -4,7 +4,6 @@ Mistakes in overrides are found here, before any work starts, and raise one `Use
 near names.
 """
 
-import functools
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -25,19 +24,10 @@ from hydra.core.utils import JobRuntime
 from hydra.errors import OverrideParseException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
-from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mme_vla.config import plugins
-from mme_vla.config.naming import (
-    POLICY,
-    Sections,
-    decisive,
-    join_memories,
-    literal,
-    may_be_of,
-    several_memories,
-    variant_name,
-)  # fmt: skip
+from mme_vla.config.naming import join_memories, several_memories
 from mme_vla.config.override_errors import COMPOSITION_ERRORS, ConfigTree
 from mme_vla.errors import UserError, require
 from mme_vla.registry import extensions
@@ -167,23 +157,7 @@ def compose(
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
     join_plugins(cfg, config_name, trees, words)
-    if {"name", "memory"} <= set(cfg):  # a tree without models has no such name
-        cfg.name = true_name(cfg, config_name, tuple(folder.resolve() for folder in trees))
     return cfg
-
-
-def name_under_hydra(*, _root_: DictConfig) -> str:
-    """`${model_name:}` in a file of the tree: the composition's name, also while Hydra decides on
-    the run's folder.
-    """
-    if not HydraConfig.initialized():
-        return str(_root_.name)  # `compose` and the command have set it
-    trees = command_trees()
-    return (
-        true_name(_root_, str(HydraConfig.get().job.config_name), trees)
-        if trees
-        else str(_root_.name)
-    )
 
 
 def command_trees() -> tuple[Path, ...]:
@@ -198,9 +172,6 @@ def command_trees() -> tuple[Path, ...]:
     # The command's own comes first, whatever the order in which Hydra searches.
     sources.sort(key=lambda source: source.provider != "main")
     return tuple(dict.fromkeys(Path(source.path).resolve() for source in sources))
-
-
-OmegaConf.register_new_resolver("model_name", name_under_hydra, replace=True)
 
 
 def join_plugins(
@@ -236,76 +207,3 @@ def import_plugins(cfg: DictConfig) -> None:
     `mme_vla.config.plugins`.
     """
     plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
-
-
-def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
-    """The name of a composition, from the models of these trees.
-
-    config_name: the file that was composed. trees: folders of YAML files, the library's first.
-    """
-    if isinstance(cfg.get("memory"), ListConfig):
-        cfg = join_memories(cfg.copy())
-    configured_name = str(cfg.name)
-    config_name = (
-        "policy" if (trees[0] / "policy.yaml").is_file() else config_name
-    )  # the least that holds a model
-    mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
-    is_library = trees[0] == config_dir().resolve()
-    model_files = (
-        library_files("model")
-        if is_library
-        else {file.stem: file for file in (trees[0] / "model").glob("*.yaml")}
-    )
-    plugin_models = set(model_files) - mine
-
-    def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
-        library_alone = searched == (
-            config_dir().resolve(),
-        )  # its files do not change while a process runs
-        return (_cached_sections if library_alone else _composed_sections)(
-            config_name, words, searched
-        )
-
-    def parts() -> Sections | None:
-        groups = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
-        for group, section in groups.items():
-            if section and not section.get("name"):
-                raise UserError(
-                    f"The section `{group}` has no name, only {', '.join(section)}. Choose one:"
-                    f" {group}=<name>; its keys are set beside it, {group}.<key>=<value>."
-                )
-        words = [
-            f"{group}={section.name if section else 'none'}" for group, section in groups.items()
-        ]
-        if POLICY in decisive(cfg):  # another kind of policy has its own processor beside its parts
-            words.insert(0, f"model={configured_name}")
-        if "members" in (groups.get("memory") or {}):
-            members = OmegaConf.to_container(groups["memory"].members, resolve=True)
-            words.append(f"memory.members={literal(members)}")
-        result = composed(tuple(words), trees)
-        return None if result is None else result[1]
-
-    sections = decisive(cfg)
-
-    def reference(model: str) -> tuple[str, Sections] | None:
-        if model in plugin_models and not may_be_of(model_files[model], sections):
-            return None
-        return composed((f"model={model}",), trees[:1] if model in plugin_models else trees)
-
-    return variant_name(str(cfg.name), sections, mine | plugin_models, reference, parts)
-
-
-def _composed_sections(
-    config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]
-) -> tuple[str, Sections] | None:
-    """Name and decisive keys of a composition; None where these words do not compose."""
-    with local_hydra(trees[0], trees[1:]):
-        try:
-            parse(overrides)
-            cfg = join_memories(hydra.compose(config_name, list(overrides)))
-            return str(cfg.name), decisive(cfg)
-        except (*COMPOSITION_ERRORS, UserError):
-            return None
-
-
-_cached_sections = functools.cache(_composed_sections)

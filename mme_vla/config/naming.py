@@ -1,11 +1,9 @@
-"""The name of a composition, found among the models of the tree it is composed from."""
+"""Words of overrides, lists of memories, and the digest of what makes one variant another."""
 
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
-from functools import lru_cache
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -65,142 +63,9 @@ def join_memories(cfg: DictConfig) -> DictConfig:
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
-FREE = (
-    "memory.budget",
-    "processor.tokenizer",
-    "processor.text",
-    "processor.side",
-    "processor.max_words",
-)
-"""Keys in them that do not: a budget has a field of its own in records; pixels and words go with
-the backbone.
-"""
 POLICY, DEFAULT_POLICY = "policy.name", "mme"
-LONGEST = 32  # Letters that differences may take in a name; more are a digest
 
-Sections = dict[str, Any]  # Flat dotted keys of the decisive sections, those that are set
-Reference = Callable[[str], tuple[str, Sections] | None]
-"""From the file name of a model to its name and sections; None where it cannot be composed."""
-
-
-def decisive(cfg: DictConfig) -> Sections:
-    """The keys of a composed configuration that make it the variant it is."""
-    values: Sections = {}
-    for key in DECISIVE:
-        if key in cfg:
-            value = cfg[key]
-            container = (
-                OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-            )
-            values |= flat({key: container})
-    if "policy" in cfg:
-        values |= of_policy(cfg.policy)
-    return {key: value for key, value in values.items() if value is not None and key not in FREE}
-
-
-def may_be_of(model: Path, sections: Sections) -> bool:
-    """Whether a model may compose to this memory and integration: reads its files, where composing
-    takes 60 ms.
-    """
-    described = _read(model)
-    if not isinstance(described, dict):
-        return True
-    return all(
-        _may_choose(model.parent.parent, described, part, sections)
-        for part in ("memory", "integration")
-    )
-
-
-def _may_choose(tree: Path, described: dict[Any, Any], part: str, sections: Sections) -> bool:
-    if "name" in (described.get(part) or {}):
-        return True
-    choices = [
-        one[f"/{part}"]
-        for one in described.get("defaults") or ()
-        if isinstance(one, dict) and f"/{part}" in one
-    ]
-    file = tree / part / f"{choices[0]}.yaml" if choices else None
-    if file is None or not file.is_file():
-        return True
-    name = _read(file)
-    return not isinstance(name, dict) or name.get("name") == sections.get(f"{part}.name")
-
-
-def _read(file: Path) -> Any:
-    return _parsed(file, file.stat().st_mtime_ns)
-
-
-@lru_cache(maxsize=256)
-def _parsed(file: Path, changed: int) -> Any:
-    """A YAML file as it was when it was last changed; a name with differences compares
-    all models.
-    """
-    return OmegaConf.to_container(OmegaConf.load(file))
-
-
-def variant_name(
-    name_in_config: str,
-    sections: Sections,
-    models: Iterable[str],
-    reference: Reference,
-    parts: Callable[[], Sections | None],
-) -> str:
-    """The name of a composition.
-
-    Args:
-        name_in_config: what the chosen model's file calls it. sections: `decisive` of the
-            composition.
-        models: the files of the group `model`. reference: what each of them composes to; None also
-            where it cannot be a composition of the same parts.
-        parts: what the memory and the integration compose to with no value changed; None where that
-            is not known.
-
-    Returns:
-        `name_in_config` if the user chose a name that is no model's, or if it is true; else the
-        name of the model that equals the composition; else that of the nearest model with the same
-        parts (or the parts' names) with the differences.
-    """
-    names = sorted(models)
-    if name_in_config not in names:
-        return name_in_config
-    base_variant = reference(name_in_config)
-    if base_variant is not None and base_variant[1] == sections:
-        return base_variant[0]
-    known = [variant for variant in map(reference, names) if variant is not None]
-    for name, known_sections in known:
-        if known_sections == sections:
-            return name
-    alike = [variant for variant in known if _kind(variant[1]) == _kind(sections)]
-    if alike:
-        name, base = min(
-            alike,
-            key=lambda variant: (
-                variant[0] != name_in_config,
-                len(_differences(variant[1], sections)),
-            ),
-        )
-        return f"{name}-{_suffix(_differences(base, sections))}"
-    name = (
-        "_".join(part for part in (sections.get(POLICY, ""), *_parts(sections)) if part)
-        or "memoryless"
-    )
-    part_sections = parts()
-    if part_sections == sections:
-        return name
-    differences = _differences(part_sections or {}, sections)
-    return f"{name}-{_suffix(differences, words=part_sections is not None)}"
-
-
-def _parts(sections: Sections) -> tuple[str, str]:
-    members = sections.get("memory.members")
-    joined = [str(m.get("name") if isinstance(m, Mapping) else m) for m in members or ()]
-    return "_".join(joined) or str(sections.get("memory.name", "")), str(
-        sections.get("integration.name", "")
-    )
-
-
-def _kind(sections: Sections) -> tuple[str, ...]:
-    return (str(sections.get(POLICY, "")), *_parts(sections))
+Sections = dict[str, Any]  # Flat dotted keys
 
 
 def of_policy(section: Mapping[str, Any]) -> Sections:
@@ -209,26 +74,6 @@ def of_policy(section: Mapping[str, Any]) -> Sections:
     """
     name = section.get("name", DEFAULT_POLICY)
     return {} if name == DEFAULT_POLICY else {POLICY: name}
-
-
-def _differences(base: Sections, sections: Sections) -> Sections:
-    keys = sorted(base.keys() | sections.keys())
-    return {key: sections.get(key) for key in keys if base.get(key) != sections.get(key)}
-
-
-def _suffix(differences: Sections, words: bool = True) -> str:
-    """The differences spelt out where these are short, else a digest of them."""
-    text = "-".join(
-        f"{key.rpartition('.')[2]}_{_word(value)}" for key, value in differences.items()
-    )
-    return text if words and len(text) <= LONGEST else digest(differences, 6)
-
-
-def _word(value: Any) -> str:
-    text = (
-        "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-    )
-    return re.sub(r"[^\w.]+", "_", text).strip("_.")
 
 
 def digest(values: Mapping[str, Any], letters: int) -> str:

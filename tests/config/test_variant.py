@@ -3,12 +3,10 @@ compositions apart.
 """
 
 import json
-import textwrap
 from pathlib import Path
 
 import pytest
 
-from helpers import commands
 from mme_vla.config.composition import compose
 from mme_vla.evaluation.records import EpisodeRecord, complete_compositions
 from mme_vla.evaluation.results.aggregate import aggregate
@@ -17,83 +15,18 @@ from mme_vla.evaluation.store import read_folders
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.saving import composition_digest
 
-OWN = {
-    "memory/mine.yaml": "{name: mine, budget: 64, spacing: 4}",
-    "model/mine_context.yaml": """
-        # @package _global_
-        defaults: [{/memory: mine}, {/integration: context}]
-        name: mine_context
-        """,
-}
-
-
-def name_of(*words: str, extra: Path | None = None) -> str:
-    return str(compose("train", words, extra_dirs=[] if extra is None else [extra]).name)
-
 
 @pytest.mark.parametrize(
     ("words", "name"),
     [
-        (["memory=framesamp", "integration=modulator"], "framesamp_modul"),
-        (["memory=none", "integration=none"], "pi05"),
-        (["model=framesamp_modul", "backbone=pi05", "memory.budget=256"], "framesamp_modul"),
         (["model=hybrid"], "hybrid"),
-        (["model=rmt_expert", "integration=context"], "rmt_context"),
-        (["model=framesamp_modul", "memory.pooling=max"], "framesamp_modul-pooling_max"),
-        (
-            ["memory=framesamp", "integration=modulator", "memory.pooling=max"],
-            "framesamp_modul-pooling_max",
-        ),
-        (["model=tokendrop_expert", "memory.causal=false"], "tokendrop_expert-causal_false"),
+        (["model=framesamp_modul", "memory.pooling=max"], "framesamp_modul"),
         (["model=pi05", "name=my_own", "processor.prompt=subgoal"], "my_own"),
     ],
 )
-def test_a_composition_is_called_what_it_is(words: list[str], name: str) -> None:
-    assert name_of(*words) == name
-
-
-@pytest.fixture
-def config_folder(tmp_path: Path) -> Path:
-    for file, text in OWN.items():
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / file).write_text(textwrap.dedent(text))
-    return tmp_path
-
-
-def test_custom_memories_are_named_by_their_files_and_components(config_folder: Path) -> None:
-    assert name_of("model=mine_context", extra=config_folder) == "mine_context"
-    assert (
-        name_of("model=mine_context", "memory.spacing=2", extra=config_folder)
-        == "mine_context-spacing_2"
-    )
-    assert name_of("memory=mine", "integration=modulator", extra=config_folder) == "mine_modulator"
-    assert (
-        name_of("memory=mine", "integration=modulator", "memory.spacing=2", extra=config_folder)
-        == "mine_modulator-spacing_2"
-    )
-    assert name_of("memory=mine", "integration=context", extra=config_folder) == "mine_context"
-
-
-@pytest.mark.slow
-def test_a_command_and_its_sweep_work_in_folders_of_the_true_name(tmp_path: Path) -> None:
-    app = tmp_path / "app.py"
-    app.write_text(
-        'from mme_vla.cli.command import cli\n@cli("train")\ndef main(cfg):\n    from'
-        ' hydra.core.hydra_config import HydraConfig\n    print("at", cfg.name,'
-        ' cfg.output.split("/")[1], HydraConfig.get().runtime.output_dir)\nmain()\n'
-    )
-    words = ["integration=modulator", "memory=framesamp"]
-    done = commands.run(str(app), *words, cwd=tmp_path)
-    assert done.stdout.startswith(
-        f"at framesamp_modul framesamp_modul {tmp_path}/outputs/framesamp_modul/"
-    ), done
-    words = ["--multirun", "integration=modulator", "memory=framesamp,tokendrop"]
-    done = commands.run(str(app), *words, cwd=tmp_path)
-    lines = [line.split() for line in done.stdout.splitlines() if line.startswith("at ")]
-    assert [(line[1], Path(line[3]).name) for line in lines] == [
-        ("framesamp_modul", "0_framesamp_modul"),
-        ("tokendrop_modul", "1_tokendrop_modul"),
-    ], done.stderr
+def test_a_run_has_the_name_of_its_model_or_the_users(words: list[str], name: str) -> None:
+    cfg = compose("train", words)
+    assert cfg.name == name and cfg.output.startswith(f"outputs/{name}/")
 
 
 def test_the_digest_tells_compositions_apart_and_nothing_else() -> None:

@@ -36,8 +36,8 @@ def test_it_keeps_an_integrations_contract(policy: MMEPolicy) -> None:
     check_integration("gist", memory="ttt")
 
 
-def test_it_is_called_what_it_is_learns_and_acts(policy: MMEPolicy) -> None:
-    assert policy.config["name"] == "framesamp_gist"
+def test_it_learns_and_acts(policy: MMEPolicy) -> None:
+    assert policy.config["name"] == "pi05"  # the model file that the parts were put into
     batch = random_batch(policy, valid=32)
     policy(batch)[0].backward()
     assert policy.integration.get_parameter("to_condition.weight").grad.abs().sum() > 0  # type: ignore[union-attr]
