@@ -331,9 +331,7 @@ PROMPTS: Registry[Any] = Registry(
     key="prompt",
 )
 TASKS: Registry[Any] = Registry("task")
-ENVS: Registry[Any] = Registry(
-    "environment", dict.fromkeys(("mme_vla", "official"), "mme_vla.envs.benchmark"), key="env"
-)
+ENVS: Registry[Any] = Registry("environment", {"mme_vla": "mme_vla.envs.benchmark"}, key="env")
 PLAYERS: Registry[Any] = Registry("player")
 INTERVENTIONS: Registry[Any] = Registry("intervention")
 REWARDS: Registry[Any] = Registry(

@@ -197,7 +197,7 @@ def run(cfg: "DictConfig") -> None:
     from mme_vla.config.sections import read_section
     from mme_vla.data.convert import ConvertOptions
 
-    if cfg.env not in ROBOMME:
+    if cfg.env != ROBOMME:
         record_environment(cfg)
         return
     require(

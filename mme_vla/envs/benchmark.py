@@ -1,6 +1,4 @@
-"""RoboMME as entries of the registry of environments: `mme_vla`, and `official` for the package
-`robomme`.
-"""
+"""RoboMME as the entry `mme_vla` of the registry of environments."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -10,8 +8,7 @@ from mme_vla.embodiment.robomme import check_benchmark
 from mme_vla.envs import make, metadata
 from mme_vla.envs.base import Environment
 from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
-from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
-from mme_vla.errors import require
+from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
 from mme_vla.registry import ENVS
 
 
@@ -77,29 +74,3 @@ class RoboMME(Environment):
 
     def open(self, task: str, split: str, episode: int, **options: Any) -> Any:
         return make.make_env(task, split, episode, env=self.name, **options)
-
-
-@ENVS.register("official")
-class Official(RoboMME):
-    """The installed package `robomme`."""
-
-    name = "official"
-
-    def check_installed(self) -> None:
-        """Nothing of this library's simulator; the package is checked when an episode is made."""
-
-    def scene_values(self, env: Any) -> Mapping[str, Any] | None:
-        """The package tells none."""
-        return None
-
-    def scene_digest(self, spec: EpisodeSpec) -> str:
-        """The package tells no values."""
-        return NO_VALUES
-
-    def check_hold(self) -> None:
-        """The package has no action for it in every action space."""
-        require(
-            False,
-            "env=official cannot pause: use env=mme_vla for events in which the robot holds its"
-            " pose.",
-        )

@@ -5,13 +5,10 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from mme_vla.envs import metadata
 from mme_vla.envs.metadata import TASK_NAMES, check_task_name, read_variant
 from mme_vla.envs.observations import Include
 from mme_vla.envs.rows import DIFFICULTIES
-from mme_vla.envs.scene_hash import NO_VALUES
 from mme_vla.errors import check_known, missing_extra, require
 from mme_vla.registry import TASKS
 
@@ -19,8 +16,8 @@ if TYPE_CHECKING:
     from mme_vla.envs.interface import RoboMMEEnv
 
 
-ROBOMME = ("mme_vla", "official")
-"""Environments that are RoboMME."""
+ROBOMME = "mme_vla"
+"""The environment that is RoboMME."""
 ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
 
 
@@ -41,7 +38,7 @@ def make_env(
     sessions: int = 0,
     only_possible: bool = False,
     **include: bool,
-) -> "RoboMMEEnv | OfficialEnv":
+) -> "RoboMMEEnv":
     """Make the environment of one episode.
 
     Args:
@@ -65,9 +62,8 @@ def make_env(
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds.
             `subtask`: an equal share for each sub-task of the execution as it is done, 1 in all. Or
             your own, registered in `REWARDS`.
-        env: `mme_vla`, `official` for the installed package `robomme`, or an environment of the
-            user's own. Of the options the latter reads `max_steps`, `render` and the action space
-            `multi_choice`.
+        env: `mme_vla`, or an environment of the user's own. Of the options the latter reads
+            `max_steps`, `render` and the action space `multi_choice`.
         sessions: unrelated episodes that the caller shows the policy first, as
             `split=stress:sessions=<n>` requires.
         only_possible: by choices, mark options that no object within reach fits (`RoboMMEEnv`).
@@ -79,7 +75,7 @@ def make_env(
     Returns:
         The environment; call `reset()` first. Close it when done.
     """
-    if env not in ROBOMME:
+    if env != ROBOMME:
         from mme_vla.envs.base import environment
 
         options: Any = {"action_space": action_space, "max_steps": max_steps, "render": render}
@@ -88,18 +84,6 @@ def make_env(
     check_names(task, action_space, difficulty, seed)
     check_sessions(split, sessions)
     max_steps = metadata.step_limit(split) if max_steps is None else max_steps
-    if env == "official":
-        require(
-            seed is None
-            and row is None
-            and recovery is None
-            and render
-            and reward == "none"
-            and not only_possible,
-            'env="official" takes episodes of a split, renders and gives no reward: leave out seed,'
-            " row, recovery, render, reward, only_possible.",
-        )
-        return make_official_env(task, split, episode, action_space, max_steps, include)
     scene: dict[str, Any] = {"seed": seed, "difficulty": difficulty}
     if row is not None:
         spec = metadata.read_row(row)
@@ -198,95 +182,3 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
     return TASKS[task](
         obs_mode=obs_mode, render_backend=backend, sim_backend="physx_cpu", **options
     )
-
-
-class OfficialEnv:
-    """One episode of the official package `robomme`; `reset`, `step`, `render`, `close` as in
-    `RoboMMEEnv`.
-
-    The package needs a patched simulator, numpy < 2 and gymnasium 0.29, therefore an environment of
-    its own.
-
-    Args:
-        env: what the official builder made.
-    """
-
-    scene_digest = NO_VALUES
-    """The package tells no values of a scene."""
-
-    def __init__(self, env: Any) -> None:
-        self._env: Any = env
-        self._newest: np.ndarray | None = None
-        self._started = False
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, list[Any]], dict[str, Any]]:
-        """Begin the episode; `seed` and `options` have no effect."""
-        observation, info = self._open().reset()
-        self._started = True
-        self._keep_newest(observation)
-        return observation, _flat(info)
-
-    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Perform one action."""
-        env = self._open()
-        require(self._started, "step() before reset(): call reset() first.")
-        observation, reward, terminated, truncated, info = env.step(action)
-        self._keep_newest(observation)
-        return observation, reward, terminated, truncated, _flat(info)
-
-    def render(self) -> np.ndarray | None:
-        """The newest front image [256, 256, 3], or None before the first reset."""
-        self._open()
-        return self._newest
-
-    def close(self) -> None:
-        """Free the simulator; closing twice is harmless."""
-        if self._env is not None:
-            self._env.close()
-            self._env = None
-
-    def _open(self) -> Any:
-        require(self._env is not None, "The environment is closed; make a new one.")
-        return self._env
-
-    def _keep_newest(self, observation: Any) -> None:
-        if observation and observation.get("front_rgb_list"):
-            self._newest = np.asarray(observation["front_rgb_list"][-1])
-
-
-def make_official_env(
-    task: str, split: str, episode: int, action_space: str, max_steps: int, options: dict[str, Any]
-) -> OfficialEnv:
-    """Make an episode of the official package."""
-    Include.from_options(options)  # refuses those that are unknown
-    require(
-        find_spec("robomme") is not None,
-        "The official package robomme is not installed. Install it from"
-        " github.com/RoboMME/robomme_benchmark in an environment of its own: it needs numpy < 2 and"
-        " gymnasium 0.29. Or use env='mme_vla', which needs none.",
-    )
-    require(
-        not hasattr(import_module("robomme"), "STANDS_IN"),
-        "The installed package robomme is this library's stand-in (plugins/robomme), whose"
-        " environments are those of env='mme_vla'. Uninstall it and install the official one, or"
-        " leave out env='official'.",
-    )
-    import_module("robomme.robomme_env")  # registers the tasks
-    builder = import_module("robomme.env_record_wrapper").BenchmarkEnvBuilder(
-        env_id=task, dataset=split, action_space=action_space, gui_render=False, max_steps=max_steps
-    )
-    count = builder.get_episode_num()
-    exists = 0 <= episode < count
-    require(
-        exists, f"Unknown episode {episode} of {task}, split {split!r}; expected 0 to {count - 1}."
-    )
-    flags = {name: True for name, yes in options.items() if yes}
-    return OfficialEnv(builder.make_env_for_episode(episode, max_steps=max_steps, **flags))
-
-
-def _flat(info: dict[str, Any]) -> dict[str, Any]:
-    """The info as one plain dict whose `task_goal` is a list."""
-    goal = info.get("task_goal")
-    return {**info, "task_goal": [goal]} if isinstance(goal, str) else dict(info)

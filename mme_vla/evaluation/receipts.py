@@ -336,7 +336,7 @@ def _compare_steps(
     except UserError as error:
         result.not_compared.append(f"steps: {error}")
         return
-    motions = settings.get("env") in ROBOMME and any(
+    motions = settings.get("env") == ROBOMME and any(
         record.action_space in MOTIONS for record in records
     )
     long = [

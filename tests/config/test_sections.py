@@ -116,7 +116,6 @@ def test_commands_read_their_settings_with_it() -> None:
         ({"video": "some"}, "video='some'"),
         ({"timeout_s": 0}, "timeout_s=0"),
         ({"draw": "need"}, "'needed'"),
-        ({"env": "official", "render": False}, "env=official"),
     ):
         with pytest.raises(UserError, match=message):
             RolloutSettings.from_config({"model": "x", **wrong})

@@ -5,7 +5,7 @@ errors.
 import gc
 import sys
 import weakref
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -219,76 +219,6 @@ def test_missing_or_old_vulkan_says_what_to_install(
     monkeypatch.setattr(rendering, "_find_backend", rendering._find_backend.__wrapped__)
     with pytest.raises(UserError, match=f"{words}[\\s\\S]*install_vulkan.sh"):
         rendering.render_backend()
-
-
-class _Builder:
-    """A fake of the official package's builder."""
-
-    made: dict[str, Any]
-
-    def __init__(self, **arguments: Any) -> None:
-        type(self).made = arguments
-
-    def get_episode_num(self) -> int:
-        return 3
-
-    def make_env_for_episode(
-        self, episode: int, max_steps: int | None = None, **include: bool
-    ) -> Any:
-        type(self).made |= {"episode": episode, "limit": max_steps, **include}
-        frame = np.zeros((256, 256, 3), np.uint8)
-        observation_ = {"front_rgb_list": [frame, frame + 1]}
-        outcome = (
-            observation_,
-            0.0,
-            False,
-            False,
-            {"task_goal": "press the button", "status": "ongoing"},
-        )
-        return SimpleNamespace(
-            reset=lambda: (observation_, {"task_goal": ["press the button"]}),
-            step=lambda action: outcome,
-            close=lambda: None,
-        )
-
-
-def test_the_official_package_comes_through_the_same_interface(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    with pytest.raises(UserError, match="robomme is not installed"):
-        make_env("StopCube", env="official")
-    wrapper = ModuleType("robomme.env_record_wrapper")
-    wrapper.BenchmarkEnvBuilder = _Builder  # type: ignore[attr-defined]
-    package, tasks = ModuleType("robomme"), ModuleType("robomme.robomme_env")
-    package.__spec__ = SimpleNamespace(name="robomme", submodule_search_locations=[])  # type: ignore[assignment]
-    for module in (package, wrapper, tasks):
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-    with pytest.raises(UserError, match="expected 0 to 2"):
-        make_env("StopCube", episode=3, env="official")
-    with pytest.raises(UserError, match="leave out seed"):
-        make_env("StopCube", seed=3, env="official")
-    env = make_env(
-        "StopCube", "val", 2, "waypoint", env="official", max_steps=7, include_front_depth=True
-    )
-    assert _Builder.made == {
-        "env_id": "StopCube",
-        "dataset": "val",
-        "action_space": "waypoint",
-        "gui_render": False,
-        "max_steps": 7,
-        "episode": 2,
-        "limit": 7,
-        "include_front_depth": True,
-    }
-    with pytest.raises(UserError, match="call reset"):
-        env.step([0] * 7)
-    observation, _ = env.reset()
-    assert len(observation["front_rgb_list"]) == 2
-    assert env.step([0] * 7)[4]["task_goal"] == ["press the button"]
-    assert env.render().max() == 1
-    env.close()
-    with pytest.raises(UserError, match="closed"):
-        env.reset()
 
 
 # Parts --------------------------------------------------------------------------------------------

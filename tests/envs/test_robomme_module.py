@@ -90,8 +90,3 @@ def test_its_environment_is_make_envs(wrapper: ModuleType) -> None:
     finally:
         benchmark_env.close()
         local_env.close()
-
-
-def test_it_is_not_taken_for_the_official_package(wrapper: ModuleType) -> None:
-    with pytest.raises(UserError, match="stand-in"):
-        make_env("StopCube", env="official")

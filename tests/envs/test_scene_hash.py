@@ -105,17 +105,6 @@ def test_an_environment_with_values_is_named_by_those_of_its_reset() -> None:
     assert isinstance(env, EpisodeEnv)
 
 
-def test_the_official_package_has_no_values() -> None:
-    assert (
-        environment("official").scene_digest(EpisodeSpec("StopCube", "test", 0, 0, "easy"))
-        == NO_VALUES
-    )
-
-
-# The benchmark ------------------------------------------------------------------------------------
-
-
-@pytest.fixture
 def tasks() -> Iterator[list[Any]]:
     pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
     made: list[Any] = []

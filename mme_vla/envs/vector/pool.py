@@ -346,7 +346,7 @@ def make_vec_env(
     source = environment(env)
     for name in names:
         if factory is make_env:
-            if env in ROBOMME:
+            if env == ROBOMME:
                 check_names(name, action_space, None, None)
             source.check_installed()
         for number in range(len(source.episodes(name, split))) if numbers is None else numbers:

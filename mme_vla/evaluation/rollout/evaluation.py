@@ -206,7 +206,7 @@ def evaluate(
             workload = Workload()
             if envs is not None:
                 folder = output / SUBGOALS if settings.subgoal_log else None
-                renders = base is make_env and settings.env in ROBOMME and settings.render
+                renders = base is make_env and settings.env == ROBOMME and settings.render
                 with envs, receipt(output / shard.file, policy, run, source, renders):
                     rollout = Rollout(
                         policy,

@@ -7,8 +7,6 @@ from typing import Any, Literal, Self
 
 from mme_vla.config.sections import NonNegativeInt, Positive, PositiveInt, read_section
 from mme_vla.envs.base import environment
-from mme_vla.envs.metadata import read_variant
-from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.events import read_events
 
 
@@ -59,12 +57,6 @@ class RolloutSettings:
             source.check_hold()
         if not self.max_steps:
             object.__setattr__(self, "max_steps", source.step_limit(self.split))
-        varied = read_variant(self.split) is not None
-        if self.env == "official" and (varied or not self.render):
-            raise UserError(
-                "env=official has its own scenes and always renders: leave out split=… and"
-                " render=false."
-            )
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:

@@ -22,13 +22,12 @@ def make_session(
     """The simulator for one episode.
 
     episode: which one. env: name of the environment. max_steps, max_choices: when it has timed out.
-    images: whether the player reads them; the official environment renders in any case.
+    images: whether the player reads them.
     """
     from mme_vla.envs import make_env
 
-    render = images or env == "official"
     which = (episode.task, episode.split, episode.episode)
-    made = make_env(*which, "multi_choice", max_steps=max_steps, env=env, render=render)
+    made = make_env(*which, "multi_choice", max_steps=max_steps, env=env, render=images)
     try:
         return ChoiceSession(made, episode, max_choices, images)
     except BaseException:
