@@ -124,35 +124,13 @@ def _check_command_line(config_name: str, tree: Path) -> None:
     extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     if args.help:
         trees = library_trees() if tree == config_dir() else (tree.resolve(),)
-        print(help_text(args.config_name or config_name, args.overrides, trees, extra))
+        print(help_page(args.config_name or config_name, args.overrides, [*trees, *extra]))
         raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
     check_overrides(
         args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra
     )
-
-
-def help_text(
-    config_name: str, words: Sequence[str], trees: Sequence[Path], extra_dirs: Sequence[Path] = ()
-) -> str:
-    """The text of `--help` beside these words (`mme_vla.cli.help`).
-
-    trees: folders of YAML files of the library, its core's first. extra_dirs: those of
-    `--config-dir`.
-    """
-
-    def selected_groups(overrides: Sequence[str]) -> dict[str, str]:
-        compose(
-            config_name, overrides, directory=trees[0], extra_dirs=extra_dirs
-        )  # says what is misspelt
-        with local_hydra(trees[0], extra_dirs):
-            cfg = hydra.compose(config_name, list(overrides), return_hydra_config=True)
-            taken = cfg.hydra.runtime.choices.items()
-            words = {group: "null" if name is None else str(name) for group, name in taken}
-            return {group: name for group, name in words.items() if not group.startswith("hydra/")}
-
-    return help_page(config_name, words, [*trees, *extra_dirs], selected_groups)
 
 
 def check_overrides(

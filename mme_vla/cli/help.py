@@ -1,18 +1,15 @@
-"""The text of `--help`: what a command does, examples, and each key with its meaning, from the YAML
-files.
+"""The text of `--help`: what a command does, examples, and the commented YAML files themselves.
 
-`--help` alone shows the command's own keys and the groups with their choices; `--help memory` the
-files of a group with their keys, `--help model=framesamp_modul` the keys under these choices.
-Nothing here imports PyTorch.
+`--help` alone prints the command's own files and the groups with their choices, `--help memory` the
+files of a group, `--help model=framesamp_modul` one of them. Nothing here imports PyTorch.
 """
 
 import argparse
 import difflib
 import re
-import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,22 +68,6 @@ def keys(file: Path) -> list[Key]:
     return result
 
 
-def explained(file: Path) -> list[Key]:
-    """`keys`, with what another file of the group says of a key where this one says nothing."""
-    local_keys = keys(file)
-    if all(key.comment for key in local_keys):
-        return local_keys
-    comments = {
-        key.name: key.comment
-        for other in sorted(file.parent.glob("*.yaml"))
-        for key in keys(other)
-        if key.comment
-    }
-    return [
-        Key(key.name, key.default, key.comment or comments.get(key.name, "")) for key in local_keys
-    ]
-
-
 def heading(file: Path) -> tuple[list[str], str]:
     """The comment that a file begins with: example commands, and the text after them as one
     paragraph.
@@ -99,17 +80,6 @@ def heading(file: Path) -> tuple[list[str], str]:
             lines.append(line.lstrip("# "))
     examples = [line for line in lines if line.startswith(("python -m ", "mme-vla "))]
     return examples, " ".join(line for line in lines if line not in examples)
-
-
-def package(file: Path, group: str) -> str:
-    """The section that a group's file fills, with a dot behind it; empty where it fills the top
-    level.
-    """
-    for line in file.read_text().splitlines()[:3]:
-        if line.startswith(_PACKAGE):
-            name = line.removeprefix(_PACKAGE).strip()
-            return "" if name == "_global_" else f"{name}."
-    return f"{group.replace('/', '.')}."
 
 
 def defaults(file: Path) -> Defaults:
@@ -136,141 +106,97 @@ def choices(trees: Iterable[Path], group: str) -> dict[str, Path]:
     return dict(sorted(files.items()))
 
 
-OPTIONS = (
-    (
-        "--help [GROUP | GROUP=NAME …]",
-        "this text; the files of a group; the keys under these choices",
-    ),
-    ("--cfg job", "print the whole configuration and run nothing"),
-    ("--config-dir DIR", "search YAML files of your own too"),
-    ("--multirun", "run once for each of several choices: model=framesamp_modul,tokendrop_modul"),
-)
-WIDEST, UNKNOWN_WIDTH = 120, 100  # Columns at most; columns where there is no terminal
-SelectGroups = Callable[[Sequence[str]], dict[str, str]]
-"""From the words of a command line to the file that each group then takes."""
+OPTIONS = """\
+  --help [GROUP | GROUP=NAME …]  this text; the files of a group; one of its files
+  --cfg job                      print the whole configuration and run nothing
+  --config-dir DIR               search YAML files of your own too
+  --multirun                     run once for each choice: model=framesamp_modul,tokendrop_modul"""
 
 
-def help_page(
-    config_name: str, words: Sequence[str], trees: Sequence[Path], select: SelectGroups
-) -> str:
+def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> str:
     """The text of `--help`.
 
-    config_name: the command's file. words: what stands beside `--help`: names of groups, and
-    overrides. trees: folders of YAML files, the library's first. select: composes.
+    Args:
+        config_name: the command's file.
+        words: what stands beside `--help`: a group, or a group's file (`model=framesamp_modul`).
+        trees: folders of YAML files, the library's first.
+
+    Raises:
+        UserError: a word is no group of this command, or no file of its group.
     """
-    file = next(
-        tree / f"{config_name}.yaml" for tree in trees if (tree / f"{config_name}.yaml").is_file()
-    )
-    overrides = [word for word in words if "=" in word]
-    named = [word for word in words if "=" not in word]
-    groups = select(overrides)
-    for word in named:
-        if word not in groups:
-            raise UserError(f"{word!r} is no group of this command. {did_you_mean(word, groups)}")
-    if named:
-        return "\n".join(
-            line
-            for group in named
-            for lines in (
-                [f"Group {group}, by default {group}={groups[group]}", ""],
-                *(_file(group, name, trees) for name in choices(trees, group)),
-            )
-            for line in lines
-        )
+    files = _with_included(choices(trees, "")[config_name], trees)
+    groups = _groups(files, trees)
+    if words:
+        return "\n\n".join(_group_page(word, groups, trees) for word in words)
     command = configured_commands().get(config_name, f"python {Path(sys.argv[0]).name}")
-    examples, text = heading(file)
-    lines = [f"Usage: {command} [KEY=VALUE | GROUP=NAME] …", "", *_wrapped(text), ""]
-    lines += ["Examples", *(f"  {example}" for example in examples), ""] if examples else []
-    for part in [file, *_included(file, trees)]:
-        rows = [key for key in keys(part) if key.default or key.comment]
-        if rows:
-            of = "" if part == file else f" of {configured_commands().get(part.stem, part.stem)}"
-            lines += [f"Keys{of}", *_table([(_assigned(key), key.comment) for key in rows]), ""]
-    lines += _group_pages(groups, {word.partition("=")[0] for word in overrides}, trees)
-    lines += ["Options", *_table(OPTIONS)]
-    return "\n".join(lines)
+    examples, text = heading(files[0])
+    parts = [f"Usage: {command} [KEY=VALUE | GROUP=NAME] …", text]
+    if examples:
+        parts.append("\n".join(["Examples", *(f"  {example}" for example in examples)]))
+    for file in files:
+        title = "Keys"
+        if file != files[0]:
+            title = f"Keys of {configured_commands().get(file.stem, file.stem)}"
+        parts.append(f"{title}\n{textwrap.indent(_body(file), '  ')}")
+    rows = []
+    for group, name in sorted(groups.items()):
+        rows.append(f"  {group}={name}: {' · '.join(choices(trees, group)) or '(none)'}")
+    if rows:
+        introduction = "Groups: GROUP=NAME takes another file; --help GROUP shows what is in them"
+        parts.append("\n".join([introduction, *rows]))
+    parts.append(f"Options\n{OPTIONS}")
+    return "\n\n".join(parts)
 
 
-def _included(file: Path, trees: Sequence[Path]) -> list[Path]:
-    """The files of the top level that a command's file is built on, theirs included."""
-    files: list[Path] = []
+def _with_included(file: Path, trees: Sequence[Path]) -> list[Path]:
+    """A file of the top level, and those that it is built on."""
+    files = [file]
     for name in defaults(file).files:
-        part = next(
-            (tree / f"{name}.yaml" for tree in trees if (tree / f"{name}.yaml").is_file()), None
-        )
+        part = choices(trees, "").get(name)
         if part is not None:
-            files += [part, *_included(part, trees)]
+            files += _with_included(part, trees)
     return files
 
 
-def _group_pages(groups: dict[str, str], requested: set[str], trees: Sequence[Path]) -> list[str]:
-    """Each group with its choices; of those that were asked for (a model means its parts) the keys
-    too.
-    """
-    if not groups:
-        return []
-    rows = [
-        (f"{group}={name}", " · ".join(choices(trees, group)) or "(none)")
-        for group, name in sorted(groups.items())
-    ]
-    lines = [
-        "Groups: GROUP=NAME takes another file; --help GROUP shows what is in them",
-        *_table(rows),
-        "",
-    ]
-    displayed = {"model", "memory", "integration"} if "model" in requested else set()
-    for group in sorted((requested | displayed) & groups.keys()):
-        lines += _file(group, groups[group], trees)
-    return lines
+def _groups(files: Sequence[Path], trees: Sequence[Path]) -> dict[str, str]:
+    """Group → the file that it takes by default, of these files and of the files that they take."""
+    groups: dict[str, str] = {}
+    pending = list(files)
+    while pending:
+        for name, choice in defaults(pending.pop(0)).groups.items():
+            group = name.strip("/").partition("@")[0]
+            if group not in groups:
+                groups[group] = choice
+                file = choices(trees, group).get(choice)
+                if file is not None:
+                    pending.append(file)
+    return groups
 
 
-def _file(group: str, name: str, trees: Sequence[Path]) -> list[str]:
-    file = choices(trees, group).get(name)
-    if file is None:  # null, or several
-        return []
-    text = heading(file)[1]
-    local_keys = [key for key in explained(file) if key.default or key.comment]
-    rows = [(f"{package(file, group)}{_assigned(key)}", key.comment) for key in local_keys]
-    taken = [f"{part.strip('/')}={choice}" for part, choice in defaults(file).groups.items()]
-    lines = [f"{group}={name}", *_wrapped(text, "  ")]
-    lines += [f"  takes {' '.join(taken)}"] if taken else []
-    return [*lines, *_table(rows), ""]
+def _group_page(word: str, groups: dict[str, str], trees: Sequence[Path]) -> str:
+    """The files of a group, or the one that `group=name` chooses."""
+    group, _, name = word.partition("=")
+    if group not in groups:
+        raise UserError(f"{group!r} is no group of this command. {did_you_mean(group, groups)}")
+    files = choices(trees, group)
+    if name and name not in files:
+        raise UserError(f"Unknown {group} {name!r}. {did_you_mean(name, files)}")
+    parts = [f"Group {group}, by default {group}={groups[group]}"]
+    for stem in [name] if name else files:
+        parts.append(f"{group}={stem}\n{textwrap.indent(files[stem].read_text().rstrip(), '  ')}")
+    return "\n\n".join(parts)
 
 
-def _assigned(key: Key) -> str:
-    """A key as it is typed; a section, which has no value of its own, with a colon."""
-    return f"{key.name}={key.default}" if key.default else f"{key.name}:"
-
-
-def _width() -> int:
-    return min(shutil.get_terminal_size((UNKNOWN_WIDTH, 24)).columns, WIDEST)
-
-
-def _wrapped(text: str, indent: str = "") -> list[str]:
-    return textwrap.wrap(
-        text,
-        _width(),
-        initial_indent=indent,
-        subsequent_indent=indent,
-        break_on_hyphens=False,
-        break_long_words=False,
-    )
-
-
-def _table(rows: Sequence[tuple[str, str]]) -> list[str]:
-    """Two columns; a long first one has a line of its own, so that the second is never squeezed."""
-    first = min(max((len(left) for left, _ in rows), default=0), 34)
-    lines = []
-    for left, right in rows:
-        remaining = textwrap.wrap(
-            right, max(_width() - first - 4, 30), break_on_hyphens=False, break_long_words=False
-        ) or [""]
-        if len(left) > first:
-            lines.append(f"  {left}")
-        else:
-            lines.append(f"  {left:<{first}}  {remaining.pop(0)}".rstrip())
-        lines += [f"{'':<{first + 4}}{line}" for line in remaining if line]
-    return lines
+def _body(file: Path) -> str:
+    """A file without the comment that it begins with and without Hydra's own sections."""
+    lines: list[str] = []
+    is_shown = True
+    for line in file.read_text().splitlines():
+        if line and not line[0].isspace() and not line.startswith("#"):
+            is_shown = not line.startswith(("defaults:", "hydra:"))
+        if is_shown and (lines or not line.startswith("#")):
+            lines.append(line)
+    return "\n".join(lines).strip()
 
 
 def unknown_option(option: str, words: Sequence[str], paths: Sequence[str]) -> UserError:
