@@ -30,6 +30,7 @@ from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats
 from mme_vla.processing.prompt import perturb_point, subgoal_kind
+from mme_vla.training.order import generator_for, seed_of
 from mme_vla.types import Batch, HistoryTokens, Labels, labels_read, stack_noise
 
 logger = logging.getLogger(__name__)
@@ -129,7 +130,7 @@ class Reflection:
 
     def __call__(self, batch: Batch, rows: Sequence[int]) -> Batch:
         """The batch of these decisions with its objects elsewhere, as chosen by the rows."""
-        generator = torch.Generator().manual_seed(hash((1, *rows)))
+        generator = generator_for("reflection", *map(int, rows))
         changes = (torch.rand(3, len(rows), generator=generator) < self.p) & ~self.fixed[
             torch.as_tensor(list(rows))
         ]
@@ -270,7 +271,7 @@ class Decisions(Dataset[int]):
 
     def _noisy(self, batch: Batch, rows: Sequence[int]) -> Batch:
         generator = torch.Generator().manual_seed(
-            hash(tuple(rows))
+            seed_of("rows", *map(int, rows))
         )  # of numbers alone, so the same everywhere
 
         def perturbed(values: Tensor, size: float | Tensor) -> Tensor:

@@ -20,6 +20,11 @@ from mme_vla.utils import require_replaceable
 
 SHIPPED = Path(__file__).resolve().parents[4] / "benchmarks" / "nano16"
 """The rows of the repository, a folder for each split."""
+NO_PUBLISHED_ROWS = (
+    "The published rows are not here: an installed package has none, and a clone has those of"
+    " benchmarks/nano16 for their splits. Rows of your own are ranked alone, and are not compared"
+    " with the published settings."
+)
 EXAMPLES = (
     "", "rows=outputs/nano16/further --html board.html",
     "--config-dir configs model=mine_modul '+memories.mine={budget: 32, grid: 1}'",
@@ -82,6 +87,8 @@ def row_folders(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
     rows, rules, split = compose_rows(config, trees), rules_of(config), config["split"]
     actions = rows.robot.action.answers or rows.robot.name
     shipped = SHIPPED / table_of(split, actions)
+    if not shipped.is_dir():
+        print(NO_PUBLISHED_ROWS)
     if folder := next((file.parent for file in sorted(shipped.rglob(TRAINED))), None):
         other = read_training(folder)
         specs = choose_episodes(config["task"], config["episodes"], split)
@@ -121,7 +128,11 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
     folders = [Path(word.removeprefix("rows=")) for word in args.words if word.startswith("rows=")]
     local = read_rows([], local=[*folders, *trained])
     shipped = SHIPPED / next((row[0].table for row in local.values()), split)
-    rows = read_rows([shipped], local=[*folders, *trained]) if shipped.is_dir() else local
+    if shipped.is_dir():
+        rows = read_rows([shipped], local=[*folders, *trained])
+    else:
+        rows = local
+        print(NO_PUBLISHED_ROWS)
     board = Board(rows, samples=args.samples or SAMPLES)
     pairs = comparison_table(board.neighbours())
     for table in (board_page.ranking(board, brief=True), board_page.targets(board), pairs):
