@@ -11,9 +11,8 @@ import numpy as np
 from mme_vla.errors import brief, require
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
-from mme_vla.subgoal.gemini import PromptedPredictor, example_of, what_there_is
-from mme_vla.subgoal.models.api import ApiFailure
-from mme_vla.subgoal.models.connection import MediaPart
+from mme_vla.subgoal.models.api import ApiFailure, MediaPart
+from mme_vla.subgoal.prompted import CLIP, PromptedPredictor
 from mme_vla.subgoal.text import (
     MalformedReply,
     json_object,
@@ -21,6 +20,7 @@ from mme_vla.subgoal.text import (
     pixels_of_pairs,
     says_done,
 )
+from mme_vla.subgoal.vocabulary import describe_subgoals, example_of
 from mme_vla.utils import is_text
 
 MONITOR = (
@@ -48,7 +48,7 @@ def planner_system(task: str, kind: str) -> str:
             " write down what later decisions depend on. Whether a subgoal is complete is judged by"
             " somebody else; you are asked once it is, and name the next one."
         ),
-        *what_there_is(task, kind),
+        *describe_subgoals(task, kind),
         (
             "Notes are of three kinds. A count says how often something has been done; it may stay"
             " or grow by one. An identity says which thing is meant, in words that tell it from the"
@@ -245,7 +245,6 @@ def _integer(value: Any, what: str, most: int) -> int:
     return value
 
 
-CLIP = 4  # frames: fewer are not worth a video
 LONGEST = 200  # frames of a subgoal that are shown: the last ones of a longer one
 
 
