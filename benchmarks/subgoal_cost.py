@@ -163,10 +163,10 @@ class CountingClient:
                     read += len(self.tokenizer.encode(part["text"]))
                 else:
                     read += IMAGE_TOKENS
-        message = SimpleNamespace(content=self.next_reply)
+        answer = SimpleNamespace(content=self.next_reply)
         n_output = len(self.tokenizer.encode(self.next_reply))
         return SimpleNamespace(
-            choices=[SimpleNamespace(message=message, finish_reason="stop")],
+            choices=[SimpleNamespace(message=answer, finish_reason="stop")],
             usage=SimpleNamespace(prompt_tokens=read, completion_tokens=n_output),
         )
 
