@@ -9,8 +9,7 @@ answers, and count. Qwen3-VL-4B's FLOPs are those of PyTorch's `FlopCounterMode`
 on the meta device: vision tower, one pass over the question with keys and values kept, one pass for
 each token of the answer. Tokens of images are exact; words are counted with a small tokenizer of
 RoboMME's language, where Qwen's own would take about as many. Gemini's FLOPs are not known; its
-tokens of images are what its documentation says (258 an image and 258 a second of video), its
-thoughts are left out, and its price is that of configs/subgoal/gemini.yaml.
+tokens of an image are what its documentation says (258), and its thoughts are left out.
 """
 
 import argparse
@@ -31,7 +30,7 @@ from mme_vla.subgoal.text import mark_points, memer_reply, write_boxes
 
 TERA = 1e12
 RUN = 16  # actions executed of a chunk
-IMAGE_TOKENS, SECOND = 258, 258  # Gemini's tokens of an image, and of a second of video
+IMAGE_TOKENS = 258  # Gemini's tokens of an image
 QWEN3_VL_4B = {
     "text_config": {
         "vocab_size": 151936,
@@ -146,43 +145,30 @@ class CountingVLM:
 
 
 class CountingClient:
-    """A fake of google-genai's client."""
+    """A fake of openai's client."""
 
     def __init__(self, tokenizer: Any) -> None:
-        self.tokenizer, self.next_reply, self.models = tokenizer, "", self
-        self.frames: dict[int, int] = {}
+        self.tokenizer = tokenizer
+        self.next_reply = ""
+        self.chat = SimpleNamespace(completions=self)
 
-    def generate_content(self, *, model: str, contents: list[Any], config: dict[str, Any]) -> Any:
-        read = len(self.tokenizer.encode(config["system_instruction"]))
-        for part in (part for message in contents for part in message["parts"]):
-            if "text" in part:
-                read += len(self.tokenizer.encode(part["text"]))
-            else:
-                video = part["inline_data"]["mime_type"] == "video/mp4"
-                read += (
-                    SECOND * max(1, round(seconds(part["inline_data"]["data"])))
-                    if video
-                    else IMAGE_TOKENS
-                )
+    def create(self, *, messages: list[dict[str, Any]], **options: Any) -> Any:
+        read = 0
+        for message in messages:
+            content = message["content"]
+            if isinstance(content, str):
+                content = [{"type": "text", "text": content}]
+            for part in content:
+                if part["type"] == "text":
+                    read += len(self.tokenizer.encode(part["text"]))
+                else:
+                    read += IMAGE_TOKENS
+        answer = SimpleNamespace(content=self.next_reply)
         n_output = len(self.tokenizer.encode(self.next_reply))
         return SimpleNamespace(
-            text=self.next_reply,
-            usage_metadata=SimpleNamespace(
-                prompt_token_count=read, candidates_token_count=n_output
-            ),
-            candidates=[],
+            choices=[SimpleNamespace(message=answer, finish_reason="stop")],
+            usage=SimpleNamespace(prompt_tokens=read, completion_tokens=n_output),
         )
-
-
-def seconds(data: bytes) -> float:
-    """Length of a video."""
-    import io
-
-    import av
-
-    with av.open(io.BytesIO(data)) as container:
-        stream = container.streams.video[0]
-        return float(stream.duration * stream.time_base)
 
 
 def play(predictor: Any, labels: Labels, say: Callable[[int], None]) -> int:
@@ -239,7 +225,7 @@ def measure(
         f"`{name}`, {kind}", f"`{policy}`", f"{chunks / n:.1f}", f"{usage.calls / n:.1f}",
         f"{usage.input_tokens / usage.calls:,.0f}", f"{usage.output_tokens / usage.calls:.0f}",
         f"{model.flops / usage.calls / TERA:.2f} T" if counted else "not known",
-        f"{model.flops / n / TERA:.0f} T" if counted else f"${usage.cost / n:.3f}",
+        f"{model.flops / n / TERA:.0f} T" if counted else "not known",
         f"{acting / n / TERA:.0f} T",
         f"{(acting + model.flops) / reference:.2f}x" if counted else "",
     ]  # fmt: skip
@@ -265,7 +251,7 @@ def count(demonstrations: Sequence[Demonstration]) -> None:
             "gemini",
             "grounded",
             "groundsg",
-            Gemini("grounded", client=client, requests_per_minute=None),
+            Gemini("grounded", client=client),
             client,
         ),
     ]

@@ -306,11 +306,8 @@ PROCESSORS: Registry[Any] = Registry("processor", {"pi05": "mme_vla.processing.p
 SUBGOALS: Registry[Any] = Registry(
     "subgoal predictor",
     {
-        **{
-            name: f"mme_vla.subgoal.{name}"
-            for name in ("oracle", "qwenvl", "memer", "gemini", "notebook")
-        },
-        "openai": "mme_vla.subgoal.gemini",
+        **{name: f"mme_vla.subgoal.{name}" for name in ("oracle", "qwenvl", "memer", "notebook")},
+        **dict.fromkeys(("gemini", "openai"), "mme_vla.subgoal.prompted"),
     },
     key="subgoal",
 )

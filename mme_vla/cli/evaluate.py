@@ -229,13 +229,10 @@ def report_events(done: "Evaluation", width: int) -> None:
 def report_usage(usage: "Usage") -> None:
     """Say in one line what a predictor did, as far as it did anything."""
     counts = {
-        "calls": usage.calls, "answers from the cache": usage.cached, "retries": usage.retries,
+        "calls": usage.calls, "answers from the cache": usage.cached,
         "tokens read": usage.input_tokens, "tokens written": usage.output_tokens,
         **{f"{problem} answers": count for problem, count in usage.problems.items()},
     }  # fmt: skip
     words = [f"{count:,} {what}" for what, count in counts.items() if count]
-    words += (
-        [f"${usage.cost:.2f}" if usage.cost >= 0.01 else f"${usage.cost:.4f}"] if usage.cost else []
-    )
     if words:
         logger.info("subgoals: %s", ", ".join(words))

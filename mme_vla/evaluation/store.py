@@ -44,10 +44,6 @@ INDIFFERENT = (
     "base_url",
     "timeout",
     "retries",
-    "backoff",
-    "requests_per_minute",
-    "input_price",
-    "output_price",
 )
 """Options of a model that predicts or plays which do not affect its output, and may differ when a
 run continues.

@@ -15,18 +15,18 @@ if TYPE_CHECKING:
         Usage,
         build_predictor,
     )
-    from mme_vla.subgoal.gemini import Gemini, OpenAI
     from mme_vla.subgoal.memer import Memer
     from mme_vla.subgoal.notebook import NotebookPredictor
     from mme_vla.subgoal.oracle import Oracle
+    from mme_vla.subgoal.prompted import Gemini, OpenAI
     from mme_vla.subgoal.qwenvl import QwenVL
 
 _MODULES = {
     "BackgroundPredictor": "background",
-    "Gemini": "gemini",
+    "Gemini": "prompted",
     "Memer": "memer",
     "NotebookPredictor": "notebook",
-    "OpenAI": "gemini",
+    "OpenAI": "prompted",
     "Oracle": "oracle",
     "QwenVL": "qwenvl",
     "Subgoal": "base",

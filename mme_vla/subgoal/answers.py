@@ -1,6 +1,4 @@
-"""State that predictors keep of an episode: past subgoals, keyframes, and how long a subgoal is
-held.
-"""
+"""Rules of the fine-tuned predictors: past subgoals, how long a subgoal is kept, and keyframes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,18 +13,18 @@ _HOLD_BY_SUBGOAL = {
 
 @dataclass
 class SubgoalHistory:
-    """The subgoals so far, each once until another one comes.
+    """The subgoals so far; a repetition of the last one is left out.
 
-    Replies with equal texts are the same, whatever their points; the first one's points are kept.
+    Texts decide, not points. Of equal texts the first one's points are kept.
+
+    entries: texts, points as `<bbox>`. points: of all entries in order, (row, column).
     """
 
     entries: list[str] = field(default_factory=list)
     points: list[Point] = field(default_factory=list)
 
     def add(self, entry: str, points: Sequence[Point] = ()) -> bool:
-        """Note an answer (points as `<bbox>`) unless it repeats the last one; return whether it was
-        noted.
-        """
+        """Add a subgoal unless it repeats the last one; return whether it was added."""
         if self.entries and self.entries[-1] == entry:
             return False
         self.entries.append(entry)
@@ -35,22 +33,24 @@ class SubgoalHistory:
 
 
 def hold_until(task: str, last: str | None) -> int:
-    """The last step up to which the last subgoal is kept without asking again; 0 for always asking.
+    """Return the step up to which the last subgoal is kept without asking again; 0 for none.
 
-    Released rules of the fine-tuned predictor for tasks whose first presses must not be cut short.
+    These are released rules, for tasks whose first presses must not be cut short.
 
     Args:
         task: its name, such as `ButtonUnmask`. last: text of the last subgoal.
     """
-    for words, step in _HOLD_BY_SUBGOAL.get(task, {}).items():
-        if last is not None and words in last.lower():
-            return step
+    if last is not None:
+        for words, step in _HOLD_BY_SUBGOAL.get(task, {}).items():
+            if words in last.lower():
+                return step
     return HOLD.get(task, 0)
 
 
 def merge_keyframes(frames: Sequence[int], distance: int = 8) -> list[int]:
-    """Thin out keyframes: of each run with gaps of at most `distance`, the middle one (the later of
-    two) stays.
+    """Thin out keyframes: of a run with gaps of at most `distance` frames the middle one stays.
+
+    Of an even number it is the later one of the two in the middle.
     """
     groups: list[list[int]] = []
     for frame in sorted(set(frames)):
@@ -62,11 +62,11 @@ def merge_keyframes(frames: Sequence[int], distance: int = 8) -> list[int]:
 
 
 def recent_frames(newest: int, queried_before: bool, count: int = 8, stride: int = 2) -> list[int]:
-    """Indices of MemER's recent frames: `count` of them, `stride` apart, ending at `newest`; one at
-    the first call.
+    """Return the numbers of MemER's recent frames, the newest one alone for the first question.
 
-    Before the episode is long enough the list is shorter, never padded.
+    They are `count` frames, `stride` apart. Early in an episode the list is shorter, not padded.
     """
     if not queried_before:
         return [newest]
-    return [i for i in range(newest - (count - 1) * stride, newest + 1, stride) if i >= 0]
+    first = newest - (count - 1) * stride
+    return [frame for frame in range(first, newest + 1, stride) if frame >= 0]

@@ -1,6 +1,4 @@
-"""A predictor in the background: the policy acts on with the last subgoal until the next one is
-there.
-"""
+"""A predictor in the background: the policy acts with the last subgoal until the next one comes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
@@ -9,16 +7,18 @@ from typing import Any
 import numpy as np
 
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.models.api import start
+from mme_vla.subgoal.threads import start
 
-GRACE = (
-    2.0  # seconds that closing waits: better not to end the process while a local model computes
-)
+# Seconds that closing waits: a process should not end while a local model computes.
+GRACE = 2.0
 
 
 class BackgroundEpisode(SubgoalEpisode):
-    """An episode as the policy sees it; the predictor's own (`inner`) waits while a model computes
-    its subgoal.
+    """An episode as the policy sees it.
+
+    inner: the episode of the predictor, which may be busy with it. Frames are passed on later.
+    answered: whether there was an answer yet.
+    fresh: whether `subgoal` is an answer that `predict` has not returned yet.
     """
 
     def __init__(self, inner: SubgoalEpisode) -> None:
@@ -26,31 +26,30 @@ class BackgroundEpisode(SubgoalEpisode):
         self.inner = inner
         self.answered = False
         self.fresh = False
-        self._news: list[Callable[[], None]] = []
+        self._delayed: list[Callable[[], None]] = []
 
     def skip(self, count: int) -> None:
         super().skip(count)
-        self._news.append(lambda: self.inner.skip(count))
+        self._delayed.append(lambda: self.inner.skip(count))
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
         super().observe(frames, info)
-        self._news.append(lambda: self.inner.observe(frames, info))
+        self._delayed.append(lambda: self.inner.observe(frames, info))
 
-    def catch_up(self) -> SubgoalEpisode:
-        """Pass on the frames since then; only while no model computes for this episode."""
-        for tell in self._news:
-            tell()
-        self._news.clear()
-        return self.inner
+    def catch_up(self) -> None:
+        """Pass the delayed frames on to `inner`; only while no model computes for this episode."""
+        for pass_on in self._delayed:
+            pass_on()
+        self._delayed.clear()
 
 
 class BackgroundPredictor(SubgoalPredictor):
     """Runs another predictor in a thread.
 
-    Only the first subgoal of an episode is waited for. Later a question goes out as soon as the
+    Only the first subgoal of an episode is waited for. Later a question is sent as soon as the
     thread is free, for all waiting episodes together, and its answer is used from the next chunk
-    on; one that came due while the thread was busy goes out once it is free. The subgoals therefore
-    depend on the speed of the model.
+    on. A question that came due while the thread was busy is sent once it is free. The subgoals
+    therefore depend on the speed of the model.
 
     Args:
         inner: the predictor. It is used by one thread at a time.
@@ -58,8 +57,11 @@ class BackgroundPredictor(SubgoalPredictor):
 
     def __init__(self, inner: SubgoalPredictor) -> None:
         super().__init__(inner.kind, inner.interval)
-        self.inner, self.usage, self.settings = inner, inner.usage, inner.settings
-        self.sees_video, self.sees_passing = inner.sees_video, inner.sees_passing
+        self.inner = inner
+        self.usage = inner.usage
+        self.settings = inner.settings
+        self.sees_video = inner.sees_video
+        self.sees_passing = inner.sees_passing
         self._queried_episodes: list[BackgroundEpisode] = []
         self._prediction: Future[list[Subgoal]] | None = None
 
@@ -69,8 +71,7 @@ class BackgroundPredictor(SubgoalPredictor):
         return BackgroundEpisode(self.inner.start_episode(goal, video, task))
 
     def predict(self, episodes: Sequence[Any]) -> list[Subgoal]:
-        """The newest subgoals there are; begins a prediction for the episodes that are due if the
-        thread is free.
+        """Return the newest subgoals; start a prediction for due episodes if the thread is free.
 
         Raises:
             Exception: what the predictor itself raised meanwhile.
@@ -82,39 +83,47 @@ class BackgroundPredictor(SubgoalPredictor):
         self._ask(episodes)
         subgoals = []
         for episode in episodes:
-            last = episode.subgoal
-            subgoals.append(last if episode.fresh else Subgoal(last.text, last.points))
+            subgoal = episode.subgoal
+            if not episode.fresh:
+                subgoal = Subgoal(subgoal.text, subgoal.points)
             episode.fresh = False
+            subgoals.append(subgoal)
         return subgoals
 
     def close(self) -> None:
-        """Drop what is under way and free the predictor."""
+        """Drop the prediction that is under way and close the predictor."""
         if self._prediction is not None:
             wait([self._prediction], GRACE)
         self.inner.close()
 
     def _ask(self, episodes: Sequence[BackgroundEpisode]) -> None:
+        """Start a prediction for the episodes that are due, unless one is under way."""
         if self._prediction is not None:
             return
-        # What was answered just now for the current frame need not be asked again.
-        advanced = [
-            e for e in episodes if not e.answered or e.inner.n_observed_frames < e.n_observed_frames
-        ]
-        due = [
-            episode
-            for episode in advanced
-            if self.inner.due(episode.catch_up()) or not episode.answered
-        ]
+        due = []
+        for episode in episodes:
+            has_news = episode.inner.n_observed_frames < episode.n_observed_frames
+            if episode.answered and not has_news:
+                continue  # answered just now, for the current frame
+            episode.catch_up()
+            if not episode.answered or self.inner.due(episode.inner):
+                due.append(episode)
         if due:
             self._queried_episodes = due
             inner = [episode.inner for episode in due]
             self._prediction = start(lambda: self.inner.predict(inner))
 
     def _collect(self, wait: bool = False) -> None:
-        if self._prediction is None or not (wait or self._prediction.done()):
+        """Take the subgoals of the prediction under way, if it has ended."""
+        if self._prediction is None:
             return
-        subgoals, self._prediction = self._prediction.result(), None
+        if not wait and not self._prediction.done():
+            return
+        subgoals = self._prediction.result()
+        self._prediction = None
         for episode, subgoal in zip(self._queried_episodes, subgoals, strict=True):
-            episode.subgoal, episode.answered, episode.fresh = subgoal, True, True
+            episode.subgoal = subgoal
             episode.query_step = episode.inner.query_step
+            episode.answered = True
+            episode.fresh = True
         self._queried_episodes = []

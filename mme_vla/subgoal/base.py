@@ -23,16 +23,15 @@ _CONFIG_TYPES = (str, int, float, bool, list, dict, type(None))  # the values of
 
 @dataclass(frozen=True)
 class Subgoal:
-    """A subgoal for the policy, and how it came about.
+    """A subgoal for the policy, and its origin.
 
-    text: in words, points as `<row, column>` in pixels of the front image; None while there has
-    been none (the
-        policy's prompt is then the plain one).
+    text: the subgoal, points as `<row, column>` in pixels of the front image. It is None while
+        there has been none; the policy's prompt is then the plain one.
     points: those points in order, (row, column).
     queried: whether a model was asked for this one; False for one that is kept.
     reply: of the model, unchanged; empty if none was asked.
     problem: why the answer could not be used (one of `PROBLEMS`), empty if it could. The last
-    subgoal is then kept.
+        subgoal is then kept.
     """
 
     text: str | None
@@ -46,17 +45,16 @@ class Subgoal:
 class Usage:
     """What a predictor has done so far, over all episodes.
 
-    calls: questions to a model (replies from the cache are counted apart). tokens: as the model
-    counts them. problems: unusable replies by kind. cost: US dollars.
+    calls: questions that a model answered. cached: answers from the cache.
+    input_tokens, output_tokens: as the model counts them. seconds: waited for answers.
+    problems: unusable replies by kind.
     """
 
     calls: int = 0
     cached: int = 0
-    retries: int = 0
     input_tokens: int = 0
     output_tokens: int = 0
     seconds: float = 0.0
-    cost: float = 0.0
     problems: Counter[str] = field(default_factory=Counter)
 
     def to_dict(self) -> dict[str, Any]:
@@ -64,7 +62,7 @@ class Usage:
 
 
 class SubgoalEpisode:
-    """What a predictor knows of one episode.
+    """The state of a predictor in one episode.
 
     goal: the task in words, lower-case as in training. task: its name, empty if unknown.
     video: [t, H, W, 3] uint8, the conditioning video without the current frame; empty without one.
@@ -74,8 +72,11 @@ class SubgoalEpisode:
     """
 
     def __init__(self, goal: str, video: np.ndarray | None = None, task: str = "") -> None:
-        self.goal, self.task = goal.strip().lower(), task
-        self.video = np.zeros((0, 1, 1, 3), np.uint8) if video is None else _checked(video, "video")
+        self.goal = goal.strip().lower()
+        self.task = task
+        if video is None:
+            video = np.zeros((0, 1, 1, 3), np.uint8)
+        self.video = _checked(video, "video")
         self.n_observed_frames = 0
         self.info: Mapping[str, Any] = {}
         self.subgoal = Subgoal(None)
@@ -90,7 +91,7 @@ class SubgoalEpisode:
         self.n_observed_frames += count
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
-        """Take execution frames [n, H, W, 3] uint8 in order, each once, the current one last.
+        """Add execution frames [n, H, W, 3] uint8 in order, each once, the current one last.
 
         Args:
             frames: of the front camera. The first call brings the first frame that is no video.
@@ -118,29 +119,29 @@ class SubgoalEpisode:
 
 
 class SubgoalPredictor:
-    """The interface of every predictor. A subclass implements `predict_due`, and overrides the rest
-    where it needs to.
+    """The interface of every predictor. A subclass implements `predict_due`.
 
     Args:
         kind: `simple` (words alone) or `grounded` (with points).
-        interval: a question is due at every multiple of it, and goes out with the first prediction
-            from there on; predictions are wanted whenever a new chunk is due, every 16 steps, so 1
-            asks every time.
+        interval: steps. A question is due at every multiple of it, and is sent with the first
+            prediction from there on. A prediction is requested with every chunk, so 1 asks for
+            each chunk.
 
     settings: the options that `build_predictor` built it from, as plain values; empty for one built
     otherwise.
     """
 
     sees_video = True
-    """Whether `start_episode` has to be given the images of a conditioning video."""
+    """Whether `start_episode` needs the images of a conditioning video."""
     sees_passing = True
-    """Whether frames are looked at besides those at which `predict` is called."""
+    """Whether it reads frames besides those at which `predict` is called."""
     episode_type: type[SubgoalEpisode] = SubgoalEpisode
 
     def __init__(self, kind: str = "grounded", interval: int = 1) -> None:
         require(kind in KINDS, f"subgoal.kind={kind!r}. {did_you_mean(str(kind), KINDS)}")
         require(interval >= 1, f"subgoal.interval={interval} must be a positive number of steps.")
-        self.kind, self.interval = kind, interval
+        self.kind = kind
+        self.interval = interval
         self.usage = Usage()
         self.settings: dict[str, Any] = {}
 
@@ -157,29 +158,31 @@ class SubgoalPredictor:
         return self.episode_type(goal, video, task)
 
     def predict(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
-        """The subgoals of these episodes at their current frames; those that are due are asked in
-        one batch.
+        """Return the subgoals of these episodes at their current frames.
 
-        An answer that cannot be used is counted in `usage.problems` and the episode keeps its last
-        subgoal.
+        Those that are due are asked in one batch. An answer that cannot be used is counted in
+        `usage.problems`, and the episode keeps its last subgoal.
         """
         due = [episode for episode in episodes if self.due(episode)]
-        for episode, subgoal in zip(due, self.predict_due(due) if due else [], strict=True):
-            episode.subgoal, episode.query_step = subgoal, episode.step
+        if due:
+            for episode, subgoal in zip(due, self.predict_due(due), strict=True):
+                episode.subgoal = subgoal
+                episode.query_step = episode.step
         queried = {id(episode) for episode in due}
-        return [
-            e.subgoal if id(e) in queried else Subgoal(e.subgoal.text, e.subgoal.points)
-            for e in episodes
-        ]
+        subgoals = []
+        for episode in episodes:
+            subgoal = episode.subgoal
+            if id(episode) not in queried:
+                subgoal = Subgoal(subgoal.text, subgoal.points)
+            subgoals.append(subgoal)
+        return subgoals
 
     def due(self, episode: SubgoalEpisode) -> bool:
-        """Whether the episode's subgoal is to be asked for now: never yet, or a multiple of the
-        interval was passed.
-        """
+        """Return whether to ask now: for the first time, or a multiple of `interval` was passed."""
         return episode.query_step is None or self.due_step(episode) > episode.query_step
 
     def due_step(self, episode: SubgoalEpisode) -> int:
-        """The step at which the newest question was due, however late the prediction comes."""
+        """Return the step at which the newest question was due, however late it is sent."""
         return episode.step - episode.step % self.interval
 
     def predict_due(self, episodes: Sequence[Any]) -> list[Subgoal]:
@@ -192,8 +195,9 @@ class SubgoalPredictor:
     def unchanged(
         self, episode: SubgoalEpisode, problem: str, reply: str = "", reason: str = ""
     ) -> Subgoal:
-        """The episode's last subgoal, after an answer that cannot be used; counts and reports the
-        problem.
+        """Return the episode's last subgoal, after an answer that cannot be used.
+
+        The problem, one of `PROBLEMS`, is counted and logged.
         """
         self.usage.problems[problem] += 1
         log.warning(
@@ -202,29 +206,28 @@ class SubgoalPredictor:
             episode.step,
             reason,
         )
-        return Subgoal(
-            episode.subgoal.text, episode.subgoal.points, queried=True, reply=reply, problem=problem
-        )
+        last = episode.subgoal
+        return Subgoal(last.text, last.points, queried=True, reply=reply, problem=problem)
 
     def unreadable(self, episode: SubgoalEpisode, reply: str, error: MalformedReply) -> Subgoal:
         """As `unchanged`, after a reply that is empty or malformed."""
-        return self.unchanged(episode, "malformed" if reply.strip() else "empty", reply, str(error))
+        problem = "malformed" if reply.strip() else "empty"
+        return self.unchanged(episode, problem, reply, str(error))
 
     def close(self) -> None:
-        """Give back what the predictor holds."""
+        """Free what the predictor holds."""
 
 
 def build_predictor(config: Mapping[str, Any] | None) -> SubgoalPredictor | None:
     """Build from the section `subgoal` of a configuration, or return None where there is none."""
     if not config or config.get("name") in (None, "none"):
         return None
-    built: SubgoalPredictor = SUBGOALS.build(config)
-    built.settings = {
-        key: value
-        for key, value in config.items()
-        if key != "name" and isinstance(value, _CONFIG_TYPES)
-    }
-    return built
+    predictor: SubgoalPredictor = SUBGOALS.build(config)
+    for key, value in config.items():
+        # Objects such as a client or a loaded model are no settings.
+        if key != "name" and isinstance(value, _CONFIG_TYPES):
+            predictor.settings[key] = value
+    return predictor
 
 
 def _checked(frames: np.ndarray, what: str) -> np.ndarray:

@@ -12,9 +12,7 @@ from mme_vla.utils.media import FPS
 
 VIDEO_FRAMES = 10  # of a video, at most
 ENCODING: dict[str, Any] = {"crf": 18, "preset": "medium"}
-"""Compression of videos for models (`mme_vla.utils.media`), finer than that of videos
-for people.
-"""
+"""Compression of videos of training data, finer than that of videos for people."""
 
 _REMEDY = "Build the training data again."
 
@@ -29,10 +27,10 @@ def read_image(path: Path) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Clip:
-    """Frames of a video that a Qwen model reads.
+    """Frames of a video that a model reads.
 
-    frames: [n, H, W, 3] uint8. indices: [n] their places in the video. length: of the whole video,
-    in frames.
+    frames: [n, H, W, 3] uint8. indices: [n] their frame numbers in the video.
+    length: frames of the whole video.
     """
 
     frames: np.ndarray
@@ -47,7 +45,11 @@ class Clip:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Sample a file; frames that are not looked at are decoded but not turned into images."""
+        """Sample a file; of the other frames no image is made.
+
+        Raises:
+            UserError: the file is damaged.
+        """
         import av
 
         with (
@@ -57,8 +59,10 @@ class Clip:
             length = container.streams.video[0].frames
             indices = sample_video(length)
             required = set(indices.tolist())
-            decoded = enumerate(container.decode(video=0))
-            frames = [frame.to_ndarray(format="rgb24") for i, frame in decoded if i in required]
+            frames = []
+            for i, frame in enumerate(container.decode(video=0)):
+                if i in required:
+                    frames.append(frame.to_ndarray(format="rgb24"))
         if len(frames) != len(indices) or len({frame.shape for frame in frames}) != 1:
             raise UserError(f"{path} is damaged: it announces {length} frames. {_REMEDY}")
         return cls(np.stack(frames), indices, length)
@@ -67,16 +71,18 @@ class Clip:
 def sample_video(
     length: int, fps: float = FPS, rate: float = 2.0, least: int = 4, most: int = VIDEO_FRAMES
 ) -> np.ndarray:
-    """Indices of the frames of a video that a Qwen model reads: `rate` a second, within bounds, an
-    even number of them.
+    """Sample an even number of frames of a video, as Qwen models do.
 
     Args:
-        length: frames of the video. fps: of the video. rate: frames a second.
+        length: frames of the video. fps: of the video.
+        rate: sampled frames a second.
         least, most: bounds of their number; a shorter video has fewer.
 
     Returns:
         int64 indices, evenly spaced from the first to the last frame.
     """
-    count = min(max(int(length / fps * rate), least), most, length)
-    count = max(count - count % 2, min(2, length))
+    count = max(int(length / fps * rate), least)
+    count = min(count, most, length)
+    count -= count % 2
+    count = max(count, min(2, length))
     return np.linspace(0, length - 1, count).round().astype(np.int64)

@@ -1,8 +1,9 @@
-"""`memer`: a fine-tuned Qwen3-VL that chooses keyframes and reads them again (MemER, as the paper
-runs it).
+"""`memer`: a fine-tuned Qwen3-VL that chooses keyframes and reads them again.
+
+This is MemER as the paper runs it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,14 @@ from mme_vla.subgoal.text import MEMER_SYSTEM, MalformedReply, memer_user, parse
 
 
 class MemerEpisode(SubgoalEpisode):
-    """An episode, its keyframes, and as many frames back as the next question may show.
+    """An episode, its keyframes, and the frames that the next question may show.
 
-    keyframes: frame number (from the first execution frame) → image.
+    Frame numbers count from the first execution frame.
+
+    Args:
+        reach: how many frames back the next question may show.
+
+    keyframes: frame number → image. queried: whether there was a question yet.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None, task: str, reach: int) -> None:
@@ -30,23 +36,18 @@ class MemerEpisode(SubgoalEpisode):
         self._reach = reach
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
-        first = self.n_observed_frames
+        number = self.n_observed_frames
         super().observe(frames, info)
-        self._recent |= {first + i: frame for i, frame in enumerate(frames)}
-        self._recent = {
-            t: frame
-            for t, frame in self._recent.items()
-            if t >= self.n_observed_frames - self._reach
-        }
+        for frame in frames:
+            self._recent[number] = frame
+            number += 1
+        for old in [t for t in self._recent if t < number - self._reach]:
+            del self._recent[old]
 
     def recent(self, count: int, stride: int) -> dict[int, np.ndarray]:
-        """The recent frames the next question shows, by number."""
-        indices = recent_frames(self.step, self.queried, count, stride)
-        return {t: self._recent[t] for t in indices}
-
-    def add_keyframes(self, frames: Mapping[int, np.ndarray], distance: int) -> None:
-        known = self.keyframes | dict(frames)
-        self.keyframes = {t: known[t] for t in merge_keyframes(list(known), distance)}
+        """Return the recent frames that the next question shows, by number."""
+        numbers = recent_frames(self.step, self.queried, count, stride)
+        return {t: self._recent[t] for t in numbers}
 
 
 @SUBGOALS.register("memer")
@@ -59,7 +60,7 @@ class Memer(VLMPredictor):
 
     Args:
         recent: frames shown besides the keyframes. stride: steps between two of them.
-        merge_distance: keyframes at most so far apart are thinned out to their middle one.
+        merge_distance: steps; keyframes at most so far apart are thinned out to their middle one.
     """
 
     def __init__(
@@ -72,29 +73,25 @@ class Memer(VLMPredictor):
         **options: Any,
     ) -> None:
         super().__init__(kind, interval, **options)
-        self.recent, self.stride, self.merge_distance = recent, stride, merge_distance
+        self.recent = recent
+        self.stride = stride
+        self.merge_distance = merge_distance
 
     def start_episode(
         self, goal: str, video: np.ndarray | None = None, task: str = ""
     ) -> MemerEpisode:
-        return MemerEpisode(goal, video, task, (self.recent - 1) * self.stride + 1)
+        reach = (self.recent - 1) * self.stride + 1
+        return MemerEpisode(goal, video, task, reach)
 
     def question(self, episode: MemerEpisode) -> Question:
+        _ = episode.frame  # raises an error where the episode has seen no frame yet
         recent = episode.recent(self.recent, self.stride)
-        video = len(episode.video) > 0
-        user = memer_user(episode.goal, len(episode.keyframes), len(recent), video)
+        clips = [Clip.of(episode.video)] if len(episode.video) else []
+        user = memer_user(episode.goal, len(episode.keyframes), len(recent), len(clips) > 0)
         images = [*episode.keyframes.values(), *recent.values()]
-        return Question(MEMER_SYSTEM, user, images, [Clip.of(episode.video)] if video else [])
+        return Question(MEMER_SYSTEM, user, images, clips)
 
-    def predict_due(self, episodes: Sequence[MemerEpisode]) -> list[Subgoal]:
-        _ = [episode.frame for episode in episodes]  # every episode has seen something
-        completions = self.ask([self.question(episode) for episode in episodes])
-        return [
-            self._read(e, completion.text)
-            for e, completion in zip(episodes, completions, strict=True)
-        ]
-
-    def _read(self, episode: MemerEpisode, reply: str) -> Subgoal:
+    def read(self, episode: MemerEpisode, reply: str) -> Subgoal:
         recent = episode.recent(self.recent, self.stride)
         episode.queried = True
         try:
@@ -102,7 +99,10 @@ class Memer(VLMPredictor):
         except MalformedReply as error:
             return self.unreadable(episode, reply, error)
         numbers = list(recent)
-        episode.add_keyframes(
-            {numbers[p - 1]: recent[numbers[p - 1]] for p in positions}, self.merge_distance
-        )
+        keyframes = dict(episode.keyframes)
+        for position in positions:  # from 1
+            number = numbers[position - 1]
+            keyframes[number] = recent[number]
+        merged = merge_keyframes(list(keyframes), self.merge_distance)
+        episode.keyframes = {t: keyframes[t] for t in merged}
         return self.accepted(parsed, reply)

@@ -1,5 +1,7 @@
-"""`notebook`: a prompted model that watches for completion, and takes typed notes only when it has
-seen it.
+"""`notebook`: a prompted model that takes typed notes whenever a subgoal is complete.
+
+A *monitor* reports whether the current subgoal is complete. Then a *planner* updates the notebook
+and names the next subgoal.
 """
 
 from collections.abc import Mapping, Sequence
@@ -8,19 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import brief, require
+from mme_vla.errors import brief
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
-from mme_vla.subgoal.gemini import PromptedPredictor, example_of, what_there_is
-from mme_vla.subgoal.models.api import ApiFailure
-from mme_vla.subgoal.models.connection import MediaPart
+from mme_vla.subgoal.models.api import ApiFailure, MediaPart
+from mme_vla.subgoal.prompted import CLIP, PromptedPredictor
 from mme_vla.subgoal.text import (
     MalformedReply,
     json_object,
+    numbered,
     parse_gemini,
     pixels_of_pairs,
     says_done,
 )
+from mme_vla.subgoal.vocabulary import describe_subgoals, example_of
 from mme_vla.utils import is_text
 
 MONITOR = (
@@ -34,11 +37,11 @@ MONITOR = (
 
 
 def planner_system(task: str, kind: str) -> str:
-    """The system prompt of the planner.
+    """Return the system prompt of the planner.
 
     Args:
-        task: its name; for an unknown one the subgoals of all tasks are listed. kind: `simple` or
-            `grounded`.
+        task: its name; for an unknown one the subgoals of all tasks are listed.
+        kind: `simple` or `grounded`.
     """
     example = example_of(task, kind)
     parts = [
@@ -48,7 +51,7 @@ def planner_system(task: str, kind: str) -> str:
             " write down what later decisions depend on. Whether a subgoal is complete is judged by"
             " somebody else; you are asked once it is, and name the next one."
         ),
-        *what_there_is(task, kind),
+        *describe_subgoals(task, kind),
         (
             "Notes are of three kinds. A count says how often something has been done; it may stay"
             " or grow by one. An identity says which thing is meant, in words that tell it from the"
@@ -67,19 +70,21 @@ def planner_system(task: str, kind: str) -> str:
 
 
 def opening_query(goal: str, video: bool) -> str:
-    """The planner's first question; its images come before it, the demonstration video first."""
-    context = (
-        "The video shows what happened before the robot's turn, the image shows the scene now. Note"
-        " what has to be remembered of the video."
-        if video
-        else "The image shows the scene at the start."
-    )
+    """Return the planner's first question; the video and the image come before it."""
+    context = "The image shows the scene at the start."
+    if video:
+        context = (
+            "The video shows what happened before the robot's turn, the image shows the scene now."
+            " Note what has to be remembered of the video."
+        )
     return f"The task: {goal}\n{context} Name the first subgoal."
 
 
 def next_query(goal: str, finished: str, notes: str, clip: bool) -> str:
-    """A later question to the planner; the video of the finished subgoal, if it has frames, comes
-    before it.
+    """Return a later question to the planner; the video of the finished subgoal comes before it.
+
+    Args:
+        clip: whether there is such a video beside the image.
     """
     context = "The image shows the scene now."
     if clip:
@@ -91,68 +96,66 @@ def next_query(goal: str, finished: str, notes: str, clip: bool) -> str:
 
 
 def monitor_query(goal: str, subgoal: str, clip: bool) -> str:
-    """A question to the monitor; its images come before it."""
-    context = (
-        "The video shows what the robot did since it was given the subgoal, the image the scene"
-        " now."
-        if clip
-        else "The image shows the scene now."
-    )
+    """Return a question to the monitor; its images come before it."""
+    context = "The image shows the scene now."
+    if clip:
+        context = (
+            "The video shows what the robot did since it was given the subgoal, the image the scene"
+            " now."
+        )
     return f"The task: {goal}\nThe subgoal: {subgoal}\n{context} Is the subgoal complete?"
 
 
-MOST_NOTES, MOST_STEPS, MOST_WORDS, MOST_COUNT = 16, 32, 200, 99
+MOST_NOTES = 16
+MOST_STEPS = 32  # of a route
+MOST_WORDS = 200  # characters of a text
+MOST_COUNT = 99
 
 
 @dataclass(frozen=True)
 class Count:
-    """How often something has been done; it never falls, and one finished subgoal adds
-    one at most.
-    """
+    """How often something has been done; a finished subgoal adds at most one."""
 
     value: int
 
     def check(self, before: "Count | None", finished: bool) -> None:
-        if before is not None and not before.value <= self.value <= before.value + finished:
-            raise MalformedReply(
-                f"a count goes from {before.value} to {self.value}; it may stay or grow by one"
-            )
+        """Raise MalformedReply if this may not follow the note `before`."""
+        if before is not None:
+            _check_growth("a count", before.value, self.value, finished)
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Which thing is meant, in words that tell it from the others."""
+    """The description of an object that distinguishes it from the others."""
 
     words: str
 
     def check(self, before: "Identity | None", finished: bool) -> None:
-        """See `Notebook.with_entries`: things are moved, so that other words may tell them."""
+        """Accept any change: an object that was moved needs another description."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """Steps in order, and how many are done; they stay what they were, and one finished subgoal
-    does one at most.
-    """
+    """Steps that never change, and how many are done; a finished subgoal adds at most one."""
 
     steps: tuple[str, ...]
     done: int = 0
 
     def check(self, before: "Route | None", finished: bool) -> None:
-        require(
-            self.done <= len(self.steps),
-            f"{self.done} of {len(self.steps)} steps cannot be done",
-            MalformedReply,
-        )
-        require(
-            before is None or before.steps == self.steps,
-            "the steps of a route were changed",
-            MalformedReply,
-        )
-        if before is not None and not before.done <= self.done <= before.done + finished:
-            raise MalformedReply(
-                f"done goes from {before.done} to {self.done}; it may stay or grow by one"
-            )
+        """Raise MalformedReply if this may not follow the note `before`."""
+        if self.done > len(self.steps):
+            raise MalformedReply(f"{self.done} of {len(self.steps)} steps cannot be done")
+        if before is None:
+            return
+        if before.steps != self.steps:
+            raise MalformedReply("the steps of a route were changed")
+        _check_growth("done", before.done, self.done, finished)
+
+
+def _check_growth(what: str, before: int, value: int, finished: bool) -> None:
+    most = before + 1 if finished else before
+    if not before <= value <= most:
+        raise MalformedReply(f"{what} goes from {before} to {value}; it may stay or grow by one")
 
 
 Note = Count | Identity | Route
@@ -160,17 +163,19 @@ Note = Count | Identity | Route
 
 @dataclass(frozen=True)
 class Notebook:
-    """What is known, by name; and the subgoals that were finished, in order."""
+    """Notes by name, and the finished subgoals in order."""
 
     notes: Mapping[str, Note] = field(default_factory=dict)
     finished: tuple[str, ...] = ()
 
     def with_entries(self, entries: Sequence[tuple[str, Note]], finished: str | None) -> "Notebook":
-        """The notebook with these entries.
+        """Return the notebook with these entries, which replace notes of the same name.
 
         Args:
-            finished: the subgoal that was just completed; None where notes are taken before
-                anything was done.
+            finished: the subgoal that was just completed; None before the first one.
+
+        Raises:
+            MalformedReply: a note changes in a way that its kind forbids.
         """
         notes = dict(self.notes)
         for name, note in entries:
@@ -179,11 +184,14 @@ class Notebook:
                 raise MalformedReply(f"{brief(name)} was another kind of note before")
             note.check(before, finished is not None)  # type: ignore[arg-type]
             notes[name] = note
-        require(len(notes) <= MOST_NOTES, f"the notebook takes {MOST_NOTES} notes", MalformedReply)
-        return Notebook(notes, self.finished if finished is None else (*self.finished, finished))
+        if len(notes) > MOST_NOTES:
+            raise MalformedReply(f"the notebook takes {MOST_NOTES} notes")
+        if finished is None:
+            return Notebook(notes, self.finished)
+        return Notebook(notes, (*self.finished, finished))
 
     def in_words(self) -> str:
-        """The notebook as a model reads it, a note a line."""
+        """Return the notebook as a model reads it, one note a line."""
         lines = []
         for name, note in self.notes.items():
             if isinstance(note, Count):
@@ -191,51 +199,54 @@ class Notebook:
             elif isinstance(note, Identity):
                 lines.append(f"- identity, {name}: {note.words}")
             else:
-                steps = "; ".join(f"{i}. {step}" for i, step in enumerate(note.steps, 1))
+                steps = numbered(note.steps)
                 lines.append(f"- route, {name}: {steps} ({note.done} of {len(note.steps)} done)")
         lines += [f"- finished: {text}" for text in self.finished]
         return "\n".join(lines) or "- nothing yet"
 
 
 def read_notes(entries: Any) -> list[tuple[str, Note]]:
-    """Entries that a model proposes: a list of maps with `name`, `kind` and what the kind has."""
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+    """Read the notes of a planner's answer: objects with `name`, `kind` and the kind's fields.
+
+    Returns:
+        Names and notes, at most one more than a notebook takes.
+
+    Raises:
+        MalformedReply: a field is missing or of another type.
+    """
+    if not isinstance(entries, list):
         raise MalformedReply("notes is not a list of objects")
-    return [
-        (_words(entry.get("name"), "name"), _read(entry)) for entry in entries[: MOST_NOTES + 1]
-    ]
+    notes = []
+    for entry in entries[: MOST_NOTES + 1]:
+        if not isinstance(entry, dict):
+            raise MalformedReply("notes is not a list of objects")
+        notes.append((_words(entry.get("name"), "name"), _read_note(entry)))
+    return notes
 
 
-def _read(entry: dict[str, Any]) -> Note:
+def _read_note(entry: dict[str, Any]) -> Note:
     kind = entry.get("kind")
     if kind == "count":
         return Count(_integer(entry.get("value"), "value", MOST_COUNT))
     if kind == "identity":
         return Identity(_words(entry.get("words"), "words"))
     if kind == "route":
-        steps: Any = entry.get("steps")
-        require(
-            isinstance(steps, list) and 1 <= len(steps) <= MOST_STEPS,
-            f"steps is not a list of 1 to {MOST_STEPS} texts",
-            MalformedReply,
-        )
-        return Route(
-            tuple(_words(step, "steps") for step in steps),
-            _integer(entry.get("done", 0), "done", MOST_STEPS),
-        )
+        steps = entry.get("steps")
+        if not isinstance(steps, list) or not 1 <= len(steps) <= MOST_STEPS:
+            raise MalformedReply(f"steps is not a list of 1 to {MOST_STEPS} texts")
+        done = _integer(entry.get("done", 0), "done", MOST_STEPS)
+        return Route(tuple(_words(step, "steps") for step in steps), done)
     raise MalformedReply(
         f"there are notes of the kinds count, identity and route, not {brief(kind)}"
     )
 
 
 def _words(value: Any, what: str) -> str:
-    if not isinstance(value, str) or not is_text(value) or not (text := " ".join(value.split())):
+    text = " ".join(value.split()) if isinstance(value, str) else ""
+    if not text or not is_text(text):
         raise MalformedReply(f"the {what} of a note is no text")
-    require(
-        len(text) <= MOST_WORDS,
-        f"the {what} of a note has more than {MOST_WORDS} characters",
-        MalformedReply,
-    )
+    if len(text) > MOST_WORDS:
+        raise MalformedReply(f"the {what} of a note has more than {MOST_WORDS} characters")
     return text
 
 
@@ -245,15 +256,15 @@ def _integer(value: Any, what: str, most: int) -> int:
     return value
 
 
-CLIP = 4  # frames: fewer are not worth a video
 LONGEST = 200  # frames of a subgoal that are shown: the last ones of a longer one
 
 
 class NotebookEpisode(SubgoalEpisode):
-    """An episode, its notebook, and the frames since its subgoal was given.
+    """An episode, its notebook, and the frames of the current subgoal.
 
-    agreed: the monitor has seen the current subgoal complete, and the next one is still to be
-    named.
+    since: [H, W, 3] each, since the subgoal was named.
+    agreed: the monitor has reported the current subgoal as complete, and the planner has not named
+        the next one yet.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None, task: str) -> None:
@@ -267,19 +278,18 @@ class NotebookEpisode(SubgoalEpisode):
         self.since = [*self.since, *frames][-LONGEST:]
 
     def images(self) -> list[MediaPart]:
-        """The video of the current subgoal, if it is worth one, and the present image."""
-        clip = [MediaPart(np.stack(self.since))] if len(self.since) >= CLIP else []
-        return [*clip, MediaPart(self.frame)]
+        """Return the video of the current subgoal, unless it is very short, and the image."""
+        if len(self.since) < CLIP:
+            return [MediaPart(self.frame)]
+        return [MediaPart(np.stack(self.since)), MediaPart(self.frame)]
 
 
 @SUBGOALS.register("notebook")
 class NotebookPredictor(PromptedPredictor):
-    """Asks whether the subgoal is complete; only then brings the notebook up to date and names the
-    next one.
+    """Asks the monitor whether the subgoal is complete, and only then the planner for the next one.
 
-    The notebook is what a question tells of the past, beside the frames of the current subgoal: no
-    conversation grows. Nothing that goes wrong ends an episode: it keeps its subgoal and its
-    notebook, and the problem is counted.
+    A question contains the notebook and the frames of the current subgoal, and no conversation. No
+    failure ends an episode: it keeps its subgoal and its notebook, and the problem is counted.
 
     Args:
         interval: steps between two questions to the monitor.
@@ -301,10 +311,9 @@ class NotebookPredictor(PromptedPredictor):
     def _ask(self, episode: NotebookEpisode) -> Subgoal:
         replies: list[str] = []
         try:
-            if episode.subgoal.text is not None and not self._complete(episode, replies):
-                return Subgoal(
-                    episode.subgoal.text, episode.subgoal.points, queried=True, reply=replies[0]
-                )
+            last = episode.subgoal
+            if last.text is not None and not self._complete(episode, last.text, replies):
+                return Subgoal(last.text, last.points, queried=True, reply=replies[0])
             return self._next(episode, replies)
         except ApiFailure as failure:
             problem, reason = failure.problem, str(failure)
@@ -313,44 +322,53 @@ class NotebookPredictor(PromptedPredictor):
         with self._lock:
             return self.unchanged(episode, problem, "\n".join(replies), reason)
 
-    def _complete(self, episode: NotebookEpisode, replies: list[str]) -> bool:
-        """Whether the monitor has seen the current subgoal complete, now or before; its answer goes
-        into `replies`.
+    def _complete(self, episode: NotebookEpisode, subgoal: str, replies: list[str]) -> bool:
+        """Return whether the monitor has reported the subgoal as complete, now or before.
+
+        Its answer is added to `replies`.
         """
-        if not episode.agreed:
-            images = episode.images()
-            query = monitor_query(episode.goal, str(episode.subgoal.text), len(images) > 1)
-            replies.append(self.api.ask(MONITOR, [("user", [*images, query])]).text)
-            done: Any = json_object(replies[-1]).get("done")
-            require(
-                isinstance(done, bool),
-                "the monitor's answer does not say whether it is done",
-                MalformedReply,
-            )
-            episode.agreed = done
-        return episode.agreed
+        if episode.agreed:
+            return True
+        images = episode.images()
+        query = monitor_query(episode.goal, subgoal, len(images) > 1)
+        reply = self.api.ask(MONITOR, [("user", [*images, query])]).text
+        replies.append(reply)
+        done = json_object(reply).get("done")
+        if not isinstance(done, bool):
+            raise MalformedReply("the monitor's answer does not say whether it is done")
+        episode.agreed = done
+        return done
 
     def _next(self, episode: NotebookEpisode, replies: list[str]) -> Subgoal:
-        """The planner's next subgoal, its notes written; its answer is added to `replies`."""
-        finished, parts = episode.subgoal.text, episode.images()
+        """Return the planner's next subgoal, and replace the notebook.
+
+        The planner's answer is added to `replies`.
+        """
+        finished = episode.subgoal.text
         if finished is None:
-            video = [MediaPart(episode.video)] if len(episode.video) else []
-            parts = [*video, MediaPart(episode.frame)]
-            query = opening_query(episode.goal, bool(video))
+            images = [MediaPart(episode.frame)]
+            if len(episode.video):
+                images.insert(0, MediaPart(episode.video))
+            query = opening_query(episode.goal, len(images) > 1)
         else:
-            query = next_query(episode.goal, finished, episode.notebook.in_words(), len(parts) > 1)
-        replies.append(
-            self.api.ask(planner_system(episode.task, self.kind), [("user", [*parts, query])]).text
-        )
-        text = parse_gemini(replies[-1]).lower()
-        notebook = episode.notebook.with_entries(
-            read_notes(json_object(replies[-1]).get("notes", [])), finished
-        )
+            images = episode.images()
+            notes = episode.notebook.in_words()
+            query = next_query(episode.goal, finished, notes, len(images) > 1)
+        system = planner_system(episode.task, self.kind)
+        reply = self.api.ask(system, [("user", [*images, query])]).text
+        replies.append(reply)
+
+        # The whole answer is read before anything of the episode is changed.
+        text = parse_gemini(reply).lower()
+        entries = read_notes(json_object(reply).get("notes", []))
+        notebook = episode.notebook.with_entries(entries, finished)
+        together = "\n".join(replies)
         if says_done(text):
-            subgoal = Subgoal(
-                finished, episode.subgoal.points, queried=True, reply="\n".join(replies)
-            )
+            points = episode.subgoal.points
+            subgoal = Subgoal(finished, points, queried=True, reply=together)
         else:
-            subgoal = self.accepted(pixels_of_pairs(text), "\n".join(replies))
-        episode.notebook, episode.since, episode.agreed = notebook, [], False
+            subgoal = self.accepted(pixels_of_pairs(text), together)
+        episode.notebook = notebook
+        episode.since = []
+        episode.agreed = False
         return subgoal

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mme_vla.errors import require
+from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.text import points_of
@@ -20,24 +20,32 @@ class Oracle(SubgoalPredictor):
     sees_video = sees_passing = False
 
     def predict_due(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
-        return [self._read(episode) for episode in episodes]
-
-    def _read(self, episode: SubgoalEpisode) -> Subgoal:
-        require(
-            isinstance(episode.info.get(f"{self.kind}_subgoal_online"), str),
-            f"subgoal=oracle needs the environment's '{self.kind}_subgoal_online' in observe(…,"
-            f" info); it reports {sorted(map(str, episode.info)) or 'nothing'}.",
-        )
-        text = online_subgoal(episode.info, self.kind)
-        if text is None:
-            return Subgoal(episode.subgoal.text, episode.subgoal.points)
-        return Subgoal(text, points_of(text))
+        subgoals = []
+        for episode in episodes:
+            key = f"{self.kind}_subgoal_online"
+            if not isinstance(episode.info.get(key), str):
+                raise UserError(
+                    f"subgoal=oracle needs the environment's {key!r} in observe(…, info); it"
+                    f" reports {sorted(map(str, episode.info)) or 'nothing'}."
+                )
+            text = online_subgoal(episode.info, self.kind)
+            if text is None:
+                last = episode.subgoal
+                subgoals.append(Subgoal(last.text, last.points))
+            else:
+                subgoals.append(Subgoal(text, points_of(text)))
+        return subgoals
 
 
 def online_subgoal(info: Mapping[str, Any], kind: str) -> str | None:
-    """The subgoal that an environment reports, lower-case as in training; None where
-    it names none.
+    """Return the subgoal that an environment reports, lower-case as in training.
+
+    It is None where the environment names none.
     """
     text = info.get(f"{kind}_subgoal_online")
-    text = text.strip().lower() if isinstance(text, str) else ""
-    return None if text in ("", "complete", "no record") else text
+    if not isinstance(text, str):
+        return None
+    text = text.strip().lower()
+    if text in ("", "complete", "no record"):
+        return None
+    return text

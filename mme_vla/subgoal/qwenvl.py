@@ -1,6 +1,4 @@
-"""`qwenvl`: a fine-tuned Qwen3-VL that reads the current image, the video and its own past
-subgoals.
-"""
+"""`qwenvl`: a fine-tuned Qwen3-VL that reads the image, the video and its past subgoals."""
 
 import time
 from collections.abc import Sequence
@@ -13,7 +11,7 @@ from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.answers import SubgoalHistory, hold_until
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.clips import Clip
-from mme_vla.subgoal.models.qwen3vl import VLM, Completion, Question
+from mme_vla.subgoal.models.qwen3vl import VLM, Question
 from mme_vla.subgoal.text import (
     MalformedReply,
     parse_subgoal,
@@ -24,14 +22,16 @@ from mme_vla.subgoal.text import (
 
 
 class VLMPredictor(SubgoalPredictor):
-    """What `qwenvl` and `memer` share: one model for a batch of all episodes.
+    """The base of `qwenvl` and `memer`: one model asks for all episodes in batches.
+
+    A subclass implements `question` and `read`.
 
     Args:
-        model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for
-            none.
+        model: a repository on the hub, a folder, or `tiny`.
+        adapter: LoRA weights to add; None for none.
         max_new_tokens: longest answer. batch_size: questions answered at once.
-        device, dtype: where and how the model runs. vlm: a model that is loaded already, instead of
-            all these.
+        device, dtype: where and how the model runs.
+        vlm: a model that is loaded already, instead of all these.
     """
 
     def __init__(
@@ -53,18 +53,30 @@ class VLMPredictor(SubgoalPredictor):
             model, adapter, device=device, dtype=dtype, batch_size=batch_size
         )
 
-    def ask(self, questions: Sequence[Question]) -> list[Completion]:
+    def question(self, episode: Any) -> Question:
+        """Return the next question of an episode."""
+        raise NotImplementedError
+
+    def read(self, episode: Any, reply: str) -> Subgoal:
+        """Return the subgoal of a reply, and update the episode."""
+        raise NotImplementedError
+
+    def predict_due(self, episodes: Sequence[Any]) -> list[Subgoal]:
+        questions = [self.question(episode) for episode in episodes]
         started = time.perf_counter()
         completions = self.vlm.generate(questions, self.max_new_tokens)
         self.usage.seconds += time.perf_counter() - started
-        self.usage.calls += len(completions)
-        self.usage.input_tokens += sum(completion.input_tokens for completion in completions)
-        self.usage.output_tokens += sum(completion.output_tokens for completion in completions)
-        return completions
+        subgoals = []
+        for episode, completion in zip(episodes, completions, strict=True):
+            self.usage.calls += 1
+            self.usage.input_tokens += completion.input_tokens
+            self.usage.output_tokens += completion.output_tokens
+            subgoals.append(self.read(episode, completion.text))
+        return subgoals
 
 
 class QwenEpisode(SubgoalEpisode):
-    """An episode and the subgoals it has had."""
+    """An episode and its past subgoals."""
 
     def __init__(self, goal: str, video: np.ndarray | None, task: str) -> None:
         super().__init__(goal, video, task)
@@ -73,7 +85,7 @@ class QwenEpisode(SubgoalEpisode):
 
 @SUBGOALS.register("qwenvl")
 class QwenVL(VLMPredictor):
-    """Predicts the next subgoal, given all that were different from the one before.
+    """Predicts the next subgoal from the image, the video and the past subgoals.
 
     Args:
         hold: keep the first subgoals of three tasks for a fixed time, as released.
@@ -89,35 +101,20 @@ class QwenVL(VLMPredictor):
         self.hold = hold
 
     def due(self, episode: SubgoalEpisode) -> bool:
-        """Whether to ask now: see `SubgoalPredictor`; what came due while the last subgoal is held
-        is left out.
-        """
+        """As `SubgoalPredictor.due`, without the questions of the time that a subgoal is kept."""
         last = episode.subgoal.text
-        on_hold = (
-            self.hold
-            and last is not None
-            and self.due_step(episode) <= hold_until(episode.task, last)
-        )
-        return super().due(episode) and not on_hold
+        if not self.hold or last is None:
+            return super().due(episode)
+        return self.due_step(episode) > hold_until(episode.task, last) and super().due(episode)
 
     def question(self, episode: QwenEpisode) -> Question:
-        video = len(episode.video) > 0
-        user = subgoal_user(self.kind, episode.goal, episode.history.entries, video)
-        return Question(
-            subgoal_system(self.kind),
-            write_boxes(user, episode.history.points),
-            [episode.frame],
-            [Clip.of(episode.video)] if video else [],
-        )
+        history = episode.history
+        clips = [Clip.of(episode.video)] if len(episode.video) else []
+        user = subgoal_user(self.kind, episode.goal, history.entries, len(clips) > 0)
+        user = write_boxes(user, history.points)
+        return Question(subgoal_system(self.kind), user, [episode.frame], clips)
 
-    def predict_due(self, episodes: Sequence[QwenEpisode]) -> list[Subgoal]:
-        completions = self.ask([self.question(episode) for episode in episodes])
-        return [
-            self._read(e, completion.text)
-            for e, completion in zip(episodes, completions, strict=True)
-        ]
-
-    def _read(self, episode: QwenEpisode, reply: str) -> Subgoal:
+    def read(self, episode: QwenEpisode, reply: str) -> Subgoal:
         try:
             parsed = parse_subgoal(reply)
         except MalformedReply as error:

@@ -1,8 +1,8 @@
-"""From a language model's answer to a subgoal: points, JSON, coordinates.
+"""Texts of the subgoal predictors: questions, answers, and points in them.
 
-Models write points in thousandths of the image's sides, `(row, column)` from 0 to 1000; the policy
-reads pixels of the 256×256 front image, `<row, column>`. What cannot be read raises
-`MalformedReply`, which the predictors count and survive.
+Models write points in thousandths of the image's sides, `(row, column)` from 0 to 1000. The policy
+reads pixels of the 256×256 front image, `<row, column>`. An answer that cannot be read raises
+`MalformedReply`, which the predictors count.
 """
 
 import re
@@ -11,11 +11,23 @@ from dataclasses import dataclass
 from typing import Any
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import UserError, brief
 from mme_vla.utils import is_text, parse_json
 
 IMAGE, VIDEO, BBOX = "<image>", "<video>", "<bbox>"
 KINDS = ("simple", "grounded")
+
+THOUSAND = 1000
+Point = tuple[int, int]
+
+# Runs of digits are bounded: Python refuses to read thousands of them.
+_BOX = re.compile(r"<\|box_start\|>\(\s*(\d{1,6})\s*,\s*(\d{1,6})\s*\)<\|box_end\|>")
+_BOX_MARK = re.compile(r"<\|box_(?:start|end)\|>")
+_PIXELS = re.compile(r"at <(-?\d{1,6}), (-?\d{1,6})>")
+_PAIR = re.compile(r"<\s*(-?\d+(?:\.\d+)?)\s*,\s*(-?\d+(?:\.\d+)?)\s*>")
+_SUBGOAL_KEY = re.compile(r'"subgoal"([^\n]*)')
+_QUOTED = re.compile(r'"((?:[^"\\]|\\.)*)"')
+_DONE = ("is complete", "is finished")
 
 _PHRASE = {"simple": "language subgoal", "grounded": "grounded language subgoal"}
 _SYSTEM = (
@@ -35,12 +47,12 @@ MEMER_SYSTEM = (
 
 
 def subgoal_system(kind: str) -> str:
-    """The system prompt of the simple or the grounded predictor."""
+    """Return the system prompt of the simple or the grounded predictor."""
     return _SYSTEM.format(_PHRASE[kind])
 
 
 def subgoal_user(kind: str, goal: str, history: Sequence[str], video: bool) -> str:
-    """The question for the next subgoal.
+    """Return the question for the next subgoal.
 
     Args:
         kind: `simple` or `grounded`.
@@ -49,22 +61,21 @@ def subgoal_user(kind: str, goal: str, history: Sequence[str], video: bool) -> s
         video: whether a conditioning video comes with it.
     """
     phrase = _PHRASE[kind]
-    past = (
-        f"The history of previous predicted {phrase}s are: {numbered(history)}"
-        if history
-        else "This is the initial turn for prediction"
-    )
+    mark = VIDEO if video else ""
+    past = "This is the initial turn for prediction"
+    if history:
+        past = f"The history of previous predicted {phrase}s are: {numbered(history)}"
     question = f"What's the next {phrase} based on current observation?"
-    return f"{VIDEO if video else ''}The task goal is: {goal}\n{past}\n{IMAGE}{question}"
+    return f"{mark}The task goal is: {goal}\n{past}\n{IMAGE}{question}"
 
 
-def numbered(history: Sequence[str]) -> str:
-    """`1. pick up the cube; 2. put it down`."""
-    return "; ".join(f"{i}. {text}" for i, text in enumerate(history, 1))
+def numbered(texts: Sequence[str]) -> str:
+    """Join texts as `1. pick up the cube; 2. put it down`."""
+    return "; ".join(f"{i}. {text}" for i, text in enumerate(texts, 1))
 
 
 def memer_user(goal: str, keyframes: int, recent: int, video: bool) -> str:
-    """MemER's question.
+    """Return MemER's question.
 
     Args:
         goal: the task in words.
@@ -72,48 +83,32 @@ def memer_user(goal: str, keyframes: int, recent: int, video: bool) -> str:
         video: whether a conditioning video comes before them.
     """
     setup = f"The task has a video input for initial setup: {VIDEO}\n" if video else ""
+    keyframe_marks = ", ".join([IMAGE] * keyframes)
+    recent_marks = ", ".join([IMAGE] * recent)
     return (
         f"{setup}The task goal is: {goal}\nHere are the selected frames from the entirety of the"
-        f" full execution that are of particular importance:{_image_tags(keyframes)}\nHere is"
-        f" current input image list from the front-view camera: {_image_tags(recent)}\n\nWhat"
+        f" full execution that are of particular importance:[{keyframe_marks}]\nHere is"
+        f" current input image list from the front-view camera: [{recent_marks}]\n\nWhat"
         " subtask should the robot execute and what is the keyframe position?"
     )
 
 
 def memer_reply(subtask: str, positions: Sequence[int]) -> str:
-    """MemER's answer; without keyframes there is no space after the first colon, as in the released
-    training set.
-    """
-    space = " " if positions else ""
+    """Return MemER's answer, as the training set has it."""
+    space = " " if positions else ""  # as in the released training set
     return f'{{"current_subtask":{space}"{subtask}", "keyframe_positions": {list(positions)}}}'
 
 
 def split_media(text: str) -> list[str]:
-    """Cut a text at its `<image>` and `<video>` marks, which stay as entries; empty pieces are left
-    out.
+    """Split a text at its `<image>` and `<video>` marks, which are pieces too.
+
+    Empty pieces are left out.
     """
     return [piece for piece in re.split(f"({IMAGE}|{VIDEO})", text) if piece]
 
 
-def _image_tags(count: int) -> str:
-    return f"[{', '.join([IMAGE] * count)}]"
-
-
-THOUSAND = 1000
-Point = tuple[int, int]
-
-# Runs of digits are bounded: Python refuses to read thousands of them.
-_BOX = re.compile(r"<\|box_start\|>\(\s*(\d{1,6})\s*,\s*(\d{1,6})\s*\)<\|box_end\|>")
-_BOX_MARK = re.compile(r"<\|box_(?:start|end)\|>")
-_PIXELS = re.compile(r"at <(-?\d{1,6}), (-?\d{1,6})>")
-_PAIR = re.compile(r"<\s*(-?\d+(?:\.\d+)?)\s*,\s*(-?\d+(?:\.\d+)?)\s*>")
-_SUBGOAL_KEY = re.compile(r'"subgoal"([^\n]*)')
-_QUOTED = re.compile(r'"((?:[^"\\]|\\.)*)"')
-_DONE = ("is complete", "is finished")
-
-
 class MalformedReply(ValueError):  # noqa: N818  (what the model gave, not a mistake of the program)
-    """An answer that holds no usable subgoal; the message says why."""
+    """An answer without a usable subgoal; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -146,39 +141,40 @@ def write_boxes(text: str, points: Sequence[Point], side: int = SIDE) -> str:
     Raises:
         ValueError: another number of marks than of points.
     """
-    pieces = text.split(BBOX)
-    if len(pieces) != len(points) + 1:
-        raise ValueError(
-            f"{len(pieces) - 1} {BBOX} marks for {len(points)} points in {brief(text)}."
-        )
-    boxes = [
-        f"<|box_start|>({to_thousandths(y, side)},{to_thousandths(x, side)})<|box_end|>"
-        for y, x in points
-    ]
-    return "".join(piece + box for piece, box in zip(pieces, [*boxes, ""], strict=True))
+    start, *pieces = text.split(BBOX)
+    if len(pieces) != len(points):
+        raise ValueError(f"{len(pieces)} {BBOX} marks for {len(points)} points in {brief(text)}.")
+    written = start
+    for (y, x), piece in zip(points, pieces, strict=True):
+        row = to_thousandths(y, side)
+        column = to_thousandths(x, side)
+        written += f"<|box_start|>({row},{column})<|box_end|>{piece}"
+    return written
 
 
 def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
-    """Read the answer of the fine-tuned predictor: a line of text with
-    `<|box_start|>(a,b)<|box_end|>` points.
+    """Read the answer of a fine-tuned predictor: text with `<|box_start|>(a,b)<|box_end|>` points.
+
+    Raises:
+        MalformedReply: it is empty, or a point is damaged.
     """
     text = " ".join(reply.split())
-    require(text, "the answer is empty", MalformedReply)
-    pixels = [(int(y), int(x)) for y, x in _BOX.findall(text)]
-    require(
-        not any(value > THOUSAND for point in pixels for value in point),
-        "a point lies outside 0…1000",
-        MalformedReply,
-    )
-    require(
-        not _BOX_MARK.search(_BOX.sub("", text)),
-        "a point is not of the form <|box_start|>(a,b)<|box_end|>",
-        MalformedReply,
-    )
-    points = tuple((to_pixels(y, side), to_pixels(x, side)) for y, x in pixels)
-    values = iter(points)
-    display_text = _BOX.sub(lambda _: "<{}, {}>".format(*next(values)), text)
-    return Parsed(display_text, _BOX.sub(BBOX, text), points)
+    if not text:
+        raise MalformedReply("the answer is empty")
+    points: list[Point] = []
+
+    def pixel(match: re.Match[str]) -> str:
+        y = int(match[1])
+        x = int(match[2])
+        if max(y, x) > THOUSAND:
+            raise MalformedReply("a point lies outside 0…1000")
+        points.append((to_pixels(y, side), to_pixels(x, side)))
+        return "<{}, {}>".format(*points[-1])
+
+    display_text = _BOX.sub(pixel, text)
+    if _BOX_MARK.search(_BOX.sub("", text)):
+        raise MalformedReply("a point is not of the form <|box_start|>(a,b)<|box_end|>")
+    return Parsed(display_text, _BOX.sub(BBOX, text), tuple(points))
 
 
 def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list[int]]:
@@ -190,20 +186,19 @@ def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list
 
     Returns:
         The subgoal and the positions, from 1, in ascending order.
+
+    Raises:
+        MalformedReply: a field is missing or of another type.
     """
     fields = json_object(reply)
-    subtask: Any = fields.get("current_subtask")
-    positions: Any = fields.get("keyframe_positions", [])
-    require(isinstance(subtask, str), "the answer has no current_subtask", MalformedReply)
-    require(
-        isinstance(positions, list)
-        and not any(isinstance(p, bool) or not isinstance(p, int) for p in positions),
-        "keyframe_positions is not a list of whole numbers",
-        MalformedReply,
-    )
-    return parse_subgoal(_writable(subtask), side), sorted(
-        {p for p in positions if 1 <= p <= recent}
-    )
+    subtask = fields.get("current_subtask")
+    positions = fields.get("keyframe_positions", [])
+    if not isinstance(subtask, str):
+        raise MalformedReply("the answer has no current_subtask")
+    if not isinstance(positions, list) or any(type(position) is not int for position in positions):
+        raise MalformedReply("keyframe_positions is not a list of whole numbers")
+    parsed = parse_subgoal(_writable(subtask), side)
+    return parsed, sorted({position for position in positions if 1 <= position <= recent})
 
 
 def parse_gemini(reply: str) -> str:
@@ -216,22 +211,27 @@ def parse_gemini(reply: str) -> str:
         quoted = _QUOTED.search(remainder)
         if quoted and quoted[1].strip():
             return _writable(quoted[1].strip().replace('\\"', '"'))
-    text: Any = json_object(reply).get("subgoal")
-    require(isinstance(text, str) and text.strip(), "the answer names no subgoal", MalformedReply)
+    text = json_object(reply).get("subgoal")
+    if not isinstance(text, str) or not text.strip():
+        raise MalformedReply("the answer names no subgoal")
     return _writable(text.strip())
 
 
 def pixels_of_pairs(text: str, side: int = SIDE) -> Parsed:
-    """Turn every `<y, x>` of a prompted model's subgoal from thousandths into pixels, clipped to
-    [0, side].
+    """Convert each `<y, x>` of a prompted model's subgoal from thousandths to pixels.
+
+    Pixels are clipped to [0, side].
     """
     points: list[Point] = []
 
     def pixel(match: re.Match[str]) -> str:
         try:
-            y, x = (min(max(to_pixels(float(match[i]), side), 0), side) for i in (1, 2))
+            y = to_pixels(float(match[1]), side)
+            x = to_pixels(float(match[2]), side)
         except (ValueError, OverflowError):
             raise MalformedReply("a point's number is too long") from None
+        y = min(max(y, 0), side)
+        x = min(max(x, 0), side)
         points.append((y, x))
         return f"<{y}, {x}>"
 
@@ -239,26 +239,30 @@ def pixels_of_pairs(text: str, side: int = SIDE) -> Parsed:
 
 
 def says_done(text: str) -> bool:
-    """Whether a prompted model reports that all is done instead of naming a subgoal."""
+    """Return whether a prompted model reports completion instead of naming a subgoal."""
     return any(words in text.lower() for words in _DONE)
 
 
 def mark_points(text: str) -> tuple[str, list[Point]]:
-    """Replace each `at <y, x>` of a label by `at <bbox>`; return the text and the
-    points in pixels.
-    """
-    points = [(int(y), int(x)) for y, x in _PIXELS.findall(text)]
-    return _PIXELS.sub(f"at {BBOX}", text), points
+    """Replace each `at <y, x>` of a label by `at <bbox>`; return the points in pixels as well."""
+    return _PIXELS.sub(f"at {BBOX}", text), list(points_of(text))
 
 
 def points_of(text: str) -> tuple[Point, ...]:
+    """Return the points `at <y, x>` of a label, in pixels."""
     return tuple((int(y), int(x)) for y, x in _PIXELS.findall(text))
 
 
 def json_object(reply: str) -> dict[str, Any]:
-    """The outermost braces of an answer as JSON."""
-    start, stop = reply.find("{"), reply.rfind("}")
-    require(start >= 0 and stop >= start, "the answer holds no JSON object", MalformedReply)
+    """Read the outermost braces of an answer as JSON.
+
+    Raises:
+        MalformedReply: there is no JSON object.
+    """
+    start = reply.find("{")
+    stop = reply.rfind("}")
+    if not 0 <= start <= stop:
+        raise MalformedReply("the answer holds no JSON object")
     try:
         fields: dict[str, Any] = parse_json(reply[start : stop + 1], "the answer", finite=False)
     except UserError as error:
@@ -267,8 +271,7 @@ def json_object(reply: str) -> dict[str, Any]:
 
 
 def _writable(text: str) -> str:
-    """The text, unless it holds half a character (JSON's escapes allow that), which no file or
-    tokenizer takes.
-    """
-    require(is_text(text), "the answer holds half a character", MalformedReply)
+    """Return the text, unless it holds half a character, which JSON's escapes allow."""
+    if not is_text(text):
+        raise MalformedReply("the answer holds half a character")
     return text

@@ -23,7 +23,8 @@ from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.finetuning.rows import RowDataset
-from mme_vla.subgoal.models.api import Api, Reply, Settings
+from mme_vla.subgoal.models.api import Api, Settings
+from mme_vla.subgoal.models.replies import Reply
 from mme_vla.utils import write_sums
 from mme_vla.utils.media import png_bytes, video_bytes
 
@@ -129,10 +130,8 @@ QUESTION = ("You plan.", [("user", ["What next?"])])
 
 
 def _api(folder: Path, reply: str) -> Api:
-    api = Api(
-        Settings(cache=str(folder / "answers"), requests_per_minute=None), Usage(), client=object()
-    )
-    api._once = lambda connection, system, messages: Reply(reply, 12, 7)  # type: ignore[method-assign]
+    api = Api(Settings(cache=str(folder / "answers")), Usage(), client=object())
+    api._request = lambda system, messages: Reply(reply, 12, 7)  # type: ignore[method-assign]
     return api
 
 

@@ -1,4 +1,4 @@
-"""A stand-in for google-genai's client, and episodes to ask it about."""
+"""A stand-in for the client of the package `openai`, and episodes to ask it about."""
 
 from types import SimpleNamespace
 
@@ -8,21 +8,18 @@ from mme_vla.subgoal import Gemini
 
 
 class ApiError(Exception):
-    """Looks like google-genai's."""
+    """Looks like that of the package `openai`."""
 
     def __init__(self, code, message=""):
         super().__init__(f"{code} {message}")
-        self.code = code
+        self.status_code = code
 
 
-def response(text, *, finish="STOP", blocked=None):
+def response(text, *, finish="stop", refusal=None):
+    message = SimpleNamespace(content=text, refusal=refusal)
     return SimpleNamespace(
-        text=text,
-        usage_metadata=SimpleNamespace(
-            prompt_token_count=1000, candidates_token_count=20, thoughts_token_count=80
-        ),
-        candidates=[SimpleNamespace(finish_reason=SimpleNamespace(name=finish))],
-        prompt_feedback=SimpleNamespace(block_reason=blocked),
+        choices=[SimpleNamespace(message=message, finish_reason=finish)],
+        usage=SimpleNamespace(prompt_tokens=1000, completion_tokens=100),
     )
 
 
@@ -31,16 +28,16 @@ def says(subgoal):
 
 
 class Client:
-    """Has google-genai's interface; returns these outcomes in turn (exceptions are raised,
+    """Has openai's interface; returns these outcomes in turn (exceptions are raised,
     functions called).
     """
 
     def __init__(self, *outcomes):
         self.outcomes, self.requests = list(outcomes), []
-        self.models = self
+        self.chat = SimpleNamespace(completions=self)
 
-    def generate_content(self, *, model, contents, config):
-        self.requests.append((contents, config))
+    def create(self, **request):
+        self.requests.append(request)
         outcome = self.outcomes.pop(0)
         if callable(outcome):
             outcome = outcome()
@@ -51,7 +48,7 @@ class Client:
 
 def predictor_of(*outcomes, **options):
     client = Client(*outcomes)
-    return Gemini(client=client, **{"backoff": 0, "requests_per_minute": None, **options}), client
+    return Gemini(client=client, **options), client
 
 
 def frames(count, first=0, size=32):
@@ -78,5 +75,20 @@ def play(predictor, episode, chunks):
     return texts, queries
 
 
-def kinds(parts):
-    return [part["inline_data"]["mime_type"] if "inline_data" in part else "text" for part in parts]
+def turns(request):
+    """The messages of a request without the system prompt."""
+    return request["messages"][1:]
+
+
+def kinds(message):
+    """What a message shows, in order: `image`, `video of N`, or `text`; a video's images apart."""
+    displayed = []
+    for part in message["content"]:
+        text = part.get("text", "")
+        if part["type"] == "image_url":
+            displayed.append("image")
+        elif text.startswith("A video of"):
+            displayed.append(f"video of {text.split()[3]}")
+        else:
+            displayed.append("text")
+    return displayed

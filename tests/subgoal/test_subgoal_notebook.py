@@ -16,7 +16,7 @@ from mme_vla.subgoal import NotebookPredictor, build_predictor
 from mme_vla.subgoal.notebook import MONITOR, Count, Identity, Notebook, Route, read_notes
 from mme_vla.subgoal.text import MalformedReply
 
-QUICK = {"backoff": 0, "requests_per_minute": None, "retries": 0}
+QUICK = {"retries": 0}
 COUNT = {"kind": "count", "name": "placed", "value": 0}
 
 
@@ -251,4 +251,4 @@ def test_impossible_options_are_refused() -> None:
     with pytest.raises(UserError, match="workers=0"):
         NotebookPredictor(workers=0)
     with pytest.raises(UserError, match="base_url"):
-        NotebookPredictor(api="gemini", base_url="http://127.0.0.1/v1")
+        NotebookPredictor(api="gemini", base_url="127.0.0.1/v1")

@@ -240,16 +240,17 @@ def test_every_key_of_the_yaml_files_is_an_option_and_every_option_a_key():
     from omegaconf import OmegaConf
 
     from mme_vla.config.composition import config_dir
-    from mme_vla.subgoal.models.connection import OpenAISettings, Settings
+    from mme_vla.subgoal.models.api import PROVIDERS
     from mme_vla.subgoal.qwenvl import VLMPredictor
 
-    shared = {**dict.fromkeys(("qwenvl", "memer"), VLMPredictor), "gemini": Settings}
-    shared |= dict.fromkeys(("openai", "notebook"), OpenAISettings)
+    settings = {name: vars(PROVIDERS[name]) for name in ("openai", "gemini")}
+    settings["notebook"] = settings["openai"]
     for name in SUBGOALS:
         keys = dict(OmegaConf.load(config_dir() / "subgoal" / f"{name}.yaml"))
         assert keys.pop("name") == name
-        defaults = {}
-        for one in (SUBGOALS[name], shared.get(name, SUBGOALS[name])):
+        defaults = dict(settings.get(name, {}))
+        parents = [VLMPredictor] if name in ("qwenvl", "memer") else []
+        for one in (SUBGOALS[name], *parents):
             parameters = inspect.signature(one).parameters.values()
             defaults |= {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD}
         assert {k: v for k, v in defaults.items() if k not in ("vlm", "client")} == keys

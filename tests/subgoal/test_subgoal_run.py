@@ -45,10 +45,7 @@ def test_whatever_decides_what_a_predictor_says_belongs_to_the_run() -> None:
         "key_variable": "K",
         "timeout": 5.0,
         "retries": 0,
-        "backoff": 0.0,
-        "requests_per_minute": None,
-        "input_price": 0.0,
-        "output_price": 0.0,
+        "base_url": "http://127.0.0.1/v1",
     }
     assert facts_of(build_predictor({**base, **other})) == facts
     background = BackgroundPredictor(build_predictor(base))
@@ -121,12 +118,12 @@ def test_a_predictor_on_auto_runs_on_the_policys_device(monkeypatch: pytest.Monk
 
 
 def test_what_a_predictor_did_is_reported_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
-    usage = Usage(calls=1200, retries=2, input_tokens=34567, cost=1.5)
+    usage = Usage(calls=1200, cached=2, input_tokens=34567)
     usage.problems["malformed"] = 3
     with caplog.at_level("INFO"):
         report_usage(Usage())
         assert caplog.text == ""
         report_usage(usage)
     assert caplog.messages == [
-        "subgoals: 1,200 calls, 2 retries, 34,567 tokens read, 3 malformed answers, $1.50"
+        "subgoals: 1,200 calls, 2 answers from the cache, 34,567 tokens read, 3 malformed answers"
     ]

@@ -1,6 +1,4 @@
-"""Vision-language models that play: Qwen3-VL on this machine, and a foundation model behind
-Google's API.
-"""
+"""Vision-language models that play: Qwen3-VL on this machine, and models behind an endpoint."""
 
 import math
 import re
@@ -18,7 +16,7 @@ from mme_vla.extras.play.game import ChoiceSession, Decision
 from mme_vla.extras.play.players import PLAYERS, NoChoiceError, Player
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.clips import Clip, sample_video
-from mme_vla.subgoal.models.api import ApiFailure, make_api
+from mme_vla.subgoal.models.api import ApiFailure, MediaPart, Message, make_api
 from mme_vla.subgoal.models.qwen3vl import TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
 from mme_vla.subgoal.text import IMAGE, THOUSAND, VIDEO, MalformedReply, to_pixels, to_thousandths
 from mme_vla.utils import parse_json
@@ -209,11 +207,13 @@ class ModelPlayer(Player):
         raise NotImplementedError
 
     def notes(self) -> dict[str, Any]:
-        """Calls, tokens, cost and unusable replies of the episode."""
-        now, before = self.usage, self._before
-        used = {name: getattr(now, name) - getattr(before, name) for name in vars(now)}
-        used |= {name: round(used[name], 6) for name in ("seconds", "cost")}
-        return {"usage": {**used, "problems": dict(used["problems"])}}
+        """Calls, tokens and unusable replies of the episode."""
+        now = self.usage.to_dict()
+        before = self._before.to_dict()
+        used = {name: now[name] - before[name] for name in now if name != "problems"}
+        used["seconds"] = round(used["seconds"], 6)
+        used["problems"] = dict(self.usage.problems - self._before.problems)
+        return {"usage": used}
 
 
 @PLAYERS.register("qwenvl")
@@ -285,32 +285,46 @@ class QwenPlayer(ModelPlayer):
         return Clip(np.stack([frames[i] for i in indices]), indices, len(frames))
 
 
-@PLAYERS.register("gemini")
-class GeminiPlayer(ModelPlayer):
+@PLAYERS.register("openai")
+class OpenAIPlayer(ModelPlayer):
     """One conversation an episode: each turn brings the frames since the last decision.
 
-    tries: replies that may be unusable in a row. client: an object with google-genai's
-    `client.models.generate_content`; None makes one. settings: keys of
-    `mme_vla.subgoal.models.connection.Settings`.
+    The model is behind an endpoint for OpenAI's chat completions. Videos are shown as images.
+
+    Args:
+        tries: replies that may be unusable in a row.
+        client: an object with openai's `chat.completions.create`; None makes one.
+        settings: keys of `mme_vla.subgoal.models.api.Settings`.
     """
 
-    provider = "gemini"
+    provider = "openai"
 
     def __init__(self, tries: int = 3, client: Any = None, **settings: Any) -> None:
         super().__init__("", tries)
         self.api = make_api(self.provider, settings, "player", self.usage, client)
         self.model = self.api.settings.model
-        self._conversation: list[tuple[str, list[Any]]] = []
+        self._conversation: list[Message] = []
+        self._unanswered: Message | None = None
 
     def start(self, session: ChoiceSession) -> None:
         super().start(session)
         self._conversation = []
+        self._unanswered = None
 
     def ask(self, session: ChoiceSession, complaint: str) -> str:
-        message = ("user", [complaint] if complaint else self._news(session))
+        message: Message = ("user", [complaint])
+        if not complaint:
+            message = ("user", self._news(session))
+        elif self._unanswered is not None:
+            message = self._unanswered
+        self._unanswered = None
         try:
             reply = self.api.ask(SYSTEM, [*self._conversation, message])
         except ApiFailure as failure:
+            if failure.problem == "empty":
+                # An empty answer is no turn of a conversation: the question is asked once more.
+                self._unanswered = message
+                return ""
             self.usage.problems[failure.problem] += 1
             # A refusal counts as a failure of the model; an episode with a network error is
             # repeated by `retry_errors`.
@@ -319,27 +333,21 @@ class GeminiPlayer(ModelPlayer):
         self._conversation += [message, ("model", [reply.text])]
         return reply.text
 
-    def _news(self, session: ChoiceSession) -> list[Any]:
-        if not session.decisions:
-            frames = session.reveals[0].frames[:-1]
-            text = opening(session.goal, session.options, bool(len(frames)))
+    def _news(self, session: ChoiceSession) -> list[str | MediaPart]:
+        if session.decisions:
+            frames = list(session.reveals[-1].frames)
+            text = following(session.decisions[-1], session.options, len(frames) > 0)
         else:
-            frames = session.reveals[-1].frames
-            text = following(session.decisions[-1], session.options, bool(len(frames)))
-        return [*_clip(frames), session.frame, text]
+            frames = list(session.reveals[0].frames[:-1])
+            text = opening(session.goal, session.options, len(frames) > 0)
+        parts: list[str | MediaPart] = []
+        if frames:
+            parts.append(MediaPart(np.stack(frames)))
+        return [*parts, MediaPart(session.frame), text]
 
 
-@PLAYERS.register("openai")
-class OpenAIPlayer(GeminiPlayer):
-    """The same conversation with any endpoint of OpenAI's chat completions; videos are shown as
-    images.
+@PLAYERS.register("gemini")
+class GeminiPlayer(OpenAIPlayer):
+    """As `OpenAIPlayer`, with the defaults of Google's endpoint."""
 
-    client: an object with openai's `client.chat.completions.create`; None makes one.
-    settings: keys of `mme_vla.subgoal.models.connection.OpenAISettings`.
-    """
-
-    provider = "openai"
-
-
-def _clip(frames: Any) -> list[np.ndarray]:
-    return [np.stack(list(frames))] if len(frames) else []
+    provider = "gemini"

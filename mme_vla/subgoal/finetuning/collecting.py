@@ -45,8 +45,12 @@ PARTS = "parts"
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One episode to build from: its labels, and its front images at some frames, both read when
-    asked for.
+    """One episode to build from. Labels and images are read when they are needed.
+
+    task, number: its name and number.
+    origin: its source and a digest of it; another origin makes other rows.
+    labels: reads its labels.
+    read_images: reads the front images [H, W, 3] of some frames, in order.
     """
 
     task: str
@@ -74,10 +78,13 @@ def open_input(entry: str | Path, tasks: Path | None = None) -> list[Demonstrati
         return _from_lerobot(EpisodeSource(root), tasks)
     refs = list_episodes(find_files([root]))
     sums = {file: file_sum(file) for file in dict.fromkeys(ref.file for ref in refs)}
-    return [
-        Demonstration(ref.task, ref.index, f"{ref.file.name}:{sums[ref.file]}", *_h5_readers(ref))
-        for ref in refs
-    ]
+    demonstrations = []
+    for ref in refs:
+        origin = f"{ref.file.name}:{sums[ref.file]}"
+        labels = partial(_h5_labels, ref)
+        read_images = partial(_h5_images, ref)
+        demonstrations.append(Demonstration(ref.task, ref.index, origin, labels, read_images))
+    return demonstrations
 
 
 def build(
@@ -92,13 +99,14 @@ def build(
         episodes and sets,
         "There is nothing to build: name at least one episode and one of the sets.",
     )
-    names = [episode.name for episode in episodes]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise UserError(
-            f"Two episodes are called {twice[0]}: give inputs that do not overlap, or build them"
-            " apart."
-        )
-    origins = {episode.name: episode.origin for episode in episodes}
+    origins: dict[str, str] = {}
+    for episode in episodes:
+        if episode.name in origins:
+            raise UserError(
+                f"Two episodes are called {episode.name}: give inputs that do not overlap, or build"
+                " them apart."
+            )
+        origins[episode.name] = episode.origin
     plan = to_json({"sets": list(sets), "options": asdict(options), "episodes": origins})
     with FolderLock(output, "build of subgoal data"):
         return _build(episodes, output, sets, options, plan)
@@ -116,87 +124,102 @@ def _build(
         f"{output} holds something else, or the result of other inputs, sets or options. Choose"
         " another output, repeat that command to finish it, or remove the folder yourself.",
     )
-    for folder in (output, *(path for path in output.rglob("*") if path.is_dir())):
-        remove_drafts(folder)
-    missing = [e for e in episodes if not all(_part(output, name, e).is_file() for name in sets)]
-    if not all((output / f"{name}.jsonl").is_file() for name in sets):
-        with progress(
-            "subgoal data", len(episodes), len(episodes) - len(missing), "episodes"
-        ) as advance:
+    # An interrupted run may have left unfinished files.
+    remove_drafts(output)
+    for path in output.rglob("*"):
+        if path.is_dir():
+            remove_drafts(path)
+
+    rows_files = {name: output / f"{name}.jsonl" for name in sets}
+    if not all(path.is_file() for path in rows_files.values()):
+        missing = []
+        for episode in episodes:
+            parts = [_part(output, name, episode) for name in sets]
+            if not all(part.is_file() for part in parts):
+                missing.append(episode)
+        n_built = len(episodes) - len(missing)
+        with progress("subgoal data", len(episodes), n_built, "episodes") as advance:
             for episode in missing:
                 _build_episode(episode, output, sets, options)
                 advance(1)
-        for name in sets:
-            with write_atomically(output / f"{name}.jsonl") as draft:
-                draft.write_text(
-                    "".join(_part(output, name, episode).read_text() for episode in episodes)
-                )
+        for name, path in rows_files.items():
+            parts = [_part(output, name, episode) for episode in episodes]
+            with write_atomically(path) as draft:
+                draft.write_text("".join(part.read_text() for part in parts))
     shutil.rmtree(output / PARTS, ignore_errors=True)
-    if not (
-        output / SUMS
-    ).is_file():  # the last thing written: what they do not list is not compared
+
+    # The checksums are written last: a file that they do not list is not compared.
+    if not (output / SUMS).is_file():
         kinds = {".jsonl", ".png", ".mp4"}
-        write_sums(
-            output,
-            [str(p.relative_to(output)) for p in sorted(output.rglob("*.*")) if p.suffix in kinds],
-        )
-    return {name: (output / f"{name}.jsonl").read_text().count("\n") for name in sets}
+        files = [path for path in sorted(output.rglob("*.*")) if path.suffix in kinds]
+        write_sums(output, [str(path.relative_to(output)) for path in files])
+    return {name: path.read_text().count("\n") for name, path in rows_files.items()}
 
 
 def _build_episode(
     episode: Demonstration, output: Path, sets: Sequence[str], options: RowOptions
 ) -> None:
     labels = episode.labels()
-    paths_at: dict[int, list[Path]] = {}
-    for name in sets:
-        built = episode_rows(name, labels, options)
-        for image, frame in built.images.items():
-            paths_at.setdefault(frame, []).append(output / image)
+    sets_rows = {name: episode_rows(name, labels, options) for name in sets}
+
+    # Videos, and the paths of missing images by frame: several sets may show the same frame.
+    missing: dict[int, list[Path]] = {}
+    for built in sets_rows.values():
         if built.video:
             path = output / built.video
             if not path.is_file():
                 write_video(episode.read_images(range(labels.exec_start)), path, **ENCODING)
-    missing = {
-        t: [path for path in paths if not path.is_file()] for t, paths in sorted(paths_at.items())
-    }
-    steps = [t for t, paths in missing.items() if paths]
-    for t, pixels in zip(steps, episode.read_images(steps), strict=True):
-        for path in missing[t]:
+        for image, frame in built.images.items():
+            path = output / image
+            if not path.is_file():
+                missing.setdefault(frame, []).append(path)
+
+    # Each frame is decoded once, in order.
+    frames = sorted(missing)
+    for frame, pixels in zip(frames, episode.read_images(frames), strict=True):
+        for path in missing[frame]:
             with write_atomically(path) as draft:
                 draft.write_bytes(png_bytes(pixels))
-    for name in sets:  # the rows last: where they are, their images are
-        rows = episode_rows(name, labels, options).rows
+
+    # The rows come last: where they exist, their images do.
+    for name, built in sets_rows.items():
+        lines = [json.dumps(row, ensure_ascii=False) + "\n" for row in built.rows]
         with write_atomically(_part(output, name, episode)) as draft:
-            draft.write_text("".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows))
+            draft.write_text("".join(lines))
 
 
 def _part(output: Path, name: str, episode: Demonstration) -> Path:
     return output / PARTS / name / f"{episode.name}.jsonl"
 
 
-def _h5_readers(
-    ref: EpisodeRef,
-) -> tuple[Callable[[], Labels], Callable[[Sequence[int]], Iterator[np.ndarray]]]:
-    def labels() -> Labels:
-        with open_episode(ref) as episode:
-            texts = _two_kinds(list(episode.subgoals()))
-            return Labels(
-                ref.task, ref.index, episode.goals[0], episode.exec_start, *texts, *episode.joints()
-            )
+def _h5_labels(ref: EpisodeRef) -> Labels:
+    with open_episode(ref) as episode:
+        joints, targets = episode.joints()
+        simple, grounded = _two_kinds(list(episode.subgoals()))
+        return Labels(
+            task=ref.task,
+            number=ref.index,
+            goal=episode.goals[0],
+            exec_start=episode.exec_start,
+            simple=simple,
+            grounded=grounded,
+            joints=joints,
+            targets=targets,
+        )
 
-    def read_images(steps: Sequence[int]) -> Iterator[np.ndarray]:
-        with open_episode(ref) as episode:
-            for t in steps:
-                yield episode.front(t)
 
-    return labels, read_images
+def _h5_images(ref: EpisodeRef, steps: Sequence[int]) -> Iterator[np.ndarray]:
+    with open_episode(ref) as episode:
+        for t in steps:
+            yield episode.front(t)
 
 
 def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstration]:
-    needed = ("simple_subgoal", "grounded_subgoal")
-    if lacking := [name for name in needed if name not in source.subgoal_names]:
+    columns = ("simple_subgoal", "grounded_subgoal")
+    missing = [name for name in columns if name not in source.subgoal_names]
+    if missing:
         raise UserError(
-            f"{source.root} has no column {' and no '.join(lacking)}: nothing to learn subgoals"
+            f"{source.root} has no column {' and no '.join(missing)}: nothing to learn subgoals"
             " from."
         )
     task_names = {} if tasks is None else _read_tasks(tasks)
@@ -205,21 +228,22 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
         task = task_names.get(str(e)) or source.task(e)
         require(
             task,
-            f"{source.root} does not tell the task of episode {e}, which some rules depend on. Give"
+            f"{source.root} does not name the task of episode {e}, which some rules depend on. Give"
             ' a JSON file tasks=<file> with {"<episode index>": "<Task>", …}.',
         )
-        record = source.records[e] if e < len(source.records) else {}
-        number = record.get("source_episode", e)
+        # The number that the episode had where it was recorded, if the dataset has it.
+        number = e
+        if e < len(source.records):
+            number = source.records[e].get("source_episode", e)
         if type(number) is not int or not 0 <= number < 2**31:
             raise UserError(
                 f"{source.root} gives {brief(number)} as the number of episode {e}; expected a"
                 " whole one."
             )
-        reader = partial(_lerobot_labels, source, e, task, number)
+        origin = f"{source.fingerprint}:{e}"
+        labels = partial(_lerobot_labels, source, e, task, number)
         read_images = partial(_lerobot_images, source, e)
-        demonstrations.append(
-            Demonstration(task, number, f"{source.fingerprint}:{e}", reader, read_images)
-        )
+        demonstrations.append(Demonstration(task, number, origin, labels, read_images))
     return demonstrations
 
 
@@ -234,18 +258,23 @@ def _read_tasks(path: Path) -> dict[str, str]:
 
 def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:
     texts = [source.subgoals(episode, t) for t in range(int(source.lengths[episode]))]
-    joints, targets = (
-        source.states(episode)[:, :ARM_JOINTS],
-        source.actions(episode)[:, :ARM_JOINTS],
+    simple, grounded = _two_kinds(texts)
+    return Labels(
+        task=task,
+        number=number,
+        goal=source.goal(episode),
+        exec_start=int(source.exec_starts[episode]),
+        simple=simple,
+        grounded=grounded,
+        joints=source.states(episode)[:, :ARM_JOINTS],
+        targets=source.actions(episode)[:, :ARM_JOINTS],
     )
-    start = int(source.exec_starts[episode])
-    return Labels(task, number, source.goal(episode), start, *_two_kinds(texts), joints, targets)
 
 
 def _lerobot_images(
     source: EpisodeSource, episode: int, steps: Sequence[int]
 ) -> Iterator[np.ndarray]:
-    for start in range(0, len(steps), 64):  # what is decoded at once stays small
+    for start in range(0, len(steps), 64):  # few frames are in memory at once
         yield from source.frames(episode, list(steps[start : start + 64]))
 
 

@@ -1,8 +1,7 @@
-"""Which steps of a demonstration become training rows of the subgoal predictors, and which frames
-are keyframes.
+"""Selects the steps of a demonstration that become training rows, and its keyframes.
 
-Everything here is arithmetic on an episode's labels and joint angles; images are not looked at
-(paper, appendix: VLM subgoal prediction, and the released builders).
+The rules read an episode's labels and joint angles, and no images. They are those of the paper
+(appendix: VLM subgoal prediction) and of the released builders.
 """
 
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-STRIDE = 16  # steps a row means, as often as a policy asks
+STRIDE = 16  # steps between two rows, as between two questions of a policy
 _STRIDE = {"StopCube": 32}
 _FIXED = {"PatternLock": 32}  # tasks whose rows follow the clock, not the changes of subgoal
 _STILL = ("PatternLock", "RouteStick")  # tasks in which the arm comes to rest at what matters
@@ -26,7 +25,7 @@ FRAME_STEP, WINDOW = 2, 8  # MemER: every second frame, eight a row
 
 @dataclass(frozen=True)
 class Labels:
-    """What is known of a demonstration without its images.
+    """A demonstration without its images.
 
     task, number: its name and number; goal: in words, lower-case.
     exec_start: first execution frame. simple, grounded: [t] the planner's subgoals, lower-case.
@@ -43,9 +42,10 @@ class Labels:
     targets: np.ndarray
 
     def __post_init__(self) -> None:
+        # "complete" is no subgoal: the one before it stays.
         for texts in (self.simple, self.grounded):
-            for t, text in enumerate(texts):  # "complete" is no subgoal: the one before it stays
-                if t and text.strip().lower() == "complete":
+            for t in range(1, len(texts)):
+                if texts[t].strip().lower() == "complete":
                     texts[t] = texts[t - 1]
 
     @property
@@ -58,29 +58,30 @@ class Labels:
         return self.length - 1
 
     def texts(self, kind: str) -> list[str]:
-        """The subgoals of a kind, `simple` or `grounded`."""
+        """Return the subgoals of a kind, `simple` or `grounded`."""
         return {"simple": self.simple, "grounded": self.grounded}[kind]
 
 
 def changes(labels: Labels) -> list[int]:
-    """Execution frames at which the simple subgoal changes, the first included."""
-    steps = range(labels.exec_start, labels.length)
-    return [t for t in steps if t == labels.exec_start or labels.simple[t] != labels.simple[t - 1]]
+    """Return the execution frames at which the simple subgoal changes, the first included."""
+    first = labels.exec_start
+    later = range(first + 1, labels.length)
+    return [first, *(t for t in later if labels.simple[t] != labels.simple[t - 1])]
 
 
 def transitions(labels: Labels) -> list[int]:
-    """Where one segment of rows ends and the next begins; the last frame closes the last one."""
-    fixed = _FIXED.get(labels.task)
-    starts = (
-        changes(labels) if fixed is None else list(range(labels.exec_start, labels.length, fixed))
-    )
+    """Return the frames where segments of rows begin, and the last frame, which ends the last."""
+    if labels.task in _FIXED:
+        starts = list(range(labels.exec_start, labels.length, _FIXED[labels.task]))
+    else:
+        starts = changes(labels)
     return sorted({*starts, labels.last})
 
 
 def selected_steps(
     labels: Labels, short_segments: bool = False
 ) -> tuple[list[int], dict[int, int]]:
-    """Steps that become rows of the simple and grounded predictors.
+    """Select the steps that become rows of the simple and grounded predictors.
 
     Args:
         short_segments: give a segment shorter than the stride one row, at its start. As released it
@@ -91,55 +92,52 @@ def selected_steps(
         less than the segment before it has rows, so that changes weigh as much as what lies between
         them.
     """
-    stride, bounds = _STRIDE.get(labels.task, STRIDE), transitions(labels)
-    steps, repeats = {labels.last}, {}
-    for start, stop in pairwise(bounds):
+    stride = _STRIDE.get(labels.task, STRIDE)
+    steps = {labels.last}
+    repeats = {}
+    for start, stop in pairwise(transitions(labels)):
         count = (stop - start) // stride
-        steps.update(
-            np.linspace(start, stop, count or int(short_segments), endpoint=False)
-            .astype(int)
-            .tolist()
-        )
+        n_rows = max(count, 1) if short_segments else count
+        steps.update(np.linspace(start, stop, n_rows, endpoint=False).astype(int).tolist())
         if stop != labels.last:
             repeats[stop] = max(count - 1, 0)
     return sorted(steps), repeats
 
 
 def keyframes(labels: Labels, substring_match: bool = False) -> list[int]:
-    """Frames MemER is taught to remember.
+    """Return the keyframes that MemER learns to name.
 
     Args:
-        substring_match: as released, where the rule of ButtonUnmaskSwap also takes in ButtonUnmask.
+        substring_match: as released, where the rule of ButtonUnmaskSwap holds for ButtonUnmask too.
     """
     starts = changes(labels)
     frames = [t for t in starts if t != labels.last]
-    bounds = sorted({*starts, labels.last})
-    task = (
-        "ButtonUnmaskSwap" if substring_match and labels.task in "ButtonUnmaskSwap" else labels.task
-    )
-    for segment, count in enumerate(_MIDPOINTS.get(task, ())):
-        if segment + 1 < len(bounds):
-            frames += (
-                np.linspace(bounds[segment], bounds[segment + 1], count + 2)[1:-1]
-                .astype(int)
-                .tolist()
-            )
-    if labels.task in _STILL:
-        merged: list[int] = []
-        for frame in sorted(
-            [*frames, *resting_frames(labels)]
-        ):  # the running midpoint of those closer than 10
-            if merged and frame - merged[-1] < _MERGE:
-                merged[-1] = (merged[-1] + frame) // 2
-            else:
-                merged.append(frame)
-        return merged
-    return sorted(set(frames))
+
+    # Frames inside the first segments of some tasks.
+    task = labels.task
+    if substring_match and task in "ButtonUnmaskSwap":
+        task = "ButtonUnmaskSwap"
+    segments = pairwise(sorted({*starts, labels.last}))
+    for (start, stop), count in zip(segments, _MIDPOINTS.get(task, ()), strict=False):
+        inside = np.linspace(start, stop, count + 2)[1:-1]
+        frames += inside.astype(int).tolist()
+
+    if labels.task not in _STILL:
+        return sorted(set(frames))
+    # Frames at which the arm rests. Those close together become their running midpoint.
+    merged: list[int] = []
+    for frame in sorted([*frames, *resting_frames(labels)]):
+        if merged and frame - merged[-1] < _MERGE:
+            merged[-1] = (merged[-1] + frame) // 2
+        else:
+            merged.append(frame)
+    return merged
 
 
 def resting_frames(labels: Labels) -> list[int]:
-    """Execution frames at which the arm has reached its targets: minima of the distance, at least 5
-    frames apart.
+    """Return the execution frames at which the arm has reached its targets.
+
+    They are minima of the distance of the joints to their targets, at least 5 frames apart.
     """
     distance = np.linalg.norm(labels.targets - labels.joints, axis=1)
     frames: list[int] = []
@@ -156,36 +154,42 @@ def resting_frames(labels: Labels) -> list[int]:
 
 @dataclass(frozen=True)
 class Window:
-    """One row of MemER: keyframes before it, the frames since the row before, and which of these
-    are keyframes.
+    """One row of MemER.
+
+    past: keyframes before it. frames: those since the row before.
+    positions: of the keyframes in `frames`, from 1.
     """
 
     past: list[int]
     frames: list[int]
-    positions: list[int]  # from 1
+    positions: list[int]
 
 
 def windows(labels: Labels, targets: Sequence[int], one_a_window: bool = False) -> list[Window]:
     """Cut an episode into MemER's rows.
 
-    A keyframe is found at the first looked-at frame within one step of it, and joins the past after
-    its window.
+    Every second frame is shown. A keyframe is matched by the first of them within one step of it,
+    and belongs to the past after its window.
 
     Args:
         targets: the keyframes.
         one_a_window: as released, where a second keyframe in one window is missed, and with it all
             that follow.
     """
-    query_steps = range(labels.exec_start, labels.length, FRAME_STEP)
     rows: list[Window] = []
-    waiting, past = list(targets), list[int]()
-    frames, matches = list[int](), list[int]()
-    for i, t in enumerate(query_steps):
+    waiting = list(targets)
+    past: list[int] = []
+    frames: list[int] = []
+    positions: list[int] = []
+    for i, t in enumerate(range(labels.exec_start, labels.length, FRAME_STEP)):
         frames.append(t)
-        if waiting and abs(t - waiting[0]) <= 1 and not (one_a_window and matches):
-            matches.append(t)
+        may_match = not positions or not one_a_window
+        if may_match and waiting and abs(t - waiting[0]) <= 1:
+            positions.append(len(frames))
             waiting.pop(0)
         if i % WINDOW == 0 or t >= labels.last - 1:
-            rows.append(Window(list(past), frames, [frames.index(f) + 1 for f in matches]))
-            past, frames, matches = past + matches, [], []
+            rows.append(Window(past, frames, positions))
+            past = [*past, *(frames[position - 1] for position in positions)]
+            frames = []
+            positions = []
     return rows

@@ -1,5 +1,6 @@
-"""Training rows of the subgoal predictors, in the layout of ms-swift: messages, images, videos,
-objects.
+"""Training rows of the subgoal predictors in the layout of ms-swift.
+
+A row has `messages`, `images`, `videos` and `objects`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,8 +36,8 @@ SETS = {
     "simple": ("qwenvl", "simple"),
     "grounded": ("qwenvl", "grounded"),
     "memer": ("memer", "grounded"),
+    "memer_simple": ("memer", "simple"),
 }
-SETS |= {"memer_simple": ("memer", "simple")}
 """A set's name → (folder of its images, kind of subgoal). The paper trains the first three."""
 
 
@@ -68,8 +69,9 @@ class RowOptions:
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """The rows of one episode in one set, and the images they refer to: frames by file name, and
-    the video's name.
+    """The rows of one episode in one set.
+
+    images: frame numbers by the file names of the rows. video: its file name; None without one.
     """
 
     rows: list[Row]
@@ -78,7 +80,7 @@ class EpisodeRows:
 
 
 def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
-    """The rows of one episode.
+    """Make the rows of one episode.
 
     Args:
         name: a key of `SETS`.
@@ -104,10 +106,8 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
             ]
         }
         if kind == "grounded":
-            row["objects"] = {
-                "ref": [],
-                "bbox": [_perturbed(point, options.noise, rng) for point in points],
-            }
+            boxes = [_perturb(point, options.noise, rng) for point in points]
+            row["objects"] = {"ref": [], "bbox": boxes}
         row["images"] = names
         if video:
             row["videos"] = [video]
@@ -125,7 +125,10 @@ def _qwenvl(kind: str, labels: Labels, options: RowOptions) -> Iterator[Draft]:
         target, points = mark_points(labels.texts(kind)[t])
         user = subgoal_user(kind, labels.goal, history.entries, video=labels.exec_start > 0)
         texts = (subgoal_system(kind), user, target)
-        for _ in range(1 + (repeats.get(t, 0) if options.repeat_changes else 0)):
+        count = 1
+        if options.repeat_changes:
+            count += repeats.get(t, 0)
+        for _ in range(count):
             yield texts, [*history.points, *points], [t]
         history.add(target, points)
 
@@ -141,7 +144,7 @@ def _memer(kind: str, labels: Labels, options: RowOptions) -> Iterator[Draft]:
         yield texts, points, [*window.past, *window.frames]
 
 
-def _perturbed(point: Point, noise: tuple[int, int] | None, rng: np.random.Generator) -> list[int]:
+def _perturb(point: Point, noise: tuple[int, int] | None, rng: np.random.Generator) -> list[int]:
     if noise is None:
         return list(point)
     shift = rng.integers(noise[0], noise[1] + 1, 2)
@@ -162,47 +165,53 @@ def read_rows(file: str | Path) -> list[Row]:
         f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}",
     )
     Sums(path.parent, remedy="Build the training data again").check(path.name)
-    rows = read_lines(path, _checked, "rows of training data", limit=_LIMIT)
+    rows = read_lines(path, _check_row, "rows of training data", limit=_LIMIT)
     require(rows, f"{path} holds no row.")
     return rows
 
 
-def _checked(row: Row) -> Row:
-    if reason := _fault(row):
-        raise UserError(f"no row of training data: {reason}. Build the training data again.")
-    return row
+def _check_row(row: Row) -> Row:
+    """Return a row of a file that any program may have written.
 
-
-def _fault(row: Row) -> str:
-    """What is wrong with a row; empty if nothing is."""
+    Raises:
+        UserError: a part is missing or of another type.
+    """
     messages = row.get("messages")
     if not isinstance(messages, list) or not all(isinstance(message, dict) for message in messages):
-        return "it has no messages"
+        raise _row_error("it has no messages")
     if [message.get("role") for message in messages] != ["system", "user", "assistant"]:
-        return "expected one message each of system, user and assistant"
+        raise _row_error("expected one message each of system, user and assistant")
     texts = [message.get("content") for message in messages]
     if not all(isinstance(text, str) and is_text(text) for text in texts):
-        return "the content of a message is no text"
+        raise _row_error("the content of a message is no text")
     for key in ("images", "videos"):
         names = row.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            return f"{key} is {brief(names)}, not a list of files"
+            raise _row_error(f"{key} is {brief(names)}, not a list of files")
     objects = row.get("objects", {})
     points = objects.get("bbox", []) if isinstance(objects, dict) else None
-    if not isinstance(points, list) or not all(
-        isinstance(point, list)
-        and len(point) == 2
-        and all(type(n) is int and 0 <= n < 2**20 for n in point)
-        for point in points
-    ):
-        return f"objects is {brief(objects)}, where bbox should be a list of [row, column]"
-    if (marks := texts[1].count(BBOX) + texts[2].count(BBOX)) != len(points):
-        return f"it has {marks} marks {BBOX} for {len(points)} points"
-    return ""
+    if not isinstance(points, list) or not all(map(_is_point, points)):
+        raise _row_error(
+            f"objects is {brief(objects)}, where bbox should be a list of [row, column]"
+        )
+    n_marks = texts[1].count(BBOX) + texts[2].count(BBOX)
+    if n_marks != len(points):
+        raise _row_error(f"it has {n_marks} marks {BBOX} for {len(points)} points")
+    return row
+
+
+def _is_point(point: Any) -> bool:
+    if not isinstance(point, list) or len(point) != 2:
+        return False
+    return all(type(number) is int and 0 <= number < 2**20 for number in point)
+
+
+def _row_error(reason: str) -> UserError:
+    return UserError(f"no row of training data: {reason}. Build the training data again.")
 
 
 def texts_of(row: Row) -> tuple[str, str, str]:
-    """System, user and answer of a row, points written as the model sees them."""
+    """Return system, user and answer of a row, points written as the model sees them."""
     system, user, target = (message["content"] for message in row["messages"])
     points = [(y, x) for y, x in row.get("objects", {}).get("bbox", [])]
     n_points = user.count(BBOX)
@@ -210,7 +219,7 @@ def texts_of(row: Row) -> tuple[str, str, str]:
 
 
 def question_of(row: Row, folder: Path) -> Question:
-    """A row with its images; paths are relative to `folder`."""
+    """Read the images of a row; paths are relative to `folder`."""
     system, user, target = texts_of(row)
     images = [read_image(inside(folder, name, "picture")) for name in row.get("images", [])]
     videos = [Clip.read(inside(folder, name, "video")) for name in row.get("videos", [])]
@@ -218,9 +227,9 @@ def question_of(row: Row, folder: Path) -> Question:
 
 
 class RowDataset(torch.utils.data.Dataset[Question]):
-    """The rows of a file that are no longer than `max_length` tokens, images read when asked for.
+    """The rows of a file of at most `max_length` tokens; images are read with their row.
 
-    left_out: how many are longer.
+    left_out: number of longer rows.
     """
 
     def __init__(self, file: str | Path, tokenizer: Any, max_length: int = 3200) -> None:
@@ -231,8 +240,9 @@ class RowDataset(torch.utils.data.Dataset[Question]):
         if example is None:
             raise UserError(f"{file} has no row with an image. Build the training data again.")
         height, width, _ = read_image(inside(self.folder, example, "picture")).shape
-        image = min(max(round(height / TOKEN_SIDE) * round(width / TOKEN_SIDE), 4), IMAGE_TOKENS)
-        self.rows = [row for row in rows if _longest(row, tokenizer, image) <= max_length]
+        n_tokens = round(height / TOKEN_SIDE) * round(width / TOKEN_SIDE)
+        n_tokens = min(max(n_tokens, 4), IMAGE_TOKENS)
+        self.rows = [row for row in rows if _most_tokens(row, tokenizer, n_tokens) <= max_length]
         self.left_out = len(rows) - len(self.rows)
         require(self.rows, f"All rows of {file} are longer than max_length={max_length}; raise it.")
 
@@ -247,8 +257,9 @@ class RowDataset(torch.utils.data.Dataset[Question]):
 
 
 class Collator:
-    """Questions with answers → a batch with labels: the answer and its end count, all else is
-    `IGNORED`.
+    """Makes a batch with labels of questions with answers.
+
+    Labels are the answer and its end; all other tokens are `IGNORED`.
     """
 
     def __init__(self, vlm: VLM) -> None:
@@ -275,10 +286,10 @@ class Collator:
 
 
 def hf_dataset(file: str | Path) -> Any:
-    """A file of rows as a Hugging Face dataset in trl's conversational form.
+    """Read a file of rows as a Hugging Face dataset in trl's conversational form.
 
     Columns: `messages` (role, and content as a list of parts with `type` and `text`), `images`
-    (images, decoded when asked for) and `videos` (absolute paths).
+    (decoded on access) and `videos` (absolute paths).
     """
     from datasets import Dataset, Features, Image, List, Value
 
@@ -288,16 +299,13 @@ def hf_dataset(file: str | Path) -> Any:
         system, user, target = texts_of(row)
         messages = Question(system, user, target=target).messages()
         for message in messages:
-            message["content"] = [
-                {"type": p["type"], "text": p.get("text")} for p in message["content"]
-            ]
+            for content in message["content"]:
+                content.setdefault("text", None)  # every part has the same keys
+        images = [str(inside(folder, name, "picture")) for name in row.get("images", [])]
+        videos = [str(inside(folder, name, "video")) for name in row.get("videos", [])]
         columns["messages"].append(messages)
-        columns["images"].append(
-            [str(inside(folder, name, "picture")) for name in row.get("images", [])]
-        )
-        columns["videos"].append(
-            [str(inside(folder, name, "video")) for name in row.get("videos", [])]
-        )
+        columns["images"].append(images)
+        columns["videos"].append(videos)
     part = {"type": Value("string"), "text": Value("string")}
     features = Features(
         messages=List({"role": Value("string"), "content": List(part)}),
@@ -307,14 +315,13 @@ def hf_dataset(file: str | Path) -> Any:
     return Dataset.from_dict(columns, features=features)
 
 
-def _longest(row: Row, tokenizer: Any, image: int) -> int:
-    """An upper bound of the row's tokens, without reading its images."""
-    words = sum(len(tokenizer.encode(text, add_special_tokens=False)) for text in texts_of(row))
-    pairs = VIDEO_FRAMES // 2
-    video = pairs * (VIDEO_TOKENS + _TIME + 2)
-    return (
-        words
-        + _MARKS
-        + len(row.get("images", [])) * (image + 2)
-        + len(row.get("videos", [])) * video
-    )
+def _most_tokens(row: Row, tokenizer: Any, image_tokens: int) -> int:
+    """Return an upper bound of the row's tokens, without reading its images."""
+    total = _MARKS
+    for text in texts_of(row):
+        total += len(tokenizer.encode(text, add_special_tokens=False))
+    # An image, and each pair of video frames, stands between two marks.
+    video_tokens = VIDEO_FRAMES // 2 * (VIDEO_TOKENS + _TIME + 2)
+    total += len(row.get("images", [])) * (image_tokens + 2)
+    total += len(row.get("videos", [])) * video_tokens
+    return total

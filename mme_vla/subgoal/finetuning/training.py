@@ -51,8 +51,9 @@ _ARGUMENTS = {
 
 
 def write_arguments(folder: Path, name: str) -> Path:
-    """Write `swift_<name>.json` beside the rows; run it from that folder: their paths are relative
-    to it.
+    """Write `swift_<name>.json` beside the rows, for ms-swift.
+
+    It has to run in that folder: paths in the rows are relative to it.
     """
     path = folder / f"swift_{name}.json"
     arguments = {**_ARGUMENTS, "dataset": [f"{name}.jsonl"], "output_dir": f"swift_{name}"}
@@ -61,13 +62,9 @@ def write_arguments(folder: Path, name: str) -> Path:
 
 
 def command(name: str) -> str:
-    return " ".join(
-        [
-            *(f"{key}={value}" for key, value in ENVIRONMENT.items()),
-            "swift sft",
-            f"swift_{name}.json",
-        ]
-    )
+    """Return the command of ms-swift that trains with `write_arguments`."""
+    variables = [f"{key}={value}" for key, value in ENVIRONMENT.items()]
+    return " ".join([*variables, "swift sft", f"swift_{name}.json"])
 
 
 # All linear layers of the language model; the vision tower and the merger stay as they are.
@@ -89,21 +86,20 @@ ZERO2 = {
 
 
 def accumulation(batch: int, per_device: int, processes: int) -> int:
-    """Batches added up before a step, so that all processes together see `batch` rows."""
-    together = per_device * processes
+    """Return the batches of a step, so that all processes together read `batch` rows."""
+    rows_at_once = per_device * processes
     require(
-        not (batch % together),
+        batch % rows_at_once == 0,
         f"batch={batch} is no multiple of per_device_batch={per_device} times {processes}"
         " processes; choose numbers that divide.",
     )
-    return batch // together
+    return batch // rows_at_once
 
 
 def find_checkpoint(output: Path, resume: str | None) -> str | None:
-    """Where to continue from: a checkpoint's path, or None to start."""
-    checkpoints = sorted(
-        output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1])
-    )
+    """Return the checkpoint to continue from; None for a new run."""
+    checkpoints = list(output.glob("checkpoint-*"))
+    checkpoints.sort(key=lambda path: int(path.name.split("-")[-1]))
     if resume is None:
         if checkpoints or (output / ADAPTER).exists():
             raise UserError(

@@ -1,92 +1,153 @@
-"""Questions to a model behind an API: retries, rate limit, time limit, cache of replies, cost. No
-secret is logged.
+"""Questions to a vision-language model behind an endpoint for OpenAI's chat completions.
+
+OpenAI, Google, vLLM, Ollama and others have such an endpoint. The package `openai` sends requests,
+repeats those that failed, and limits their time. This module converts images, stores replies,
+limits their size, and keeps secrets out of messages, logs and files.
 """
 
+import base64
 import hashlib
 import json
-import logging
+import os
 import threading
 import time
-import uuid
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass, field
-from multiprocessing.pool import ThreadPool
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any
+from urllib.parse import SplitResult, unquote, urlsplit
 
 import numpy as np
 
-from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, did_you_mean, require
+from mme_vla.config.sections import NonNegative, NonNegativeInt, Positive, Range, read_section
+from mme_vla.errors import UserError, brief, check_choice, missing_extra, printable, require
 from mme_vla.subgoal.base import Usage
-from mme_vla.subgoal.models.connection import (
-    Connection,
-    GoogleConnection,
-    MediaPart,
-    Message,
-    OpenAIConnection,
-    Settings,
-)  # fmt: skip
-from mme_vla.utils import read_json, verified, with_checksum
+from mme_vla.subgoal.clips import sample_video
+from mme_vla.subgoal.models.replies import MOST_TOKENS, Reply, ReplyCache
+from mme_vla.subgoal.threads import start
+from mme_vla.utils.media import png_bytes
 
+LONGEST_REPLY = 2**20
+"""Bytes of a response: many times the longest chat completion."""
 
-def start[T](call: Callable[[], T]) -> Future[T]:
-    """Begin a call in a daemon thread, which does not keep an interrupted process alive."""
-    future: Future[T] = Future()
-
-    def work() -> None:
-        try:
-            future.set_result(call())
-        except BaseException as error:
-            future.set_exception(error)
-
-    threading.Thread(target=work, name="subgoals", daemon=True).start()
-    return future
-
-
-def side_by_side[A, T](call: Callable[[A], T], items: Sequence[A], workers: int) -> list[T]:
-    """Call with each item, `workers` at a time; the results in the items' order.
-
-    Raises:
-        Exception: of the first item that failed; no further call begins then.
-    """
-    failed = threading.Event()
-
-    def guarded(item: A) -> T | None:
-        if failed.is_set():
-            return None  # the error of an earlier item is raised
-        try:
-            return call(item)
-        except BaseException:
-            failed.set()
-            raise
-
-    if not items:
-        return []
-    with ThreadPool(min(workers, len(items))) as pool:  # daemon threads
-        return cast(list[T], list(pool.imap(guarded, items)))
-
-
-log = logging.getLogger(__name__)
-CONNECTIONS: dict[str, type[Connection]] = {"gemini": GoogleConnection, "openai": OpenAIConnection}
-"""Clients by the name of their API."""
-
-_PASSING = (408, 429, 500, 502, 503, 504)  # HTTP: worth another try
+_LONGEST_REASON = 500  # characters quoted of an endpoint's error
 _FATAL = (401, 403, 404)  # the key or the model's name is wrong: no question will ever be answered
-_LONGEST_PAUSE = 60.0  # seconds
-# characters; what is shorter protects nothing, such as the key `none`, and may be a word of an
-# answer
+# Characters. A shorter secret protects nothing, such as the key `none`, and may be a word of an
+# answer.
 _SECRET = 8
 
 
 @dataclass(frozen=True)
-class Reply:
-    """A usable answer and the tokens it took; thoughts count as output."""
+class Settings:
+    """An endpoint, and how it is used.
 
-    text: str
-    input_tokens: int
-    output_tokens: int
+    model: its name.
+    base_url: address of the endpoint, such as http://127.0.0.1:8000/v1; None for OpenAI's own.
+    key_variable: environment variable that holds the key; None where none is needed.
+    temperature: 0 for the likeliest answer; None for models that take none.
+    video_frames: images sent in place of a video, which these endpoints do not take; even, 2 or
+        more.
+    timeout: seconds of one try. A question is given up after `retries + 1` times as long.
+    retries: further tries after an error that may pass, after pauses that the package `openai`
+        chooses.
+    cache: folder of replies; None stores none.
+    """
+
+    model: str = "gpt-5-mini"
+    base_url: str | None = None
+    key_variable: str | None = "OPENAI_API_KEY"
+    temperature: NonNegative | None = None
+    video_frames: Annotated[int, Range(least=2)] = 10
+    timeout: Positive = 120.0
+    retries: NonNegativeInt = 5
+    cache: str | None = None
+
+    def __post_init__(self) -> None:
+        require(
+            self.video_frames % 2 == 0,
+            f"video_frames={self.video_frames} must be an even number of images, 2 or more.",
+        )
+        if self.base_url is None:
+            return
+        try:
+            scheme = urlsplit(self.base_url).scheme
+        except ValueError:  # brackets that hold no address
+            scheme = ""
+        if scheme not in ("http", "https"):
+            visible = self.base_url.rpartition("@")[2]  # without a password
+            raise UserError(
+                f"base_url={brief(visible)} must be an address such as http://127.0.0.1:8000/v1, or"
+                " null."
+            )
+
+    @property
+    def address(self) -> SplitResult:
+        return urlsplit(self.base_url or "")
+
+    @property
+    def key(self) -> str:
+        if self.key_variable is None:
+            return ""
+        return os.environ.get(self.key_variable, "")
+
+    @property
+    def login(self) -> str:
+        """`user:password` of an address that has them, else empty."""
+        user, password = self.address.username, self.address.password
+        if not user and not password:
+            return ""
+        return f"{unquote(user or '')}:{unquote(password or '')}"
+
+    @property
+    def secrets(self) -> list[str]:
+        """What no message, log or file may hold, the longest first.
+
+        These are the key, and the login of the address: itself, as it is sent, and its password.
+        """
+        login = self.login
+        candidates = [self.key, login, _base64(login.encode()), login.partition(":")[2]]
+        return sorted(filter(None, candidates), key=len, reverse=True)
+
+
+PROVIDERS = {
+    "openai": Settings(),
+    "gemini": Settings(
+        model="gemini-2.5-pro",
+        base_url="https://generativelanguage.googleapis.com/v1beta/openai/",
+        key_variable="GEMINI_API_KEY",
+        temperature=0.0,
+    ),
+}
+"""Default settings by name."""
+
+
+@dataclass
+class MediaPart:
+    """An image [H, W, 3] or a video [t, H, W, 3] of a conversation, uint8.
+
+    It is encoded once, however many questions show it.
+    """
+
+    pixels: np.ndarray
+    _content: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
+
+    def content(self, video_frames: int) -> list[dict[str, Any]]:
+        """Return the parts of a message: the image, or images sampled from the video."""
+        if video_frames not in self._content:
+            self._content[video_frames] = self._encode(video_frames)
+        return self._content[video_frames]
+
+    def _encode(self, video_frames: int) -> list[dict[str, Any]]:
+        if self.pixels.ndim == 3:
+            return [_image_part(self.pixels)]
+        indices = sample_video(len(self.pixels), most=video_frames)
+        caption = f"A video of {len(self.pixels)} frames; {len(indices)} of them in order:"
+        return [_text_part(caption), *(_image_part(self.pixels[i]) for i in indices)]
+
+
+Message = tuple[str, Sequence[str | MediaPart]]
+"""Role (`user` or `model`), and parts in order."""
 
 
 class ApiFailure(Exception):  # noqa: N818  (an outcome that is expected and counted)
@@ -97,36 +158,22 @@ class ApiFailure(Exception):  # noqa: N818  (an outcome that is expected and cou
         self.problem = problem
 
 
-@dataclass
 class Api:
-    """Asks one model. Safe to use from several threads.
+    """Asks one model. Several threads may use it.
 
-    client: what the connection asks, such as google-genai's; None makes one: at once, but with a
-    cache and no key when
-        the first question comes that the cache does not hold.
-    clock, sleep: of the rate limit and the pauses.
-    provider: a key of `CONNECTIONS`.
+    Args:
+        client: an object with openai's `chat.completions.create`. None makes one: at once, or,
+            with a cache, when the first question comes that the cache does not hold.
     """
 
-    settings: Settings
-    usage: Usage
-    client: Any = None
-    clock: Callable[[], float] = time.monotonic
-    sleep: Callable[[float], None] = time.sleep
-    provider: str = "gemini"
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-    _next: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._connection: Connection | None = None
-        if self.client is not None or self.settings.cache is None or self.settings.key:
-            self._connected()
-
-    def _connected(self) -> Connection:
-        with self._lock:
-            if self._connection is None:
-                self._connection = CONNECTIONS[self.provider](self.settings, self.client)
-            return self._connection
+    def __init__(self, settings: Settings, usage: Usage, client: Any = None) -> None:
+        self.settings = settings
+        self.usage = usage
+        self._lock = threading.Lock()
+        self._replies = None if settings.cache is None else ReplyCache(Path(settings.cache))
+        self._client = client
+        if client is None and self._replies is None:
+            self._client = make_client(settings)
 
     def ask(self, system: str, messages: Sequence[Message]) -> Reply:
         """Ask the last turn of a conversation.
@@ -135,168 +182,257 @@ class Api:
             ApiFailure: no usable answer came, after all tries.
             UserError: the key or the model's name is not accepted.
         """
-        known = self._cache_file(system, messages)
-        if known is not None and (cached := _read_reply(known)) is not None:
+        if self._replies is None:
+            return self._request(system, messages)
+        digest = question_digest(self.settings, system, messages)
+        stored = self._replies.read(digest)
+        if stored is not None:
             with self._lock:
                 self.usage.cached += 1
-            return cached
-        reply = self._tried(system, messages)
-        if known is not None:
-            known.parent.mkdir(parents=True, exist_ok=True)
-            draft = known.with_suffix(
-                f".{uuid.uuid4().hex}.partial"
-            )  # other processes may share the folder
-            draft.write_text(json.dumps(with_checksum(vars(reply))))
-            try:
-                draft.replace(known)
-            except (
-                OSError
-            ) as error:  # a folder in its place: the answer counts, it is only not kept
-                draft.unlink(missing_ok=True)
-                log.warning("%s cannot be written: %s", known, error.strerror)
+            return stored
+        reply = self._request(system, messages)
+        self._replies.write(digest, reply)
         return reply
 
-    def _tried(self, system: str, messages: Sequence[Message]) -> Reply:
-        try:
-            connection = self._connected()
-        except UserError as error:
-            hint = (
-                ""
-                if self.settings.cache is None
-                else f" (The cache {self.settings.cache} lacks this answer.)"
-            )
-            raise UserError(f"{error}{hint}") from None
-        pause = self.settings.backoff
-        failure = ApiFailure("failed", "never asked")
-        for attempt in range(self.settings.retries + 1):
-            if attempt:
-                with self._lock:
-                    self.usage.retries += 1
-                self.sleep(min(pause, _LONGEST_PAUSE))
-                pause *= 2
-            self._wait_for_slot()
-            try:
-                return self._once(connection, system, messages)
-            except ApiFailure as error:
-                failure = error
-                if error.problem == "refused":
-                    break
-            except Exception as error:  # whatever the network and the client come up with
-                reason = self._redacted(f"{type(error).__name__}: {error}")
-                if _code(error) in _FATAL or (
-                    _code(error) == 400 and "api key" in str(error).lower()
-                ):
-                    raise UserError(
-                        f"{self.settings.model} cannot be asked: {reason}. Check the key in "
-                        f"${self.settings.key_variable} and the model's name."
-                    ) from None
-                failure = ApiFailure("failed", reason)
-                if not _is_passing(error):
-                    break
-            log.info("%s: try %d came to nothing (%s)", self.settings.model, attempt + 1, failure)
-        raise failure
+    def _request(self, system: str, messages: Sequence[Message]) -> Reply:
+        settings = self.settings
+        client = self._connect()
+        request: dict[str, Any] = {
+            "model": settings.model,
+            "messages": chat_messages(system, messages, settings.video_frames),
+        }
+        if settings.temperature is not None:
+            request["temperature"] = settings.temperature
 
-    def _once(self, connection: Connection, system: str, messages: Sequence[Message]) -> Reply:
-        started = self.clock()
-        raw = start(lambda: connection.ask(system, messages)).result(self.settings.timeout)
-        prices = self.settings.input_price, self.settings.output_price
+        # The client limits the time between two bytes. An endpoint that sends them slowly is given
+        # up here, and its thread ends with the response.
+        limit = settings.timeout * (settings.retries + 1)
+        started = time.monotonic()
+        call = start(lambda: client.chat.completions.create(**request))
+        try:
+            response = call.result(limit)
+        except ApiFailure as failure:
+            raise ApiFailure(failure.problem, self._quote(str(failure))) from None
+        except TimeoutError:
+            raise ApiFailure("failed", f"no answer within {limit:g} seconds") from None
+        except Exception as error:  # whatever the network and the client raise
+            raise self._failure(error) from None
+
+        tokens = getattr(response, "usage", None)
+        input_tokens = _token_count(tokens, "prompt_tokens")
+        output_tokens = _token_count(tokens, "completion_tokens")
         with self._lock:
             self.usage.calls += 1
-            self.usage.seconds += self.clock() - started
-            self.usage.input_tokens += raw.input_tokens
-            self.usage.output_tokens += raw.output_tokens
-            self.usage.cost += (raw.input_tokens * prices[0] + raw.output_tokens * prices[1]) / 1e6
-        if raw.refusal:
-            raise ApiFailure("refused", self._redacted(raw.refusal, _SECRET))
-        if not (text := self._redacted(raw.text, _SECRET).strip()):
-            raise ApiFailure("empty", "the answer is empty")
-        return Reply(text, raw.input_tokens, raw.output_tokens)
+            self.usage.seconds += time.monotonic() - started
+            self.usage.input_tokens += input_tokens
+            self.usage.output_tokens += output_tokens
+        return Reply(self._text(response), input_tokens, output_tokens)
 
-    def _wait_for_slot(self) -> None:
-        if self.settings.requests_per_minute is None:
-            return
+    def _connect(self) -> Any:
         with self._lock:
-            start = max(self.clock(), self._next)
-            self._next = start + 60 / self.settings.requests_per_minute
-        if (wait := start - self.clock()) > 0:
-            self.sleep(wait)
+            if self._client is None:
+                try:
+                    self._client = make_client(self.settings)
+                except UserError as error:
+                    raise UserError(
+                        f"{error} (The cache {self.settings.cache} lacks this answer.)"
+                    ) from None
+            return self._client
 
-    def _cache_file(self, system: str, messages: Sequence[Message]) -> Path | None:
-        if self.settings.cache is None:
-            return None
-        digest = hashlib.sha256(
-            json.dumps([*CONNECTIONS[self.provider].cached_as(self.settings), system]).encode()
-        )
-        for role, parts in messages:
-            digest.update(f"\n{role}".encode())
-            for item in parts:
-                part = item.pixels if isinstance(item, MediaPart) else item
-                # The images themselves, not their encoding, which may differ between versions of
-                # the encoder.
-                raw = (
-                    part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes()
-                )
-                digest.update(f"\n{getattr(part, 'shape', 'text')} {len(raw)} ".encode() + raw)
-        name = digest.hexdigest()
-        return Path(self.settings.cache) / name[:2] / f"{name}.json"
+    def _text(self, response: Any) -> str:
+        """Return the text of a response, which may be of any form."""
+        choices = getattr(response, "choices", None)
+        choice = choices[0] if isinstance(choices, list) and choices else None
+        message = getattr(choice, "message", None)
+        refusal = getattr(message, "refusal", None)
+        if not refusal and getattr(choice, "finish_reason", None) == "content_filter":
+            refusal = "the answer was stopped: content_filter"
+        if refusal:
+            raise ApiFailure("refused", self._quote(str(refusal)))
+        content = getattr(message, "content", None) or ""
+        if not isinstance(content, str):
+            raise ApiFailure(
+                "failed", f"the answer is no text but of type {type(content).__name__}"
+            )
+        # Half a character, which JSON's escapes allow, could not be sent with the next question.
+        text = content.encode("utf-8", "replace").decode().strip()
+        if not text:
+            raise ApiFailure("empty", "the answer is empty")
+        return self._redact(text, _SECRET)
 
-    def _redacted(self, text: str, shortest: int = 1) -> str:
-        """Text without the secrets, as far as they have `shortest` characters."""
-        for secret in sorted(self.settings.secrets, key=len, reverse=True):
+    def _failure(self, error: Exception) -> Exception:
+        """Return the error to raise for one of the client: fatal, or a failure that is counted."""
+        reason = f"{type(error).__name__}: {error}"
+        if error.__cause__ is not None:  # "Connection error." does not say why
+            reason += f" ({type(error.__cause__).__name__}: {error.__cause__})"
+        code = getattr(error, "status_code", None)
+        bad_key = code == 400 and "api key" in str(error).lower()
+        if code in _FATAL or bad_key:
+            return UserError(
+                f"{self.settings.model} cannot be asked: {self._quote(reason)}. Check the key in"
+                f" ${self.settings.key_variable} and the model's name."
+            )
+        return ApiFailure("failed", self._quote(reason))
+
+    def _quote(self, text: str) -> str:
+        """Return a text of the endpoint as messages show it: one line, short, without secrets."""
+        line = printable(" ".join(self._redact(text).split()))
+        return brief(line, _LONGEST_REASON, quote=False)
+
+    def _redact(self, text: str, shortest: int = 1) -> str:
+        """Replace the secrets of at least `shortest` characters."""
+        for secret in self.settings.secrets:
             if len(secret) >= shortest:
                 text = text.replace(secret, "***")
         return text
 
 
-def _read_reply(path: Path) -> Reply | None:
-    """An answer that was kept; None where there is none, or its file is damaged."""
-    if not path.exists() and not path.is_symlink():
-        return None
-    try:
-        stored = verified(read_json(path, "an answer that was kept"), str(path))
-        counts: list[Any] = [stored.get("input_tokens"), stored.get("output_tokens")]
-        if not isinstance(stored.get("text"), str) or not all(
-            type(n) is int and 0 <= n < 2**40 for n in counts
-        ):
-            raise UserError(f"{path} lacks a text and two numbers of tokens")
-        return Reply(stored["text"], *counts)
-    except UserError as error:
-        log.warning("%s The question is asked again.", error)
-        return None
-
-
-def _is_passing(error: Exception) -> bool:
-    if _code(error):
-        return _code(error) in _PASSING
-    # httpx's errors derive from no built-in one; their names tell.
-    return isinstance(error, OSError) or any(
-        word in type(error).__name__ for word in ("Timeout", "Connect", "Network")
-    )
-
-
-def _code(error: Exception) -> int:
-    codes = (
-        getattr(error, name, 0) for name in ("status_code", "code")
-    )  # as openai has it, as google-genai has it
-    return next((code for code in codes if isinstance(code, int) and code), 0)
-
-
 def make_api(
     provider: str, settings: Mapping[str, Any], where: str, usage: Usage, client: Any = None
 ) -> Api:
-    """An `Api` out of plain settings.
+    """Make an `Api` from plain settings.
 
     Args:
-        provider: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in,
-            for messages.
+        provider: a key of `PROVIDERS`, whose defaults hold for what `settings` does not name.
+        settings: keys of `Settings`. where: the section they stand in, for messages.
+    """
+    check_choice(f"{where}.api", provider, PROVIDERS)
+    values = {**asdict(PROVIDERS[provider]), **settings}
+    return Api(read_section(Settings, values, where), usage, client)
+
+
+def make_client(settings: Settings) -> Any:
+    """Make a client of the package `openai`.
+
+    Raises:
+        UserError: the key or the package is missing.
     """
     require(
-        provider in CONNECTIONS,
-        f"{where}.api={provider!r}. {did_you_mean(str(provider), CONNECTIONS)}",
+        settings.key_variable is None or settings.key,
+        f"{settings.model} needs a key in the environment variable {settings.key_variable}; an"
+        " endpoint that asks for none has key_variable=null.",
     )
-    return Api(
-        read_section(CONNECTIONS[provider].settings_type, settings, where),
-        usage,
-        client,
-        provider=provider,
+    try:
+        import openai
+    except ImportError:
+        raise missing_extra("An OpenAI-compatible endpoint", "openai") from None
+
+    class LimitedClient(openai.DefaultHttpxClient):
+        """Sends a request to its own address only, and reads at most `LONGEST_REPLY` bytes."""
+
+        def send(self, request: Any, **options: Any) -> Any:
+            options["stream"] = True
+            response = super().send(request, **options)
+            with closing(response):
+                content = _read_limited(response)
+            return type(response)(
+                response.status_code,
+                headers=response.headers,
+                content=content,
+                request=request,
+            )
+
+    # The client's errors and logs name its address, so the login is sent in a header instead.
+    address = settings.address._replace(netloc=settings.address.netloc.rpartition("@")[2])
+    headers = {"Accept-Encoding": "identity"}
+    if settings.login:
+        headers["Authorization"] = f"Basic {_base64(settings.login.encode())}"
+    return openai.OpenAI(
+        api_key=settings.key or "none",
+        base_url=address.geturl() or None,
+        default_headers=headers,
+        timeout=settings.timeout,
+        max_retries=settings.retries,
+        # A redirect would send the question, images included, to another host.
+        http_client=LimitedClient(follow_redirects=False, timeout=settings.timeout),
     )
+
+
+def _read_limited(response: Any) -> bytes:
+    """Return the body of an httpx response; of an error, at most its beginning.
+
+    Raises:
+        ApiFailure: the body is compressed or too long, or is somewhere else.
+    """
+    if response.has_redirect_location:
+        target = response.headers["location"]
+        raise ApiFailure(
+            "failed",
+            f"the endpoint redirects to {target}, which is not followed: set base_url to the"
+            " address of the endpoint itself",
+        )
+    encoding = response.headers.get("content-encoding", "identity")
+    if encoding != "identity":  # a few bytes may unpack to any size
+        raise ApiFailure("failed", f"the response is compressed ({encoding}), against the request")
+    content = bytearray()
+    for chunk in response.iter_raw():
+        content += chunk
+        if len(content) > LONGEST_REPLY:
+            break
+    if len(content) > LONGEST_REPLY and response.is_success:
+        raise ApiFailure("failed", f"the response is longer than {LONGEST_REPLY:,} bytes")
+    return bytes(content[:LONGEST_REPLY])
+
+
+def chat_messages(
+    system: str, messages: Sequence[Message], video_frames: int
+) -> list[dict[str, Any]]:
+    """Return a conversation in the form of OpenAI's chat completions."""
+    converted: list[dict[str, Any]] = [{"role": "system", "content": system}]
+    for role, parts in messages:
+        if role == "model":
+            # Many servers take an assistant's message as a text only.
+            converted.append({"role": "assistant", "content": "".join(map(str, parts))})
+            continue
+        content: list[dict[str, Any]] = []
+        for part in parts:
+            if isinstance(part, MediaPart):
+                content += part.content(video_frames)
+            else:
+                content.append(_text_part(part))
+        converted.append({"role": role, "content": content})
+    return converted
+
+
+def question_digest(settings: Settings, system: str, messages: Sequence[Message]) -> str:
+    """Return the SHA-256 of all that decides an answer.
+
+    The address of the endpoint does not count: another machine may have the same model elsewhere.
+    Of images the pixels count, not their encoding, which may differ between versions of the
+    encoder.
+    """
+    decisive = [settings.model, settings.temperature, "openai", settings.video_frames, system]
+    digest = hashlib.sha256(json.dumps(decisive).encode())
+    for role, parts in messages:
+        digest.update(f"\n{role}".encode())
+        for part in parts:
+            if isinstance(part, MediaPart):
+                kind = str(part.pixels.shape)
+                data = np.ascontiguousarray(part.pixels).tobytes()
+            else:
+                kind = "text"
+                data = part.encode()
+            digest.update(f"\n{kind} {len(data)} ".encode() + data)
+    return digest.hexdigest()
+
+
+def _token_count(usage: Any, name: str) -> int:
+    """Return a number of tokens, 0 where an endpoint does not say, or sends another thing."""
+    count = getattr(usage, name, None)
+    if type(count) is not int or not 0 <= count < MOST_TOKENS:
+        return 0
+    return count
+
+
+def _text_part(text: str) -> dict[str, Any]:
+    return {"type": "text", "text": text}
+
+
+def _image_part(pixels: np.ndarray) -> dict[str, Any]:
+    """pixels: [H, W, 3] uint8."""
+    url = f"data:image/png;base64,{_base64(png_bytes(pixels))}"
+    return {"type": "image_url", "image_url": {"url": url}}
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")

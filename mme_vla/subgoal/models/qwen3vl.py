@@ -29,8 +29,8 @@ class Question:
     """One question.
 
     system, user: texts; `<image>` and `<video>` in the user's mark where images go.
-    images: [H, W, 3] uint8 each. videos: what is looked at of each.
-    target: what the model is to learn to say; None where it is asked.
+    images: [H, W, 3] uint8 each. videos: sampled frames of each.
+    target: the answer to learn in training; None for a question to the model.
     """
 
     system: str
@@ -40,23 +40,28 @@ class Question:
     target: str | None = None
 
     def messages(self) -> list[dict[str, Any]]:
-        """The conversation in the form of chat templates."""
-        kinds = {IMAGE: {"type": "image"}, VIDEO: {"type": "video"}}
-        parts = [
-            kinds.get(piece, {"type": "text", "text": piece}) for piece in split_media(self.user)
+        """Return the conversation in the form of chat templates."""
+        parts = []
+        for piece in split_media(self.user):
+            if piece == IMAGE:
+                parts.append({"type": "image"})
+            elif piece == VIDEO:
+                parts.append({"type": "video"})
+            else:
+                parts.append({"type": "text", "text": piece})
+        messages = [
+            {"role": "system", "content": [{"type": "text", "text": self.system}]},
+            {"role": "user", "content": parts},
         ]
-        messages = [{"role": "system", "content": [{"type": "text", "text": self.system}]}]
-        messages.append({"role": "user", "content": parts})
         if self.target is not None:
-            messages.append(
-                {"role": "assistant", "content": [{"type": "text", "text": self.target}]}
-            )
+            answer = [{"type": "text", "text": self.target}]
+            messages.append({"role": "assistant", "content": answer})
         return messages
 
 
 @dataclass(frozen=True)
 class Completion:
-    """What the model said, special tokens of points kept; and the tokens it read and wrote."""
+    """An answer, special tokens of points kept, and the tokens read and written."""
 
     text: str
     input_tokens: int
@@ -71,7 +76,9 @@ class VLM:
 
     def __init__(self, model: Any, processor: Any, batch_size: int = 8) -> None:
         _check_batch(batch_size)
-        self.model, self.processor, self.batch_size = model, processor, batch_size
+        self.model = model
+        self.processor = processor
+        self.batch_size = batch_size
         limit_images(processor)
 
     @classmethod
@@ -93,7 +100,7 @@ class VLM:
             dtype: of the weights, one of `DTYPES`.
         """
         _check_batch(batch_size)
-        place = find_device(device)  # before the minutes that loading may take
+        where = find_device(device)  # before the minutes that loading may take
         model, processor = load_model(name, dtype)
         if adapter is not None:
             from peft import PeftModel
@@ -105,31 +112,35 @@ class VLM:
                 raise UserError(
                     f"subgoal.adapter={adapter!r} is no LoRA adapter of {name!r}: {error}"
                 ) from None
-        return cls(model.to(place).eval(), processor, batch_size)
+        return cls(model.to(where).eval(), processor, batch_size)
 
     def encode(self, questions: Sequence[Question], side: str = "left") -> Any:
         """Token ids, masks and pixels of a batch, padded on `side`."""
-        texts = [
-            self.processor.apply_chat_template(
-                q.messages(), tokenize=False, add_generation_prompt=q.target is None
+        texts: list[str] = []
+        images: list[np.ndarray] = []
+        videos: list[np.ndarray] = []
+        metadata: list[dict[str, Any]] = []
+        for question in questions:
+            text = self.processor.apply_chat_template(
+                question.messages(), tokenize=False, add_generation_prompt=question.target is None
             )
-            for q in questions
-        ]
-        images = [image for q in questions for image in q.images]
-        videos = [video for q in questions for video in q.videos]
-        options: dict[str, Any] = {"images": images} if images else {}
+            texts.append(text)
+            images += question.images
+            for clip in question.videos:
+                videos.append(clip.frames)
+                metadata.append(
+                    {
+                        "total_num_frames": clip.length,
+                        "fps": FPS,
+                        "frames_indices": clip.indices.tolist(),
+                        "duration": clip.length / FPS,
+                    }
+                )
+        options: dict[str, Any] = {}
+        if images:
+            options["images"] = images
         if videos:
-            options["videos"] = [video.frames for video in videos]
-            options["video_metadata"] = [
-                {
-                    "total_num_frames": video.length,
-                    "fps": FPS,
-                    "frames_indices": video.indices.tolist(),
-                    "duration": video.length / FPS,
-                }
-                for video in videos
-            ]
-            options["do_sample_frames"] = False
+            options |= {"videos": videos, "video_metadata": metadata, "do_sample_frames": False}
         return self.processor(
             text=texts, padding=True, padding_side=side, return_tensors="pt", **options
         )
@@ -138,7 +149,9 @@ class VLM:
     def generate(
         self, questions: Sequence[Question], max_new_tokens: int = 128
     ) -> list[Completion]:
-        """Answer greedily. What is asked together does not change an answer beyond rounding."""
+        """Answer greedily. The other questions of a batch change an answer by rounding only."""
+        tokenizer = self.processor.tokenizer
+        ends = {tokenizer.eos_token_id, tokenizer.pad_token_id}
         completions: list[Completion] = []
         for start in range(0, len(questions), self.batch_size):
             batch = self.encode(questions[start : start + self.batch_size]).to(self.model.device)
@@ -150,25 +163,18 @@ class VLM:
                 top_p=None,
                 top_k=None,
             )
-            read = batch["attention_mask"].sum(1).tolist()
-            completions += [
-                self._reply(ids, n)
-                for ids, n in zip(sequences[:, batch["input_ids"].shape[1] :], read, strict=True)
-            ]
+            answers = sequences[:, batch["input_ids"].shape[1] :].tolist()
+            lengths = batch["attention_mask"].sum(1).tolist()
+            for ids, length in zip(answers, lengths, strict=True):
+                tokens = [token for token in ids if token not in ends]
+                # The marks of points are special tokens and must stay.
+                text = tokenizer.decode(tokens, skip_special_tokens=False).strip()
+                completions.append(Completion(text, length, len(tokens)))
         return completions
-
-    def _reply(self, ids: torch.Tensor, read: int) -> Completion:
-        tokenizer = self.processor.tokenizer
-        ends = {tokenizer.eos_token_id, tokenizer.pad_token_id}
-        tokens = [token for token in ids.tolist() if token not in ends]
-        # The marks of points are special tokens and must stay.
-        return Completion(
-            tokenizer.decode(tokens, skip_special_tokens=False).strip(), read, len(tokens)
-        )
 
 
 def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
-    """A model and its processor, on the CPU."""
+    """Load a model and its processor, on the CPU."""
     require(dtype in DTYPES, f"dtype={dtype!r} of a Qwen3-VL. {did_you_mean(str(dtype), DTYPES)}")
     try:
         from transformers import AutoProcessor, Qwen3VLForConditionalGeneration
@@ -179,14 +185,12 @@ def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
     check_transformers_folder(name)
     try:
         processor = AutoProcessor.from_pretrained(name)
-        return Qwen3VLForConditionalGeneration.from_pretrained(
-            name, dtype=getattr(torch, dtype)
-        ), processor
+        model = Qwen3VLForConditionalGeneration.from_pretrained(name, dtype=getattr(torch, dtype))
     except (OSError, ValueError) as error:
-        place = "that folder" if Path(name).exists() else "the hub"
-        raise UserError(
-            f"No Qwen3-VL model {name!r} in {place}: {str(error).splitlines()[0]}"
-        ) from None
+        source = "that folder" if Path(name).exists() else "the hub"
+        first_line = str(error).splitlines()[0]
+        raise UserError(f"No Qwen3-VL model {name!r} in {source}: {first_line}") from None
+    return model, processor
 
 
 def _check_batch(size: int) -> None:
@@ -197,15 +201,9 @@ def _check_batch(size: int) -> None:
 
 
 def limit_images(processor: Any) -> None:
-    """Hold images and videos to the released limits; nothing of 256×256 pixels is
-    resized by them.
-    """
+    """Set the released limits of images and videos; they resize nothing of 256×256 pixels."""
     area = TOKEN_SIDE**2
-    processor.image_processor.size = {
-        "shortest_edge": 4 * area,
-        "longest_edge": IMAGE_TOKENS * area,
-    }
-    processor.video_processor.size = {
-        "shortest_edge": 4 * area,
-        "longest_edge": VIDEO_FRAMES * VIDEO_TOKENS * area,
-    }
+    least = 4 * area
+    most = VIDEO_FRAMES * VIDEO_TOKENS * area
+    processor.image_processor.size = {"shortest_edge": least, "longest_edge": IMAGE_TOKENS * area}
+    processor.video_processor.size = {"shortest_edge": least, "longest_edge": most}

@@ -1,7 +1,7 @@
 """A Qwen3-VL of toy size with random weights and its processor, made without any download.
 
-It says nothing sensible, but it is the real architecture: tests and first runs go through the whole
-path with it (`subgoal.model=tiny`).
+Its answers make no sense, but it has the real architecture, for tests and first runs
+(`subgoal.model=tiny`).
 """
 
 from pathlib import Path
@@ -32,7 +32,7 @@ CHAT_TEMPLATE = """{%- for message in messages %}{{ '<|im_start|>' + message.rol
 
 
 def tiny_processor() -> Any:
-    """A `Qwen3VLProcessor` with a tokenizer trained on RoboMME's language on the spot."""
+    """Make a `Qwen3VLProcessor`; its tokenizer is trained on RoboMME's language here."""
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import (
         PreTrainedTokenizerFast,
@@ -68,7 +68,7 @@ def tiny_processor() -> Any:
 
 
 def tiny_config(processor: Any) -> Any:
-    """A `Qwen3VLConfig` of toy size that goes with this processor."""
+    """Make a `Qwen3VLConfig` of toy size for this processor."""
     from transformers import Qwen3VLConfig
 
     build: Any = Qwen3VLConfig  # its keyword arguments are declared at run time
@@ -83,9 +83,8 @@ def tiny_config(processor: Any) -> Any:
             "num_key_value_heads": 2,
             "head_dim": 16,
             "max_position_embeddings": 8192,
-            "initializer_range": (
-                0.15
-            ),  # the head is tied to the embeddings, and large enough to prefer one token
+            # The head is tied to the embeddings, and large enough to prefer one token.
+            "initializer_range": 0.15,
             "rope_parameters": {
                 "rope_type": "default",
                 "rope_theta": 5e6,
@@ -111,6 +110,7 @@ def tiny_config(processor: Any) -> Any:
 
 
 def make_tiny(seed: int = 0) -> tuple[Any, Any]:
+    """Make the model and its processor."""
     import torch
     from transformers import Qwen3VLForConditionalGeneration
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.play_fakes import BLOCKS, MOTION, VIDEO, a_session
+from helpers.subgoal_fakes import Client, kinds, response, turns
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import read_records
@@ -76,53 +77,29 @@ def test_a_reply_that_cannot_be_used_says_why(reply, reason):
         parse_choice(reply, OPTIONS)
 
 
-# Gemini -------------------------------------------------------------------------------------------
-
-
-class Client:
-    """Has google-genai's interface; returns these answers in turn."""
-
-    def __init__(self, *answers):
-        self.answers, self.queries, self.models = list(answers), [], self
-
-    def generate_content(self, *, model, contents, config):
-        self.queries.append(contents)
-        reply = self.answers.pop(0)
-        if isinstance(reply, Exception):
-            raise reply
-        used = SimpleNamespace(
-            prompt_token_count=1000, candidates_token_count=20, thoughts_token_count=80
-        )
-        return SimpleNamespace(text=reply, usage_metadata=used, candidates=[], prompt_feedback=None)
+# Models behind an endpoint ------------------------------------------------------------------------
 
 
 def gemini(*answers, **options):
-    client = Client(*answers)
-    return GeminiPlayer(
-        client=client, requests_per_minute=None, backoff=0, retries=0, **options
-    ), client
-
-
-def kinds(message):
-    return [
-        "text" if "text" in part else part["inline_data"]["mime_type"] for part in message["parts"]
-    ]
+    client = Client(*[a if isinstance(a, Exception) else response(a) for a in answers])
+    return GeminiPlayer(client=client, **options), client
 
 
 def test_a_conversation_holds_the_frames_since_the_last_decision():
     player, client = gemini(says("blue"), '{"choice": "b"}', says("red"))
     session = play(a_session(), player)
     assert session.status == "success"
-    first, second, third = client.queries
-    assert kinds(first[0]) == ["video/mp4", "image/png", "text"]
-    assert "a: press the block [point]\nb: wait\n" in first[0]["parts"][-1]["text"]
-    assert [message["role"] for message in third] == ["user", "model", "user", "model", "user"]
-    assert kinds(second[-1]) == ["video/mp4", "image/png", "text"]
-    assert second[-1]["parts"][-1]["text"].startswith(
+    first, second, third = map(turns, client.requests)
+    assert kinds(first[0]) == [f"video of {VIDEO}", *["image"] * 4, "image", "text"]
+    assert "a: press the block [point]\nb: wait\n" in first[0]["content"][-1]["text"]
+    roles = [message["role"] for message in third]
+    assert roles == ["user", "assistant", "user", "assistant", "user"]
+    assert kinds(second[-1]) == [f"video of {MOTION}", *["image"] * 4, "image", "text"]
+    assert second[-1]["content"][-1]["text"].startswith(
         "You chose a: press the block at [703, 742]; the video shows it"
     )
-    assert kinds(third[-1]) == ["image/png", "text"]
-    assert "nothing moved" in third[-1]["parts"][-1]["text"]
+    assert kinds(third[-1]) == ["image", "text"]
+    assert "nothing moved" in third[-1]["content"][-1]["text"]
     usage = player.notes()["usage"]
     assert (usage["calls"], usage["input_tokens"], usage["output_tokens"], usage["problems"]) == (
         3,
@@ -138,7 +115,7 @@ def test_an_unusable_reply_is_counted_and_requested_again_with_the_reason():
     assert session.status == "success"
     assert (
         "could not be used: the answer holds no JSON object"
-        in client.queries[1][-1]["parts"][0]["text"]
+        in turns(client.requests[1])[-1]["content"][0]["text"]
     )
     assert player.notes()["usage"]["problems"] == {"malformed": 2}
     assert session.decisions[0].note == {"answers": ["no idea", says("blue")]}
@@ -159,9 +136,17 @@ def test_a_model_that_never_answers_well_fails_and_a_broken_network_is_an_error(
         "error",
         "no answer (failed): ConnectionError: gone",
     )
-    player, _ = gemini("")
+
+
+def test_an_empty_answer_is_requested_again_with_the_same_question():
+    player, client = gemini("", says("blue"), '{"choice": "b"}', says("red"))
     session = play(a_session(), player)
-    assert (session.status, player.notes()["usage"]["problems"]) == ("fail", {"empty": 1})
+    assert (session.status, player.notes()["usage"]["problems"]) == ("success", {"empty": 1})
+    assert turns(client.requests[0]) == turns(client.requests[1])
+    player, client = gemini("", "", "")
+    session = play(a_session(), player)
+    assert (session.status, player.notes()["usage"]["problems"]) == ("fail", {"empty": 3})
+    assert len(client.requests) == 3
 
 
 # Qwen3-VL -----------------------------------------------------------------------------------------

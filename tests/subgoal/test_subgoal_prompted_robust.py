@@ -6,9 +6,9 @@ import sys
 import pytest
 
 from helpers import REPOSITORY
-from helpers.subgoal_fakes import frames, kinds, play, predictor_of, says, started
+from helpers.subgoal_fakes import frames, kinds, play, predictor_of, says, started, turns
 from mme_vla.errors import UserError
-from mme_vla.subgoal.models.api import side_by_side
+from mme_vla.subgoal.threads import side_by_side
 
 
 def test_late_tasks_leave_out_what_came_due_before_their_step():
@@ -29,11 +29,9 @@ def test_late_tasks_leave_out_what_came_due_before_their_step():
         ("timeout", "soon"),
         ("retries", -1),
         ("retries", 1.5),
-        ("backoff", -1),
         ("temperature", -0.1),
-        ("requests_per_minute", 0),
-        ("input_price", -1),
-        ("output_price", float("nan")),
+        ("temperature", float("nan")),
+        ("video_frames", 3),
         ("workers", 0),
         ("wait", -1),
     ],
@@ -58,37 +56,50 @@ def test_a_damaged_reply_on_disk_is_requested_again(damage, tmp_path):
     assert [path.suffix for path in tmp_path.rglob("*.*")] == [".json"]
 
 
+def test_a_reply_that_cannot_be_stored_is_used_all_the_same(tmp_path, caplog):
+    first, _ = predictor_of(says("press"), cache=str(tmp_path))
+    first.predict([started(first)])
+    (cached,) = tmp_path.rglob("*.json")
+    cached.unlink()
+    cached.mkdir()
+    again, _ = predictor_of(says("press"), cache=str(tmp_path))
+    assert again.predict([started(again)])[0].text == "press"
+    assert "cannot be written" in caplog.text
+    assert list(tmp_path.rglob("*.*")) == [cached]
+
+
 def test_a_clip_is_encoded_once_however_many_questions_show_it(monkeypatch):
     encoded = []
 
-    def count(pixels, **options):
+    def count(pixels):
         encoded.append(pixels.shape)
-        return b"clip"
+        return b"image"
 
-    monkeypatch.setattr("mme_vla.subgoal.models.connection.video_bytes", count)
+    monkeypatch.setattr("mme_vla.subgoal.models.api.png_bytes", count)
     predictor, client = predictor_of(*[says("a")] * 4)
     play(predictor, started(predictor, video=10), 10)
-    assert len(client.requests) == 4 and [shape[0] for shape in encoded] == [10, 48, 48, 48]
-    last = client.requests[-1][0]
-    assert [message["role"] for message in last] == ["user", "model"] * 3 + ["user"]
-    assert kinds(last[2]["parts"]) == kinds(last[4]["parts"]) == ["video/mp4", "text"]
+    assert len(client.requests) == 4 and len(encoded) == 4 + 1 + 3 * 4
+    last = turns(client.requests[-1])
+    assert [message["role"] for message in last] == ["user", "assistant"] * 3 + ["user"]
+    clip = ["video of 48", *["image"] * 4, "text"]
+    assert kinds(last[2]) == kinds(last[4]) == clip
 
 
 @pytest.mark.slow
 def test_an_interrupt_does_not_wait_for_answers_under_way():
     code = """
-import signal, threading, time
+import signal, threading, time, types
 import numpy as np
 from mme_vla.subgoal import BackgroundPredictor, Gemini
 
 class Client:
-    def generate_content(self, **_):
+    def create(self, **_):
         time.sleep(900)
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever the parent did with it
 main = threading.main_thread().ident
 client = Client()
-client.models = client
+client.chat = types.SimpleNamespace(completions=client)
 gemini = Gemini(client=client)
 for predictor in (gemini, BackgroundPredictor(gemini)):
     episode = predictor.start_episode("goal")
