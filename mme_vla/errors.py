@@ -10,6 +10,10 @@ class UserError(ValueError):
     """
 
 
+class SceneError(RuntimeError):
+    """A scene that cannot be laid out from its seed: an object found no place."""
+
+
 def require(holds: object, message: str, error: type[Exception] = UserError) -> None:
     """Raise an error with this message unless something holds.
 

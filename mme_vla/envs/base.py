@@ -17,7 +17,7 @@ import numpy as np
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option
-from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
 from mme_vla.errors import check_known, require
 from mme_vla.registry import ENVS
@@ -175,7 +175,7 @@ class Environment(ABC):
 
     def step_limit(self, split: str) -> int:
         """Steps after which an episode of a split is a timeout."""
-        return 1300
+        return DEFAULT_STEPS
 
     def suite_of(self, task: str) -> str | None:
         """The suite of a task."""

@@ -19,6 +19,7 @@ import torch
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.base import Hold
 from mme_vla.envs.grounding import Grounding
+from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import (
     INTRINSIC,
     Include,
@@ -152,7 +153,7 @@ class RoboMMEEnv(gymnasium.Env):
         self,
         task: "Task",
         action: str = "joint_angle",
-        max_steps: int = 1300,
+        max_steps: int = DEFAULT_STEPS,
         include: Include | None = None,
         render: bool = True,
         reward: str = "none",

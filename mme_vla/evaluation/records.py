@@ -1,11 +1,12 @@
 """What is kept of an evaluated episode, and how records come together into runs."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from typing import Annotated, Any, NamedTuple, Self
 
 from mme_vla.config.sections import Range, read_section
+from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.policy.training_identity import TrainingIdentity
@@ -68,6 +69,36 @@ class Seconds:
 
 
 @dataclass(frozen=True)
+class RolloutDetails:
+    """What a rollout keeps in `EpisodeRecord.extra`; what is None or empty is not written.
+
+    env: the environment's name. goal: the instruction. chunks: how often the policy acted.
+    video_frames: observed frames of the conditioning video. actions_sha256: digest of the executed
+    actions. suite: the task's, where its environment has suites. refused: what the environment says
+    of an episode that failed. video: name of the file. process: where the chain of sub-tasks broke.
+    events: what happened, and when. notes: that the policy wrote. subgoals: their score.
+    """
+
+    env: str
+    goal: str
+    chunks: int
+    video_frames: int
+    actions_sha256: str
+    suite: str | None = None
+    refused: str | None = None
+    video: str | None = None
+    process: Mapping[str, Any] | None = None
+    events: Sequence[Mapping[str, Any]] = ()
+    notes: Sequence[Mapping[str, Any]] = ()
+    subgoals: Mapping[str, Any] | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values by name, for records."""
+        optional = {f.name for f in fields(self) if f.default is not MISSING}
+        return {name: value for name, value in vars(self).items() if value or name not in optional}
+
+
+@dataclass(frozen=True)
 class EpisodeRecord:
     """One evaluated episode.
 
@@ -106,7 +137,7 @@ class EpisodeRecord:
     seconds: Seconds = field(default_factory=Seconds)
     error: str | None = None
     split: str = "test"
-    max_steps: Integer = 1300
+    max_steps: Integer = DEFAULT_STEPS
     action_space: str = "joint_angle"
     subgoal: str | None = None
     memory_budget: Integer | None = None

@@ -133,15 +133,13 @@ def _await_content(path: Path, patience: float = 2) -> None:
 
 
 def _differences(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    pairs = {
-        key: [flat(values).get(key, "not set") for values in (there, now)]
-        for key in sorted({*flat(there), *flat(now)})
-    }
-    return "; ".join(
-        f"{key} was {brief(old)}, is {brief(new)}"
-        for key, (old, new) in pairs.items()
-        if old != new
-    )
+    earlier, later = flat(there), flat(now)
+    words = []
+    for key in sorted({*earlier, *later}):
+        old, new = earlier.get(key, "not set"), later.get(key, "not set")
+        if old != new:
+            words.append(f"{key} was {brief(old)}, is {brief(new)}")
+    return "; ".join(words)
 
 
 RECORDS = "episodes.jsonl"  # Name of a run's file; its shards are called `episodes-<shard>.jsonl`
@@ -227,14 +225,17 @@ def find_records(paths: Iterable[Path]) -> list[Path]:
     """
     files: list[Path] = []
     for path in paths:
+        if path.is_file():
+            files.append(path)
+            continue
+        if not path.is_dir():
+            raise UserError(f"{path} does not exist: name files of records, or folders.")
         below = sorted([*path.rglob("episodes*.jsonl"), *path.rglob("episodes*.jsonl.xz")])
-        inside = below if path.is_dir() else [path] * path.is_file()
-        if not inside:
-            fault = "does not exist: name files of records, or folders"
-            if path.is_dir():
-                fault = f"holds no results: no {RECORDS} or episodes-<shard>.jsonl in it or below"
-            raise UserError(f"{path} {fault}.")
-        files += inside
+        if not below:
+            raise UserError(
+                f"{path} holds no results: no {RECORDS} or episodes-<shard>.jsonl in it or below."
+            )
+        files += below
     return list({path.resolve(): path for path in files}.values())
 
 
@@ -293,13 +294,14 @@ class Claims:
         self.folder, self.records = folder, records
         self._newest: dict[EpisodeKey, tuple[int, Claim]] = {}
         for path in sorted((folder / CLAIMS).glob("[!.]*.json")):
-            if match := _CLAIM.fullmatch(path.name):
-                key, number = (
-                    EpisodeKey(unquote(match["task"]), int(match["episode"])),
-                    int(match["number"]),
-                )
-                if number > self._newest.get(key, (-1, None))[0]:
-                    self._newest[key] = number, _read_claim(path)
+            match = _CLAIM.fullmatch(path.name)
+            if match is None:
+                continue
+            key = EpisodeKey(unquote(match["task"]), int(match["episode"]))
+            number = int(match["number"])
+            newest, _ = self._newest.get(key, (-1, None))
+            if number > newest:
+                self._newest[key] = number, _read_claim(path)
         done = _finished_in(folder / records)
         for key, (number, claim) in list(self._newest.items()):
             if claim.records == records and key not in done:
@@ -331,9 +333,8 @@ class Claims:
             return False
         if records not in finished_by:
             path = self.folder / records
-            finished_by[records] = (
-                None if records == self.records or _is_held(path, claim) else _finished_in(path)
-            )
+            is_running = records == self.records or _is_held(path, claim)
+            finished_by[records] = None if is_running else _finished_in(path)
         done = finished_by[records]
         return done is None or key in done
 

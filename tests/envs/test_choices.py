@@ -4,6 +4,7 @@ real recordings.
 
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -251,7 +252,8 @@ class Offering(ChoiceEnvs):
 
     def start(self, worker: int, job: Job, **how: Any) -> None:
         super().start(worker, job, **how)
-        self._replies[-1].info["available_multi_choices"] = self.offered
+        reply = self._replies[-1]
+        reply.info = replace(reply.info, options=self.offered)
 
 
 def test_a_rollout_asks_after_each_choice_and_takes_what_is_offered_only() -> None:

@@ -15,8 +15,8 @@ import pytest
 from helpers.env_fakes import FRAME, make_light_env
 from mme_vla.envs import VecEnv, make_vec_env
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import UserError
+from mme_vla.envs.vector.worker import _portable, begin, settings, simulating_processes
+from mme_vla.errors import SceneError, UserError
 
 
 @pytest.fixture(scope="module")
@@ -122,13 +122,25 @@ def test_a_lost_worker_is_reported_and_replaced_while_others_continue(
 def test_an_exception_is_reported_and_the_worker_stays(envs: VecEnv) -> None:
     envs.start(0, Job("StopCube", "test", 13))
     failed = only(envs.recv())
-    assert failed.crashed
+    assert failed.crashed and type(failed.error) is ValueError
     assert failed.info["exception_type"] == "ValueError"
     assert "StopCube test episode 13: no scene for this seed" in failed.info["error_message"]
     envs.start(0, Job("StopCube", "test", 2))
     assert not only(envs.recv()).done
     envs.send(0, "raise")
     assert "the arm fell off" in only(envs.recv()).info["error_message"]
+
+
+def test_an_exception_of_a_class_that_others_cannot_read_becomes_its_text() -> None:
+    class OwnError(Exception):
+        """Of a class that no other process can import."""
+
+    for error in (UserError("no"), SceneError("no"), KeyError("no")):
+        assert _portable(error) is error
+    text = _portable(OwnError("no place"))
+    assert (type(text), str(text)) == (RuntimeError, "OwnError: no place")
+    undecodable = UnicodeDecodeError("utf-8", b"x", 0, 1, "bad")
+    assert _portable(undecodable) is undecodable
 
 
 def test_a_worker_whose_renderer_failed_is_replaced(envs: VecEnv) -> None:

@@ -21,6 +21,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.data.waypoints import find_choices, find_motions
+from mme_vla.envs.vector.messages import Command
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.processing.processor import Processor
@@ -216,13 +217,13 @@ def test_recorded_actions_of_a_real_episode_succeed_in_the_environment(
     env = make_rollout_env(
         task, "train", 8, robot=panda, action_space=panda.action.space, render=False
     )
-    _, info = env.reset()
-    assert not chooses or info["available_multi_choices"] == recorded_options
-    frames, _, terminated, _, report = env.step({"actions": actions})
+    _, first = env.reset()
+    assert not chooses or first.options == recorded_options
+    frames, _, terminated, _, report = env.step(Command(actions))
     env.close()
-    assert terminated and report["status"] == "success"
-    assert len(frames["state"]) == report["steps"] >= report["executed"]
-    assert (report["steps"] == report["executed"]) == (panda.action.frames == 1)
+    assert terminated and report.status == "success"
+    assert len(frames["state"]) == report.steps >= report.executed
+    assert (report.steps == report.executed) == (panda.action.frames == 1)
 
 
 def test_files_without_poses_or_choices_convert_as_before(tmp_path: Path) -> None:

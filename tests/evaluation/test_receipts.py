@@ -209,7 +209,7 @@ def first(content: dict[str, Any]) -> dict[str, Any]:
 ABSENCES: dict[str, tuple[Callable[[dict[str, Any]], object], set[str]]] = {
     "no condition": (
         lambda c: c.update(conditions=[]),
-        {"code", "simulator", "renderer", "libraries", "checkpoint", "statistics"},
+        {"code", "simulator", "renderer", "libraries", "hardware", "checkpoint", "statistics"},
     ),
     "no files of the checkpoint": (
         lambda c: first(c)["checkpoint"].update(files={}),
@@ -224,12 +224,12 @@ ABSENCES: dict[str, tuple[Callable[[dict[str, Any]], object], set[str]]] = {
     "no statistics": (lambda c: first(c).pop("statistics"), {"statistics"}),
     "no code": (lambda c: first(c).pop("code"), {"code"}),
     "code of nothing": (
-        lambda c: first(c)["code"].update(covers=[], sha256=receipts._code([])),
+        lambda c: first(c).update(code={"mme-vla": first(c)["code"]["mme-vla"]}),
         {f"code.{name}" for name in receipts.CODE},
     ),
     "no version of the library": (lambda c: first(c)["code"].pop("mme-vla"), {"code.mme-vla"}),
     "no simulator": (lambda c: first(c).update(simulator={}), {"simulator"}),
-    "no PyTorch": (lambda c: first(c)["libraries"].pop("torch"), {"libraries"}),
+    "no PyTorch": (lambda c: first(c)["libraries"].pop("torch"), {"libraries.torch"}),
     "no renderer": (lambda c: first(c).pop("renderer"), {"renderer"}),
     "no hardware": (lambda c: first(c).pop("hardware"), {"hardware"}),
     "no file of records": (lambda c: c.update(records={}), {"records"}),
@@ -343,6 +343,16 @@ def test_settings_that_were_changed_everywhere_but_in_the_records_are_noticed(
     ]
 
 
+def test_records_of_two_policies_in_one_run_are_noticed(checkpoint: Path, tmp_path: Path) -> None:
+    path = run(tmp_path, checkpoint, range(2))
+    records = tmp_path / "episodes.jsonl"
+    one, other = map(EpisodeRecord.from_json, records.read_text().splitlines())
+    lines = [one.to_json(), replace(other, composition="another").to_json()]
+    records.write_text("".join(line + "\n" for line in lines))
+    differences = receipts.verify(path, build=False).differences
+    assert any(line.startswith("records.composition: ") for line in differences)
+
+
 def test_the_time_that_events_hold_the_robot_is_added_to_the_limit(finished: Path) -> None:
     for path in (finished, finished.with_name("run.json")):
         rewrite(path, lambda content: content["settings"].update(event="pause:100"))
@@ -390,6 +400,13 @@ def test_names_that_lead_outside_are_refused(
         lambda c: c.update(settings=[]),
         lambda c: c.update(records="x"),
         lambda c: c.update(score=5),
+        lambda c: c.update(settings=None),
+        lambda c: c["settings"].update(event=5),
+        lambda c: c["settings"].update(env=["mme_vla"]),
+        lambda c: c["records"].update(file=5),
+        lambda c: first(c).update(hardware="x"),
+        lambda c: first(c)["checkpoint"].update(folder=5),
+        lambda c: first(c)["checkpoint"].update(files=["x"]),
     ],
 )
 def test_parts_of_another_kind_are_refused(
@@ -427,14 +444,21 @@ def test_the_digest_of_the_code_covers_what_can_change_a_result(name: str, count
     assert all(list((root / part).rglob("*.py")) for part in receipts.CODE), "a package was moved"
 
 
-def test_a_receipt_that_digests_every_file_says_what_it_cannot_tell(finished: Path) -> None:
-    rewrite(
-        finished,
-        lambda content: first(content).update(
-            code={"mme-vla": "0.1.0", "files": receipts._code([""])}
-        ),
-    )
-    assert receipts.verify(finished).word == "agrees"
-    rewrite(finished, lambda content: first(content)["code"].update(files="0" * 64))
-    result = receipts.verify(finished)
-    assert result.word == "not compared" and "every file" in result.not_compared[0]
+def test_digests_of_the_code_that_earlier_versions_wrote_are_not_compared(finished: Path) -> None:
+    earlier = {"mme-vla": first(receipts.read_receipt(finished))["code"]["mme-vla"]}
+    for code in ({"files": "0" * 64}, {"covers": list(receipts.CODE), "sha256": "0" * 64}):
+        rewrite(finished, lambda content, code=code: first(content).update(code=earlier | code))
+        result = receipts.verify(finished)
+        assert result.word == "not compared"
+        assert any(line.startswith("code.memory: ") for line in result.not_compared)
+
+
+def test_the_code_is_read_once_in_a_process(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tmp_path / "first", checkpoint, range(1))
+    read: list[Path] = []
+    file_sum = receipts.file_sum
+    monkeypatch.setattr(receipts, "file_sum", lambda path: (read.append(path), file_sum(path))[1])
+    run(tmp_path / "second", checkpoint, range(1))
+    assert not [path for path in read if path.suffix == ".py"]

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from mme_vla import UserError
-from mme_vla.evaluation.records import EpisodeRecord, Seconds, by_run, merge
+from mme_vla.evaluation.records import EpisodeRecord, RolloutDetails, Seconds, by_run, merge
 from mme_vla.evaluation.store import RecordLog, claim_run, find_records, read_records, read_run
 
 
@@ -179,3 +179,11 @@ def test_processes_of_one_number_on_two_machines_do_not_share_a_file(
     for _ in range(2):
         claim_run(tmp_path, {"a": 1})
     assert len(set(linked)) == 2
+
+
+def test_details_of_a_rollout_that_are_absent_are_not_written() -> None:
+    bare = RolloutDetails("mme_vla", "", 0, 0, "0123")
+    names = ["env", "goal", "chunks", "video_frames", "actions_sha256"]
+    assert list(bare.to_dict()) == names, "in the order in which records have them"
+    full = replace(bare, suite="Counting", video="a.mp4", events=[{"event": "restart", "step": 0}])
+    assert list(full.to_dict()) == [*names, "suite", "video", "events"]

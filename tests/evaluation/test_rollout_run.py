@@ -19,6 +19,7 @@ from helpers.rollout_fakes import (
 from helpers.scripted_env import make_mortal_env, make_moving_env
 from mme_vla import UserError
 from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import SceneError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import Shard, choose_shard, evaluate
 from mme_vla.evaluation.rollout.progress import RolloutProgress
@@ -175,18 +176,18 @@ def test_environments_that_cannot_begin_stop_the_run() -> None:
         def start(self, worker, job, **how):
             from mme_vla.envs.vector.pool import Reply
 
-            self._replies.append(Reply.of_failure(worker, job, True, self.kind, "no scene"))
+            self._replies.append(Reply.of_failure(worker, job, True, self.kind("no scene")))
 
     envs = Broken(2)
-    envs.kind = "UserError"
+    envs.kind = UserError
     with pytest.raises(UserError, match="no scene"):
         roll(quick_policy("pi05"), JOBS, envs)
     envs = Broken(2)
-    envs.kind = "RuntimeError"
+    envs.kind = RuntimeError
     with pytest.raises(UserError, match="8 environments in a row"):
         roll(quick_policy("pi05"), JOBS, envs)
     envs = Broken(2)
-    envs.kind = "SceneError"
+    envs.kind = SceneError
     many = [Job("VideoPlaceOrder", "reserved", episode) for episode in range(12)]
     assert [record.outcome for record in roll(quick_policy("pi05"), many, envs)] == ["error"] * 12
 

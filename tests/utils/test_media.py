@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mme_vla.embodiment import ROBOMME_JOINT, Camera
+from mme_vla.envs.vector.messages import Command
 from mme_vla.evaluation.rollout.environment import ChunkEnv
 from mme_vla.evaluation.rollout.video import EpisodeVideo
 from mme_vla.utils.media import (
@@ -62,7 +63,7 @@ def test_an_episodes_video_shows_every_camera_of_the_robot(
         ThreeCameras, video=EpisodeVideo(lambda outcome, goal: tmp_path / "a.mp4"), robot=robot
     )
     env.reset()
-    env.step({"actions": np.zeros((1, 8), np.float32)})
+    env.step(Command(np.zeros((1, 8), np.float32)))
     env.close()
     frames = decoded(tmp_path / "a.mp4")
     assert len(frames) == 3 and frames[0].shape == (64 + CAPTION, 3 * 64, 3)

@@ -26,6 +26,7 @@ from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import ROBOMME, check_names, make_env
 from mme_vla.envs.vector import worker as protocol
+from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import require
 from mme_vla.utils.processes import signals_deferred
@@ -53,16 +54,24 @@ class Reply:
     reward: Any
     terminated: bool
     truncated: bool
-    info: dict[str, Any]
-    crashed: bool = False
-    """The worker died or hung and was replaced, or the environment raised: no result
-    of the policy.
+    info: Any
+    """What the environment says: a dictionary, or the `Report` of one that takes chunks."""
+    error: Exception | None = None
+    """Why there is no result of the policy: the environment raised it, or the worker died or hung
+    and was replaced.
     """
+
+    @property
+    def crashed(self) -> bool:
+        """Whether there is no result of the policy."""
+        return self.error is not None
 
     @property
     def done(self) -> bool:
         """Whether the episode is over."""
-        return self.terminated or self.truncated or self.info.get("status") == "error"
+        info = self.info
+        status = info.status if isinstance(info, Report) else info.get("status")
+        return self.terminated or self.truncated or status == "error"
 
     @classmethod
     def of_outcome(cls, worker: int, job: Job, resetting: bool, outcome: tuple) -> "Reply":
@@ -74,10 +83,18 @@ class Reply:
         return cls(worker, job, observation, reward, bool(terminated), bool(truncated), info)
 
     @classmethod
-    def of_failure(cls, worker: int, job: Job, resetting: bool, kind: str, message: str) -> "Reply":
+    def of_failure(cls, worker: int, job: Job, resetting: bool, error: Exception) -> "Reply":
         """Of a command that came to nothing; the message names the episode."""
-        info = {"status": "error", "error_message": f"{job}: {message}", "exception_type": kind}
-        return cls(worker, job, None, None if resetting else 0.0, True, False, info, crashed=True)
+        info = {
+            "status": "error",
+            "error_message": f"{job}: {error}",
+            "exception_type": type(error).__name__,
+        }
+        return cls(worker, job, None, None if resetting else 0.0, True, False, info, error)
+
+
+class WorkerCrash(RuntimeError):  # noqa: N818  (the name that records of crashes have)
+    """A worker process died, or gave no result in time."""
 
 
 _CLOSING_SECONDS = 5.0
@@ -297,15 +314,15 @@ class VecEnv:
         return None
 
     def _crashed(self, index: int, what: str) -> Reply:
-        return self._replace(index, "WorkerCrash", f"the worker process {what}")
+        return self._replace(index, WorkerCrash(f"the worker process {what}"))
 
-    def _replace(self, index: int, kind: str, message: str) -> Reply:
+    def _replace(self, index: int, error: Exception) -> Reply:
         """Start a new process for a worker; the reply reports the failure of its command."""
         old = self._workers[index]
         old.connection.close()
         protocol.end(old.process)
         self._workers[index] = self._spawn()
-        return Reply.of_failure(index, old.begun, old.resetting, kind, message)
+        return Reply.of_failure(index, old.begun, old.resetting, error)
 
     def _require_open(self) -> None:
         require(not self._closed, "The environments are closed; make new ones.")

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla import errors
 from mme_vla.envs.rendering import renderer_works
 from mme_vla.utils.processes import end_with_parent
 
@@ -140,7 +141,7 @@ def serve(
                     continue
             except Exception as error:
                 works = renderer_works()
-                send(connection, FAILURE if works else LOST, type(error).__name__, str(error))
+                send(connection, FAILURE if works else LOST, _portable(error))
                 if works:
                     continue
                 return
@@ -150,6 +151,17 @@ def serve(
     finally:
         if env is not None:
             env.close()
+
+
+def _portable(error: Exception) -> Exception:
+    """The error, or a RuntimeError of its text if the reader would have to import its class."""
+    if type(error).__module__ in ("builtins", errors.__name__):
+        try:
+            pickle.loads(pickle.dumps(error))
+            return error
+        except Exception:
+            pass  # its arguments do not survive the way
+    return RuntimeError(f"{type(error).__name__}: {error}")
 
 
 def _hand_over(connection: Any, block: Any, outcome: Any) -> None:

@@ -2,7 +2,8 @@
 every frame.
 
 A worker gets a chunk at a time, so it simulates on while the policy acts in others. Its frames come
-in the form the policy reads, and its report says where the time went.
+in the form the policy reads. What the benchmark's interface says in dictionaries becomes a `Report`
+here.
 """
 
 import time
@@ -18,11 +19,12 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state, choice_row
 from mme_vla.envs.base import Hold
 from mme_vla.envs.make import make_env
-from mme_vla.envs.metadata import STICK_TASKS
+from mme_vla.envs.metadata import DEFAULT_STEPS, STICK_TASKS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.oracle import oracle_of
-from mme_vla.envs.scene_hash import NO_VALUES
+from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.envs.subtasks import Progress, process_score
+from mme_vla.envs.vector.messages import Command, Report
 from mme_vla.errors import require
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
@@ -33,7 +35,7 @@ REPORTED = (
     "status", "task_goal", SUBGOAL, "grounded_subgoal_online", "error_message", "exception_type",
     OPTIONS,
 )  # fmt: skip
-"""What is passed on of the environment's info."""
+"""What is passed on of the environment's info, in `Report.info`."""
 _BLIND = np.zeros((SIDE, SIDE, 3), np.uint8)
 
 Observation = dict[str, Any]
@@ -95,7 +97,7 @@ class ChunkEnv:
         self,
         make: Callable[[], Any],
         stick: bool = False,
-        max_steps: int = 1300,
+        max_steps: int = DEFAULT_STEPS,
         video: EpisodeVideo | None = None,
         robot: Embodiment = ROBOMME_JOINT,
         max_actions: int | None = None,
@@ -110,13 +112,14 @@ class ChunkEnv:
         self._pose: np.ndarray | None = None
         self._last: np.ndarray | None = None
         self._subgoal, self._n_subgoals = "", 0
+        self._goal: str | None = None
+        self._scene = NOT_BUILT
         with self._simulation():
             self._env = make()
         self._clock.watch(self._env)
 
-    def reset(self, draw: RenderRequest | None = None) -> tuple[Observation, dict[str, Any]]:
-        """All frames of the conditioning video, the current one last, and the report, with the
-        `scene`'s digest.
+    def reset(self, draw: RenderRequest | None = None) -> tuple[Observation, Report]:
+        """All frames of the conditioning video, the current one last, and the report.
 
         draw: the requested images; by default all.
         """
@@ -129,36 +132,27 @@ class ChunkEnv:
         self._note_subgoal(info)
         self._draw(frames, count, demo=count - 1)
         self._returned = frames.leave(draw, 0)
-        scene = getattr(
-            self._env, "scene_digest", NO_VALUES
-        )  # environments of other packages do not know it
-        return frames.observation(), self._report(info) | {"scene": scene}
+        # Environments of other packages do not know their scene.
+        self._scene = getattr(self._env, "scene_digest", NO_VALUES)
+        return frames.observation(), self._report(info)
 
-    def step(
-        self, command: dict[str, Any]
-    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, command: Command) -> tuple[Observation, float, bool, bool, Report]:
         """Execute actions one after the other until they, or the episode, are over.
-
-        command: `actions` [n, w], or `hold`, the control steps for which the robot stays where it
-        is; `subgoal`, the text that is in the video meanwhile; `draw`, the images that are
-        requested, where it is not all: frames are counted from the reset on, and the newest is the
-        last.
 
         Returns:
             The frames of the executed actions, the sum of their rewards, terminated, truncated, and
-            the report with `executed`, the number of actions, and `steps`, that of frames. After
-            `hold` no action counts as executed, and `held` is the action [w] that keeps the robot
-            there, None before the first one.
+            the report. After `hold` no action counts as executed.
         """
-        if "hold" in command:
-            self._max_steps += command["hold"]
+        self._max_steps += command.hold
+        actions = [Hold(command.hold)] if command.hold else list(np.asarray(command.actions))
         frames, executed, n_frames, total_reward = _Frames(self._robot), 0, 0, 0.0
         terminated = truncated = False
         info: dict[str, Any] = {}
-        draw: RenderRequest | None = command.get("draw")
-        actions = [Hold(command["hold"])] if "hold" in command else np.asarray(command["actions"])
+        draw = command.draw
         for number, action in enumerate(actions, 1):
-            self._ask(draw if draw is None or number == len(actions) else replace(draw, now=()))
+            # Only the chunk's last frame is the newest when the policy reads it.
+            is_last = number == len(actions)
+            self._ask(draw if draw is None or is_last else replace(draw, now=()))
             with self._simulation():
                 observation, reward, ended, cut, info = self._env.step(self._command(action))
             terminated, truncated = bool(ended), bool(cut)
@@ -168,27 +162,28 @@ class ChunkEnv:
                 if _is_unreachable(observation, info):
                     info = {**info, "status": "fail"}
                 break
-            executed += not isinstance(action, Hold)
-            self._executed += not isinstance(action, Hold)
+            if not isinstance(action, Hold):
+                executed += 1
+                self._executed += 1
             count = frames.add(observation)
             self._note_pose(observation)
             self._note_subgoal(info)
             n_frames += count
-            self._steps += max(
-                count, 1
-            )  # a choice that moves nothing takes time too, or it could continue for ever
-            self._draw(frames, count, caption=command.get("subgoal"))
+            # A choice that moves nothing takes time too, or it could continue for ever.
+            self._steps += max(count, 1)
+            self._draw(frames, count, caption=command.subgoal)
             spent = self._executed == self._max_actions
             if not (terminated or truncated) and (spent or self._steps > self._max_steps):
                 truncated, info = True, {**info, "status": "timeout"}
             if terminated or truncated:
                 break
         self._returned = frames.leave(draw, self._returned)
-        report = self._report(info) | {"executed": executed, "steps": n_frames}
-        if "hold" in command:
-            report["held"] = self._hold_action()
-        if terminated or truncated:
-            report |= self._finish_video(report)
+        report = replace(self._report(info), executed=executed, steps=n_frames)
+        if command.hold:
+            report = replace(report, held=self._hold_action())
+        if (terminated or truncated) and self._video is not None:
+            path = self._video.finish(str(report.status), report.goal or "")
+            report = replace(report, video=None if path is None else path.name)
         return frames.observation(), total_reward, terminated, truncated, report
 
     def close(self) -> None:
@@ -246,32 +241,41 @@ class ChunkEnv:
             self._rendered += render_seconds
             self._simulating += time.perf_counter() - begun - render_seconds
 
-    def _report(self, info: dict[str, Any]) -> dict[str, Any]:
-        report = {key: info[key] for key in REPORTED if key in info}
-        progress, subtask = (
-            getattr(getattr(self._env, "task", None), "progress", None),
-            self._n_subgoals,
-        )
+    def _report(self, info: dict[str, Any]) -> Report:
+        status = info.get("status")
+        if goals := info.get("task_goal"):
+            self._goal = str(goals[0])
+        subtask, process = self._n_subgoals, None
+        progress = getattr(getattr(self._env, "task", None), "progress", None)
         if isinstance(progress, Progress):
-            process = process_score(progress, str(report.get("status")))
-            report["process"], subtask = process.to_dict(), min(process.done + 1, process.of)
-        report["subtask"] = subtask  # of the execution, from 1; 0 where the environment tells none
-        if (began := getattr(self._env, "began", None)) is not None:
-            report["began"] = began
-        if self._oracle and report.get("status") == "ongoing":
-            report["oracle"] = self._oracle_action()
-        report["seconds"] = {"sim": self._simulating, "render": self._rendered}
+            score = process_score(progress, str(status))
+            process = score.to_dict()
+            subtask = min(score.done + 1, score.of)
+        oracle = None
+        if self._oracle and status == "ongoing":
+            oracle = self._oracle_action()
+        report = Report(
+            status=status,
+            goal=self._goal,
+            error=info.get("error_message"),
+            info={key: info[key] for key in REPORTED if key in info},
+            options=info.get(OPTIONS),
+            scene=self._scene,
+            subtask=subtask,
+            began=getattr(self._env, "began", None) or (),
+            process=process,
+            oracle=oracle,
+            simulated_s=self._simulating,
+            rendered_s=self._rendered,
+        )
         self._simulating = self._rendered = 0.0
-        self._goal = str((report.get("task_goal") or [getattr(self, "_goal", "")])[0])
         return report
 
     def _oracle_action(self) -> np.ndarray | None:
         choice = oracle_of(self._env)
-        return (
-            None
-            if choice is None
-            else choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
-        )
+        if choice is None:
+            return None
+        return choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
 
     def _draw(
         self, frames: "_Frames", count: int, demo: int = 0, caption: str | None = None
@@ -279,12 +283,6 @@ class ChunkEnv:
         if self._video is not None:
             for index, views in enumerate(frames.newest(count)):
                 self._video.add(views, caption, demo=index < demo)
-
-    def _finish_video(self, report: dict[str, Any]) -> dict[str, Any]:
-        if self._video is None:
-            return {}
-        path = self._video.finish(str(report.get("status")), self._goal)
-        return {} if path is None else {"video": path.name}
 
 
 def _is_unreachable(observation: Any, info: dict[str, Any]) -> bool:
@@ -372,7 +370,7 @@ def make_rollout_env(
     episode: int,
     *,
     base: Callable[..., Any] = make_env,
-    max_steps: int = 1300,
+    max_steps: int = DEFAULT_STEPS,
     videos: tuple[str, str] | None = None,
     robot: Embodiment = ROBOMME_JOINT,
     max_actions: int | None = None,

@@ -9,10 +9,11 @@ import numpy as np
 
 from mme_vla.embodiment.action_space import read_options
 from mme_vla.envs.scene_hash import NOT_BUILT
+from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds
-from mme_vla.evaluation.rollout.environment import OPTIONS, Observation
+from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.events import Event, EventCourse, PlacedEvent
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.policy.base import Policy
@@ -59,14 +60,14 @@ class RunningEpisode:
         self.worker = -1
         self.steps = self.chunks = 0
         self.video_frames = 0
-        self.video = ""
         self.scene = NOT_BUILT
         """Digest of the scene, once it is built."""
-        self.process: dict[str, Any] = {}
-        """Where the chain of sub-tasks broke, once the episode is over; empty where it is not
-        reported.
-        """
-        self.redrawn: int | None = None
+        self.report = Report()
+        """The environment's last one."""
+        self.process: dict[str, Any] | None = None
+        """Where the chain of sub-tasks broke, once the episode is over and if it is reported."""
+        self.video: str | None = None
+        self.first_video_frames: int | None = None
         """Frames of the conditioning video, once it is being simulated again for its images."""
         self._actions = hashlib.sha256()
         self._robot = policy.embodiment
@@ -75,17 +76,30 @@ class RunningEpisode:
         self._begun = time.perf_counter()
         self._frames: Observation = {"state": np.zeros((0, self._robot.state.width), np.float32)}
         self._demo = np.zeros(0, bool)
-        self._led: np.ndarray | None = None
-        self._info: dict[str, Any] = {}
+        self._leading: np.ndarray | None = None  # Actions that led to the waiting frames
         self._at = 0
 
-    def begin(self, frames: Observation, info: dict[str, Any]) -> None:
+    def take_report(self, report: Report) -> None:
+        """Note what the environment says: its time, its scene, and what there is to choose."""
+        self.report = report
+        self.scene = report.scene
+        self._sim += report.simulated_s
+        self._render += report.rendered_s
+        # Which options are possible may change after each choice.
+        if self._robot.action.choice and report.options is not None:
+            self.episode.options = read_options(report.options, len(self._robot.action.choice))
+
+    def begin(self, frames: Observation) -> None:
         """Take the first observation: a conditioning video, if the task has one, and the current
         frame.
+
+        Raises:
+            UserError: the environment names no goal.
         """
-        goal = str(info["task_goal"][0])
+        goal = self.report.goal
+        if goal is None:
+            raise UserError(f"{self.job}: the environment's info has no task_goal.")
         self.episode.goal = goal
-        self._offer(info)
         length = len(frames["state"])
         frames = self._observed(
             frames, length, np.append(self.events.video(length - 1), length - 1)
@@ -95,34 +109,29 @@ class RunningEpisode:
             needs_video = self.video_frames and self._subgoals.sees_video
             video = np.stack(frames[self._robot.memory_camera][:-1]) if needs_video else None
             self.watched = self._subgoals.start_episode(goal, video, self.job.task)
-        self._expect(frames, np.arange(self.video_frames + 1) < self.video_frames, None, info)
+        self._expect(frames, np.arange(self.video_frames + 1) < self.video_frames, None)
 
-    def resume(self, frames: Observation, info: dict[str, Any]) -> None:
+    def resume(self, frames: Observation) -> None:
         """Take the frames that the executed actions led to: one each, unless an action is a motion
         of many.
         """
-        self._offer(info)
-        count, length = self._count(info), len(frames["state"])
+        self._count()
+        executed, length = self.report.executed, len(frames["state"])
         if self.events.holding is not None:
             self.events.hold_steps += length
             n_frames = min(self.events.holding.observed, length)
             frames = self._observed(frames, length, np.arange(length - n_frames, length))
-            self._expect(
-                frames,
-                np.zeros(n_frames, bool),
-                self._holding_actions(n_frames, info.get("held")),
-                info,
-            )
+            self._expect(frames, np.zeros(n_frames, bool), self._holding_actions(n_frames))
             return
-        n_frames = count if self._robot.action.frames is not None else length
+        n_frames = executed if self._robot.action.frames is not None else length
         self._observed(frames, length)
-        self._expect(frames, np.zeros(n_frames, bool), self._sent[:count], info)
+        self._expect(frames, np.zeros(n_frames, bool), self._sent[:executed])
 
     def next_event(self) -> Event | None:
         """Let the events take place that are due; the one that holds the robot before the policy
         acts, if there is.
         """
-        return self.events.next(self.episode, self.steps, self._info.get("subtask", 0))
+        return self.events.next(self.episode, self.steps, self.report.subtask)
 
     @property
     def unobserved(self) -> int:
@@ -131,24 +140,10 @@ class RunningEpisode:
         """
         return self._simulated - len(self._visible)
 
-    def _offer(self, info: dict[str, Any]) -> None:
-        """Let the episode choose among the options of now: which of them are possible
-        may change.
-        """
-        if self._robot.action.choice and OPTIONS in info:
-            self.episode.options = read_options(info[OPTIONS], len(self._robot.action.choice))
-
-    def end(self, info: dict[str, Any]) -> None:
-        """Take the report of the last actions; their frames are not needed any more."""
-        self._count(info)
-        self.video = str(info.get("video", ""))
-        self.process = info.get("process", {})
-
-    def add_env_seconds(self, info: dict[str, Any]) -> None:
-        """Add up the environment's time."""
-        seconds = info.get("seconds", {})
-        self._sim += seconds.get("sim", 0.0)
-        self._render += seconds.get("render", 0.0)
+    def end(self) -> None:
+        """Count the last actions; their frames are not needed any more."""
+        self._count()
+        self.process, self.video = self.report.process, self.report.video
 
     @property
     def pieces(self) -> int:
@@ -159,30 +154,33 @@ class RunningEpisode:
         """Take one piece of the waiting frames into memory."""
         begun = time.perf_counter()
         part = slice(self._at, self._at + self._piece)
+        demo = self._demo[part]
         views, rendered = self._views(part)
-        views |= {name: np.stack(self._frames[name][part]) for name in self._robot.readings}
-        led = self._led
-        if (
-            led is not None
-        ):  # one action a frame; or some motions, all given with the first of their frames
-            led = (
-                led[part]
-                if self._robot.action.frames is not None
-                else led[: len(led) if not self._at else 0]
-            )
-        some = (
-            {}
-            if all(len(places) == len(self._demo[part]) for places in rendered.values())
-            else {"rendered": rendered}
-        )
-        self.episode.observe(views, self._frames["state"][part], self._demo[part], led, **some)
-        if self.watched is not None and not self._demo[part][-1:].any():
-            camera, demo = self._robot.memory_camera, self._demo[part]
+        for name in self._robot.readings:
+            views[name] = np.stack(self._frames[name][part])
+
+        # One action a frame; or some motions, all given with the first of their frames.
+        actions = self._leading
+        if actions is not None and self._robot.action.frames is not None:
+            actions = actions[part]
+        elif actions is not None and self._at > 0:
+            actions = actions[:0]
+
+        states = self._frames["state"][part]
+        if all(len(places) == len(demo) for places in rendered.values()):
+            self.episode.observe(views, states, demo, actions)
+        else:
+            self.episode.observe(views, states, demo, actions, rendered=rendered)
+
+        # A subgoal predictor has seen the video when the episode began.
+        if self.watched is not None and not demo[-1:].any():
+            camera = self._robot.memory_camera
             displayed = views[camera][~demo[rendered[camera]]]
-            if passed := int((~demo).sum()) - len(displayed):
+            passed = int((~demo).sum()) - len(displayed)
+            if passed:
                 self.watched.skip(passed)
             if len(displayed):
-                self.watched.observe(displayed, self._info)
+                self.watched.observe(displayed, self.report.info)
         self._at = part.stop
         self.add_policy_seconds(time.perf_counter() - begun)
 
@@ -191,12 +189,11 @@ class RunningEpisode:
         views, rendered = {}, {}
         for name in self._robot.camera_names:
             images = self._frames[name][part]
-            rendered[name] = np.array(
-                [i for i, image in enumerate(images) if image is not None], np.int64
-            )
-            views[name] = (
-                np.stack([images[i] for i in rendered[name]]) if len(rendered[name]) else _NONE
-            )
+            places = [i for i, image in enumerate(images) if image is not None]
+            rendered[name] = np.array(places, np.int64)
+            views[name] = _NONE
+            if places:
+                views[name] = np.stack([images[i] for i in places])
         return views, rendered
 
     def add_policy_seconds(self, seconds: float) -> None:
@@ -234,43 +231,44 @@ class RunningEpisode:
         self, frames: Observation, length: int, numbers: np.ndarray | None = None
     ) -> Observation:
         """Those of the environment's next frames that the policy observes; by default all."""
-        every = np.arange(length)
-        numbers = every if numbers is None else numbers
+        everything = np.arange(length)
+        if numbers is None:
+            numbers = everything
         self._visible = np.concatenate([self._visible, self._simulated + numbers])
         self._simulated += length
-        if np.array_equal(numbers, every):
+        if np.array_equal(numbers, everything):
             return frames
-        lists = {
-            name: [images[i] for i in numbers] for name, images in frames.items() if name != "state"
-        }
-        return {**lists, "state": frames["state"][numbers]}
+        observed: Observation = {}
+        for name, values in frames.items():
+            if name == "state":
+                observed[name] = values[numbers]
+            else:
+                observed[name] = [values[i] for i in numbers]
+        return observed
 
-    def _holding_actions(self, n_frames: int, action: np.ndarray | None) -> np.ndarray | None:
+    def _holding_actions(self, n_frames: int) -> np.ndarray | None:
         """The actions that led to frames at which the robot held its pose; None before the first
         action.
         """
         if self._robot.action.frames is None:
             return self._sent[:0]
-        return (
-            None if action is None else np.repeat(np.asarray(action, np.float32)[None], n_frames, 0)
-        )
+        if self.report.held is None:
+            return None
+        return np.repeat(np.asarray(self.report.held, np.float32)[None], n_frames, 0)
 
-    def _count(self, info: dict[str, Any]) -> int:
-        count = int(info.get("executed", 0))
-        self.steps += int(info.get("steps", count))
-        self._actions.update(np.ascontiguousarray(self._sent[:count], np.float32).tobytes())
-        return count
+    def _count(self) -> None:
+        executed = self._sent[: self.report.executed]
+        self.steps += self.report.steps
+        self._actions.update(np.ascontiguousarray(executed, np.float32).tobytes())
 
-    def _expect(
-        self, frames: Observation, demo: np.ndarray, led: np.ndarray | None, info: dict[str, Any]
-    ) -> None:
+    def _expect(self, frames: Observation, demo: np.ndarray, leading: np.ndarray | None) -> None:
+        """Have these frames wait to be read; `leading` are the actions that led to them."""
         if len(frames["state"]) != len(demo):
             raise UserError(
                 f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need"
                 " one frame an action."
             )
-        self._frames, self._demo, self._led, self._info, self._at = frames, demo, led, info, 0
-        began = np.searchsorted(
-            self._visible, info.get("began", ())
-        )  # as numbers of observed frames
+        self._frames, self._demo, self._leading = frames, demo, leading
+        self._at = 0
+        began = np.searchsorted(self._visible, self.report.began)  # as numbers of observed frames
         self.episode.begun(began.tolist(), self.video_frames)

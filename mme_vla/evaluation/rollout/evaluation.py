@@ -93,7 +93,7 @@ VIDEOS = "videos"
 
 
 class Evaluation(NamedTuple):
-    """What came of a run: the records of its episodes, old and new, and what the policy did this
+    """The outcome of a run: the records of its episodes, old and new, and what the policy did this
     time.
 
     Of several processes that share a run each has the records that it wrote. matched: those of the
@@ -109,8 +109,9 @@ class Evaluation(NamedTuple):
         """Share of successes, 0 to 1; an episode that ended in an error is none. NaN without
         episodes.
         """
-        won = [record.outcome == "success" for record in self.records]
-        return sum(won) / len(won) if won else float("nan")
+        if not self.records:
+            return float("nan")
+        return sum(record.success for record in self.records) / len(self.records)
 
 
 def evaluate_events(
@@ -129,23 +130,19 @@ def evaluate_events(
 
     events: arms, such as `pause:100@subtask:2`.
     """
-    for placed in (placed for event in events for placed in read_events(event)):
-        placed.event.check(policy)
-    arms = [replace(settings, event=event) for event in events]
+    for event in events:
+        for placed in read_events(event):
+            placed.event.check(policy)
     matched = evaluate(policy, jobs, output, facts, settings, **how)
+    if not events:
+        return matched
+    how["times_from"] = how.get("times_from") or output
     records: list[EpisodeRecord] = []
-    for arm in arms:
-        named, folder = replace(facts, event=arm.event), output / folder_of(str(arm.event))
-        run = evaluate(
-            policy,
-            jobs,
-            folder,
-            named,
-            arm,
-            **{**how, "times_from": how.get("times_from") or output},
-        )
+    for event in events:
+        folder, named = output / folder_of(event), replace(facts, event=event)
+        run = evaluate(policy, jobs, folder, named, replace(settings, event=event), **how)
         records += run.records
-    return Evaluation(records, run.workload, matched.records) if arms else matched
+    return Evaluation(records, run.workload, matched.records)
 
 
 def evaluate(
@@ -188,7 +185,8 @@ def evaluate(
     with RecordLog(output / shard.file) as log:
         remove_drafts(output / VIDEOS)  # videos of workers that were killed
         done = _done(output, jobs, facts)
-        missing = [job for job in jobs if (job.task, job.episode) not in finished(done)]
+        finished_keys = finished(done)
+        missing = [job for job in jobs if (job.task, job.episode) not in finished_keys]
         durations = Durations(earlier_records(output, times_from))
         missing = durations.longest_first(missing)
         completed = [record for record in done if record.outcome != "error"]
@@ -201,13 +199,15 @@ def evaluate(
             workers = settings.worker_count(-(-len(missing) // shard.count))
             if forecast := durations.forecast(missing, workers, shard.count):
                 progress.say(str(forecast))
-            waiting = Waiting(missing, Claims(output, shard.file) if shard.count > 1 else None)
-            envs = _environments(policy, output, settings, base, workers) if missing else None
             workload = Workload()
-            if envs is not None:
+            if missing:
+                claims = Claims(output, shard.file) if shard.count > 1 else None
                 folder = output / SUBGOALS if settings.subgoal_log else None
                 renders = base is make_env and settings.env == ROBOMME and settings.render
-                with envs, receipt(output / shard.file, policy, run, source, renders):
+                with (
+                    _environments(policy, output, settings, base, workers) as envs,
+                    receipt(output / shard.file, policy, run, source, renders),
+                ):
                     rollout = Rollout(
                         policy,
                         envs,
@@ -219,7 +219,7 @@ def evaluate(
                         progress,
                         workload,
                     )
-                    rollout.run(waiting)
+                    rollout.run(Waiting(missing, claims))
     return Evaluation(_done(output, jobs, facts, shard), workload)
 
 
@@ -231,18 +231,22 @@ def _environments(
     policy: Policy, output: Path, settings: RolloutSettings, base: Callable[..., Any], workers: int
 ) -> VecEnv:
     robot = policy.embodiment
-    options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps, "robot": robot}
     limit = policy.max_actions if isinstance(policy, LimitsActions) else None
-    options["max_actions"] = settings.max_actions or limit
+    options: dict[str, Any] = {
+        "base": base,
+        "max_steps": settings.max_steps,
+        "robot": robot,
+        "max_actions": settings.max_actions or limit,
+    }
     if base is make_env:
-        options |= {"only_possible": True} if settings.only_possible else {}
-        options |= {"sessions": _n_distractors(policy)}
-        options |= {
-            "env": settings.env,
-            "render": settings.render,
-            "action_space": robot.action.space,
-        }
-        options |= {f"include_{name}": True for name in robot.readings}
+        options["env"] = settings.env
+        options["render"] = settings.render
+        options["action_space"] = robot.action.space
+        options["sessions"] = _n_distractors(policy)
+        if settings.only_possible:
+            options["only_possible"] = True
+        for name in robot.readings:
+            options[f"include_{name}"] = True
     if settings.video != "none":
         options["videos"] = (str(output / VIDEOS), settings.video)
     return VecEnv([], workers, make_rollout_env, options, settings.timeout_s)
@@ -260,32 +264,40 @@ def run_settings(
     How many workers or shards there are, and on which machine, does not belong to it; nor does the
     batch size, though batches may change the last bits of an action.
     """
-    names = ("seed", "split", "env", "max_steps", "render")
-    dtype = str(next(policy.parameters()).dtype).removeprefix("torch.")
-    return {
+    sample_steps = policy.sample_steps if isinstance(policy, SamplesInSteps) else 1
+    decisive = {
         "model": facts.model,
         "checkpoint": facts.checkpoint,
         "source": _end_of(source),
         "policy": fingerprint(dict(policy.config)),
-        "dtype": dtype,
+        "dtype": str(next(policy.parameters()).dtype).removeprefix("torch."),
         "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
         "execute": settings.execute or policy.embodiment.action.execute,
-        "flow_steps": settings.flow_steps
-        or (policy.sample_steps if isinstance(policy, SamplesInSteps) else 1),
-        **{name: getattr(settings, name) for name in names},
-        **{
-            n: value
-            for n in ("event", "max_actions", "only_possible")
-            if (value := getattr(settings, n))
-        },
+        "flow_steps": settings.flow_steps or sample_steps,
+        "seed": settings.seed,
+        "split": settings.split,
+        "env": settings.env,
+        "max_steps": settings.max_steps,
+        "render": settings.render,
     }
+    # Left out where they are not set, as in runs from before there were these options.
+    optional = {
+        "event": settings.event,
+        "max_actions": settings.max_actions,
+        "only_possible": settings.only_possible,
+    }
+    return decisive | {name: value for name, value in optional.items() if value}
 
 
 def _predictor_facts(name: str | None, subgoals: SubgoalPredictor) -> dict[str, Any]:
-    mode = {"mode": "background"} if isinstance(subgoals, BackgroundPredictor) else {}
     decisive = {key: value for key, value in subgoals.settings.items() if key not in INDIFFERENT}
-    decisive |= {key: _end_of(decisive[key]) for key in ("model", "adapter") if key in decisive}
-    return {**decisive, "name": name, "kind": subgoals.kind, "interval": subgoals.interval, **mode}
+    for key in ("model", "adapter"):
+        if key in decisive:
+            decisive[key] = _end_of(decisive[key])
+    decisive |= {"name": name, "kind": subgoals.kind, "interval": subgoals.interval}
+    if isinstance(subgoals, BackgroundPredictor):
+        decisive["mode"] = "background"
+    return decisive
 
 
 def _end_of(place: str | None) -> str | None:
@@ -323,11 +335,9 @@ def predictor_of(policy: Policy, subgoal: str | SubgoalPredictor | None) -> Subg
     """A predictor by its name, of the kind of subgoals that the policy reads; one that is given
     stays as it is.
     """
-    return (
-        build_predictor({"name": subgoal, **kind_section(policy)})
-        if isinstance(subgoal, str)
-        else subgoal
-    )
+    if isinstance(subgoal, str):
+        return build_predictor({"name": subgoal, **kind_section(policy)})
+    return subgoal
 
 
 def checkpoint_label(source: str | None) -> int | str:
@@ -376,18 +386,20 @@ def default_output(facts: RunFacts) -> Path:
     `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`.
     """
     model = safe_name(facts.model, "the policy's name")  # which a checkpoint may have brought
-    name = model if facts.memory_budget is None else f"{model}-{facts.memory_budget}"
-    run = f"seed{facts.model_seed}" + (f"-{facts.subgoal}" if facts.subgoal else "")
-    run += "" if facts.split == "test" else f"-{re.sub('[:=]', '-', facts.split)}"
-    return Path("outputs", "evaluation", name, str(facts.checkpoint), run)
+    if facts.memory_budget is not None:
+        model += f"-{facts.memory_budget}"
+    run = f"seed{facts.model_seed}"
+    if facts.subgoal:
+        run += f"-{facts.subgoal}"
+    if facts.split != "test":
+        run += f"-{re.sub('[:=]', '-', facts.split)}"
+    return Path("outputs", "evaluation", model, str(facts.checkpoint), run)
 
 
 def _done(
     output: Path, jobs: Sequence[Job], facts: RunFacts, shard: Shard | None = None
 ) -> list[EpisodeRecord]:
-    """What the folder has of these episodes, whichever process wrote it, or this one; folders below
-    hold other runs.
-    """
+    """The folder's records of these episodes; with a shard, only those of its own file."""
     checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
     run = RunKey(
         facts.model,
@@ -401,17 +413,16 @@ def _done(
         facts.event,
     )
     keys = {(job.task, job.episode) for job in jobs}
-    files = (
-        sorted(output.glob("episodes*.jsonl"))
-        if shard is None or shard.count == 1
-        else [output / shard.file]
-    )
-    records = [record for path in files for record in read_records(path)]
-    # run.json has seen to it that this is the same policy: records from before there were digests
-    # are of it too.
-    records = [
-        replace(r, composition=facts.composition) if r.composition is None else r for r in records
-    ]
-    return [
-        record for record in merge(records, "first") if record.run == run and record.key in keys
-    ]
+    files = sorted(output.glob("episodes*.jsonl"))
+    if shard is not None and shard.count > 1:
+        files = [output / shard.file]
+    records = []
+    for path in files:
+        for record in read_records(path):
+            # run.json has seen to it that this is the same policy: records from before there were
+            # digests are of it too.
+            if record.composition is None:
+                record = replace(record, composition=facts.composition)
+            records.append(record)
+    merged = merge(records, "first")
+    return [record for record in merged if record.run == run and record.key in keys]

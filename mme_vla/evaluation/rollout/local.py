@@ -58,7 +58,7 @@ class LocalEnvs:
         except UserError:
             raise
         except Exception as error:
-            reply = Reply.of_failure(worker, self._job, first, type(error).__name__, str(error))
+            reply = Reply.of_failure(worker, self._job, first, error)
         self._add(reply)
 
     def _add(self, reply: Reply) -> None:

@@ -8,24 +8,24 @@ No episode waits for a slow one, and a long conditioning video is read in pieces
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from mme_vla.envs.base import environment
-from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.metadata import DEFAULT_STEPS
+from mme_vla.envs.vector.messages import Command
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.errors import UserError, require
-from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.curves import EXTRA as PROCESS
+from mme_vla.errors import SceneError, UserError
+from mme_vla.evaluation.records import EpisodeRecord, RolloutDetails
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.render_plan import RenderPlan
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.rollout.subgoals import EXTRA, SubgoalTrace
+from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import PreparesChunks
@@ -83,7 +83,7 @@ class RunFacts:
     checkpoint: int | str
     model_seed: int
     split: str = "test"
-    max_steps: int = 1300
+    max_steps: int = DEFAULT_STEPS
     subgoal: str | None = None
     memory_budget: int | None = None
     composition: str | None = None
@@ -106,40 +106,80 @@ class Workload:
         return self.chunks / max(self.batches, 1)
 
 
-@dataclass
+@dataclass(frozen=True)
+class Ending:
+    """How an episode ended.
+
+    outcome: `success`, `fail`, `timeout` or `error`. error: what went wrong, where something says
+    so. again: whether the episode is tried once more.
+    """
+
+    outcome: str
+    error: str | None
+    again: bool
+
+
 class Rollout:
     """Runs episodes and records each when it ends.
 
-    Args:
-        policy: in eval mode, on its device.
-        envs: environments that take chunks (`make_rollout_env`).
-        facts: what the records say of the policy.
-        record: called with every record, as soon as there is one.
-        subgoals: predicts the subgoal; None leaves it out of the prompt.
-        subgoal_folder: where every subgoal is written down with its image; None keeps the scores
-            alone.
+    A subclass may override three methods: `on_reply`, `choose` and `on_end`.
     """
 
-    policy: Policy
-    envs: Environments
-    facts: RunFacts
-    settings: RolloutSettings
-    record: Callable[[EpisodeRecord], None]
-    subgoals: SubgoalPredictor | None = None
-    subgoal_folder: Path | None = None
-    progress: RolloutProgress = field(default_factory=lambda: RolloutProgress(0, visible=False))
-    workload: Workload = field(default_factory=Workload)
-    _waiting: Waiting = field(default_factory=Waiting)
-    _running: dict[int, RunningEpisode] = field(default_factory=dict)
-    _tries: Counter[Job] = field(default_factory=Counter)
-    _stillborn: int = 0
+    def __init__(
+        self,
+        policy: Policy,
+        envs: Environments,
+        facts: RunFacts,
+        settings: RolloutSettings,
+        record: Callable[[EpisodeRecord], None],
+        subgoals: SubgoalPredictor | None = None,
+        subgoal_folder: Path | None = None,
+        progress: RolloutProgress | None = None,
+        workload: Workload | None = None,
+    ) -> None:
+        """Prepare a rollout; `run` does it.
 
-    def __post_init__(self) -> None:
+        Args:
+            policy: in eval mode, on its device.
+            envs: environments that take chunks (`make_rollout_env`).
+            facts: what the records say of the policy.
+            record: called with every record, as soon as there is one.
+            subgoals: predicts the subgoal; None leaves it out of the prompt.
+            subgoal_folder: where every subgoal is written down with its image; None keeps the
+                scores alone.
+            progress: is told of every record. workload: counts what the policy does.
+        """
+        self.policy, self.envs, self.facts, self.settings = policy, envs, facts, settings
+        self.record = record
+        self.subgoals, self.subgoal_folder = subgoals, subgoal_folder
+        self.progress = progress or RolloutProgress(0, visible=False)
+        self.workload = workload or Workload()
+        self._waiting = Waiting()
+        self._running: dict[int, RunningEpisode] = {}  # by worker
+        self._tries: Counter[Job] = Counter()
+        self._stillborn = 0  # episodes in a row whose environments did not begin
         self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(
-            self.settings.max_batch
+            settings.max_batch
         )
-        self._events = read_events(self.settings.event)
-        self._render_plan = RenderPlan(self.policy, self.subgoals, self.settings)
+        self._events = read_events(settings.event)
+        self._render_plan = RenderPlan(policy, subgoals, settings)
+
+    # What a subclass may override -----------------------------------------------------------------
+
+    def on_reply(self, running: RunningEpisode, reply: Reply) -> None:
+        """See what came back from an episode's environment, before the episode takes it."""
+
+    def choose(self, batch: Sequence[RunningEpisode]) -> np.ndarray:
+        """The chunks [n, h, w] that these episodes execute the first actions of."""
+        return self.policy.act([running.episode for running in batch], self.settings.flow_steps)
+
+    def on_end(self, running: RunningEpisode, ending: Ending) -> None:
+        """Keep what is wanted of an episode that is over: its record."""
+        record = self._record_of(running, ending)
+        self.record(record)
+        self.progress.episode(record, ending.again)
+
+    # The rollout ----------------------------------------------------------------------------------
 
     def run(self, jobs: Sequence[Job] | Waiting) -> None:
         """Run these episodes."""
@@ -185,50 +225,54 @@ class Rollout:
         """Deal with what came back from a worker."""
         running = self._running[reply.worker]
         self._scheduler.later.pop(running, None)
-        running.add_env_seconds(reply.info)
-        running.scene = reply.info.get("scene", running.scene)
-        if reply.info.get("exception_type") == "UserError" and reply.crashed:
-            raise UserError(str(reply.info.get("error_message")))
+        self.on_reply(running, reply)
+        if reply.error is None:
+            running.take_report(reply.info)
         if reply.done:
-            if not reply.crashed:
-                running.end(reply.info)
-            # A scene in which an object finds no place finds none again, and says nothing of the
-            # simulator.
-            unbuildable = reply.info.get("exception_type") == "SceneError"
-            self._stillborn += not (running.chunks or unbuildable)
-            require(
-                self._stillborn < GIVE_UP_AFTER,
-                f"{self._stillborn} environments in a row could not be started, so the run stops;"
-                f" the last one: {reply.info.get('error_message')}",
-            )
-            message = reply.info.get("error_message")
-            self._finish(running, str(reply.info.get("status")), message, retry=not unbuildable)
+            self._take_last(running, reply)
             return
         if reply.reward is None:
             self._stillborn = 0
-            if self._draws_again(running, reply):
+            if self._restarts(running, reply):
                 return
-            running.begin(reply.observation, reply.info)
+            running.begin(reply.observation)
         else:
-            running.resume(reply.observation, reply.info)
+            running.resume(reply.observation)
         self._scheduler.reading.append(running)
 
-    def _draws_again(self, running: RunningEpisode, reply: Reply) -> bool:
-        """Let the episode begin once more if images of its video are needed that it
-        did not draw.
-        """
-        missing, length = (
-            self._render_plan.missing(reply.observation),
-            len(reply.observation["state"]) - 1,
-        )
-        require(
-            running.redrawn in (None, length),
-            f"{reply.job}: its conditioning video had {running.redrawn} frames, and {length} when"
-            " it was simulated again: the environment does not repeat itself. Set draw=all.",
-        )
+    def _take_last(self, running: RunningEpisode, reply: Reply) -> None:
+        """Finish an episode that is over, or that an error ended."""
+        if reply.error is None:
+            running.end()
+            status, message = str(running.report.status), running.report.error
+        else:
+            status, message = "error", f"{reply.job}: {reply.error}"
+        if isinstance(reply.error, UserError):
+            raise UserError(message)
+        # A scene in which an object finds no place finds none again, and says nothing of the
+        # simulator.
+        is_unbuildable = isinstance(reply.error, SceneError)
+        if not running.chunks and not is_unbuildable:
+            self._stillborn += 1
+        if self._stillborn >= GIVE_UP_AFTER:
+            raise UserError(
+                f"{self._stillborn} environments in a row could not be started, so the run stops;"
+                f" the last one: {message}"
+            )
+        self._finish(running, status, message, retry=not is_unbuildable)
+
+    def _restarts(self, running: RunningEpisode, reply: Reply) -> bool:
+        """Restart the episode if required video frames were not rendered."""
+        missing = self._render_plan.missing(reply.observation)
+        first, length = running.first_video_frames, len(reply.observation["state"]) - 1
+        if first not in (None, length):
+            raise UserError(
+                f"{reply.job}: its conditioning video had {first} frames, and {length} when"
+                " it was simulated again: the environment does not repeat itself. Set draw=all."
+            )
         if missing is None:
             return False
-        running.redrawn = length
+        running.first_video_frames = length
         self.envs.start(running.worker, running.job, draw=missing)
         return True
 
@@ -255,9 +299,8 @@ class Rollout:
             self._scheduler.acting.append(running)
             return
         draw = self._render_plan.of_chunk(running, event.observed, event.hold - event.observed)
-        self.envs.send(
-            running.worker, {"hold": event.hold, "subgoal": running.episode.subgoal, "draw": draw}
-        )
+        command = Command(hold=event.hold, subgoal=running.episode.subgoal, draw=draw)
+        self.envs.send(running.worker, command)
 
     def _act(self, batch: list[RunningEpisode]) -> None:
         begun = time.perf_counter()
@@ -266,7 +309,7 @@ class Rollout:
             latency = time.perf_counter() - begun
             for running, subgoal in zip(batch, subgoals, strict=True):
                 running.set_subgoal(subgoal, latency)
-        chunks = self._choose(batch)
+        chunks = self.choose(batch)
         self.workload.batches += 1
         self.workload.chunks += len(batch)
         share = (time.perf_counter() - begun) / len(batch)
@@ -280,32 +323,45 @@ class Rollout:
                 continue
             running.set_actions(actions)
             draw = self._render_plan.of_chunk(running, len(actions))
-            self.envs.send(
-                running.worker,
-                {"actions": actions, "subgoal": running.episode.subgoal, "draw": draw},
-            )
+            command = Command(actions, subgoal=running.episode.subgoal, draw=draw)
+            self.envs.send(running.worker, command)
             self._scheduler.later[running] = None
-
-    def _choose(self, batch: list[RunningEpisode]) -> np.ndarray:
-        """The chunks [n, h, w] that these episodes execute the first actions of."""
-        return self.policy.act([running.episode for running in batch], self.settings.flow_steps)
-
-    def _spec(self, job: Job) -> tuple[EpisodeSpec, str | None]:
-        """The episode of a job, and the suite of its task."""
-        source = environment(self.settings.env)
-        return source.episode(job.task, job.split, job.episode), source.suite_of(job.task)
 
     def _finish(
         self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True
     ) -> None:
-        """Record an episode and let its worker begin another."""
-        job = running.job
-        outcome = status if status in ("success", "fail", "timeout") else "error"
-        if outcome == "error":
+        """End an episode and let its worker begin another."""
+        outcome = status
+        if status not in ("success", "fail", "timeout"):
+            outcome = "error"
             error = error or f"the environment ended the episode with the status {status!r}"
-        spec, suite = self._spec(job)
-        robot = self.policy.embodiment
-        record = EpisodeRecord(
+        again = outcome == "error" and retry and self._tries[running.job] <= self.settings.retries
+        self.on_end(running, Ending(outcome, error, again))
+        if again:
+            self._waiting.put_back(running.job)
+        del self._running[running.worker]
+        self._start(running.worker)
+
+    def _record_of(self, running: RunningEpisode, ending: Ending) -> EpisodeRecord:
+        job, robot = running.job, self.policy.embodiment
+        source = environment(self.settings.env)
+        spec = source.episode(job.task, job.split, job.episode)
+        failed = ending.outcome == "error"
+        details = RolloutDetails(
+            env=self.settings.env,
+            goal=running.episode.goal,
+            chunks=running.chunks,
+            video_frames=running.video_frames,
+            actions_sha256=running.actions_sha256,
+            suite=source.suite_of(job.task),
+            refused=None if failed else ending.error,
+            video=running.video,
+            process=running.process,
+            events=running.events.log,
+            notes=running.episode.written,
+            subgoals=None if running.trace is None else running.trace.score.to_dict(),
+        )
+        return EpisodeRecord(
             **vars(self.facts),
             action_space=robot.action.answers or robot.name,
             task=job.task,
@@ -313,29 +369,9 @@ class Rollout:
             seed=spec.seed,
             difficulty=spec.difficulty,
             scene=running.scene,
-            outcome=outcome,
+            outcome=ending.outcome,
             steps=running.steps,
             seconds=running.seconds,
-            error=error if outcome == "error" else None,
-            extra={
-                "env": self.settings.env,
-                "goal": running.episode.goal,
-                "chunks": running.chunks,
-                "video_frames": running.video_frames,
-                "actions_sha256": running.actions_sha256,
-                **({"suite": suite} if suite else {}),
-                **({"refused": error} if error and outcome != "error" else {}),
-                **({"video": running.video} if running.video else {}),
-                **({PROCESS: running.process} if running.process else {}),
-                **({"events": running.events.log} if running.events.log else {}),
-                **({"notes": running.episode.written} if running.episode.written else {}),
-                **({EXTRA: running.trace.score.to_dict()} if running.trace else {}),
-            },
+            error=ending.error if failed else None,
+            extra=details.to_dict(),
         )
-        again = outcome == "error" and retry and self._tries[job] <= self.settings.retries
-        self.record(record)
-        self.progress.episode(record, again)
-        if again:
-            self._waiting.put_back(job)
-        del self._running[running.worker]
-        self._start(running.worker)

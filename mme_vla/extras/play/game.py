@@ -15,7 +15,7 @@ import numpy as np
 
 from mme_vla.embodiment.action_space import Option
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.scene_hash import NO_VALUES
 from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
@@ -210,7 +210,7 @@ class ChoiceSession:
         model: str,
         checkpoint: int | str = 0,
         model_seed: int = 0,
-        max_steps: int = 1300,
+        max_steps: int = DEFAULT_STEPS,
         **extra: Any,
     ) -> EpisodeRecord:
         """The episode as evaluation keeps it, its decisions in `extra`."""

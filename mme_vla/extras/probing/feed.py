@@ -128,54 +128,53 @@ class FedEpisode(Episode):
     ) -> None:
         """Take frames as `Episode.observe` does."""
         self.inner.goal, self.inner.options = self.goal, self.options
-        states, numbers = np.asarray(states), self.n_observed_frames + np.arange(len(states))
-        demo = np.broadcast_to(np.asarray(is_demo, bool), (len(states),))
+        states, length = np.asarray(states), len(states)
+        numbers = self.n_observed_frames + np.arange(length)
+        demo = np.broadcast_to(np.asarray(is_demo, bool), (length,))
         video = int(demo.sum())
         if not self.n_observed_frames:
             self._observe_sessions()
-        if self.exec_start is None and video < len(states):
+        if self.exec_start is None and video < length:
             self.exec_start = self.n_observed_frames + video
-        self.n_observed_frames += len(states)
-        repeats = self._host.feed.repeats(
-            numbers, self.n_observed_frames if self.exec_start is None else self.exec_start
-        )
-        if self._host.feed.drops and len(repeats) and video < len(states):
-            repeats[-1] = max(repeats[-1], 1)  # the frame at which the policy decides
+        self.n_observed_frames += length
+
+        # How often each frame is observed; the one at which the policy decides always is.
+        exec_start = self.n_observed_frames if self.exec_start is None else self.exec_start
+        repeats = self._host.feed.repeats(numbers, exec_start)
+        if self._host.feed.drops and video < length:
+            repeats[-1] = max(repeats[-1], 1)
         self._counts = np.concatenate([self._counts, repeats])
-        order = np.repeat(np.arange(len(states)), repeats)
+        order = np.repeat(np.arange(length), repeats)
+
+        # The actions that led to those of the execution.
         executed = order[order >= video]
-        if actions is not None:
-            per_frame = self._robot.action.frames is not None
-            actions = (
-                np.asarray(actions)[executed - video]
-                if per_frame
-                else actions
-                if len(executed)
-                else None
-            )
+        if actions is not None and self._robot.action.frames is not None:
+            actions = np.asarray(actions)[executed - video]
+        elif not len(executed):
+            actions = None
+
         views, places = {}, {}
         for name, view in frames.items():
-            at = (
-                np.arange(len(states))
-                if rendered is None or name not in rendered
-                else np.asarray(rendered[name])
-            )
-            places[name] = np.flatnonzero(np.isin(order, at))
-            views[name] = (
-                view if (repeats == 1).all() else view[np.searchsorted(at, order[places[name]])]
-            )
-        visible = (
-            {} if rendered is None else {"rendered": {name: places[name] for name in rendered}}
-        )
-        self.inner.observe(views, states[order], demo[order], actions, **visible)
+            shown = np.arange(length)  # frames that there are images of
+            if rendered is not None and name in rendered:
+                shown = np.asarray(rendered[name])
+            places[name] = np.flatnonzero(np.isin(order, shown))
+            views[name] = view
+            if (repeats != 1).any():
+                views[name] = view[np.searchsorted(shown, order[places[name]])]
+        if rendered is None:
+            self.inner.observe(views, states[order], demo[order], actions)
+        else:
+            visible = {name: places[name] for name in rendered}
+            self.inner.observe(views, states[order], demo[order], actions, rendered=visible)
         if len(self._starts):
             self.boundaries = self.numbers(self._starts)
 
     def _observe_sessions(self) -> None:
         stored, before = stored_frames(self._host.inner, self._host.before), 0
         for recording in self._host.sessions:
-            here = None if stored is None else stored[stored >= before] - before
-            recording.show(self.inner, 0, recording.length, here, video=True)
+            of_recording = None if stored is None else stored[stored >= before] - before
+            recording.show(self.inner, 0, recording.length, of_recording, video=True)
             before += recording.length
 
     def restart_clock(self) -> None:
@@ -192,9 +191,8 @@ class FedEpisode(Episode):
         """
         frames = frames[frames < len(self._counts)]
         last = self._host.before + np.cumsum(self._counts)[frames] - 1
-        return [
-            int(number) for number, count in zip(last, self._counts[frames], strict=True) if count
-        ]
+        numbers: list[int] = last[self._counts[frames] > 0].tolist()
+        return numbers
 
     @property
     def state(self) -> Tensor:
@@ -299,12 +297,9 @@ class FedPolicy(Policy):
         )
 
     def write_notes(self, batch: Any, episodes: Sequence[Episode]) -> Sequence[Mapping[str, str]]:
-        inner = [inner_episode(episode) for episode in episodes]
-        return (
-            self.inner.write_notes(batch, inner)
-            if isinstance(self.inner, WritesNotes)
-            else [{} for _ in inner]
-        )
+        if not isinstance(self.inner, WritesNotes):
+            return [{} for _ in episodes]
+        return self.inner.write_notes(batch, [inner_episode(episode) for episode in episodes])
 
 
 def inner_episode(episode: Episode) -> Episode:

@@ -2,8 +2,9 @@
 came of it.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,13 @@ from mme_vla.backbone.choice import ChoiceHead
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.config.sections import read_section
 from mme_vla.envs.make import make_env
-from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import UserError, check_known, require
-from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.local import LocalEnvs
-from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
+from mme_vla.evaluation.rollout.runner import Ending, Rollout, RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.trajectories.log_prob import SamplePath, log_prob, sample_path
 from mme_vla.memory.base import stack_history
@@ -141,18 +141,7 @@ def rollouts(
         if workers
         else LocalEnvs(options)
     )
-    facts = RunFacts(
-        "rollouts", "rollouts", run_settings.seed, run_settings.split, run_settings.max_steps
-    )
-    collector = _Collector(
-        policy,
-        envs,
-        facts,
-        run_settings,
-        lambda record: None,
-        keep=tuple(keep),
-        oracle_share=oracle_share,
-    )
+    collector = _Collector(policy, envs, run_settings, tuple(keep), oracle_share)
     with envs:
         for _ in collector.rounds(list(jobs)):
             while collector.finished:
@@ -265,82 +254,90 @@ def _env_options(
 class _Decision:
     """One decision of a running episode."""
 
-    row: Batch | None
     state: Tensor
     chunk: Tensor
     actions: np.ndarray
-    log_prob: Tensor | None
-    path: Tensor | None
     oracle: np.ndarray | None
+    row: Batch | None = None
+    log_prob: Tensor | None = None
+    path: Tensor | None = None
     reward: float = 0.0
 
 
-@dataclass
 class _Collector(Rollout):
-    """A rollout that keeps every decision.
+    """A rollout that keeps every decision, and makes a trajectory of each episode.
 
     keep, oracle_share: as for `rollouts`. finished: trajectories that were not yielded yet.
     """
 
-    keep: tuple[str, ...] = ()
-    oracle_share: float = 0.0
-    finished: list[Trajectory] = field(default_factory=list)
-    _decisions: dict[RunningEpisode, list[_Decision]] = field(default_factory=dict)
-    _oracle: dict[RunningEpisode, np.ndarray | None] = field(default_factory=dict)
+    policy: MMEPolicy
 
-    def _take(self, reply: Reply) -> None:
-        running = self._running[reply.worker]
-        self._oracle[running] = reply.info.get("oracle")
-        decisions = self._decisions.setdefault(running, [])
-        if reply.reward is not None and decisions:
-            decisions[-1].reward += float(reply.reward)
-            if running.events.holding is None:
-                decisions[-1].actions = decisions[-1].actions[: int(reply.info.get("executed", 0))]
-        super()._take(reply)
+    def __init__(
+        self,
+        policy: MMEPolicy,
+        envs: Any,
+        settings: RolloutSettings,
+        keep: Sequence[str],
+        oracle_share: float,
+    ) -> None:
+        facts = RunFacts("rollouts", "rollouts", settings.seed, settings.split, settings.max_steps)
+        super().__init__(policy, envs, facts, settings, record=lambda record: None)
+        self.keep, self.oracle_share = keep, oracle_share
+        self.finished: list[Trajectory] = []
+        self._decisions: dict[RunningEpisode, list[_Decision]] = defaultdict(list)
+        self._oracle: dict[RunningEpisode, np.ndarray | None] = {}
+
+    def on_reply(self, running: RunningEpisode, reply: Reply) -> None:
+        """Note the reward and what was executed of the last decision, and the oracle's next one."""
+        report = Report() if reply.error else reply.info
+        self._oracle[running] = report.oracle
+        decisions = self._decisions[running]
+        if reply.reward is None or not decisions:
+            return
+        last = decisions[-1]
+        last.reward += float(reply.reward)
+        if running.events.holding is None:
+            last.actions = last.actions[: report.executed]
 
     @torch.no_grad()
-    def _choose(self, batch: list[RunningEpisode]) -> np.ndarray:
+    def choose(self, batch: Sequence[RunningEpisode]) -> np.ndarray:
+        """The chunks of the policy, or of the oracle where it acts; every decision is kept."""
         policy, episodes = self.policy, [running.episode for running in batch]
-        assert isinstance(policy, MMEPolicy)
-        rows: list[Batch] = []
-        path: SamplePath | None = None
+        seen: list[Batch] = []
+        paths: list[SamplePath] = []
 
         def predict(observation: Batch, noise: Mapping[str, Tensor]) -> Tensor:
-            nonlocal path
-            rows.append(_with_memory(policy, observation, batch))
+            seen.append(_with_memory(policy, observation, batch))
             if "increments" in noise and "log_probs" in self.keep:
                 deviation = policy.backbone.head.deviation  # type: ignore[union-attr]
-                path = sample_path(policy, rows[0], deviation, **noise)  # type: ignore[arg-type]
-                return path.chunk
+                paths.append(sample_path(policy, seen[0], deviation, **noise))  # type: ignore[arg-type]
+                return paths[0].chunk
             return policy.predict_chunk(observation, episodes, noise, self.settings.flow_steps)
 
         selection = choose_actions(policy, episodes, predict)
+        rows, path = seen[0], paths[0] if paths else None
         execute = self.settings.execute or policy.embodiment.action.execute
-        log_probs = None if path is None else path.log_prob
-        if "log_probs" in self.keep and path is None:
-            log_probs = log_prob(policy, rows[0], selection.chunk, execute=execute)
+        log_probs = None
+        if path is not None:
+            log_probs = path.log_prob
+        elif "log_probs" in self.keep:
+            log_probs = log_prob(policy, rows, selection.chunk, execute=execute)
+
         actions = selection.actions.copy()
         for i, running in enumerate(batch):
             oracle = self._oracle.get(running)
             if self.oracle_share and oracle is not None and self._oracle_acts(running):
                 actions[i] = oracle
                 running.episode.acted(actions[i])
-            row = (
-                rows[0].rows(slice(i, i + 1)).to("cpu")
-                if {"observations", "oracle"} & set(self.keep)
-                else None
-            )
-            log = None if log_probs is None else log_probs[i].cpu()
-            states = None if path is None else path.states[i].cpu()
             decision = _Decision(
-                row,
-                running.episode.state,
-                selection.chunk[i],
-                actions[i][:execute],
-                log,
-                states,
-                oracle,
+                running.episode.state, selection.chunk[i], actions[i][:execute], oracle
             )
+            if {"observations", "oracle"} & set(self.keep):
+                decision.row = rows.rows(slice(i, i + 1)).to("cpu")
+            if log_probs is not None:
+                decision.log_prob = log_probs[i].cpu()
+            if path is not None:
+                decision.path = path.states[i].cpu()
             self._decisions[running].append(decision)
         return actions
 
@@ -352,56 +349,47 @@ class _Collector(Rollout):
         rng = np.random.default_rng([self.settings.seed, job.episode, number, *job.task.encode()])
         return bool(rng.random() < self.oracle_share)
 
-    def _spec(self, job: Job) -> tuple[EpisodeSpec, str | None]:
-        return EpisodeSpec(
-            job.task, job.split, job.episode, 0, ""
-        ), None  # of any environment; no record is written
-
-    def _finish(
-        self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True
-    ) -> None:
-        records: list[EpisodeRecord] = []
+    def on_end(self, running: RunningEpisode, ending: Ending) -> None:
+        """Make a trajectory of the episode, unless it is tried again."""
         decisions = self._decisions.pop(running, [])
         self._oracle.pop(running, None)
-        self.record = records.append
-        tries = self._tries[running.job]
-        super()._finish(running, status, error, retry)
-        (record,) = records
-        tried_again = record.outcome == "error" and retry and tries <= self.settings.retries
-        if not tried_again:
-            self.finished.append(self._trajectory(running.job, record, decisions))
+        if not ending.again:
+            self.finished.append(self._trajectory(running, ending, decisions))
 
     def _trajectory(
-        self, job: Job, record: EpisodeRecord, decisions: list[_Decision]
+        self, running: RunningEpisode, ending: Ending, decisions: Sequence[_Decision]
     ) -> Trajectory:
-        keep = self.keep
-        rows = [d.row for d in decisions if d.row is not None]
-        executed = [
-            self._labelled(d.row, d.state, d.actions) for d in decisions if d.row is not None
-        ]
-        targets = [
-            (d.row, d.state, d.oracle[None])
-            for d in decisions
-            if d.row is not None and d.oracle is not None
-        ]
+        executed: list[Batch] = []
+        targets: list[Batch] = []
+        for decision in decisions:
+            if decision.row is None:
+                continue
+            executed.append(self._labelled(decision.row, decision.state, decision.actions))
+            if decision.oracle is not None:
+                by_oracle = decision.oracle[None]
+                targets.append(self._labelled(decision.row, decision.state, by_oracle))
+        chunks = [decision.chunk for decision in decisions]
         log_probs = [d.log_prob for d in decisions if d.log_prob is not None]
         paths = [d.path for d in decisions if d.path is not None]
+        observations, rewards, oracle = None, None, None
+        if "observations" in self.keep and executed:
+            observations = join(executed)
+        if "rewards" in self.keep:
+            rewards = torch.tensor([decision.reward for decision in decisions])
+        if "oracle" in self.keep and targets:
+            oracle = join(targets)
         return Trajectory(
-            job,
-            record.outcome,
-            record.steps,
-            torch.stack([d.chunk for d in decisions])
-            if decisions
-            else torch.zeros(0, *self._chunk_shape),
-            tuple(d.actions for d in decisions),
-            join(executed) if "observations" in keep and rows else None,
-            torch.tensor([d.reward for d in decisions]) if "rewards" in keep else None,
+            running.job,
+            ending.outcome,
+            running.steps,
+            torch.stack(chunks) if chunks else torch.zeros(0, *self._chunk_shape),
+            tuple(decision.actions for decision in decisions),
+            observations,
+            rewards,
             torch.stack(log_probs) if log_probs else None,
             torch.stack(paths) if paths else None,
-            join([self._labelled(*target) for target in targets])
-            if "oracle" in keep and targets
-            else None,
-            record.error,
+            oracle,
+            ending.error if ending.outcome == "error" else None,
         )
 
     @property

@@ -16,6 +16,7 @@ from mme_vla.config.composition import compose, resolved
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs import metadata
+from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.episode import RunningEpisode
@@ -169,24 +170,21 @@ def test_what_is_not_possible_is_listed_and_not_selected() -> None:
 
 
 def test_what_is_possible_is_queried_again_after_each_choice() -> None:
-    def info(possible: bool) -> dict[str, object]:
+    def report(possible: bool) -> Report:
         press = {"label": "a", "action": "press", "need_parameter": False}
         options = [
             {"label": "b", "action": "pick up", "need_parameter": False, "possible": possible},
             press,
         ]
-        return {
-            "task_goal": ["do it"],
-            "available_multi_choices": options,
-            "executed": 1,
-            "steps": 1,
-        }
+        return Report(goal="do it", options=options, executed=1, steps=1)
 
     frames = {"state": np.zeros((1, 8), np.float32), "front": [np.zeros((256, 256, 3), np.uint8)]}
     running = RunningEpisode(policy("pi05"), Job("StopCube", "test", 0), 0, None, 32, None)
-    running.begin(frames, info(False))
+    running.take_report(report(False))
+    running.begin(frames)
     assert not running.episode.options[0].possible
-    running.resume(frames, info(True))
+    running.take_report(report(True))
+    running.resume(frames)
     assert running.episode.options[0].possible
 
 

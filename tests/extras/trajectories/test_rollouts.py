@@ -15,6 +15,7 @@ from helpers import REPOSITORY
 from helpers.scripted_env import ScriptedEnv
 from mme_vla import MMEPolicy, UserError, build_policy, register
 from mme_vla.embodiment.robomme import ROBOMME_JOINT
+from mme_vla.envs.vector.messages import Command
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.rollout.environment import ChunkEnv
 from mme_vla.extras.trajectories.log_prob import SamplePath, log_prob, path_log_prob
@@ -174,7 +175,7 @@ class Rewarding(ScriptedEnv):
 def test_the_reward_of_a_chunk_is_the_sum_over_its_actions() -> None:
     env = ChunkEnv(lambda: Rewarding("PickXtimes", 0, 40, 1e9, 0.0, ""), robot=ROBOMME_JOINT)
     env.reset()
-    assert env.step({"actions": np.zeros((5, 8))})[1] == 5.0
+    assert env.step(Command(np.zeros((5, 8))))[1] == 5.0
 
 
 def test_a_reward_of_your_own_is_registered_by_name() -> None:

@@ -22,6 +22,7 @@ from mme_vla.envs.robomme.scene.articulated import BUTTON_BASE, Button
 from mme_vla.envs.robomme.scene.bounding_box import shadow_of_smallest_box
 from mme_vla.envs.robomme.scene.objects import Board, Disc, H
 from mme_vla.envs.robomme.scene.things import Thing
+from mme_vla.errors import SceneError
 
 
 class Draws:
@@ -75,10 +76,6 @@ TRIALS = 256
 CONTAINER_HALF = 0.0275
 """Half the width of a container as the placement counts it, metres."""
 BUTTON_CLEARANCE = 1.5 * BUTTON_BASE[0]
-
-
-class SceneError(RuntimeError):
-    """A scene that cannot be laid out from its seed: an object found no place."""
 
 
 @dataclass(frozen=True)
