@@ -76,6 +76,7 @@ _OF_TRAINING = (
     "raw.",
     "raw-",
     "optimizer",
+    "shards/",
     STATE,
 )  # Files of a checkpoint that no policy is loaded from
 _LOADED = (
