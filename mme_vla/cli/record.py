@@ -1,5 +1,6 @@
 """`mme-vla record`: demonstrate episodes of the benchmark and keep them as a dataset."""
 
+import glob
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -14,7 +15,7 @@ from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import ROBOMME, make_task, require_simulator
 from mme_vla.envs.robomme.recording.frames import FrameChoice
 from mme_vla.envs.robomme.recording.outputs import Job, RecordingPlan
-from mme_vla.envs.robomme.recording.own import record_own
+from mme_vla.envs.robomme.recording.own import DRAFT, episode_file, record_own
 from mme_vla.envs.robomme.recording.processes import carry_out, simulation_pool
 from mme_vla.envs.rows import task_options
 from mme_vla.errors import UserError, require
@@ -247,7 +248,14 @@ def run(cfg: "DictConfig") -> None:
         else:
             print(f"{places}: {len(jobs)} episodes, all there already.")
         recording_plan.tidy()
-        drop_plan(work)
+        drop_plan(
+            work,
+            *(
+                f"episodes/{job.name}.{ending}"
+                for job in jobs
+                for ending in ("h5", "json", "writing")
+            ),
+        )
     if cfg.coverage is not None:
         report_coverage(named_tasks(cfg), recording_plan, Path(cfg.coverage), cfg.workers)
 
@@ -265,7 +273,7 @@ def record_environment(cfg: "DictConfig") -> None:
     with FolderLock(work, "recording"):
         _claim(work, [{"env": cfg.env, "fps": cfg.fps}, *map(vars, specs)])
         frames, failures = record_own(source, specs, output, work, cfg.fps)
-        drop_plan(work)
+        drop_plan(work, DRAFT, *(glob.escape(episode_file(spec)) for spec in specs))
     print(
         f"{cfg.output}: {len(specs) - len(failures)} episodes, {frames} steps; {len(failures)} did"
         " not succeed."

@@ -237,9 +237,12 @@ def _train(
     if run.checkpoint is not None:
         check_content(run.checkpoint, data.content)
         # A resumed command may leave it out. Later checkpoints keep what the run began with.
-        cfg["init_from"] = config["init_from"] = read_state(run.checkpoint)["config"].get(
-            "init_from"
-        )
+        then = read_state(run.checkpoint)["config"]
+        cfg["init_from"] = config["init_from"] = then.get("init_from")
+        if "narrow_ranges" in config["data"]:
+            cfg["data"]["narrow_ranges"] = config["data"]["narrow_ranges"] = then["data"].get(
+                "narrow_ranges"
+            )
     config["data"]["content"] = data.content
     policy.config[TRAINING] = identify(config, data.content)
     check_disk(run.folder, policy, settings.keep, sharded)

@@ -103,6 +103,9 @@ def write_previews(file: Path, index: int, task: str, folder: Path) -> tuple[Pat
 
 
 _PARTS, _MERGED, _KEYFRAMES = "episodes", "merged", "keyframes.npz"
+_WRITING = "writing"
+_WORK = (f"{_PARTS}/[0-9][0-9][0-9][0-9][0-9][0-9]-*-*", _MERGED, _WRITING)
+"""What a conversion writes into its work folder."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +217,7 @@ def convert(
         return 0
     with FolderLock(partial, "conversion"):
         if _finished(output, plan):  # asked again: another process may have finished it meanwhile
-            drop_plan(partial)
+            drop_plan(partial, *_WORK)
             return 0
         return _convert(episodes, output, partial, plan, options)
 
@@ -226,7 +229,7 @@ def drop_work(output: Path) -> None:
     partial = _work_folder(output)
     if partial.exists():
         with FolderLock(partial, "conversion"):
-            drop_plan(partial)
+            drop_plan(partial, *_WORK)
 
 
 def _work_folder(output: Path) -> Path:
@@ -287,7 +290,7 @@ def _convert(
         " options). Repeat that one to finish it, choose another output, or remove that folder"
         " yourself.",
     )
-    for leftover in (partial / "writing", partial / _MERGED):
+    for leftover in (partial / _WRITING, partial / _MERGED):
         shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
     (partial / _PARTS).mkdir(exist_ok=True)
     names = [f"{i:06d}-{ref.task}-{ref.group}" for i, ref in enumerate(episodes)]
@@ -301,7 +304,7 @@ def _convert(
     with quiet_libraries():
         _merge(parts, partial / _MERGED, plan)
     (partial / _MERGED).rename(output)
-    drop_plan(partial)
+    drop_plan(partial, *_WORK)
     return len(missing)
 
 
@@ -331,7 +334,7 @@ def _finished(output: Path, plan: dict[str, Any]) -> bool:
 
 def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
     """Write one episode as a dataset of its own; `part` appears only when it is whole."""
-    draft = part.parent.parent / "writing"
+    draft = part.parent.parent / _WRITING
     shutil.rmtree(draft, ignore_errors=True)
     with open_episode(ref) as episode:
         _write_dataset(episode, draft, options)

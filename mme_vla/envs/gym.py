@@ -30,8 +30,10 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
 
     Observations are a dict of `state` [8] (joints in radians, first finger in metres) and, with
     `images`, `front` and `wrist` [256, 256, 3] uint8: those of the newest frame. The info dict
-    holds `goal`, `subgoal`, `status` and `success`, and on reset `video`: the front images [t, 256,
-    256, 3] of the conditioning video, t = 0 without one.
+    holds `goal`, `subgoal`, `status` and `success`, and on reset `video`: the front images [256,
+    256, 3] of the conditioning video, a tuple, empty without one. (Gymnasium's vector environments
+    stack arrays, and videos have different lengths: there `infos["video"]` is an object array of
+    tuples.)
 
     Args:
         task: its name.
@@ -112,8 +114,9 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
             number = int(self.np_random.integers(self._count))
         frames, info = self._open(number).reset()
         self._take(frames)
-        visible = frames.get("front_rgb_list", [])[:-1]
-        video = np.stack(visible) if visible else np.zeros((0, SIDE, SIDE, 3), np.uint8)
+        video = tuple(
+            np.asarray(image, np.uint8) for image in frames.get("front_rgb_list", [])[:-1]
+        )
         return self._copy(), {**self._info(info), "episode": number, "video": video}
 
     def step(

@@ -73,7 +73,7 @@ step limit.
 """
 _MARGIN = 2  # steps beyond its limit that the benchmark counts
 # Files of a checkpoint that no policy is loaded from, and endings of those that one may be
-_OF_TRAINING = ("raw.", "raw-", "optimizer", STATE, SUMS)
+_OF_TRAINING = ("raw.", "raw-", "optimizer", "shards/", STATE, SUMS)
 _LOADED = (".safetensors", ".json", ".model", ".pt", ".pth", ".bin")
 _IDENTITY = {
     "model": "model",

@@ -25,6 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor, distributed, nn
 
+from mme_vla.config.sections import section_keys
 from mme_vla.errors import UserError, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
@@ -49,12 +50,14 @@ from mme_vla.training.shards import (
     read_shards,
     read_weights,
     shard_files,
+    shard_notes,
     training_tensors,
 )
 from mme_vla.utils import checked_file, inside, read_json, write_sums
 
 FORMAT = "mme_vla training checkpoint 1"
 RAW, OPTIMIZER = "raw.safetensors", "optimizer.safetensors"
+_STATE_KEYS = ("format", "step", "config", "versions", "shards")
 _ADAM = (*MOMENTS, "step")
 
 
@@ -126,13 +129,13 @@ def save_shards(
         about = [*save_settings(policy, draft), STATE]
 
     def finish() -> None:
-        place = draft
+        place, notes = draft, shard_notes(draft)
         _write_state(draft, step, config, shards=len(shard_files(draft)))
         if hurry:
-            write_sums(draft, about)
+            write_sums(draft, [*about, *notes])
             place = _publish(draft, target)
         save_tensors(averaged, place, dtype=torch.float32)
-        write_sums(place, [*about, *list_weight_files(place)])
+        write_sums(place, [*about, *notes, *list_weight_files(place)])
         if not hurry:
             _publish(draft, target)
         tidy(folder, keep)
@@ -223,6 +226,7 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
         raise UserError(
             f"{path} was not written by this library's training (format {FORMAT!r} expected)."
         )
+    section_keys(state, str(path), _STATE_KEYS)
     step = state.get("step")
     sections = isinstance(state.get("config"), dict) and isinstance(state.get("versions"), dict)
     if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < 2**53 or not sections:

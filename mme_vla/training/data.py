@@ -11,8 +11,8 @@ from mme_vla.data.cache import COMMAND
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.dataset import GroupDataset, TrainingDataset
 from mme_vla.data.sources import default_val_episodes, open_sources, split_episodes
-from mme_vla.data.statistics import NARROW, compute_norm_stats
-from mme_vla.errors import check_choice, require
+from mme_vla.data.statistics import NARROW, check_ranges, compute_norm_stats
+from mme_vla.errors import UserError, check_choice, require
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import WeighsLosses, with_vision_memory
@@ -66,16 +66,36 @@ def prepare_data(
     )
     split = split_episodes(sources, data["val_fraction"], val_episodes)
     processor, offset = policy.require_processor(), data["action_offset"]
+    counted = processor.stats_spec
+    horizon = counted.horizon or processor.embodiment.action.horizon
+    narrow = data.get("narrow_ranges") or "refuse"
+    check_choice("data.narrow_ranges", narrow, NARROW)
+    if counted.bounds == "extremes":
+        narrow = "ignore"  # nothing lies beyond them
     if stats_from is not None:
         processor.stats = NormStats.load(checked_file(stats_from, STATS_FILE))
+        try:
+            check_ranges(
+                processor.stats,
+                sources,
+                split.train,
+                horizon,
+                offset,
+                policy.embodiment,
+                counted.video,
+                "refuse"
+                if narrow == "widen"
+                else narrow,  # a run's statistics stay what they are to its end
+            )
+        except UserError as error:
+            raise UserError(
+                f"{stats_from / STATS_FILE}, the statistics that this run began with: {error} In a"
+                " run that is resumed they stay as they are: begin a new one with that and"
+                f" init_from={stats_from}, or continue with data.narrow_ranges=warn."
+            ) from None
     else:
-        counted, horizon = processor.stats_spec, processor.embodiment.action.horizon
-        narrow = data.get("narrow_ranges") or "refuse"
-        check_choice("data.narrow_ranges", narrow, NARROW)
-        if counted.bounds == "extremes":
-            narrow = "ignore"  # nothing lies beyond them
         processor.stats = compute_norm_stats(
-            sources, split.train, counted.horizon or horizon, offset, seed, policy.embodiment,
+            sources, split.train, horizon, offset, seed, policy.embodiment,
             every=counted.every, extremes=counted.extremes, exact=counted.exact,
             video=counted.video, narrow=narrow,
         )  # fmt: skip

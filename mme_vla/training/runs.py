@@ -54,6 +54,7 @@ MAY_DIFFER = (
     "train.device",
     "data.cache",
     "data.content",
+    "data.narrow_ranges",
     "trust_plugins",
 )
 """Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that
@@ -61,7 +62,8 @@ changes a loss.
 
 The name too: it follows from the sections that are compared, and runs of earlier versions may be
 called otherwise. `data.content`, the fingerprints of the datasets, is compared when they are open
-(`check_content`).
+(`check_content`). A run's statistics stay what they are: `data.narrow_ranges` decides only whether
+it goes on with narrow ones.
 """
 
 

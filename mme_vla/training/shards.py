@@ -29,7 +29,7 @@ from torch.distributed.tensor import DTensor
 from mme_vla.errors import listed, require
 from mme_vla.policy.tensor_files import check_header, check_values
 from mme_vla.training.parallel import reshard
-from mme_vla.utils import Sums, decoding, inside, sum_line
+from mme_vla.utils import Sums, check_sums, decoding, inside, sum_line
 
 SHARDS = "shards"
 RAW, AVERAGE, STEPS = "raw", "average", "steps"
@@ -42,6 +42,12 @@ def shard_files(checkpoint: Path) -> list[Path]:
     other run.
     """
     return sorted((checkpoint / SHARDS).glob("*.safetensors"))
+
+
+def shard_notes(checkpoint: Path) -> list[str]:
+    """The names, within a checkpoint, of the checksums beside its `shard_files`."""
+    notes = [file.with_suffix(".sha256") for file in shard_files(checkpoint)]
+    return [note.relative_to(checkpoint).as_posix() for note in notes]
 
 
 class ShardWriter:
@@ -167,6 +173,10 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     files = shard_files(checkpoint)
     rank, world = (0, 1) if alone else (distributed.get_rank(), distributed.get_world_size())
     sums: dict[Path, Sums] = {}
+    if any(
+        name.startswith(f"{SHARDS}/") for name in Sums(checkpoint).table
+    ):  # earlier versions listed none
+        check_sums(checkpoint, shard_notes(checkpoint))
     for file in files:
         note = file.with_suffix(".sha256")
         for path in (file, note):

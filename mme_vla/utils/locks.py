@@ -130,18 +130,27 @@ def claim_plan(folder: Path, plan: Any) -> bool:
     return True
 
 
-def drop_plan(folder: Path) -> None:
-    """Remove a plan's work folder, the plan last: a removal that was cut off is recognised, and
-    repeated.
+def drop_plan(folder: Path, *work: str) -> None:
+    """Remove a plan's work, the plan last: a removal that was cut off is recognised, and repeated.
 
-    The caller holds the folder's lock, whose release removes the folder itself.
+    Whatever else somebody has put into the folder stays, and the folder with it. Otherwise the
+    release of its lock, which the caller holds, removes it.
+
+    Args:
+        work: patterns, relative to the folder, of what the command writes there: `episodes/*.h5`,
+            `merged`.
     """
-    for path in folder.iterdir():
-        if path.name not in (PLAN, LOCK):
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
+    places = [path for pattern in work for path in folder.glob(pattern)]
+    for path in places:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+    parents = {parent for pattern in work for parent in Path(pattern).parents if parent != Path()}
+    for parent in sorted(parents, reverse=True):  # inner ones first
+        with suppress(OSError):  # something else lies in it, or it is not there
+            (folder / parent).rmdir()
+    remove_drafts(folder)
     (folder / PLAN).unlink(missing_ok=True)
 
 

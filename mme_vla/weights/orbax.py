@@ -25,7 +25,16 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, missing_extra, require
-from mme_vla.utils import checked_file, decoding, inside, read_text, require_file, safe_name
+from mme_vla.utils import (
+    SUMS,
+    check_sums,
+    checked_file,
+    decoding,
+    inside,
+    read_text,
+    require_file,
+    safe_name,
+)
 
 MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
 ARRAY_FILES = {"/.zarray": "zarr", "/zarr.json": "zarr3"}
@@ -48,9 +57,12 @@ class Zipped:
         return f"{self.file} ({self.place or 'at its top'})"
 
     def check(self) -> None:
-        """Compare what lies there with the archive's checksums, which tensorstore does
-        not ask for.
+        """Compare what lies there with the checksums in the archive, and the archive with those
+        beside it, if any.
+
+        Tensorstore asks for neither.
         """
+        check_sums(self.file.parent, [self.file.name])
         with (
             decoding(self.file, "a zip archive", "Download or copy it again."),
             zipfile.ZipFile(self.file) as opened,
@@ -93,6 +105,9 @@ def read_orbax(
     """Read all arrays of a checkpoint, named by their path without the leading `params/` and the
     trailing `/value`.
 
+    A `SHA256SUMS` in the arrays' folder, or in that of their step, must list each of their files,
+    and fit it.
+
     Args:
         params: the arrays' folder, or where they are in an archive.
         fits: called with tensors of the arrays' names and shapes on meta, before memory is taken
@@ -102,11 +117,17 @@ def read_orbax(
     if isinstance(params, Zipped):
         params.check()
     else:
+        parts = []
         for place in params.rglob("*"):
             if place.is_symlink():
                 inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
             if not place.is_dir():  # tensorstore would wait for a pipe without end
-                require_file(place, "a part of an Orbax checkpoint")
+                parts.append(require_file(place, "a part of an Orbax checkpoint"))
+        for folder in (params, params.parent) if params.name == "params" else (params,):
+            check_sums(
+                folder,
+                sorted(part.relative_to(folder).as_posix() for part in parts if part.name != SUMS),
+            )
     with _reading(params):
         arrays = _list_arrays(ts, params)
         pending = {

@@ -13,7 +13,7 @@ from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.saving import CONFIG, local_folder, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
 from mme_vla.registry import WeightFormat, extensions
-from mme_vla.utils import SUMS, check_sums, decoding, require_file
+from mme_vla.utils import decoding, require_file
 from mme_vla.weights.names.jax_memory import ENCODER
 from mme_vla.weights.orbax import (
     ARCHIVE_SUFFIX,
@@ -98,11 +98,9 @@ class Source:
                 and shapes on meta; raises where they do not fit.
         """
         if self.params is not None:
-            self._check_orbax()
             return read_orbax(self.params, fits)
         if self.format in native_formats():
             to_native = method_formats()[self.format].function("native")
-            check_sums(self.folder, [self.files[0].name])
             native: dict[str, Tensor] = to_native(
                 read_torch_file(self.files[0]), str(self.files[0])
             )
@@ -121,21 +119,6 @@ class Source:
             if self.format in ("lerobot", "openpi")
             else tensors
         )
-
-    def _check_orbax(self) -> None:
-        """Compare the files of Orbax arrays, or the archive, with the checksums beside them; each
-        must be listed.
-        """
-        if isinstance(self.params, Zipped):
-            check_sums(self.params.file.parent, [self.params.file.name])
-            return
-        assert self.params is not None
-        for folder in dict.fromkeys((self.folder, self.params)):
-            if (folder / SUMS).is_file():
-                files = [
-                    file for file in self.params.rglob("*") if file.is_file() and file.name != SUMS
-                ]
-                check_sums(folder, sorted(file.relative_to(folder).as_posix() for file in files))
 
     @property
     def label(self) -> str:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError, listed
-from mme_vla.utils import decoding, require_file
+from mme_vla.utils import check_sums, decoding, require_file
 
 SUFFIXES = (".pth", ".pt")
 MODEL = ("model", "state_dict", "model_state_dict", "model_state")
@@ -31,9 +31,12 @@ def load_torch_file(path: Path, what: str, mapped: bool = False) -> Any:
     Args:
         what: the file is, for the message.
         mapped: read a tensor when it is used, without a check of its bytes. Files from before torch
-            1.6 are read whole.
+            1.6 are read whole. Otherwise a `SHA256SUMS` in its folder must list the file, and fit
+            it.
     """
     require_file(path, what)  # torch would wait for a pipe without end
+    if not mapped:
+        check_sums(path.parent, [path.name])
     with decoding(path, what, _REMEDY):
         return torch.load(
             path, map_location="cpu", weights_only=True, mmap=mapped and zipfile.is_zipfile(path)

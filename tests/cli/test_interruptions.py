@@ -133,8 +133,36 @@ def test_an_incomplete_plan_is_ignored(tmp_path: Path) -> None:
     (tmp_path / PLAN).write_text('{"epis')
     (tmp_path / "episodes" / "finished").touch()
     assert not claim_plan(tmp_path, {"a": 1}), "another run's files are there"
-    drop_plan(tmp_path)
+    drop_plan(tmp_path, "episodes/finished")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plan_that_is_done_removes_its_own_work_and_nothing_else(tmp_path: Path) -> None:
+    with FolderLock(tmp_path / "out.partial") as lock:
+        work = lock.folder
+        claim_plan(work, {"a": 1})
+        for name in (
+            "episodes/000001-Task-episode_1/part",
+            "episodes/thesis.txt",
+            "merged/meta",
+            "notes.md",
+        ):
+            (work / name).parent.mkdir(parents=True, exist_ok=True)
+            (work / name).write_text("mine")
+        drop_plan(work, "episodes/[0-9]*-*", "merged", "writing")
+    assert {path.relative_to(work).as_posix() for path in work.rglob("*")} == {
+        "episodes", "episodes/thesis.txt", "notes.md",
+    }  # fmt: skip
+
+
+def test_a_conversion_leaves_what_somebody_put_into_its_work_folder(tmp_path: Path) -> None:
+    write_file(tmp_path / "record_dataset_Alpha.h5", [4])
+    refs = list_episodes(find_files([tmp_path]))
+    convert(refs, tmp_path / "out", PNG)
+    (tmp_path / "out.partial" / "episodes").mkdir(parents=True)
+    (tmp_path / "out.partial" / "episodes" / "notes.txt").write_text("mine")
+    assert convert(refs, tmp_path / "out", PNG) == 0
+    assert (tmp_path / "out.partial" / "episodes" / "notes.txt").read_text() == "mine"
 
 
 def test_a_conversion_notices_that_an_input_changed_at_the_same_size(tmp_path: Path) -> None:

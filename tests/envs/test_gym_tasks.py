@@ -51,7 +51,10 @@ def test_images_and_the_conditioning_video_are_numpy_arrays() -> None:
     try:
         observation, info = env.reset(seed=0)
         assert observation in env.observation_space
-        assert info["video"].dtype == np.uint8 and len(info["video"]) > 10
+        assert len(info["video"]) > 10
+        assert {(image.dtype, image.shape) for image in info["video"]} == {
+            (np.dtype(np.uint8), (256, 256, 3))
+        }
         assert info["video"][0].std() > 5, "nothing is rendered"
     finally:
         env.close()
@@ -114,6 +117,70 @@ if __name__ == "__main__":
     print(envs.step(envs.action_space.sample())[4]["status"].tolist())
     envs.close()"""
     assert run_fresh(code).strip() == "['ongoing', 'ongoing']"
+
+
+class Watched:
+    """An environment whose conditioning video has so many frames."""
+
+    steps_counted = 1
+
+    def __init__(self, frames: int) -> None:
+        images = [np.full((256, 256, 3), i, np.uint8) for i in range(frames + 1)]
+        states = {"joint_state_list": [np.zeros(7)], "gripper_state_list": [np.zeros(2)]}
+        self.frames = {"front_rgb_list": images, "wrist_rgb_list": images[-1:], **states}
+
+    def reset(self) -> tuple[dict, dict]:
+        return self.frames, {"status": "ongoing", "task_goal": ["watch"]}
+
+    def step(self, action: np.ndarray) -> tuple:
+        return (
+            {**self.frames, "front_rgb_list": self.frames["front_rgb_list"][-1:]},
+            0.0,
+            True,
+            False,
+            {},
+        )
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("mode", [gymnasium.vector.SyncVectorEnv, gymnasium.vector.AsyncVectorEnv])
+def test_vector_environments_hand_on_videos_of_different_lengths(
+    mode: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def begin(task: mme_vla.envs.gym.GymTask, number: int) -> Watched:
+        task._env = Watched(number)  # type: ignore[assignment]
+        return task._env  # type: ignore[return-value]
+
+    monkeypatch.setattr(mme_vla.envs.gym.GymTask, "_open", begin)
+    envs = mode(
+        [lambda n=n: gymnasium.make("mme_vla/PatternLock-v0", episode=n) for n in (3, 0, 5)]
+    )
+    try:
+        _, infos = envs.reset(seed=0)
+        assert [len(video) for video in infos["video"]] == [3, 0, 5]
+        assert [image[0, 0, 0] for image in infos["video"][2]] == [0, 1, 2, 3, 4]
+        for _ in range(2):  # the second one begins an episode of its own accord
+            infos = envs.step(envs.action_space.sample())[4]
+        assert [len(video) for video in infos["video"]] == [3, 0, 5]
+    finally:
+        envs.close()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("renderer")
+def test_episodes_with_videos_begin_in_a_vector_environment_in_a_fresh_process() -> None:
+    code = f"""{FRESH["an import"]}
+if __name__ == "__main__":
+    def make(episode):
+        return lambda: gymnasium.make("mme_vla/PatternLock-v0", episode=episode)
+    for mode in (gymnasium.vector.AsyncVectorEnv, gymnasium.vector.SyncVectorEnv):
+        envs = mode([make(0), make(2)])
+        videos = envs.reset(seed=0)[1]["video"]
+        print(len(videos[0]) > 0, len(videos[0]) != len(videos[1]))
+        envs.close()"""
+    assert run_fresh(code).split() == ["True"] * 4
 
 
 def test_a_process_forked_after_rendering_is_refused_by_name(

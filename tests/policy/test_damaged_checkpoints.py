@@ -119,6 +119,19 @@ def test_a_flipped_bit_in_one_shard_is_detected(tmp_path: Path) -> None:
     assert f"{shard.name} is damaged" in refusal(MMEPolicy.from_pretrained, tmp_path)
 
 
+def test_an_unknown_key_of_the_training_state_is_refused(checkpoint: Path) -> None:
+    (checkpoint / SUMS).unlink()
+    state = json.loads((checkpoint / "training_state.json").read_text())
+    (checkpoint / "training_state.json").write_text(json.dumps({**state, "stpe": 2}))
+    message = refusal(resume, checkpoint)
+    assert (
+        "training_state.json" in message
+        and "Unknown key" in message
+        and "stpe" in message
+        and "step" in message
+    )
+
+
 def test_a_checkpoint_from_before_there_were_sums_loads_without_a_word(
     checkpoint: Path, recwarn: pytest.WarningsRecorder
 ) -> None:

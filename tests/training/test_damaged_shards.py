@@ -14,8 +14,8 @@ from torch.distributed import checkpoint as dcp
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import small_policy
-from mme_vla.training.shards import RAW, SHARDS, read_weights, shard_files
-from mme_vla.utils import sum_line
+from mme_vla.training.shards import RAW, SHARDS, read_weights, shard_files, shard_notes
+from mme_vla.utils import sum_line, write_sums
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +60,44 @@ def test_a_shard_without_its_checksum_is_refused(policy: MMEPolicy, checkpoint: 
     note.unlink()
     with pytest.raises(UserError, match=f"with the checksum of {file.name} is missing"):
         read_weights(checkpoint, policy)
+
+
+def add_shard(checkpoint: Path) -> Path:
+    (file,) = shard_files(checkpoint)
+    added = file.with_name("shard-00002-model-00001-of-00001.safetensors")
+    shutil.copy(file, added)
+    added.with_suffix(".sha256").write_text(sum_line(added, added.name))
+    return added
+
+
+def test_a_shard_that_was_added_is_refused(policy: MMEPolicy, checkpoint: Path) -> None:
+    (checkpoint / "config.json").write_text("{}")
+    write_sums(checkpoint, ["config.json", *shard_notes(checkpoint)])
+    read_weights(checkpoint, policy)
+    added = add_shard(checkpoint)
+    with pytest.raises(UserError, match=rf"SHA256SUMS does not list shards/{added.stem}\.sha256"):
+        read_weights(checkpoint, policy)
+
+
+def test_a_shard_that_was_replaced_with_its_checksum_is_refused(
+    policy: MMEPolicy, checkpoint: Path
+) -> None:
+    write_sums(checkpoint, shard_notes(checkpoint))
+    (file,) = shard_files(checkpoint)
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(content)
+    add_sums(checkpoint)
+    with pytest.raises(UserError, match=r"\.sha256 is damaged"):
+        read_weights(checkpoint, policy)
+
+
+def test_shards_whose_checksums_an_earlier_version_did_not_list_are_read(
+    policy: MMEPolicy, checkpoint: Path
+) -> None:
+    (checkpoint / "config.json").write_text("{}")
+    write_sums(checkpoint, ["config.json"])
+    read_weights(checkpoint, policy)
 
 
 def test_damage_is_an_error_of_the_library_whatever_the_checksum_says(

@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import signal
 import subprocess
 import time
@@ -17,7 +18,10 @@ from helpers import commands
 from mme_vla import MMEPolicy, UserError
 from mme_vla.cli.train import main
 from mme_vla.config.composition import compose
+from mme_vla.processing.base import STATS_FILE
+from mme_vla.processing.normalise import NormStats
 from mme_vla.training.logging import read_metrics
+from mme_vla.utils import write_sums
 
 STEPS, SAVE_EVERY = 9, 4
 SMALL = [
@@ -102,6 +106,34 @@ def test_a_resumed_run_names_the_weights_that_it_began_with(runs: tuple[Path, st
     main(compose("train", [*words, "train.steps=1", f"init_from={base / 'whole'}"]))
     main(compose("train", [*words, "train.steps=2", f"resume={base / 'tuned'}"]))
     assert OmegaConf.load(base / "tuned" / "config.yaml")["init_from"] == str(base / "whole")
+
+
+@pytest.mark.slow
+def test_a_run_with_narrow_statistics_goes_on_when_told_to_and_stays_the_same_training(
+    tmp_path: Path,
+) -> None:
+    others = ("model=", "memory.", "train.steps=", "train.save_every=")
+    small = ["model=pi05", *(word for word in SMALL if not word.startswith(others))]
+    small += ["train.save_every=1", "train.steps=2", "train.keep.last=2"]
+    folder = tmp_path / "run"
+    main(compose("train", [*small, f"output={folder}"]))
+    first, second = (folder / "checkpoints" / f"step_00000{i}" for i in (1, 2))
+    shutil.rmtree(second)
+    stats = NormStats.load(first / STATS_FILE)
+    stats.actions.q01[0], stats.actions.q99[0] = -1e-6, 1e-6
+    stats.save(
+        first / STATS_FILE
+    )  # as a version of the library might have left it that did not look
+    write_sums(first, [STATS_FILE], keep=True)
+    with pytest.raises(UserError, match=r"data\.narrow_ranges=warn"):
+        main(compose("train", [*small, f"resume={folder}"]))
+    main(compose("train", [*small, f"resume={folder}", "data.narrow_ranges=warn"]))
+    assert OmegaConf.load(folder / "config.yaml")["data"]["narrow_ranges"] is None
+    identities = [
+        json.loads((place / "config.json").read_text())["training"] for place in (first, second)
+    ]
+    assert identities[0] == identities[1]
+    assert NormStats.load(second / STATS_FILE).actions.q99[0] == 1e-6
 
 
 @pytest.mark.slow

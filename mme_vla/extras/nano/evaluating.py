@@ -155,34 +155,26 @@ def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
     env = make_env(
         spec.task, spec.split, spec.episode, "waypoint", max_steps=max_steps, render=False
     )
-    status = "fail"
+    status, reason = "fail", None
     try:
         env.reset()
         for target in () if motions is None else motions.targets:
             *_, info = env.step(target)
-            status = str(info["status"])
+            status, reason = str(info["status"]), info.get("error_message")
             if status != "ongoing":
                 break
         scene = env.scene_digest
         steps = env.steps_counted  # type: ignore[union-attr]  # never the official environment
     finally:
         env.close()
+    extra: dict[str, Any] = {"status": status, "demonstrated": motions is not None}
+    if reason:
+        extra["refused"] = str(reason)  # as a policy's record says why a motion was not carried out
     return EpisodeRecord(
-        PLANNER,
-        "none",
-        0,
-        spec.task,
-        spec.episode,
-        spec.seed,
-        spec.difficulty,
-        status if status in ("success", "fail", "timeout") else "fail",
-        steps,
-        split=spec.split,
-        max_steps=max_steps,
-        action_space="waypoint",
-        extra={"status": status, "demonstrated": motions is not None},
-        scene=scene,
-    )
+        PLANNER, "none", 0, spec.task, spec.episode, spec.seed, spec.difficulty,
+        status if status in ("success", "fail", "timeout") else "fail", steps, split=spec.split,
+        max_steps=max_steps, action_space="waypoint", extra=extra, scene=scene,
+    )  # fmt: skip
 
 
 def _planned(spec: EpisodeSpec) -> Motions | None:

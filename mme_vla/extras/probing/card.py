@@ -33,7 +33,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import with_vision_memory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.subgoal import SubgoalPredictor
-from mme_vla.utils import to_json, write_atomically, write_json
+from mme_vla.utils import require_earlier, to_json, write_atomically, write_json
 
 TIME, CONTENT, WRONG_SCENE = "time-shifted", "content-swapped", "wrong scene first"
 ARMS = {
@@ -46,6 +46,7 @@ NEGLIGIBLE = 0.01
 of 0.
 """
 AGAIN, PAGE, FIGURES = "again", "card.html", "card.json"
+MARK = "Report card of"  # stands in the heading of each page
 _SAMPLES, _TAILS = 10_000, (0.025, 0.975)
 _HOW = (
     (
@@ -161,6 +162,8 @@ def run_card(
             those to take contents from. references: name → folder of records, floors and ceilings
             such as `{"demonstrator": "outputs/…"}`.
     """
+    for name, mark in ((PAGE, MARK), (FIGURES, "memory_or_clock")):
+        require_earlier(folder / name, mark)
     channel, in_simulation = channel_of(policy), base is make_env and settings.env == "mme_vla"
     arms = {label: read_arm(word) for label, word in ARMS.items()}
     reasons = {label: lacking(arm, policy, channel, len(plan.lend), boundaries=in_simulation)
@@ -466,10 +469,7 @@ def write_card(card: Card, folder: Path) -> None:
     write_json(folder / FIGURES, to_json(asdict(card)))
     sections = [Section(table.title, tables=[table]) for table in tables_of(card)]
     sections.append(Section("How the numbers are made", paragraphs=_HOW))
-    title, subtitle = (
-        f"Report card of {card.model}",
-        f"checkpoint {card.checkpoint}, {card.scenes} scenes",
-    )
+    title, subtitle = f"{MARK} {card.model}", f"checkpoint {card.checkpoint}, {card.scenes} scenes"
     with write_atomically(folder / PAGE) as draft:
         draft.write_text(html_page(title, sections, subtitle, card.notes), encoding="utf-8")
 

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mme_vla.errors import require
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, comparison_table, to_markdown
 from mme_vla.extras.probing.lines import EntryLine, Line, MomentLine
 from mme_vla.extras.probing.recordings import Recording
-from mme_vla.utils import write_atomically
+from mme_vla.utils import require_earlier, write_atomically
 from mme_vla.utils.media import Tile, contact_sheet
 from mme_vla.utils.pages import render
 
@@ -340,6 +341,29 @@ def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image
     return contact_sheet(tiles, min(len(tiles), 8), title, None)
 
 
+MARK = "takes from its memory"  # stands in the heading of each page and table
+
+
+def check_outputs(folder: Path, claimed: bool) -> None:
+    """Make sure that the page, the table and the images of a probe replace nothing but earlier
+    ones.
+
+    Args:
+        claimed: whether the folder holds an earlier probe, to which the images in it belong.
+
+    Raises:
+        UserError: a file of somebody's own is in the place of one.
+    """
+    for name in (PAGE, TABLE):
+        require_earlier(folder / name, MARK)
+    images = folder / IMAGES
+    require(
+        claimed or not images.exists() or (images.is_dir() and not any(images.iterdir())),
+        f"{images} exists, and no probe is in {folder} that it could belong to: nothing is written"
+        " into it. Choose another output, or move it away yourself.",
+    )
+
+
 def write_images(findings: Findings, recordings: Sequence[Recording], folder: Path) -> list[Path]:
     """Render the step of each task at which an entry mattered most; entries that are
     frames alone.
@@ -393,7 +417,7 @@ def write_page(
         sections.append(
             Section("In closed loop", tables=tables[-1:], caption="; ".join(verdicts) + ".")
         )
-    page = html_page(f"What {name} takes from its memory", sections, notes=notes)
+    page = html_page(f"What {name} {MARK}", sections, notes=notes)
     text = render(
         "probe.md", name=name, tables=map(to_markdown, tables), verdicts=verdicts, notes=notes
     )

@@ -32,14 +32,13 @@ from mme_vla.evaluation.rollout.evaluation import (
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import claim_run, find_records, fingerprint, read_folders
+from mme_vla.evaluation.store import RUN_FILE, claim_run, find_records, fingerprint, read_folders
 from mme_vla.extras.probing import lines
 from mme_vla.extras.probing.arms import UNPROBED, Arm, choose_arms, options_of, slug
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.offline import OfflineSettings, probe_offline
 from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
-from mme_vla.extras.probing.recordings import Recording, all_recordings
-from mme_vla.extras.probing.report import Findings, write_images, write_page
+from mme_vla.extras.probing.report import Findings, check_outputs, write_images, write_page
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
 
@@ -97,6 +96,7 @@ def run_probe(
     show_progress: bool = True,
 ) -> Probe:
     """Run the parts of the plan that the folder lacks, and write the page."""
+    check_outputs(folder, claimed=(folder / OFFLINE / RUN_FILE).is_file())
     channel, notes = channel_of(policy), list[str]()
     if plan.recordings:
         has_boundaries = all(recording.tells_subtasks for recording in plan.recordings)

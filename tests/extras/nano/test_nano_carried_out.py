@@ -2,12 +2,15 @@
 digits.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_env
+from mme_vla.extras.nano import evaluating
 from mme_vla.extras.nano.demonstrations import record
 from mme_vla.extras.nano.evaluating import replay
 
@@ -37,3 +40,33 @@ def test_what_the_demonstrator_does_solves_an_episode_through_the_actions_of_pol
     record = replay(spec, max_steps=500)
     assert (record.model, record.outcome, record.seed) == ("planner", "success", spec.seed)
     assert replay(spec, max_steps=record.steps // 2).outcome == "timeout"
+
+
+class Refusing:
+    """An environment in which no motion can be carried out."""
+
+    scene_digest, steps_counted = "not built", 3
+
+    def reset(self) -> None:
+        pass
+
+    def step(self, target: object) -> tuple:
+        info = {
+            "status": "error",
+            "error_message": "no path to the pose",
+            "exception_type": "PlanningError",
+        }
+        return {}, 0.0, True, False, info
+
+    def close(self) -> None:
+        pass
+
+
+def test_the_planners_record_says_why_a_motion_was_not_carried_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(evaluating, "_planned", lambda spec: SimpleNamespace(targets=[np.zeros(7)]))
+    monkeypatch.setattr(evaluating, "make_env", lambda *_, **__: Refusing())
+    record = replay(metadata.episode("VideoUnmask", "val", 0), max_steps=500)
+    assert record.outcome == "fail" and record.extra["status"] == "error"
+    assert record.extra["refused"] == "no path to the pose"

@@ -122,3 +122,21 @@ def test_a_folder_of_another_probe_is_refused(tmp_path: Path) -> None:
                 run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False)
     with pytest.raises(UserError, match="holds no probe on recorded episodes"):
         probed_folder(tmp_path / "elsewhere")
+
+
+@pytest.mark.parametrize("name", ["page.html", "table.md", "remembered/StopCube.png"])
+def test_a_probe_replaces_no_file_of_somebody_else_and_runs_nothing_before_it_says_so(
+    name: str, tmp_path: Path
+) -> None:
+    policy, recordings = quick_policy("framesamp_modul").eval(), made_up()
+    request = ProbePlan(
+        ["drop:all"], recordings[:1], recordings, (), OfflineSettings(1, 2, 1, False, 2)
+    )
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(UserError, match=rf"{Path(name).parts[0]} exists"):
+        run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False)
+    assert (tmp_path / name).read_text() == "mine" and not (tmp_path / "offline").exists()
+    (tmp_path / name).unlink()
+    for _ in range(2):  # an earlier page of its own is written again
+        run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False)

@@ -16,6 +16,14 @@ from mme_vla.utils import write_atomically
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
 
 
+DRAFT = "dataset"
+
+
+def episode_file(spec: EpisodeSpec) -> str:
+    """The name, in the work folder, of the file that keeps a demonstrated episode."""
+    return f"{spec.task}-{spec.episode}.npz"
+
+
 def record_own(
     environment: Environment,
     specs: Sequence[EpisodeSpec],
@@ -34,10 +42,7 @@ def record_own(
     Returns:
         Frames, and the episodes that did not succeed.
     """
-    draft, episodes = (
-        work / "dataset",
-        {work / f"{spec.task}-{spec.episode}.npz": spec for spec in specs},
-    )
+    draft, episodes = work / DRAFT, {work / episode_file(spec): spec for spec in specs}
     shutil.rmtree(draft, ignore_errors=True)
     dataset: Any = None
     failures, frames = [], 0

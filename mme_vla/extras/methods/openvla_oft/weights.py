@@ -17,7 +17,7 @@ from mme_vla.extras.methods.openvla_oft.policy import OpenVlaPolicy
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import WEIGHTS, cast, read_files
 from mme_vla.processing.normalise import NormStats, QuantileStats
-from mme_vla.utils import check_sums, checked_file, read_json
+from mme_vla.utils import check_sums, checked_file, inside, read_json
 from mme_vla.weights.tables import Adapter, Piece
 from mme_vla.weights.torch_files import read_torch_file
 
@@ -185,7 +185,7 @@ def with_heads(tensors: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]
     for module in (HEAD, STATE):
         files = sorted(folder.glob(f"{module.rstrip('/')}--*_checkpoint.pt"), key=_step)
         if files:
-            heads = read_torch_file(checked_file(folder, files[-1].name, "weights"))
+            heads = read_torch_file(inside(folder, files[-1].name, "weights"))
             merged |= {
                 f"{module}{name.removeprefix(_WRAPPED)}": tensor for name, tensor in heads.items()
             }

@@ -195,16 +195,22 @@ class SubtaskPolicy(MMEPolicy):
             [block.mask for block in blocks], 1
         )
 
-    def forward(  # type: ignore[override]  # returns metrics too, as all policies do
-        self, batch: Batch, *args: Any, **options: Any
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The action's loss under the recorded words, and the weighted cross entropy of these.
+    def losses(
+        self,
+        batch: Batch,
+        noise: Mapping[str, Tensor],
+        memory: MemoryTokens | None = None,
+        augmentation: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """The losses of `MMEModel` under the recorded words, in place of a memory, and their cross
+        entropy `words`.
 
         Each word's counts as much as its sample (`Batch.weight`).
         """
         if not isinstance(batch, SubtaskBatch) or batch.words is None or batch.words_mask is None:
             raise ValueError(
-                "forward() computes a loss: the batch must hold the words of its sub-tasks."
+                "A loss is computed from recorded words: the batch must hold those of its sub-tasks"
+                " (SubtaskBatch)."
             )
         if batch.words.shape[1] > self.subtask.longest + 1:
             raise UserError(
@@ -221,15 +227,17 @@ class SubtaskPolicy(MMEPolicy):
         words = (
             losses if batch.weight is None else losses * batch.weight[:, None]
         ).sum() / mask.sum()
-        memory = MemoryTokens(hidden[:, 1:], mask)
-        action, metrics = super().forward(batch, *args, **{**options, "memory": memory})
-        loss = action + self.subtask_weight * words
-        return loss, {
-            **metrics,
-            "loss": loss.detach(),
-            "action": action.detach(),
-            "words": words.detach(),
+        return {
+            **super().losses(batch, noise, MemoryTokens(hidden[:, 1:], mask), augmentation),
+            "words": words,
         }
+
+    def total_loss(self, losses: Mapping[str, Tensor]) -> Tensor:
+        """What training minimises: the other losses, and `subtask_weight` times that
+        of the words.
+        """
+        others = {name: value for name, value in losses.items() if name != "words"}
+        return super().total_loss(others) + self.subtask_weight * losses["words"]
 
     @torch.no_grad()
     def sample_actions(self, batch: Batch, *args: Any, **options: Any) -> Tensor:
