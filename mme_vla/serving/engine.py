@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.embodiment import Option
+from mme_vla.embodiment.robomme import SIDE
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import PreparesChunks
 from mme_vla.policy.episode import Episode
@@ -115,6 +117,11 @@ class Engine:
         self._thread = ThreadPoolExecutor(1, "policy")
         self._readers = ThreadPoolExecutor(2, "decode")
         self._task: asyncio.Task[None] | None = None
+
+    async def warm_up(self, n_frames: int) -> None:
+        """Encode a piece of video and choose chunks, alone and as a pair; nothing of it is kept."""
+        n_episodes = min(2, self.scheduler.max_batch)
+        await self.call(lambda: _try_out(self.policy, n_episodes, n_frames, self.flow_steps))
 
     def start(self) -> None:
         self._task = asyncio.get_running_loop().create_task(self._work())
@@ -232,6 +239,24 @@ class Engine:
         if finished and not waiting.future.done():
             waiting.future.set_result(None)
         return None
+
+
+def _try_out(policy: Policy, n_episodes: int, n_frames: int, flow_steps: int | None) -> None:
+    robot = policy.embodiment
+    # Black images of every camera, and a wall at no distance where it reads depth.
+    frames: dict[str, np.ndarray] = {}
+    for camera in robot.cameras:
+        frames[camera.name] = np.zeros((n_frames, SIDE, SIDE, 3), np.uint8)
+        if camera.depth:
+            depth_name, pose_name = camera.readings
+            frames[depth_name] = np.zeros((n_frames, SIDE, SIDE, 1), np.float32)
+            frames[pose_name] = np.tile(np.eye(3, 4, dtype=np.float32), (n_frames, 1, 1))
+    episodes = [policy.start_episode("warm up") for _ in range(n_episodes)]
+    for episode in episodes:
+        episode.subgoal, episode.options = "warm up", (Option("a", "warm up"),)
+        episode.observe(frames, np.zeros((n_frames, robot.state.width), np.float32))
+    policy.act(episodes[:1], flow_steps)
+    policy.act(episodes, flow_steps)
 
 
 _END = object()

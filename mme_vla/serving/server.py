@@ -1,59 +1,66 @@
-"""`PolicyServer`: one asyncio process, one port, websocket and HTTP, many clients, one policy."""
+"""`PolicyServer`: one asyncio process, one port, websocket and HTTP, many clients, one policy.
+
+uvicorn speaks HTTP and websocket, limits sizes, and pings. `PolicyServer.websocket` and
+`PolicyServer.infer` take a client's requests, `Session` does what they ask, and `Engine` computes.
+`Places` limits how many clients there are.
+"""
 
 import asyncio
+import hmac
 import logging
 import time
 from contextlib import suppress
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
 
-import numpy as np
-
-from mme_vla.embodiment import Option
-from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import missing_extra
+from mme_vla.errors import UserError, missing_extra
 from mme_vla.policy.base import Policy
 from mme_vla.processing.prompt import subgoal_kind
-from mme_vla.serving.codec import pack
+from mme_vla.serving.codec import pack, unpack
 from mme_vla.serving.engine import Engine, ServerStats
-from mme_vla.serving.settings import ServeSettings, listen
-
-
-def warm_up(policy: Policy, settings: ServeSettings) -> None:
-    """Encode a piece of video and choose chunks, alone and as a pair; nothing of it is kept."""
-    robot, count = policy.embodiment, settings.encode_chunk
-    # Black images of every camera, and a wall at no distance where it reads depth.
-    frames: dict[str, np.ndarray] = {}
-    beside = (
-        np.zeros((count, SIDE, SIDE, 1), np.float32),
-        np.tile(np.eye(3, 4, dtype=np.float32), (count, 1, 1)),
-    )
-    for camera in robot.cameras:
-        frames[camera.name] = np.zeros((count, SIDE, SIDE, 3), np.uint8)
-        frames |= dict(zip(camera.readings, beside, strict=False))
-    episodes = [
-        policy.start_episode("warm up", seed=settings.seed)
-        for _ in range(min(2, settings.max_batch))
-    ]
-    for episode in episodes:
-        episode.subgoal, episode.options = "warm up", (Option("a", "warm up"),)
-        episode.observe(frames, np.zeros((count, robot.state.width), np.float32))
-    policy.act(episodes[:1], settings.flow_steps)
-    policy.act(episodes, settings.flow_steps)
-
+from mme_vla.serving.requests import Request as PolicyRequest
+from mme_vla.serving.requests import RequestReader
+from mme_vla.serving.session import BusyError, HttpSessions, NoEpisodeError, Session
+from mme_vla.serving.settings import Limits, ServeSettings, listen
 
 try:
     import uvicorn
-
-    from mme_vla.serving.app import make_app
-    from mme_vla.serving.connections import Connections, timed_protocol
-    from mme_vla.serving.session import HttpSessions
+    from starlette.applications import Starlette
+    from starlette.datastructures import Headers
+    from starlette.exceptions import HTTPException
+    from starlette.requests import Request
+    from starlette.responses import JSONResponse, PlainTextResponse, Response
+    from starlette.routing import Route, WebSocketRoute
+    from starlette.types import ASGIApp, Receive, Scope, Send
+    from starlette.websockets import WebSocket, WebSocketDisconnect
 except ImportError as error:
     raise missing_extra("Serving", "serve") from error
 
 logger = logging.getLogger("mme_vla.serving")
-STOPPING = "The server is stopping."
+MSGPACK = "application/msgpack"
+METHODS = {
+    "/healthz": "GET",
+    "/metadata": "GET",
+    "/stats": "GET",
+    "/reset": "POST",
+    "/infer": "POST",
+}
+OPEN = ("/healthz", "/metadata")
+"""Need no key: the challenge's client requests the metadata without one."""
 HEAD = 2**16  # bytes of request line and headers
+BRIEF_S = 10
+"""Seconds from a connection to the end of a request's headers, from the reply to a client without
+the key to its next request, and for the closing handshake of a websocket.
+"""
+KEEP_ALIVE_S = 75  # seconds from a reply to the end of the next request's headers
+MIN_BYTES_S = 2**16  # bytes a second of a body, beside limits.receive_s
+MAX_STRANGERS = 64  # connections that are between two requests
+SMALL = 2**16  # bytes decoded on the event loop; larger messages are decoded in a thread
+BUSY = "The server is full (limits.connections), and every client waits for a reply.\n"
+FULL = "The server is full and this client was silent longest; begin the episode again."
+IDLE = "This connection was silent for limits.idle_s; connect and begin the episode again."
+STOPPING = "The server is stopping."
 
 
 class PolicyServer:
@@ -75,47 +82,46 @@ class PolicyServer:
         settings.check_robot(policy.embodiment, policy.require_processor().prompt_spec.past_actions)
         self.settings, self.stats = settings, ServerStats()
         self.engine = Engine(policy, settings.max_batch, settings.flow_steps, self.stats)
+        self.reader = RequestReader(policy.embodiment, settings.limits.frames)
+        self.sessions = HttpSessions(self.engine, settings)
+        self.places = Places(settings.limits, self.stats)
         self.metadata = _metadata(policy, settings, name, trained)
         self.port = settings.port
-        self.connections = Connections(settings.limits, self.stats)
-        self.sessions = HttpSessions(self.engine, settings)
-        self._background: set[asyncio.Task[Any]] = set()
+        self._background: list[asyncio.Task[None]] = []
         self._uvicorn: uvicorn.Server | None = None
 
     async def start(self) -> None:
         begun = time.perf_counter()
-        await self.engine.call(lambda: warm_up(self.engine.policy, self.settings))
+        await self.engine.warm_up(self.settings.encode_chunk)
         logger.info("warmed up in %.1f s", time.perf_counter() - begun)
         bound = listen(self.settings.host, self.settings.port)
         self.engine.start()
         config = self._config()
         config.load()
-        self._uvicorn = uvicorn.Server(config)
-        self._uvicorn.lifespan = config.lifespan_class(
-            config
-        )  # `serve()` would take over the signals of the process
-        await self._uvicorn.startup(sockets=[bound])
+        server = self._uvicorn = uvicorn.Server(config)
+        # `serve()` would take over the signals of the process.
+        server.lifespan = config.lifespan_class(config)
+        await server.startup(sockets=[bound])
         self.port = bound.getsockname()[1]
-        for work in (
-            self._log_regularly(),
-            self.connections.watch(),
-            self.sessions.forget_silent(),
-        ):
-            self._background.add(asyncio.get_running_loop().create_task(work))
+        loop = asyncio.get_running_loop()
+        self._background = [
+            loop.create_task(self._log_regularly()),
+            loop.create_task(self._end_silent(server)),
+        ]
 
     def _config(self) -> uvicorn.Config:
         limits = self.settings.limits
+        # No `limit_concurrency`: it would count clients without the key, who could so lock out
+        # those who have it.
         return uvicorn.Config(
-            make_app(
-                self.engine, self.settings, pack(self.metadata), self.connections, self.sessions
-            ),
-            http=timed_protocol(self.connections),
+            self._app(),
+            http="h11",
             ws="websockets-sansio",
             ws_max_size=limits.message_bytes,
             ws_per_message_deflate=False,
             ws_ping_timeout=limits.pong_s,
             h11_max_incomplete_event_size=HEAD,
-            timeout_keep_alive=int(limits.idle_s) + 60,  # `Connections` is stricter
+            timeout_keep_alive=KEEP_ALIVE_S,
             timeout_graceful_shutdown=1,
             lifespan="off",
             log_config=None,
@@ -130,20 +136,21 @@ class PolicyServer:
         """Refuse new clients, finish the requests that are running, close every connection with a
         reason.
         """
-        connections, server = self.connections, self._uvicorn
-        connections.stopping = True
+        self.places.stopping = True
         for task in self._background:
             task.cancel()
-        if server is not None:
+        if (server := self._uvicorn) is not None:
             for listener in server.servers:
                 listener.close()
-            connections.close_idle(1001, STOPPING)
+            for place in self.places.waiting():
+                self.places.end(place, STOPPING)
             with suppress(TimeoutError):
                 async with asyncio.timeout(self.settings.limits.stop_s):
-                    while any(connection.is_open for connection in connections.open.values()):
+                    while self.places.taken or self.places.closing:
                         await asyncio.sleep(0.02)
             await server.shutdown()
-            connections.abort()
+            for protocol in list(server.server_state.connections):
+                protocol.transport.abort()
         self.sessions.entries.clear()
         await self.engine.stop()
 
@@ -154,6 +161,379 @@ class PolicyServer:
             if (total := self.stats.counts.total()) != before:
                 logger.info("%s", self.stats.line())
             before = total
+
+    async def _end_silent(self, server: uvicorn.Server) -> None:
+        while True:
+            await asyncio.sleep(min(1.0, self.settings.limits.idle_s / 4))
+            self.sessions.forget_silent()
+            self.places.end_overdue(server)
+
+    # Routes.
+
+    def _app(self) -> ASGIApp:
+        handlers = {
+            "/healthz": self.healthz,
+            "/metadata": self.describe,
+            "/stats": self.show_stats,
+            "/reset": self.infer,
+            "/infer": self.infer,
+        }
+        routes: list[Route | WebSocketRoute] = [
+            Route(path, handler, methods=[METHODS[path]]) for path, handler in handlers.items()
+        ]
+        routes.append(WebSocketRoute("/{path:path}", self.websocket))
+        app = Starlette(routes=routes, exception_handlers={HTTPException: self._refuse})
+
+        async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
+            """Check the key before anything of the body is read."""
+            address = scope["client"]
+            refusal = self._refusal(scope)
+            self.places.begin_request(address)
+            try:
+                if refusal is None:
+                    await app(scope, receive, send)
+                elif scope["type"] == "http":
+                    await refusal(scope, receive, send)
+                else:
+                    await WebSocket(scope, receive, send).send_denial_response(refusal)
+            finally:
+                ends_soon = refusal is not None or scope["path"] in OPEN
+                if scope["type"] == "websocket":
+                    ends_soon = True
+                self.places.end_request(address, BRIEF_S if ends_soon else KEEP_ALIVE_S)
+
+        return guarded
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        """The reply to a request that is not let in."""
+        headers, path = Headers(scope=scope), None
+        if scope["type"] == "http":
+            path = scope["path"]
+        if "origin" in headers and path != "/healthz":
+            self.stats.count("refused")
+            return PlainTextResponse("Pages in a browser are not served.\n", 403)
+        if path not in OPEN and not self._has_key(headers):
+            self.stats.count("refused")
+            return PlainTextResponse("Send the header Authorization: Api-Key <key>.\n", 401)
+        return None
+
+    def _has_key(self, headers: Headers) -> bool:
+        """Whether the key is right; takes the same time for every wrong one."""
+        if self.settings.api_key is None:
+            return True
+        sent = headers.getlist("authorization")
+        scheme, _, key = (sent[0] if len(sent) == 1 else "").partition(" ")
+        right = hmac.compare_digest(key.strip().encode(), self.settings.api_key.encode())
+        return right and scheme.lower() == "api-key"
+
+    async def _refuse(self, request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        path = request.url.path
+        known = {
+            404: f"There is no {path[:80]!r}; known: {', '.join(METHODS)}.",
+            405: f"{path} takes {METHODS.get(path, 'another method')}.",
+        }
+        self.stats.count("refused")
+        text = known.get(error.status_code, error.detail)
+        return PlainTextResponse(f"{text}\n", error.status_code, error.headers)
+
+    # HTTP.
+
+    async def healthz(self, _: Request) -> Response:
+        return PlainTextResponse("OK\n")
+
+    async def describe(self, _: Request) -> Response:
+        return Response(pack(self.metadata), media_type=MSGPACK)
+
+    async def show_stats(self, _: Request) -> Response:
+        return JSONResponse(self.stats.snapshot())
+
+    async def infer(self, request: Request) -> Response:
+        """Reply to a request of a session that begins with `reset` or `is_first_step`."""
+        name = (request.client.host if request.client else "", request.headers.get("x-session", ""))
+        place = self.places.take(request.scope["client"])
+        if place is None:
+            raise HTTPException(503, BUSY.strip())
+        try:
+            body = await self._body(request)
+            if place.ended:
+                raise HTTPException(503, FULL)
+            place.work()
+            begun = time.perf_counter()
+            try:
+                message = await self._read(body)
+            except UserError:
+                self.sessions.drop(name)
+                raise
+            del body
+            reply = await self.sessions.respond(name, message, begun)
+            return Response(pack(reply), media_type=MSGPACK)
+        except NoEpisodeError as error:
+            raise HTTPException(409, error_text(error)) from None
+        except BusyError as error:
+            raise HTTPException(503, error_text(error)) from None
+        except UserError as error:
+            logger.info("%s: refused: %s", name[0], error)
+            raise HTTPException(400, error_text(error)) from None
+        except HTTPException:
+            raise
+        except Exception as error:
+            self.stats.count("failed")
+            logger.exception("%s: failed", name[0])
+            return PlainTextResponse(f"{error_text(error)}\n", 500)
+        finally:
+            self.places.leave(place)
+
+    async def _body(self, request: Request) -> bytearray:
+        """The body that Content-Length announces.
+
+        Raises:
+            HTTPException: no body, of unknown length, too long, cut short, or too slow.
+        """
+        limits = self.settings.limits
+        if "transfer-encoding" in request.headers:
+            raise HTTPException(411, "Send the body in one piece, with Content-Length.")
+        length = int(request.headers.get("content-length", "0"))  # digits: h11 checks that
+        if length == 0:
+            raise HTTPException(400, "The body is empty: send a packed request.")
+        if length > limits.message_bytes:
+            raise HTTPException(
+                413,
+                f"The message has {length} bytes; this server takes {limits.message_bytes}"
+                " (limits.message_mib).",
+            )
+        body, last = bytearray(), time.monotonic() + limits.receive_s + length / MIN_BYTES_S
+        while len(body) < length:
+            try:
+                seconds = min(limits.receive_s, last - time.monotonic())
+                message = await asyncio.wait_for(request.receive(), seconds)
+            except TimeoutError:
+                raise HTTPException(
+                    408,
+                    f"No byte of the body came for {limits.receive_s:g} s, or less than"
+                    f" {MIN_BYTES_S} of them a second.",
+                ) from None
+            if message["type"] == "http.disconnect":
+                raise HTTPException(400, "The body was cut short.")
+            body += message["body"]
+        return body
+
+    async def _read(self, data: bytes | bytearray) -> PolicyRequest:
+        """Decode and check a message; a large one beside the event loop."""
+        if len(data) <= SMALL:
+            return self.reader.parse(unpack(data))
+        return await self.engine.decode(lambda: self.reader.parse(unpack(data)))
+
+    # Websocket.
+
+    async def websocket(self, socket: WebSocket) -> None:
+        """Send the metadata, then reply to one request after the other."""
+        place = self.places.take(socket.scope["client"], socket)
+        if place is None:
+            self.stats.count("refused")
+            return await socket.send_denial_response(PlainTextResponse(BUSY, 503))
+        coming: asyncio.Future[Any] | None = None
+        try:
+            await socket.accept()
+            await self._send(socket, self.metadata)
+            session = Session(self.engine, self.settings)
+            coming = asyncio.ensure_future(socket.receive())
+            while True:
+                await asyncio.wait([coming], timeout=self.settings.limits.idle_s)
+                if not coming.done():
+                    self.places.end(place, IDLE)
+                event = await coming
+                if event["type"] == "websocket.disconnect":
+                    raise WebSocketDisconnect(event["code"])
+                if place.ended:  # the client sent this before it knew
+                    coming = asyncio.ensure_future(socket.receive())
+                    continue
+                place.work()
+                # Reading goes on while the policy computes, so that a client that leaves is
+                # noticed.
+                coming = asyncio.ensure_future(socket.receive())
+                answering = asyncio.ensure_future(self._answer(session, event, place))
+                del event  # hundreds of megabytes that need not wait for the next request
+                await asyncio.wait([answering, coming], return_when=asyncio.FIRST_COMPLETED)
+                if not answering.done() and coming.result()["type"] == "websocket.disconnect":
+                    answering.cancel()
+                    raise WebSocketDisconnect(coming.result()["code"])
+                reply = await answering  # another request may have come; it waits for its turn
+                await self._send(socket, reply)
+                if isinstance(reply, str):
+                    return await _close(socket, 1011, reply)
+                place.wait()
+                if self.places.stopping:
+                    self.places.end(place, STOPPING)
+        except WebSocketDisconnect as gone:
+            if gone.code == 1009:
+                self.stats.count("refused")
+                logger.info("%s: message too large (limits.message_mib)", place.name)
+        except TimeoutError:
+            self.stats.count("too_slow")
+            logger.info("%s: took no reply for limits.send_s", place.name)
+        finally:
+            if coming is not None:
+                coming.cancel()
+            self.places.leave(place)
+        return None
+
+    async def _answer(
+        self, session: Session, event: dict[str, Any], place: "Place"
+    ) -> dict[str, Any] | str:
+        """The reply to a message, or the reason why there is none; then the connection closes."""
+        try:
+            if event.get("bytes") is None:
+                raise UserError("Requests are binary msgpack messages; this one is text.")
+            begun = time.perf_counter()
+            return await session.respond(await self._read(event["bytes"]), begun)
+        except UserError as error:
+            self.stats.count("refused")
+            logger.info("%s: refused: %s", place.name, error)
+            return error_text(error)
+        except Exception as error:
+            self.stats.count("failed")
+            logger.exception("%s: failed", place.name)
+            return error_text(error)
+
+    async def _send(self, socket: WebSocket, reply: dict[str, Any] | str) -> None:
+        """Send a reply, or a reason as text.
+
+        Raises:
+            TimeoutError: the client takes no replies.
+        """
+        async with asyncio.timeout(self.settings.limits.send_s):
+            if isinstance(reply, str):
+                await socket.send_text(reply)
+            else:
+                await socket.send_bytes(pack(reply))
+
+
+@dataclass(eq=False)
+class Place:
+    """What a websocket, or an HTTP request with a body, takes of `limits.connections`.
+
+    socket: a websocket, which has an episode of its own; None for HTTP.
+    waiting_since: when the server began to wait for the client (`time.monotonic()`); None while
+        the client waits for a reply.
+    ended: the server has ended it.
+    """
+
+    address: Any
+    socket: WebSocket | None = None
+    waiting_since: float | None = field(default_factory=time.monotonic)
+    ended: bool = False
+
+    @property
+    def name(self) -> str:
+        host, port = self.address
+        return f"{host}:{port}"
+
+    def work(self) -> None:
+        self.waiting_since = None
+
+    def wait(self) -> None:
+        self.waiting_since = time.monotonic()
+
+
+class Places:
+    """Who is served, and who has to go.
+
+    When all places are taken, the client that the server has waited for longest makes room for a
+    new one: a body that arrives slowly before a websocket, which holds an episode. Connections
+    between two requests hold no place. They end after a time, and the oldest of more than
+    `MAX_STRANGERS` at once, so that clients without the key keep out nobody.
+    """
+
+    def __init__(self, limits: Limits, stats: ServerStats) -> None:
+        self._limits, self._stats = limits, stats
+        self.taken: list[Place] = []
+        self.closing: set[asyncio.Task[None]] = set()
+        """Closing frames that are being sent."""
+        self.stopping = False
+        self._deadlines: dict[Any, float | None] = {}
+        """By client address, when a connection is cut; None while it has a request."""
+
+    def take(self, address: Any, socket: WebSocket | None = None) -> Place | None:
+        """A place, or None if there is none."""
+        if self.stopping:
+            return None
+        if len(self.taken) >= self._limits.connections:
+            waiting = self.waiting()
+            if not waiting:
+                return None
+            longest = min(waiting, key=lambda place: (place.socket is not None, _since(place)))
+            self._stats.count("let_go")
+            self.end(longest, FULL)
+        place = Place(address, socket)
+        self.taken.append(place)
+        self._stats.connections = len(self.taken)
+        return place
+
+    def leave(self, place: Place) -> None:
+        if place in self.taken:
+            self.taken.remove(place)
+        self._stats.connections = len(self.taken)
+
+    def waiting(self) -> list[Place]:
+        """Places of clients that wait for no reply."""
+        return [place for place in self.taken if place.waiting_since is not None]
+
+    def end(self, place: Place, reason: str) -> None:
+        """Close a websocket with the reason, and an HTTP connection without one."""
+        place.ended = True
+        self.leave(place)
+        if place.socket is None:
+            self._deadlines[place.address] = time.monotonic()
+            return
+        self._deadlines[place.address] = time.monotonic() + BRIEF_S
+        task = asyncio.get_running_loop().create_task(_close(place.socket, 1001, reason))
+        self.closing.add(task)
+        task.add_done_callback(self.closing.discard)
+
+    def begin_request(self, address: Any) -> None:
+        """Note that the headers of a request are complete."""
+        self._deadlines[address] = None
+
+    def end_request(self, address: Any, seconds: float) -> None:
+        """Note that a reply is sent, and how long the connection may wait for the next request."""
+        self._deadlines[address] = time.monotonic() + seconds
+
+    def end_overdue(self, server: uvicorn.Server) -> None:
+        """Cut connections that are past their time."""
+        now = time.monotonic()
+        connections: set[Any] = server.server_state.connections
+        transports = {connection.client: connection.transport for connection in connections}
+        for address in list(self._deadlines):
+            if address not in transports:
+                del self._deadlines[address]
+        for address in transports:
+            self._deadlines.setdefault(address, now + BRIEF_S)
+        pending = [(end, address) for address, end in self._deadlines.items() if end is not None]
+        pending.sort(reverse=True)
+        for number, (end, address) in enumerate(pending):
+            if end < now or number >= MAX_STRANGERS:
+                transports[address].abort()
+
+
+def _since(place: Place) -> float:
+    return place.waiting_since or 0.0
+
+
+async def _close(socket: WebSocket, code: int, reason: str) -> None:
+    short = reason.encode()[:120].decode(errors="ignore")  # a close frame takes no more
+    with suppress(TimeoutError, RuntimeError, WebSocketDisconnect):  # the client has left
+        async with asyncio.timeout(BRIEF_S):
+            await socket.close(code, short)
+
+
+def error_text(error: Exception) -> str:
+    """What a client is told of an error: a mistake of its own in full, anything else without its
+    traceback.
+    """
+    if isinstance(error, UserError | BusyError):
+        return str(error)
+    return f"The server failed on this request ({type(error).__name__}: {str(error)[:200]})."
 
 
 def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool) -> dict[str, Any]:

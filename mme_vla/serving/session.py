@@ -1,10 +1,12 @@
-"""One client: its episode, and what its requests do to it. Dropping the session frees all the
-client's memory.
+"""`Session`: the episode of one client, and what its requests do to it.
+
+Dropping the session frees all the client's memory. `HttpSessions` holds those of clients whose
+connection does not identify an episode.
 """
 
 import asyncio
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,30 +15,13 @@ import numpy as np
 from mme_vla.embodiment.robomme import benchmark_action
 from mme_vla.errors import UserError, require
 from mme_vla.processing.prompt import subgoal_kind
-from mme_vla.serving.codec import unpack
 from mme_vla.serving.engine import Engine
-from mme_vla.serving.requests import AddBuffer, Infer, Request, Reset, parse
+from mme_vla.serving.requests import AddBuffer, Infer, Request, Reset
 from mme_vla.serving.settings import ServeSettings
-
-SMALL = 2**16  # bytes decoded on the event loop; larger messages are decoded in a thread
 
 
 class NoEpisodeError(UserError):
     """A request continues with an episode that is not here."""
-
-
-async def read_request(engine: Engine, settings: ServeSettings, data: bytes | bytearray) -> Request:
-    """Decode and check a message; a large one beside the event loop."""
-
-    def read() -> Request:
-        return parse(unpack(data), settings.limits.frames, engine.policy.embodiment)
-
-    return read() if len(data) <= SMALL else await engine.decode(read)
-
-
-def begins(request: Request) -> bool:
-    """Whether a request begins an episode, whatever was before it."""
-    return isinstance(request, Reset) or (isinstance(request, Infer) and request.first is True)
 
 
 class Session:
@@ -56,132 +41,127 @@ class Session:
         self._n_frames_at_action: int | None = None
 
     async def respond(self, request: Request, begun: float) -> dict[str, Any]:
-        """Do what a request asks and return the answer, not yet packed.
+        """Do what a request asks and return the reply as the protocol has it, not yet packed.
 
         Args:
-            begun: when the message was there whole (`time.perf_counter()`); the answer says how
+            begun: when the message was there whole (`time.perf_counter()`); the reply says how
                 long it took.
         """
+        reply: dict[str, Any]
         if isinstance(request, Reset):
+            kind, reply = "reset", {"reset_finished": True}
             self._begin()
-            return {"reset_finished": True, "reset_time_ms": self._took("reset", begun)}
-        if isinstance(request, AddBuffer):
-            await self._add(request)
-            return {
-                "add_buffer_finished": True,
-                "add_buffer_time_ms": self._took("add_buffer", begun),
-            }
-        actions = await self._infer(request)
-        space = self._engine.policy.embodiment.action
-        choices = (
-            {"choices": [benchmark_action(space, row) for row in actions]} if space.choice else {}
-        )
-        return {"actions": actions, **choices, "infer_time_ms": self._took("infer", begun)}
-
-    def _took(self, kind: str, begun: float) -> float:
+        elif isinstance(request, AddBuffer):
+            kind, reply = "add_buffer", {"add_buffer_finished": True}
+            await self._add_buffer(request)
+        else:
+            actions = await self._infer(request)
+            kind, reply = "infer", {"actions": actions}
+            space = self._engine.policy.embodiment.action
+            if space.choice:
+                reply["choices"] = [benchmark_action(space, row) for row in actions]
         seconds = time.perf_counter() - begun
         self._engine.stats.took(kind, seconds)
-        return seconds * 1e3
+        return reply | {f"{kind}_time_ms": seconds * 1e3}
 
-    async def _add(self, request: AddBuffer) -> None:
+    async def _add_buffer(self, request: AddBuffer) -> None:
+        count = len(request.frames)
+        self._check_capacity(count)
         if request.exec_start > 0:
             self._exec_start = request.exec_start
-        self._check_capacity(len(request.frames))
-        await self._engine.run(
-            self._add_frames(request.frames, request.states), self._pieces(request.frames)
-        )
+
+        def take(part: slice, is_demo: np.ndarray) -> None:
+            frames = np.stack(request.frames[part])
+            self.episode.add_frames(frames, is_demo, states=request.states[part])
+
+        await self._engine.run(self._in_pieces(count, take), self._n_pieces(count))
 
     async def _infer(self, request: Infer) -> np.ndarray:
-        policy = self._engine.policy
-        reads_actions = policy.require_processor().prompt_spec.past_actions > 0
+        policy, count = self._engine.policy, len(request.states)
+        # A client that repeats its first request means the same episode, not a longer one.
         if request.first:
-            # a client that repeats its first request means the same episode, not a longer one
             self._begin()
-        elif request.first is not None and self.episode.n_observed_frames == 0:
+            self._exec_start = count - 1
+        self._check_course(request)
+        if request.stored:
+            self._check_capacity(count)
+
+        episode = self.episode
+        episode.goal, episode.subgoal = request.goal, self._subgoal(request)
+        episode.options = request.options or episode.options
+        await self._engine.run(self._observe(request), self._n_pieces(count))
+        chunk = await self._engine.act(episode)
+        if not np.isfinite(chunk).all():
+            raise RuntimeError("the policy's answer is not finite")
+        self._n_frames_at_action = episode.n_observed_frames
+        if request.first is None:  # an MME-VLA client cuts the chunk itself
+            return chunk
+        return chunk[: self._settings.executed(policy.embodiment)]
+
+    def _check_course(self, request: Infer) -> None:
+        """Make sure that the episode has the frames this request continues from.
+
+        Raises:
+            NoEpisodeError: the episode that the client means is not here.
+            UserError: frames have to be sent before.
+        """
+        policy, seen = self._engine.policy, self.episode.n_observed_frames
+        if request.first is False and seen == 0:
             raise NoEpisodeError(
                 "is_first_step is false but this episode has no frame here: its first request must"
                 " come first. Was the server restarted, or the connection lost? Reset and begin the"
                 " episode again."
             )
-        if (
-            request.frames is None
-            and self.episode.n_observed_frames == 0
-            and policy.memory is not None
-        ):
-            raise UserError(
-                "This policy remembers past frames: send them with add_buffer, the current one"
-                " included."
-            )
-        if request.frames is None and request.observed is not None:
-            self._check_capacity(1)
-        if request.frames is not None:
-            self._check_capacity(len(request.frames))
-            if request.first:
-                self._exec_start = len(request.frames) - 1
-        elif reads_actions and self._n_frames_at_action == self.episode.n_observed_frames:
-            raise UserError(
-                "This policy reads which actions were executed, one a frame: send the frames since"
-                " the last chunk with add_buffer before the observation."
-            )
-        episode = self.episode
-        episode.goal, episode.subgoal = request.goal, self._subgoal(request)
-        episode.options = request.options or episode.options
-        await self._engine.run(self._observe(request), self._pieces(request.frames or ()))
-        chunk = await self._engine.act(episode)
-        if not np.isfinite(chunk).all():
-            raise RuntimeError("the policy's answer is not finite")
-        self._n_frames_at_action = episode.n_observed_frames
-        # A challenge client executes all it is given; an MME-VLA client cuts the chunk itself.
-        return (
-            chunk if request.frames is None else chunk[: self._settings.executed(policy.embodiment)]
+        if request.stored:
+            return
+        require(
+            seen > 0 or policy.memory is None,
+            "This policy remembers past frames: send them with add_buffer, the current one"
+            " included.",
+        )
+        reads_actions = policy.require_processor().prompt_spec.past_actions > 0
+        require(
+            not reads_actions or self._n_frames_at_action != seen,
+            "This policy reads which actions were executed, one a frame: send the frames since"
+            " the last chunk with add_buffer before the observation.",
         )
 
     def _observe(self, request: Infer) -> Iterator[None]:
-        if request.observed is not None and request.states is not None:
-            yield from self._watch(request.observed, request.states)
+        if request.stored:
+
+            def take(part: slice, is_demo: np.ndarray) -> None:
+                views = {name: np.stack(view[part]) for name, view in request.views.items()}
+                self.episode.observe(views, request.states[part], is_demo)
+
+            yield from self._in_pieces(len(request.states), take)
         else:
-            if request.frames is not None:
-                yield from self._add_frames(request.frames, request.states)
-            self.episode.set_view(request.images, request.state)
-        _ = (
-            self.episode.prompt
-        )  # a goal that cannot be read fails here, and not in a batch with others
+            views = {name: view[-1] for name, view in request.views.items()}
+            self.episode.set_view(views, request.states[-1])
+        # A goal that cannot be read fails here, and not in a batch with others.
+        _ = self.episode.prompt
 
-    def _add_frames(
-        self, frames: Sequence[np.ndarray], states: np.ndarray | None
-    ) -> Iterator[None]:
-        """Take frames into memory, pausing after every `encode_chunk` frames that have to be
-        encoded.
+    def _in_pieces(self, count: int, take: Callable[[slice, np.ndarray], None]) -> Iterator[None]:
+        """Take frames, pausing after every `encode_chunk` of those that have to be encoded.
+
+        take: is given the piece of the request's frames, and which of them are of the conditioning
+            video.
         """
-        episode, piece = self.episode, self._piece
-        for start in range(0, len(frames), piece):
+        piece = self._frames_a_piece()
+        for start in range(0, count, piece):
             if start:
                 yield
-            taken = np.stack(frames[start : start + piece])
-            demo = episode.n_observed_frames + np.arange(len(taken)) < self._exec_start
-            proprio = None if states is None else states[start : start + piece]
-            episode.add_frames(taken, demo, states=proprio)
+            part = slice(start, min(start + piece, count))
+            numbers = self.episode.n_observed_frames + np.arange(part.stop - start)
+            take(part, numbers < self._exec_start)
 
-    def _watch(self, frames: Mapping[str, np.ndarray], states: np.ndarray) -> Iterator[None]:
-        """Take frames with what all cameras delivered, for a policy that reads more than images."""
-        episode, piece = self.episode, self._piece
-        for start in range(0, len(states), piece):
-            if start:
-                yield
-            part = slice(start, start + piece)
-            demo = episode.n_observed_frames + np.arange(len(states[part])) < self._exec_start
-            episode.observe(
-                {name: values[part] for name, values in frames.items()}, states[part], demo
-            )
-
-    @property
-    def _piece(self) -> int:
-        """Frames to a piece; of some memories most frames are never encoded."""
+    def _frames_a_piece(self) -> int:
         memory = self._engine.policy.memory
-        return self._settings.encode_chunk * (1 if memory is None else memory.storage.keep_every)
+        if memory is None:
+            return self._settings.encode_chunk
+        return self._settings.encode_chunk * memory.storage.keep_every
 
-    def _pieces(self, frames: Sequence[np.ndarray]) -> int:
-        return max(1, -(-len(frames) // self._piece))
+    def _n_pieces(self, count: int) -> int:
+        return max(1, -(-count // self._frames_a_piece()))
 
     def _check_capacity(self, count: int) -> None:
         total, most = self.episode.n_observed_frames + count, self._settings.limits.frames
@@ -214,8 +194,10 @@ class BusyError(Exception):
 
 @dataclass(eq=False)
 class SessionEntry:
-    """A session. requests: those it works on or that wait for their turn; `used`: end of the last
-    one.
+    """A session of an HTTP client.
+
+    requests: those it works on or that wait for their turn.
+    used: end of the last one (`time.monotonic()`).
     """
 
     session: Session
@@ -225,19 +207,24 @@ class SessionEntry:
 
 
 class HttpSessions:
-    """The sessions of a server, at most `limits.connections` of them."""
+    """The sessions of HTTP clients, at most `limits.connections` of them."""
 
     def __init__(self, engine: Engine, settings: ServeSettings) -> None:
         self._engine, self._settings = engine, settings
         self.entries: dict[Name, SessionEntry] = {}
 
     async def respond(self, name: Name, request: Request, begun: float) -> dict[str, Any]:
-        """Answer a request of a session, after those of the same session that came before."""
+        """Reply to a request of a session, after those of the same session that came before.
+
+        Raises:
+            NoEpisodeError: the session has ended, or never began.
+            BusyError: there is no place for a new session.
+        """
         entry = self.find(name, request)
         entry.requests += 1
         try:
             async with entry.lock:
-                if self.entries.get(name) is not entry and not begins(request):
+                if self.entries.get(name) is not entry and not _begins(request):
                     raise NoEpisodeError(LOST)  # a request before this one failed
                 return await entry.session.respond(request, begun)
         except Exception:
@@ -248,12 +235,13 @@ class HttpSessions:
             entry.used = time.monotonic()
 
     def find(self, name: Name, request: Request) -> SessionEntry:
-        """The session of that name; a new one takes the place of the longest silent where there is
-        no other.
+        """The session of that name.
+
+        A new one replaces the longest silent one where there is no other place.
         """
         if name in self.entries:
             return self.entries[name]
-        if not begins(request):
+        if not _begins(request):
             raise NoEpisodeError(LOST)
         if len(self.entries) >= self._settings.limits.connections:
             silent = [known for known, entry in self.entries.items() if not entry.requests]
@@ -269,21 +257,14 @@ class HttpSessions:
         if entry is None or self.entries.get(name) is entry:
             self.entries.pop(name, None)
 
-    async def forget_silent(self) -> None:
+    def forget_silent(self) -> None:
         """Free the memory of sessions that have been silent for `limits.idle_s`."""
-        idle = self._settings.limits.idle_s
-        while True:
-            await asyncio.sleep(min(15, idle / 4))
-            oldest = time.monotonic() - idle
-            for name, entry in list(self.entries.items()):
-                if entry.used < oldest and not entry.requests:
-                    del self.entries[name]
+        oldest = time.monotonic() - self._settings.limits.idle_s
+        for name, entry in list(self.entries.items()):
+            if entry.used < oldest and not entry.requests:
+                del self.entries[name]
 
 
-def error_text(error: Exception) -> str:
-    """What a client is told of an error: a mistake of its own in full, anything else without its
-    traceback.
-    """
-    if isinstance(error, UserError | BusyError):
-        return str(error)
-    return f"The server failed on this request ({type(error).__name__}: {str(error)[:200]})."
+def _begins(request: Request) -> bool:
+    """Whether a request begins an episode, whatever was before it."""
+    return isinstance(request, Reset) or (isinstance(request, Infer) and request.first is True)

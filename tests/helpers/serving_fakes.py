@@ -65,7 +65,7 @@ class Served:
         await self.server.start()
 
     def __exit__(self, *_: object) -> None:
-        if not self.server.connections.stopping:
+        if not self.server.places.stopping:
             self.on_loop(self.server.stop())
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(10)
@@ -80,7 +80,7 @@ class Served:
     @property
     def busy(self) -> int:
         """Clients that wait for an answer."""
-        return sum(connection.busy for connection in self.server.connections.open.values())
+        return len(self.server.places.taken) - len(self.server.places.waiting())
 
     @contextmanager
     def reading(self) -> Iterator["Reading"]:

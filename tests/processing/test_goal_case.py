@@ -88,10 +88,18 @@ def test_an_episode_without_a_goal_is_refused_when_its_prompt_is_made() -> None:
 
 @pytest.mark.parametrize("goal", ["", "   ", ["", "press the button"]])
 def test_a_server_refuses_a_request_without_a_goal(goal: Any) -> None:
-    from mme_vla.serving.requests import _goal
+    from mme_vla.embodiment import ROBOMME_JOINT
+    from mme_vla.serving.requests import RequestReader
 
+    image = np.zeros((16, 16, 3), np.uint8)
+    message = {
+        "observation/image": image,
+        "observation/wrist_image": image,
+        "observation/state": np.zeros(8, np.float32),
+        "prompt": goal,
+    }
     with pytest.raises(UserError, match=r"prompt is '.*': a policy is told what to do in words"):
-        _goal("prompt", goal)
+        RequestReader(ROBOMME_JOINT, 10).parse(message)
 
 
 def test_simplememvla_spells_alike() -> None:

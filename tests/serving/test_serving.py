@@ -339,7 +339,7 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
             )
             wait_until(lambda: served.busy == 1)
             stopped = pool.submit(served.on_loop, served.server.stop())
-            wait_until(lambda: served.server.connections.stopping)
+            wait_until(lambda: served.server.places.stopping)
         stopped.result(60)
         assert pending.result(60)["actions"].shape == (16, 8)
         for client in (idle, busy):

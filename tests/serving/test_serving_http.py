@@ -157,8 +157,7 @@ def test_bodies_that_arrive_slowly_hold_no_place(policy):
             raw.close()
 
 
-def test_a_body_has_a_time_limit_as_a_whole(policy, monkeypatch):
-    monkeypatch.setattr("mme_vla.serving.app.LINGER_S", 0.1)
+def test_a_body_has_a_time_limit_as_a_whole(policy):
     with Served(policy, limits=Limits(receive_s=1)) as served, slow_post(served) as raw:
         raw.settimeout(0.2)
         output = b""

@@ -9,6 +9,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +22,10 @@ from helpers.serving_fakes import (
     course,
     serving_policy,
     states,
+    wait_until,
 )
 from mme_vla.errors import UserError
-from mme_vla.serving import Limits, connections, pack
+from mme_vla.serving import Limits, pack, server
 
 IMAGE = np.zeros((16, 16, 3), np.uint8)
 
@@ -59,6 +61,11 @@ def test_a_silent_websocket_is_closed_and_its_episode_freed(policy):
         assert steady.reset()
 
 
+def open_connections(served: Served) -> set[Any]:
+    assert served.server._uvicorn
+    return served.server._uvicorn.server_state.connections
+
+
 def idle(served: Served, count: int, request: bytes) -> list[socket.socket]:
     sockets = []
     for _ in range(count):
@@ -75,29 +82,29 @@ def idle(served: Served, count: int, request: bytes) -> list[socket.socket]:
 def test_unauthenticated_clients_take_no_place_from_those_who_have_the_key(policy, request_):
     with Served(policy, api_key="right", limits=Limits(connections=2)) as served:
         known = served.client(api_key="right")
-        sockets = idle(served, connections.MAX_UNAUTHENTICATED + 20, request_)
+        sockets = idle(served, server.MAX_STRANGERS + 20, request_)
         with served.client(api_key="right") as client:
             assert client.reset() and known.reset()
             assert ask(served, "GET", "/healthz")[0] == 200
-        assert len(served.server.connections.open) <= connections.MAX_UNAUTHENTICATED + 3
+        wait_until(lambda: len(open_connections(served)) <= server.MAX_STRANGERS + 3)
         for raw in sockets:
             raw.close()
 
 
 def test_headers_that_never_end_are_not_waited_for(policy, monkeypatch):
-    monkeypatch.setattr(connections, "HEAD_S", 0.5)
+    monkeypatch.setattr(server, "BRIEF_S", 0.5)
+    monkeypatch.setattr(server, "KEEP_ALIVE_S", 1)
     with Served(policy, limits=Limits(receive_s=1)) as served:
         sockets = idle(served, 1, b"")
-        sockets += idle(
-            served, 1, b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
-        )  # answered, and then it dawdles
+        for path in (b"healthz", b"stats"):  # answered, and then the next headers never end
+            sockets += idle(served, 1, b"GET /" + path + b" HTTP/1.1\r\nHost: x\r\n\r\n")
         until = time.monotonic() + 30
-        while time.monotonic() < until and served.server.connections.open:
+        while time.monotonic() < until and open_connections(served):
             for raw in sockets:
                 with suppress(OSError):
                     raw.sendall(b"G")
             time.sleep(0.1)
-        assert not served.server.connections.open
+        assert not open_connections(served)
 
 
 def resident_mib() -> float:
@@ -109,7 +116,7 @@ def resident_mib() -> float:
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads memory from /proc")
 @pytest.mark.parametrize("path", ["/healthz", "/infer"])
 def test_an_unrequested_body_is_discarded(policy, monkeypatch, path):
-    monkeypatch.setattr("mme_vla.serving.app.LINGER_S", 0.5)
+    monkeypatch.setattr(server, "BRIEF_S", 0.5)
     piece = bytes(2**20)
     with Served(policy, api_key="right") as served:
         before = resident_mib()

@@ -231,14 +231,15 @@ def test_sam2act_is_reported_which_depth_a_request_lacks(loaded: Callable[[str],
     request = challenge(frames, frames, states, first=True, **lists)
     wrong = {
         "lacks wrist_depth_list": {k: v for k, v in request.items() if k != "wrist_depth_list"},
-        "front_depth_list must have one entry for each of 2 frames": request
+        "front_depth_list must be depth in millimetres, one number a pixel": request
         | {"front_depth_list": []},
-        r"front_depth_list must hold arrays \[64, 64\]": request
+        r"front_depth_list must have one number a pixel of the image \[64, 64\]": request
         | {"front_depth_list": [np.zeros((8, 8))] * 2},
         "front_depth_list must be millimetres": request
         | {"front_depth_list": [-d for d in lists["front_depth_list"]]},
-        r"wrist_camera_extrinsic_list must hold arrays \[3, 4\]": request
+        r"wrist_camera_extrinsic_list must be an array of numbers \[frames, 3, 4\]": request
         | {"wrist_camera_extrinsic_list": ["x", "y"]},
+        "front_depth_list has 1": request | {"front_depth_list": lists["front_depth_list"][:1]},
         "add_buffer has no place for them": {
             "add_buffer": True,
             "images": frames[:, None],

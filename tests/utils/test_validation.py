@@ -1,0 +1,69 @@
+"""Checks of what comes from outside: the first mistake, as one sentence with key, value and
+what is allowed.
+"""
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pytest
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictInt
+
+from mme_vla.errors import UserError
+from mme_vla.utils.validation import described, validated
+
+
+def even(value: int) -> int:
+    if value % 2:
+        raise ValueError("must be an even number")
+    return value
+
+
+class Inner(BaseModel):
+    width: StrictInt
+
+
+class Outer(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    steps: Annotated[StrictInt, Field(ge=0)] = 0
+    kind: Literal["simple", "grounded"] = "simple"
+    count: Annotated[int, AfterValidator(even)] = 0
+    inners: list[Inner] = []
+    name: str = Field(alias="the/name", description="what it is called")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"steps": "x"}, "steps='x' must be a whole number."),
+        ({"steps": -1}, "steps=-1 must be greater than or equal to 0."),
+        ({"kind": "grounde"}, "kind='grounde'. Did you mean 'grounded'? Known: grounded, simple."),
+        ({"kind": 3}, "kind=3 must be 'simple' or 'grounded'."),
+        ({"count": 3}, "count must be an even number, got 3."),
+        ({"inners": [{"width": 1}, {"width": None}]}, "inners[1].width=None must be a whole"),
+        ({"inners": [{}]}, "The file lacks inners[0].width; it has none."),
+        ({"stepz": 1}, "Unknown key stepz. Did you mean 'steps'?"),
+        ({"the/name": 3}, "the/name=3 must be a text."),
+    ],
+)
+def test_a_mistake_names_key_value_and_what_is_allowed(
+    change: dict[str, Any], message: str
+) -> None:
+    right = {"the/name": "a"}
+    assert validated(Outer, right, "The file").name == "a"
+    with pytest.raises(UserError) as raised:
+        validated(Outer, right | change, "The file")
+    assert str(raised.value).startswith(message)
+
+
+def test_a_missing_key_is_named_with_its_meaning() -> None:
+    with pytest.raises(UserError, match=r"The file lacks the/name \(what it is called\); it has"):
+        validated(Outer, {"steps": 1}, "The file")
+
+
+def test_large_values_are_described_in_short() -> None:
+    assert described(np.zeros((2, 3), np.uint8)) == "uint8 [2, 3]"
+    nested: Any = []
+    for _ in range(5000):
+        nested = [nested]
+    assert described(nested) == "a list of 1 value, the first: a list"
+    assert len(described("x" * 10_000)) < 100
