@@ -28,12 +28,12 @@ from types import MappingProxyType
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import AuxiliaryLosses, Backbone, Injection, KeepsKeysValues
+from mme_vla.backbone.base import Backbone, Injection
 from mme_vla.backbone.layers import Block
 from mme_vla.errors import UserError, check_known, require
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
-from mme_vla.types import Batch, HistoryTokens, KeysValues, MemoryTokens, Noise
+from mme_vla.types import Batch, HistoryTokens, MemoryTokens, Noise
 
 
 class MMEModel(nn.Module):
@@ -104,8 +104,7 @@ class MMEModel(nn.Module):
         memory: MemoryTokens | None = None,
         augmentation: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """The mean losses of a batch by name: `action`, and in training those of memory,
-        integration and backbone.
+        """The mean losses of a batch by name: `action`, and in training those of the memory.
 
         The arguments are those of `loss`.
         """
@@ -114,32 +113,19 @@ class MMEModel(nn.Module):
             memory = (
                 self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
             )
-            injection = self.inject(batch, memory)
-            losses = self.backbone.loss(batch, injection, noise)  # b h
-            auxiliary = self.auxiliary_losses(batch, injection, memory) if self.training else {}
-        means = {
-            name: weighted_mean(rows.float(), batch.weight) for name, rows in auxiliary.items()
-        }
-        return {"action": masked_mean(losses, batch.action_mask, batch.weight), **means}
-
-    def auxiliary_losses(
-        self, batch: Batch, injection: Injection, memory: MemoryTokens | None
-    ) -> dict[str, Tensor]:
-        """Losses [b] by name that memory, integration and backbone return beside that of the
-        actions.
-        """
-        rows = {} if memory is None else dict(memory.losses)
-        for part in (self.integration, self.backbone):
-            if isinstance(part, AuxiliaryLosses):
-                rows |= part.losses(batch, injection, memory)
-        for name, values in rows.items():
+            rows = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
+        losses = {"action": masked_mean(rows, batch.action_mask, batch.weight)}
+        if memory is None or not self.training:
+            return losses
+        for name, values in memory.losses.items():
             require(
                 name != "action" and values.shape == (len(batch.prompt),),
                 f"The auxiliary loss {name!r} has shape {list(values.shape)}: return one number a"
                 f" sample, [{len(batch.prompt)}], under another name than 'action'.",
                 ValueError,
             )
-        return rows
+            losses[name] = weighted_mean(values.float(), batch.weight)
+        return losses
 
     def total_loss(self, losses: Mapping[str, Tensor]) -> Tensor:
         """The loss that training minimises: `action`, and the others times their weights. Weight 0
@@ -180,22 +166,6 @@ class MMEModel(nn.Module):
             )
             batch = self.prepare_images(batch)
             return self.backbone.sample(batch, self.inject(batch, memory), noise, steps)
-
-    @torch.no_grad()
-    def sample_and_keep(
-        self,
-        batch: Batch,
-        noise: Mapping[str, Tensor],
-        steps: int | None = None,
-        memory: MemoryTokens | None = None,
-    ) -> tuple[Tensor, KeysValues]:
-        """A chunk as `sample` returns it, and the keys and values that the backbone made of its
-        prefix.
-        """
-        assert isinstance(self.backbone, KeepsKeysValues)
-        with self.autocast():
-            batch = self.prepare_images(batch)
-            return self.backbone.sample_and_keep(batch, self.inject(batch, memory), noise, steps)
 
     # The steps, in order
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers import Block, Visibility
-from mme_vla.types import Batch, KeysValues, MemoryTokens, Noise, ReadsLabels
+from mme_vla.types import Batch, Noise
 
 Hook = Callable[[int, Tensor], Tensor]
 """`hook(layer, x)`: the input of the action expert's MLP in a layer, made from its residual stream
@@ -52,8 +52,6 @@ class Injection:
     visibility: which block attends to which; rows for these blocks, for those beside the actions
     and for `action`. hook: see `Hook`. condition: maps the condition [b, c] of the action expert's
     norms to a changed one. beside: blocks that run with the actions, before them, in every step.
-    past: stored keys and values, read beside the prefix as the block `cache`. They take no
-    positions.
     """
 
     blocks: Sequence[Block]
@@ -61,7 +59,6 @@ class Injection:
     hook: Hook | None = None
     condition: Callable[[Tensor], Tensor] | None = None
     beside: Sequence[Block] = ()
-    past: KeysValues | None = None
 
 
 class Backbone(nn.Module):
@@ -75,8 +72,8 @@ class Backbone(nn.Module):
         Config: the dataclass of its sizes, read from the section `backbone`; integrations are built
             from it.
         supports: what an integration may use, of `blocks`, `expert`, `hook`, `condition`, `beside`,
-            `positions` (blocks at rotary positions of their own) and `cache` (`Injection.past`,
-            which needs `KeepsKeysValues`); and a memory, `past` (`Batch.past`).
+            and `positions` (blocks at rotary positions of their own); and a memory, `past`
+            (`Batch.past`).
         vision: the vision tower; its weights decide what a cache of its tokens holds.
         image_size: side of the square images, in pixels. grid: side of a view's token grid.
         vision_width: width d_vision of the tokens that a memory stores.
@@ -151,56 +148,6 @@ class Backbone(nn.Module):
 
         Fine-tuning uses the names `vision`, `vlm`, `action`, and `memory` for the extra experts of
         an integration.
-        """
-        raise NotImplementedError
-
-
-class HasLanguageHead:
-    """Capability of a backbone: it writes a line of text at each decision, the note `note` of its
-    next prompt.
-    """
-
-    note: str = "note"
-
-    def write(self, batch: Batch, injection: Injection) -> Tensor:
-        """Token ids [b, l] int64 of a line, 0 after its end, under the caller's autocast.
-
-        Args:
-            batch: its images are prepared. injection: the blocks of `embed` with memory added.
-        """
-        raise NotImplementedError
-
-
-class AuxiliaryLosses(ReadsLabels):
-    """Capability of an integration or a backbone: losses beside that of the actions.
-
-    A memory returns its own with its tokens (`MemoryTokens.losses`).
-    """
-
-    def losses(
-        self, batch: Batch, injection: Injection, memory: MemoryTokens | None
-    ) -> dict[str, Tensor]:
-        """Losses by name, each [b], with gradients; called in training alone.
-
-        Args:
-            batch: its images are prepared. injection: what the backbone's own loss reads. memory:
-                the memory tokens.
-        """
-        raise NotImplementedError
-
-
-class KeepsKeysValues:
-    """Capability of a backbone: it returns the keys and values that it made of a chunk's prefix."""
-
-    def sample_and_keep(
-        self,
-        batch: Batch,
-        injection: Injection,
-        noise: Mapping[str, Tensor],
-        steps: int | None = None,
-    ) -> tuple[Tensor, KeysValues]:
-        """A chunk as `Backbone.sample` returns it, and the keys and values of
-        `injection.blocks`.
         """
         raise NotImplementedError
 

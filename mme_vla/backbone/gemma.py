@@ -32,7 +32,6 @@ from mme_vla.backbone.layers import (
     token_positions,
 )
 from mme_vla.speed import Recompute, run_layer
-from mme_vla.types import KeysValues
 
 KeyValue = tuple[Tensor, Tensor]
 
@@ -262,21 +261,6 @@ class KVCache:
     layers: Sequence[KeyValue | StaticKV]
     spans: list[Span]
     mask: Tensor  # [b, past] bool
-    stored: int = 0  # leading tokens of earlier chunks, which count for no position
-
-    @classmethod
-    def of(cls, cache: KeysValues | None) -> "KVCache | None":
-        """Keys and values of earlier chunks as the block `cache`."""
-        if cache is None:
-            return None
-        layers = [(layer[:, 0], layer[:, 1]) for layer in cache.values.unbind(1)]
-        count = cache.mask.shape[1]
-        return cls(layers, [Span("cache", count)], cache.mask, count)
-
-    def new(self) -> KeysValues:
-        """All but the tokens of earlier chunks."""
-        pairs = [torch.stack([layer[0], layer[1]], 1)[:, :, self.stored :] for layer in self.layers]
-        return KeysValues(torch.stack(pairs, 1), self.mask[:, self.stored :])
 
     def preallocate(self, tokens: int) -> "KVCache":
         """The same with space behind it, in which every one of many passes of so many tokens writes
@@ -291,7 +275,7 @@ class KVCache:
             )
             for layer in self.layers
         ]
-        return KVCache(static, self.spans, self.mask, self.stored)
+        return KVCache(static, self.spans, self.mask)
 
 
 class Layout(NamedTuple):
@@ -376,7 +360,7 @@ class JointTransformer(nn.Module):
         """
         spans = [Span(block.name, len(block)) for block in blocks]
         asking = torch.cat([block.mask for block in blocks], 1)
-        before = past.mask[:, past.stored :] if past else None
+        before = past.mask if past else None
         positions = apply_custom_positions(token_positions(asking, before), blocks)
         all_spans, valid = (
             (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
@@ -433,8 +417,7 @@ class JointTransformer(nn.Module):
         if segments:
             final = condition.final if isinstance(condition, Conditioning) else condition
             output, _ = self.final_norm(segments[-1].tokens, final)
-        stored = past.stored if past else 0
-        return output, KVCache(cached, layout.spans, layout.valid, stored) if keep else None
+        return output, KVCache(cached, layout.spans, layout.valid) if keep else None
 
 
 def _after(past: KeyValue | StaticKV | None, k: Tensor, v: Tensor) -> KeyValue:

@@ -13,7 +13,6 @@ from mme_vla.backbone.base import (
     HasExtraExperts,
     HasLoraTargets,
     Injection,
-    KeepsKeysValues,
 )
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
@@ -22,7 +21,7 @@ from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, check_backend, f
 from mme_vla.backbone.siglip import VisionTower
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes, Sharded
-from mme_vla.types import Batch, KeysValues, Noise, PastViews
+from mme_vla.types import Batch, Noise, PastViews
 
 if TYPE_CHECKING:
     from mme_vla.speed.sharding import ShardGroup
@@ -38,7 +37,6 @@ class Pi05Backbone(
     Recomputes,
     Sharded,
     CapturableSampling,
-    KeepsKeysValues,
 ):
     """Vision tower, VLM expert and action expert under joint attention; chunks by flow matching.
 
@@ -46,9 +44,7 @@ class Pi05Backbone(
     """
 
     Config = BackboneConfig
-    supports = frozenset(
-        {"blocks", "expert", "hook", "condition", "beside", "positions", "cache", "past"}
-    )
+    supports = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions", "past"})
     heads = ("action_in", "action_out", "time_in", "time_out")
     # The VLM's last layer has `kv` in place of `qkv`.
     lora_targets = tuple(
@@ -178,11 +174,10 @@ class Pi05Backbone(
         pass.
         """
         blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
-        past = KVCache.of(injection.past)
-        layout = self.transformer.layout(blocks, injection.visibility, past)
+        layout = self.transformer.layout(blocks, injection.visibility)
         condition = self.time_condition(time)
         condition = condition if injection.condition is None else injection.condition(condition)
-        hidden, _ = self.transformer(blocks, layout, condition, injection.hook, past)
+        hidden, _ = self.transformer(blocks, layout, condition, injection.hook)
         return self.read_velocity(hidden)
 
     # Sampling
@@ -205,27 +200,7 @@ class Pi05Backbone(
         prefix and of the modulator, and every layer's time modulation. A step runs the action block
         alone.
         """
-        return self._integrate(batch, injection, noise, steps, self.prefill(injection))
-
-    @torch.no_grad()
-    def sample_and_keep(
-        self,
-        batch: Batch,
-        injection: Injection,
-        noise: Mapping[str, Tensor],
-        steps: int | None = None,
-    ) -> tuple[Tensor, KeysValues]:
         prefix = self.prefill(injection)
-        return self._integrate(batch, injection, noise, steps, prefix), prefix.new()
-
-    def _integrate(
-        self,
-        batch: Batch,
-        injection: Injection,
-        noise: Mapping[str, Tensor],
-        steps: int | None,
-        prefix: KVCache,
-    ) -> Tensor:
         x, steps = noise["noise"], self.head.steps if steps is None else steps
         blocks = [*injection.beside, self.action_block(x)]
         layout = self.transformer.layout(blocks, injection.visibility, prefix)
@@ -244,9 +219,8 @@ class Pi05Backbone(
 
     def prefill(self, injection: Injection) -> KVCache:
         """Keys and values of the prefix, which all steps of a chunk share."""
-        past = KVCache.of(injection.past)
-        layout = self.transformer.layout(injection.blocks, injection.visibility, past)
-        _, prefix = self.transformer(injection.blocks, layout, past=past, keep=True)
+        layout = self.transformer.layout(injection.blocks, injection.visibility)
+        _, prefix = self.transformer(injection.blocks, layout, keep=True)
         return prefix
 
     def denoise(

@@ -19,7 +19,6 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import (
     LimitsActions,
     SamplesInSteps,
-    WritesNotes,
     frames_read,
     with_vision_memory,
 )
@@ -110,7 +109,6 @@ class FedEpisode(Episode):
         super().__init__(host, goal, seed)
         self._host, self.seed = host, seed
         self.inner = host.inner.start_episode(goal, seed)
-        self.notes, self.written = self.inner.notes, self.inner.written
         self.exec_start: int | None = None
         self._counts: np.ndarray = np.zeros(0, np.int64)
         self._starts: np.ndarray = np.zeros(0, np.int64)
@@ -294,14 +292,6 @@ class FedPolicy(Policy):
     ) -> Tensor:
         return self.inner.predict_chunk(
             batch, [inner_episode(episode) for episode in episodes], draws, steps
-        )
-
-    def write_notes(self, batch: Any, episodes: Sequence[Episode]) -> Sequence[Mapping[str, str]]:
-        inner = [inner_episode(episode) for episode in episodes]
-        return (
-            self.inner.write_notes(batch, inner)
-            if isinstance(self.inner, WritesNotes)
-            else [{} for _ in inner]
         )
 
 

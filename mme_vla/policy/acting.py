@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.policy.capabilities import WritesNotes
 from mme_vla.types import stack_noise
 
 if TYPE_CHECKING:
@@ -50,16 +49,11 @@ def choose_actions(
     policy.eval()
     try:
         chunk = predict(batch, noise).float().cpu()
-        stored = (
-            policy.write_notes(batch, episodes)
-            if isinstance(policy, WritesNotes)
-            else [{} for _ in episodes]
-        )
     finally:
         policy.train(was_training)
     absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
     decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
     actions = torch.stack(decided).numpy()[:, processor.samples.window - 1 :]
-    for episode, actions_of, notes in zip(episodes, actions, stored, strict=True):
-        episode.acted(actions_of, notes)
+    for episode, actions_of in zip(episodes, actions, strict=True):
+        episode.acted(actions_of)
     return SelectedActions(batch, chunk, actions)

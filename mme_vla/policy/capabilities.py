@@ -95,17 +95,6 @@ class AugmentsImages(Protocol):
 
 
 @runtime_checkable
-class WritesNotes(Protocol):
-    """Writes notes, which its own prompts have from the next decision on (`Episode.notes`)."""
-
-    def write_notes(self, batch: Any, episodes: "Sequence[Episode]") -> Sequence[Mapping[str, str]]:
-        """One line by name for each episode at an `observation`; an empty mapping
-        writes nothing.
-        """
-        ...
-
-
-@runtime_checkable
 class WeighsLosses(Protocol):
     """Learns from auxiliary losses, labels and weighted samples (`Batch.weight`,
     `Batch.labels`).

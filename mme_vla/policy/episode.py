@@ -63,12 +63,6 @@ class Episode:
         self.goal = checked_text(goal, "the goal")
         self.subgoal: str | None = None
         """The current language subgoal, for policies whose prompt has one; set it before `act`."""
-        self.notes: dict[str, str] = {}
-        """The notes of prompts that read some, by name; a policy that writes notes replaces its own
-        at each `act`.
-        """
-        self.written: list[dict[str, Any]] = []
-        """What the policy wrote: for each decision its frame, and the lines by name."""
         self.options: tuple[Option, ...] = ()
         """The options of policies that choose among some; set them before `act`."""
         memory = policy.memory
@@ -303,9 +297,8 @@ class Episode:
             self._recent[-1][1] if self._recent else None,
         )
         goal = self._robot.action.worded(checked_goal(self.goal), self.options)
-        notes = {"notes": self.notes} if processor.prompt_spec.notes else {}
         return processor.prompt(
-            goal, subgoal=self.subgoal, state=state, past_actions=self._executed, **notes
+            goal, subgoal=self.subgoal, state=state, past_actions=self._executed
         )
 
     def set_action_prefix(self, actions: np.ndarray, delay: int = 0) -> None:
@@ -340,15 +333,12 @@ class Episode:
         use it.
         """
 
-    def acted(self, chunk: np.ndarray, notes: Mapping[str, str] | None = None) -> None:
-        """Take the chunk [h, w] of the policy, and the notes it wrote.
-
-        The frames that follow tell how much of the chunk was executed.
+    def acted(self, chunk: np.ndarray) -> None:
+        """Take the chunk [h, w] of the policy; the frames that follow show how much of it was
+        executed.
         """
-        self._chunk, self.action_prefix = chunk, None
-        if notes:
-            self.notes |= notes
-            self.written.append({"frame": self.n_observed_frames - 1, **notes})
+        self._chunk = chunk
+        self.action_prefix = None
 
     @property
     def noise_state(self) -> Tensor:

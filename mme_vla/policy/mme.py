@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLanguageHead, HasLoraTargets
+from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets
 from mme_vla.backbone.building import read_backbone, shapes_only
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.backbone.layers import check_backend
@@ -20,7 +20,6 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, listed
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import (
-    CacheMemory,
     CompilableMemory,
     MatmulPrecision,
     MemoryModule,
@@ -33,7 +32,6 @@ from mme_vla.memory.history import PromptConditionedHistory
 from mme_vla.model import MMEModel
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_integrated
-from mme_vla.policy.caching import CachingEpisode, stack_caches, stage_writes
 from mme_vla.policy.episode import Episode, prefix_overlap
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.network import MemoryTower, NetworkPolicy
@@ -298,9 +296,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
     @property
     def compiles_sampling(self) -> bool:
         """Whether the backbone's sampler can be compiled."""
-        return isinstance(self.backbone, CapturableSampling) and not isinstance(
-            self.memory, CacheMemory
-        )
+        return isinstance(self.backbone, CapturableSampling)
 
     def compile_sampling(self, layers: bool = False) -> None:
         """Speed up sampling with fixed weights; chunks are equal up to the rounding of other
@@ -343,10 +339,6 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     # Episodes
 
-    def start_episode(self, goal: str, seed: int = 0) -> Episode:
-        kind = CachingEpisode if isinstance(self.memory, CacheMemory) else Episode
-        return kind(self, goal, seed)
-
     def observation(self, episodes: Sequence[Episode]) -> Batch:
         """The current views and prompts of running episodes."""
         prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
@@ -372,14 +364,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
     ) -> Tensor:
         """A chunk for the batch of `observation`, with the episodes' memories."""
         memory = self._memory_tokens(episodes, batch)
-        if not isinstance(self.memory, CacheMemory):
-            return self.sample_actions(batch, noise, steps, memory=memory)
-        assert memory is not None
-        memory.cache = stack_caches(episodes)
-        values = map_noise(noise, lambda value: send(value, self.device))
-        chunk, made = self.sample_and_keep(batch, values, steps, memory)
-        stage_writes(self.memory, episodes, made)
-        return chunk
+        return self.sample_actions(batch, noise, steps, memory=memory)
 
     @torch.no_grad()
     def _memory_tokens(self, episodes: Sequence[Episode], batch: Batch) -> MemoryTokens | None:
@@ -397,23 +382,6 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             for episode, history in zip(episodes, histories, strict=True):
                 episode.read = history
             return encode_histories(self.memory, histories, [e.stream for e in episodes])
-
-    @torch.no_grad()
-    def write_notes(self, batch: Batch, episodes: Sequence[Episode]) -> list[dict[str, str]]:
-        """The lines that a backbone with a language head writes; nothing without one."""
-        if not isinstance(self.backbone, HasLanguageHead):
-            return [{} for _ in episodes]
-        memory, tokenizer = self._memory_tokens(episodes, batch), self.require_processor().tokenizer  # type: ignore[attr-defined]
-        if memory is not None:
-            memory.cache = stack_caches(episodes)
-        with self.autocast():
-            prepared = self.prepare_images(batch)
-            ids = self.backbone.write(prepared, self.inject(prepared, memory)).tolist()
-        lines = (
-            tokenizer.decode([token for token in row if 0 < token < tokenizer.vocab_size])
-            for row in ids
-        )
-        return [{self.backbone.note: " ".join(line.split())} for line in lines]
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.memory.base import CacheMemory, stack_history
+from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import FrameScores, History
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import WritableMemory, with_vision_memory
@@ -311,7 +311,7 @@ class WritableChannel(Channel):
 
 def channel_of(policy: Policy) -> Channel:
     """The way to what this policy remembers."""
-    if policy.memory is not None and not isinstance(policy.memory, CacheMemory):
+    if policy.memory is not None:
         return SelectionChannel(policy)
     episode = policy.start_episode("")
     return (

@@ -75,7 +75,8 @@ def prepare_data(
             every=counted.every, extremes=counted.extremes, exact=counted.exact,
             video=counted.video, narrow=narrow,
         )  # fmt: skip
-    labels = labels_read(*(part for part in policy.children() if part is not policy.memory))
+    memory_parts = set() if policy.memory is None else set(policy.memory.modules())
+    labels = labels_read(*(part for part in policy.modules() if part not in memory_parts))
     require(
         data.get("weights") is None
         or (isinstance(policy, WeighsLosses) and processor.samples.kind == "steps"),
@@ -128,7 +129,6 @@ def prepare_data(
             subgoal=subgoal,
             labels=labels,
             weights=data.get("weights"),
-            texts=data.get("texts"),
             seed=seed,
             transforms=() if held_out else transforms,
         )

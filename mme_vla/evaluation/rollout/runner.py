@@ -328,7 +328,6 @@ class Rollout:
                 **({"video": running.video} if running.video else {}),
                 **({PROCESS: running.process} if running.process else {}),
                 **({"events": running.events.log} if running.events.log else {}),
-                **({"notes": running.episode.written} if running.episode.written else {}),
                 **({EXTRA: running.trace.score.to_dict()} if running.trace else {}),
             },
         )
