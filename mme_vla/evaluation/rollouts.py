@@ -231,7 +231,7 @@ def with_view_tokens(policy: MMEPolicy, batch: Batch, size: int = 32) -> Batch:
     tokens = []
     with policy.autocast():
         for start in range(0, len(batch.prompt), size):
-            images = policy.prepare_images(
+            images = policy.model.prepare_images(
                 batch.rows(slice(start, start + size)).to(policy.device)
             ).images
             tokens.append(

@@ -29,7 +29,7 @@ from mme_vla.memory.base import (
     past_view_spec,
 )
 from mme_vla.memory.history import PromptConditionedHistory
-from mme_vla.model import MMEModel
+from mme_vla.model import MMEModel, unit_images
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_integrated
 from mme_vla.policy.episode import Episode, prefix_overlap
@@ -48,11 +48,16 @@ if TYPE_CHECKING:
 
 
 @POLICIES.register("mme")
-class MMEPolicy(MMEModel, NetworkPolicy):
+class MMEPolicy(NetworkPolicy):
     """One composition of backbone, memory and integration, as a policy. No method depends on the
     variant.
+
+    model: the network. Its modules `backbone`, `memory` and `integration` are the policy's own too.
     """
 
+    model: MMEModel
+    backbone: Backbone
+    integration: Integration
     acts_in_bfloat16 = True
     _sampler: CapturedSampling | None = None
 
@@ -78,31 +83,57 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             float32_products: how a GPU multiplies in recurrent memories, which compute in float32:
                 `ieee` or `tf32`.
         """
-        NetworkPolicy.__init__(
-            self,
+        model = MMEModel(backbone, memory, integration, transform_images=self.transform_images)
+        object.__setattr__(self, "model", model)
+        super().__init__(
             processor,
             config,
             compute_dtype=compute_dtype,
             history_dtype=history_dtype,
             augment=augment,
         )
-        self.backbone, self.memory, self.integration = backbone, memory, integration
-        self._set_backends(attention, checked_products(float32_products))
-        self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
+        # The model's modules are the policy's, so that the names of weights have no prefix and a
+        # part that is replaced in one is replaced in both.
+        self._modules = model._modules
+        self.horizon = backbone.horizon
+        self.action_dim = backbone.action_dim
         if isinstance(backbone, HasFlowHead):
-            self.sample_steps, self.supports_rtc = backbone.head.steps, backbone.head.supports_rtc
-
-    def _set_backends(self, attention: str, float32_products: str) -> None:
-        if isinstance(self.backbone, HasAttentionBackends):
-            self.backbone.set_attention_backend(attention)
+            self.sample_steps = backbone.head.steps
+            self.supports_rtc = backbone.head.supports_rtc
+        if isinstance(backbone, HasAttentionBackends):
+            backbone.set_attention_backend(attention)
         elif check_backend(attention) != "auto":
             raise UserError(
-                f"policy.attention={attention}: {type(self.backbone).__name__} has one attention"
+                f"policy.attention={attention}: {type(backbone).__name__} has one attention"
                 " backend; leave it at auto."
             )
+        checked_products(float32_products)
         for module in self.modules():
             if isinstance(module, MatmulPrecision):
                 module.float32_products = float32_products
+
+    @property
+    def compute_dtype(self) -> torch.dtype:  # type: ignore[override]
+        """Matrix products run in it, under autocast."""
+        return self.model.compute_dtype
+
+    @compute_dtype.setter
+    def compute_dtype(self, dtype: torch.dtype) -> None:
+        self.model.compute_dtype = dtype
+
+    @property
+    def loss_weights(self) -> Mapping[str, float]:
+        """Weights of auxiliary losses by name (`train.losses`)."""
+        return self.model.loss_weights
+
+    @loss_weights.setter
+    def loss_weights(self, weights: Mapping[str, float]) -> None:
+        self.model.loss_weights = weights
+
+    def train(self, mode: bool = True) -> Self:
+        """Set policy and model to training, or to inference."""
+        self.model.training = mode
+        return super().train(mode)
 
     @classmethod
     def from_config(
@@ -155,17 +186,21 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     # Training
 
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        return self.model.training_noise(count, generator)
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        return self.model.sampling_noise(generator)
+
     def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
         """While training with augmentation `changes` [n, …]: random numbers that change a sample's
         images.
         """
-        return (
-            {"changes": self._sample_augmentation(count, generator)}
-            if self.training and self.augment
-            else {}
-        )
+        if self.training and self.augment:
+            return {"changes": self._sample_augmentation(count, generator)}
+        return {}
 
-    def forward(  # type: ignore[override]  # returns metrics too, as all policies do
+    def forward(
         self,
         batch: Batch,
         noise: Mapping[str, Tensor] | Tensor | None = None,
@@ -176,9 +211,10 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
         Args:
             batch: with `actions`.
-            noise: as `training_noise` makes it; of a flow also its noise [b, h, a] alone, with the
-                times beside it.
-            time: flow times [b], if `noise` is a tensor.
+            noise: as `training_noise` makes it, sampled by default; of a flow also its noise [b, h,
+                a] alone, with the times beside it. In training `augmentation_params` may be beside
+                it, else they are sampled.
+            time: flow times [b], if `noise` is a tensor; sampled by default.
             memory: memory tokens; by default those of `batch.history`.
 
         Returns:
@@ -190,23 +226,17 @@ class MMEPolicy(MMEModel, NetworkPolicy):
                 "forward() computes a loss: batch.actions must hold the recorded chunk (it is"
                 " None)."
             )
+        count, generator = len(batch.actions), torch.default_generator
         values = named_noise(noise, time=time)
-        if set(self.training_noise(0, torch.default_generator)) - set(values):
-            values = self.training_noise(len(batch.actions), torch.default_generator) | values
+        if not isinstance(noise, Mapping) and time is None:
+            values = self.training_noise(count, generator) | values
         if "changes" not in values:
-            values = values | self.augmentation_params(len(batch.actions), torch.default_generator)
+            values = self.augmentation_params(count, generator) | values
         values = map_noise(values, lambda value: value.to(self.device))
         augmentation = values.pop("changes", None)
-        if memory is None:
-            with self.autocast():
-                memory = self.encode_memory(self.conditioned_history(batch))
-        losses = self.losses(batch, values, memory, augmentation)
-        loss = self.total_loss(losses)
-        metrics = {"loss": loss.detach()}
-        if len(losses) > 1:
-            metrics |= {f"losses/{name}": value.detach() for name, value in losses.items()}
-        reported = {} if memory is None else memory.metrics
-        return loss, metrics | {f"memory/{name}": value for name, value in reported.items()}
+        metrics: dict[str, Tensor] = {}
+        loss = self.model.loss(batch, values, memory, augmentation, metrics)
+        return loss, metrics
 
     def velocity(
         self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None
@@ -214,11 +244,10 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times
         [b], in one pass.
         """
+        if memory is None:
+            memory = self.model.memory_tokens(batch)
         with self.autocast():
-            memory = (
-                self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
-            )
-            injection = self.inject(self.prepare_images(batch), memory)
+            injection = self.model.inject(self.model.prepare_images(batch), memory)
             return self.backbone.velocity(injection, x_t, time)  # type: ignore[operator]
 
     def recompute(self, mode: Recompute) -> None:
@@ -254,12 +283,10 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
         """Views in [−1, 1], augmented as the cameras of the embodiment say."""
-        unit = super().transform_images(images, None)
-        return (
-            unit
-            if augmentation is None
-            else augment_views(unit, self.embodiment.augmentations, augmentation)
-        )
+        views = unit_images(images)
+        if augmentation is None:
+            return views
+        return augment_views(views, self.embodiment.augmentations, augmentation)
 
     # Sampling
 
@@ -287,11 +314,10 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         values = map_noise(named_noise(noise), lambda value: send(value, self.device))
         # Real-time chunking also runs the network backwards, which a graph does not contain.
         if self._sampler is None or self.training or batch.overlap is not None:
-            return self.sample(batch, values, steps, memory)
+            return self.model.sample(batch, values, steps, memory)
         if memory is None:
-            with self.autocast():
-                memory = self.encode_memory(self.conditioned_history(batch))
-        return self._sampler(batch, memory, values, steps or self.sample_steps)
+            memory = self.model.memory_tokens(batch)
+        return self._sampler(batch, values, steps or self.sample_steps, memory)
 
     @property
     def compiles_sampling(self) -> bool:
@@ -322,7 +348,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             self.backbone.compile(dynamic=False)
         if self.device.type != "cuda" or not self.compiles_sampling:
             return
-        self._sampler = CapturedSampling(self._sample, self.backbone.sampling_stamp)
+        self._sampler = CapturedSampling(self.model.sample, self.backbone.sampling_stamp)
         if self.processor is None:
             return
         full = self.full_batch(self.device)
@@ -331,11 +357,6 @@ class MMEPolicy(MMEModel, NetworkPolicy):
                 full, prompt=full.prompt[:, :length], prompt_mask=full.prompt_mask[:, :length]
             )
             self.sample_actions(cut)
-
-    def _sample(
-        self, batch: Batch, memory: MemoryTokens | None, noise: Mapping[str, Tensor], steps: int
-    ) -> Tensor:
-        return self.sample(batch, noise, steps, memory)
 
     # Episodes
 

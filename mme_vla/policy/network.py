@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.layers import autocast
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule, StreamingMemory, encode_histories
 from mme_vla.policy.base import Policy
@@ -81,8 +82,7 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
 
     def autocast(self) -> torch.autocast:
         """The context all network code runs in."""
-        kind = self.device.type if self.device.type != "meta" else "cpu"
-        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
+        return autocast(self.device, self.compute_dtype)
 
     def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
         """Size → its value in the processor and in the network; a checkpoint in which they differ

@@ -179,7 +179,7 @@ def test_released_modulator_starts_near_the_memoryless_policy():
 def prefill(policy, batch):
     """Keys and values of the prefix, and what the memory injects."""
     memory = policy.encode_memory(batch.history)
-    injection = policy.inject(policy.prepare_images(batch), memory)
+    injection = policy.model.inject(policy.model.prepare_images(batch), memory)
     return policy.backbone.prefill(injection), injection
 
 

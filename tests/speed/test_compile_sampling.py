@@ -24,8 +24,8 @@ MODELS = ["pi05", "tokendrop_expert", "framesamp_modul", "framesamp_context", "r
 def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> Tensor:
     """Sampling by the parts: every step puts its keys behind the prefix's in a new tensor."""
     backbone = policy.backbone
-    memory = policy.encode_memory(policy.conditioned_history(batch))
-    injection = policy.inject(policy.prepare_images(batch), memory)
+    memory = policy.model.memory_tokens(batch)
+    injection = policy.model.inject(policy.model.prepare_images(batch), memory)
     prefix = backbone.prefill(injection)
     layout = backbone.transformer.layout(
         [backbone.action_block(noise)], injection.visibility, prefix
@@ -115,7 +115,7 @@ def test_few_sizes_are_captured_and_each_batch_gets_its_reply(
     ]
     expected = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
     policy.compile_sampling()
-    policy._sampler = CapturedSampling(policy._sample, policy.backbone.sampling_stamp)
+    policy._sampler = CapturedSampling(policy.model.sample, policy.backbone.sampling_stamp)
     chunks = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
     assert captures == [4, 1, 2]
     assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(chunks, expected, strict=True))

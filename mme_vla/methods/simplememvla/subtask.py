@@ -190,12 +190,12 @@ class SubtaskPolicy(MMEPolicy):
 
     def _context(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Embeddings [b, n, d] of current images and prompt, and their mask [b, n]."""
-        blocks = self.backbone.embed(self.prepare_images(batch))
+        blocks = self.backbone.embed(self.model.prepare_images(batch))
         return torch.cat([block.tokens for block in blocks], 1), torch.cat(
             [block.mask for block in blocks], 1
         )
 
-    def forward(  # type: ignore[override]  # returns metrics too, as all policies do
+    def forward(  # type: ignore[override]
         self, batch: Batch, *args: Any, **options: Any
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The action's loss under the recorded words, and the weighted cross entropy of these.
