@@ -25,7 +25,7 @@ from mme_vla.evaluation.rollout.local import LocalEnvs
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.memory.base import stack_history
-from mme_vla.policy.acting import choose_actions
+from mme_vla.policy.base import choose_actions
 from mme_vla.policy.log_prob import SamplePath, log_prob, sample_path
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.registry import REWARDS
@@ -314,7 +314,7 @@ class _Collector(Rollout):
                 return path.chunk
             return policy.predict_chunk(observation, episodes, noise, self.settings.flow_steps)
 
-        selection = choose_actions(policy, episodes, predict)
+        selection = choose_actions(policy, episodes, predict=predict)
         execute = self.settings.execute or policy.embodiment.action.execute
         log_probs = None if path is None else path.log_prob
         if "log_probs" in self.keep and path is None:

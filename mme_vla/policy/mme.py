@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets
+from mme_vla.backbone.base import Backbone, FineTuneSpec, HasExtraExperts
 from mme_vla.backbone.building import read_backbone, shapes_only
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.backbone.layers import check_backend
@@ -33,7 +33,6 @@ from mme_vla.model import MMEModel, unit_images
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_integrated
 from mme_vla.policy.episode import Episode, prefix_overlap
-from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
@@ -113,7 +112,7 @@ class MMEPolicy(NetworkPolicy):
                 module.float32_products = float32_products
 
     @property
-    def compute_dtype(self) -> torch.dtype:  # type: ignore[override]
+    def compute_dtype(self) -> torch.dtype:
         """Matrix products run in it, under autocast."""
         return self.model.compute_dtype
 
@@ -319,12 +318,7 @@ class MMEPolicy(NetworkPolicy):
             memory = self.model.memory_tokens(batch)
         return self._sampler(batch, values, steps or self.sample_steps, memory)
 
-    @property
-    def compiles_sampling(self) -> bool:
-        """Whether the backbone's sampler can be compiled."""
-        return isinstance(self.backbone, CapturableSampling)
-
-    def compile_sampling(self, layers: bool = False) -> None:
+    def compile_sampling(self, layers: bool = False) -> bool:
         """Speed up sampling with fixed weights; chunks are equal up to the rounding of other
         kernels.
 
@@ -335,28 +329,26 @@ class MMEPolicy(NetworkPolicy):
         Args:
             layers: compile the tower and the layers too, which takes a minute or more at full size.
 
-        Raises:
-            UserError: this backbone has no sampler that can be captured.
+        Returns:
+            Whether this backbone has a sampler that can be captured.
         """
         if not isinstance(self.backbone, CapturableSampling):
-            name = type(self.backbone).__name__
-            raise UserError(
-                f"The backbone {name} has no sampler that can be compiled: leave sampling=eager."
-            )
+            return False
         self.backbone.compile_sampling()
         if layers:
             self.backbone.compile(dynamic=False)
-        if self.device.type != "cuda" or not self.compiles_sampling:
-            return
+        if self.device.type != "cuda":
+            return True
         self._sampler = CapturedSampling(self.model.sample, self.backbone.sampling_stamp)
         if self.processor is None:
-            return
+            return True
         full = self.full_batch(self.device)
         for length in range(16, self._prompt_length() + 16, 16):
             cut = replace(
                 full, prompt=full.prompt[:, :length], prompt_mask=full.prompt_mask[:, :length]
             )
             self.sample_actions(cut)
+        return True
 
     # Episodes
 
@@ -413,11 +405,9 @@ class MMEPolicy(NetworkPolicy):
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray:
         """What the memory reads; nothing without one."""
-        return (
-            np.zeros(0, np.int64)
-            if self.memory is None
-            else self.memory.frames_read(steps, exec_start)
-        )
+        if self.memory is None:
+            return np.zeros(0, np.int64)
+        return self.memory.frames_read(steps, exec_start)
 
     def _condition_one(self, prompt: Tensor, prompt_mask: Tensor, tokens: Tensor) -> Tensor:
         """Stored tokens [n, d_vision] of one episode, read with its prompt [l]."""
@@ -434,56 +424,51 @@ class MMEPolicy(NetworkPolicy):
         """A batch of one without content: all views, the longest prompt without padding, and a
         memory that is full.
         """
-        size, views, length = (
-            self.backbone.image_size,
-            len(self.embodiment.cameras),
-            self._prompt_length(),
-        )
+        size = self.backbone.image_size
+        views = len(self.embodiment.cameras)
+        length = self._prompt_length()
+        history = None
+        if self.memory is not None:
+            history = full_history(self.memory, self.backbone.vision_width, device)
         return Batch(
             images=torch.zeros(1, views, 3, size, size, dtype=torch.uint8, device=device),
             image_mask=torch.ones(1, views, dtype=torch.bool, device=device),
             prompt=torch.full((1, length), 5, device=device),
             prompt_mask=torch.ones(1, length, dtype=torch.bool, device=device),
-            history=None
-            if self.memory is None
-            else full_history(self.memory, self.backbone.vision_width, device),
+            history=history,
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
             past=full_past(past_view_spec(self.memory), views, size, device),
         )
 
     def _prompt_length(self) -> int:
-        return (
-            int(self.config["processor"]["prompt_length"]) + self.embodiment.action.options_length
-        )
+        words = int(self.config["processor"]["prompt_length"])
+        return words + self.embodiment.action.options_length
 
     def warm_up_vision(self) -> None:
         size = self.backbone.image_size
         self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 
     def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        processor = self.require_processor()
-        sizes = {
-            name: (getattr(processor, name), getattr(self.backbone, name))
-            for name in ("image_size", "action_dim")
+        processor: Any = self.require_processor()
+        backbone = self.backbone
+        return {
+            "image_size": (processor.image_size, backbone.image_size),
+            "action_dim": (processor.action_dim, backbone.action_dim),
+            "horizon": (processor.embodiment.action.horizon, backbone.horizon),
         }
-        return {**sizes, "horizon": (processor.embodiment.action.horizon, self.backbone.horizon)}
 
     @property
     def finetune_spec(self) -> FineTuneSpec:
         """The backbone's components in its order; memory, integration and its experts are the
         component `memory`.
         """
-        backbone = self.backbone
+        spec = self.backbone.finetune_spec
         components = {
-            name: rf"backbone\.(?:{pattern})" for name, pattern in backbone.parts().items()
+            name: rf"backbone\.(?:{pattern})" for name, pattern in spec.components.items()
         }
         experts = f"|{components['memory']}" if "memory" in components else ""
         components["memory"] = rf"memory\.|integration\.{experts}"
-        if not isinstance(backbone, HasLoraTargets):
-            return FineTuneSpec(components)
-        return FineTuneSpec(
-            components, backbone.lora_targets, backbone.heads, backbone.lora_exclude
-        )
+        return replace(spec, components=components)
 
 
 def mme_of(policy: Policy, what: str) -> MMEPolicy:

@@ -22,7 +22,6 @@ from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import with_vision_memory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.probing import lines
 from mme_vla.probing.arms import UNPROBED, lacking, read_arm, slug
@@ -403,7 +402,7 @@ def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
 
 def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any] | str:
     """The score of writing on demonstrations of the card's scenes, or why there is none."""
-    memory, env = with_vision_memory(policy).require_memory(), environment("mme_vla")
+    memory, env = policy.require_memory(), environment("mme_vla")
     try:
         frames = required_frames(memory)
         specs = (env.episode(job.task, job.split, job.episode) for job in plan.jobs)

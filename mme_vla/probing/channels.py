@@ -14,7 +14,7 @@ from torch import Tensor
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import FrameScores, History
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import WritableMemory, with_vision_memory
+from mme_vla.policy.capabilities import WritableMemory
 from mme_vla.policy.episode import Episode
 from mme_vla.types import HistoryTokens
 
@@ -225,7 +225,7 @@ class SelectionChannel(Channel):
 
     def __init__(self, policy: Policy) -> None:
         super().__init__(policy)
-        self._memory = with_vision_memory(policy).require_memory()
+        self._memory = policy.require_memory()
 
     def read(
         self, episode: Episode, step: int | None = None, only: np.ndarray | None = None

@@ -16,7 +16,6 @@ from mme_vla.data.statistics import NARROW, compute_norm_stats
 from mme_vla.errors import check_choice, require
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import TrainsOnKeyframes, WeighsLosses, with_vision_memory
 from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import SubgoalText
@@ -79,23 +78,23 @@ def prepare_data(
     labels = labels_read(*(part for part in policy.modules() if part not in memory_parts))
     require(
         data.get("weights") is None
-        or (isinstance(policy, WeighsLosses) and processor.samples.kind == "steps"),
+        or (policy.loss_weights is not None and processor.samples.kind == "steps"),
         f"data.weights={data.get('weights')}: {type(policy).__name__} does not weigh samples. Set"
         " data.weights=null.",
     )
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
     if policy.memory is not None:
-        cache, source_policy = data["cache"], with_vision_memory(policy)
-        encoder = encoder or source_policy.vision_fingerprint()
+        cache = data["cache"]
+        encoder = encoder or policy.vision_fingerprint()
         caches = [
             ensure_cache(
                 source,
                 policy.memory,
-                source_policy.encode_frames,
+                policy.encode_frames,
                 encoder,
                 root=cache["root"],
-                dtype=str(source_policy.history_dtype).removeprefix("torch."),
+                dtype=str(policy.history_dtype).removeprefix("torch."),
                 max_build_frames=cache["max_build_frames"],
                 batch_size=cache["batch_size"],
                 command=cache_command,
@@ -112,9 +111,13 @@ def prepare_data(
 
     def side(episodes: list[Any], held_out: bool = False) -> TrainingDataset | KeyframeDataset:
         if processor.samples.kind == "keyframes":
-            keyframes = policy.keyframes if isinstance(policy, TrainsOnKeyframes) else 1
             return KeyframeDataset(
-                sources, processor, keyframes, episodes=episodes, seed=seed, sampled=not held_out
+                sources,
+                processor,
+                policy.keyframes,
+                episodes=episodes,
+                seed=seed,
+                sampled=not held_out,
             )
         kind = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
         return kind(

@@ -195,9 +195,7 @@ class SubtaskPolicy(MMEPolicy):
             [block.mask for block in blocks], 1
         )
 
-    def forward(  # type: ignore[override]
-        self, batch: Batch, *args: Any, **options: Any
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(self, batch: Batch, *args: Any, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
         """The action's loss under the recorded words, and the weighted cross entropy of these.
 
         Each word's counts as much as its sample (`Batch.weight`).
