@@ -20,7 +20,7 @@ in an episode, and makes `Batch.history`. `MemoryModule.forward`, called here, e
 Shapes: b batch · n tokens · d width · v views · h action horizon · a action width (types.py).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -28,12 +28,17 @@ from types import MappingProxyType
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import AuxiliaryLosses, Backbone, Injection, KeepsKeysValues
-from mme_vla.backbone.layers import Block
-from mme_vla.errors import UserError, check_known, require
+from mme_vla.backbone.base import Backbone, Injection
+from mme_vla.backbone.layers import Block, autocast
+from mme_vla.errors import UserError, check_known
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
-from mme_vla.types import Batch, HistoryTokens, KeysValues, MemoryTokens, Noise
+from mme_vla.types import Batch, HistoryTokens, MemoryTokens, Noise
+
+
+def unit_images(images: Tensor, augmentation: Tensor | None = None) -> Tensor:
+    """Views [b, v, 3, s, s] uint8 → float32 in [−1, 1], without augmentation."""
+    return images.to(torch.float32, copy=True).div_(255).mul_(2).sub_(1)
 
 
 class MMEModel(nn.Module):
@@ -44,6 +49,8 @@ class MMEModel(nn.Module):
         memory: None for the policy without memory. integration: the base class `Integration` adds
             nothing.
         compute_dtype: bfloat16 runs matrix products under autocast over float32 weights.
+        transform_images: from views [b, v, 3, s, s] uint8, and in training the random numbers
+            [b, …] of their augmentation, to views in [−1, 1] as the backbone reads them.
 
     >>> sizes = BackboneConfig()  # doctest: +SKIP
     >>> integration = Modulator(sizes)  # doctest: +SKIP
@@ -52,6 +59,7 @@ class MMEModel(nn.Module):
     >>> model = MMEModel(backbone, memory, integration)  # doctest: +SKIP
     """
 
+    memory: MemoryModule | None
     loss_weights: Mapping[str, float] = MappingProxyType({})
     """Weights of auxiliary losses by name (`train.losses`); 1 for those that are not named."""
 
@@ -61,10 +69,14 @@ class MMEModel(nn.Module):
         memory: MemoryModule | None,
         integration: Integration,
         compute_dtype: torch.dtype = torch.float32,
+        transform_images: Callable[[Tensor, Tensor | None], Tensor] = unit_images,
     ) -> None:
         super().__init__()
-        self.backbone, self.memory, self.integration = backbone, memory, integration
+        self.backbone = backbone
+        self.register_module("memory", memory)
+        self.integration = integration
         self.compute_dtype = compute_dtype
+        self.transform_images = transform_images
 
     def loss(
         self,
@@ -72,18 +84,37 @@ class MMEModel(nn.Module):
         noise: Mapping[str, Tensor],
         memory: MemoryTokens | None = None,
         augmentation: Tensor | None = None,
+        metrics: dict[str, Tensor] | None = None,
     ) -> Tensor:
         """The mean loss of a batch: that of the actions, and in training the weighted auxiliary
-        ones.
+        ones of the memory.
 
         Args:
             batch: with `actions`, on the model's device. noise: as `training_noise` makes it, on
                 that device.
             memory: memory tokens; by default those of `batch.history`.
-            augmentation: random numbers [b, …] of the image augmentation; None leaves images as
-                they are.
+            augmentation: random numbers [b, …] of the image augmentation; None augments nothing.
+            metrics: receives what is worth logging, detached: `loss`, and if there are auxiliary
+                losses `losses/<name>` of all, unweighted; `memory/<name>` of the memory's own.
         """
-        return self.total_loss(self.losses(batch, noise, memory, augmentation))
+        batch = self.prepare_images(batch, augmentation)
+        if memory is None:
+            memory = self.memory_tokens(batch)
+        with self.autocast():
+            rows = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
+        losses = {"action": masked_mean(rows, batch.action_mask, batch.weight)}
+        if memory is not None and self.training:
+            for name, values in memory.losses.items():
+                check_auxiliary(name, values, len(batch.prompt))
+                losses[name] = weighted_mean(values.float(), batch.weight)
+        total = self._total(losses)
+        if metrics is not None:
+            metrics["loss"] = total.detach()
+            if len(losses) > 1:
+                metrics |= {f"losses/{name}": value.detach() for name, value in losses.items()}
+            reported = {} if memory is None else memory.metrics
+            metrics |= {f"memory/{name}": value for name, value in reported.items()}
+        return total
 
     def forward(
         self,
@@ -97,65 +128,17 @@ class MMEModel(nn.Module):
         """
         return self.loss(batch, noise, memory, augmentation)
 
-    def losses(
-        self,
-        batch: Batch,
-        noise: Mapping[str, Tensor],
-        memory: MemoryTokens | None = None,
-        augmentation: Tensor | None = None,
-    ) -> dict[str, Tensor]:
-        """The mean losses of a batch by name: `action`, and in training those of memory,
-        integration and backbone.
-
-        The arguments are those of `loss`.
-        """
-        batch = self.prepare_images(batch, augmentation)
-        with self.autocast():
-            memory = (
-                self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
-            )
-            injection = self.inject(batch, memory)
-            losses = self.backbone.loss(batch, injection, noise)  # b h
-            auxiliary = self.auxiliary_losses(batch, injection, memory) if self.training else {}
-        means = {
-            name: weighted_mean(rows.float(), batch.weight) for name, rows in auxiliary.items()
-        }
-        return {"action": masked_mean(losses, batch.action_mask, batch.weight), **means}
-
-    def auxiliary_losses(
-        self, batch: Batch, injection: Injection, memory: MemoryTokens | None
-    ) -> dict[str, Tensor]:
-        """Losses [b] by name that memory, integration and backbone return beside that of the
-        actions.
-        """
-        rows = {} if memory is None else dict(memory.losses)
-        for part in (self.integration, self.backbone):
-            if isinstance(part, AuxiliaryLosses):
-                rows |= part.losses(batch, injection, memory)
-        for name, values in rows.items():
-            require(
-                name != "action" and values.shape == (len(batch.prompt),),
-                f"The auxiliary loss {name!r} has shape {list(values.shape)}: return one number a"
-                f" sample, [{len(batch.prompt)}], under another name than 'action'.",
-                ValueError,
-            )
-        return rows
-
-    def total_loss(self, losses: Mapping[str, Tensor]) -> Tensor:
-        """The loss that training minimises: `action`, and the others times their weights. Weight 0
-        leaves one out.
-        """
+    def _total(self, losses: Mapping[str, Tensor]) -> Tensor:
+        """`action`, and the others times their weights. Weight 0 leaves one out."""
         total = losses["action"]
         for name, value in losses.items():
-            if name != "action" and (weight := self.loss_weights.get(name, 1.0)):
+            weight = self.loss_weights.get(name, 1.0)
+            if name != "action" and weight:
                 total = total + weight * value
         if self.training:
+            auxiliary = [name for name in losses if name != "action"]
             for name in self.loss_weights:
-                check_known(
-                    "auxiliary loss in train.losses:",
-                    name,
-                    [key for key in losses if key != "action"],
-                )
+                check_known("auxiliary loss in train.losses:", name, auxiliary)
         return total
 
     @torch.no_grad()
@@ -174,28 +157,11 @@ class MMEModel(nn.Module):
                 default.
             memory: memory tokens; by default those of `batch.history`.
         """
+        if memory is None:
+            memory = self.memory_tokens(batch)
+        batch = self.prepare_images(batch)
         with self.autocast():
-            memory = (
-                self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
-            )
-            batch = self.prepare_images(batch)
             return self.backbone.sample(batch, self.inject(batch, memory), noise, steps)
-
-    @torch.no_grad()
-    def sample_and_keep(
-        self,
-        batch: Batch,
-        noise: Mapping[str, Tensor],
-        steps: int | None = None,
-        memory: MemoryTokens | None = None,
-    ) -> tuple[Tensor, KeysValues]:
-        """A chunk as `sample` returns it, and the keys and values that the backbone made of its
-        prefix.
-        """
-        assert isinstance(self.backbone, KeepsKeysValues)
-        with self.autocast():
-            batch = self.prepare_images(batch)
-            return self.backbone.sample_and_keep(batch, self.inject(batch, memory), noise, steps)
 
     # The steps, in order
 
@@ -208,9 +174,13 @@ class MMEModel(nn.Module):
         )
         return self.memory.condition_on_prompt(batch.history, condition)
 
-    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
-        """Memory tokens of a selection, or None without memory."""
-        return None if self.memory is None or history is None else self.memory(history)
+    def memory_tokens(self, batch: Batch) -> MemoryTokens | None:
+        """Memory tokens of the batch's selection, or None without memory."""
+        with self.autocast():
+            history = self.conditioned_history(batch)
+            if self.memory is None or history is None:
+                return None
+            return self.memory(history)
 
     def prepare_images(self, batch: Batch, augmentation: Tensor | None = None) -> Batch:
         """The batch with its views, past ones included, in [−1, 1] float32. Past views change as
@@ -228,10 +198,6 @@ class MMEModel(nn.Module):
             )
             past = replace(past, images=images)
         return replace(batch, images=self.transform_images(batch.images, augmentation), past=past)
-
-    def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
-        """Views [b, v, 3, s, s] uint8 → float32 in [−1, 1]; subclasses augment them."""
-        return images.to(torch.float32, copy=True).div_(255).mul_(2).sub_(1)
 
     def inject(self, batch: Batch, memory: MemoryTokens | None) -> Injection:
         """The observation's blocks with memory added. The batch's images are prepared."""
@@ -261,19 +227,28 @@ class MMEModel(nn.Module):
 
     def autocast(self) -> torch.autocast:
         """The autocast context of all network code."""
-        kind = self.device.type if self.device.type != "meta" else "cpu"
-        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
+        return autocast(self.device, self.compute_dtype)
 
 
 def check_uncounted(block: Block, backbone: Backbone) -> None:
     """Make sure that a block for a backbone which numbers tokens itself brings no positions."""
     if block.positions is not None:
         count = block.positions.shape[-1] if block.positions.ndim > 2 else 1
+        numbers = "1 number" if count == 1 else f"{count} numbers"
         raise UserError(
-            f"The block {block.name!r} has positions of {count} number{'s'[: count > 1]} a token,"
+            f"The block {block.name!r} has positions of {numbers} a token,"
             f" and {type(backbone).__name__} counts tokens in causal order. Allowed here is"
             " Block.positions=None. A backbone whose `supports` has 'positions', such as"
             " backbone=pi05, takes others."
+        )
+
+
+def check_auxiliary(name: str, values: Tensor, samples: int) -> None:
+    """Raise an error unless an auxiliary loss has one number a sample, and a name of its own."""
+    if name == "action" or values.shape != (samples,):
+        raise ValueError(
+            f"The auxiliary loss {name!r} has shape {list(values.shape)}: return one number a"
+            f" sample, [{samples}], under another name than 'action'."
         )
 
 

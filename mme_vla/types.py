@@ -165,37 +165,6 @@ class HistoryTokens(TensorStruct):
 
 
 @dataclass
-class KeysValues(TensorStruct):
-    """Keys, rotated, and values of all layers of a backbone, K heads of h numbers each.
-
-    values: [b, layers, 2, n, K, h]; keys first. mask: [b, n] bool; False on padding.
-    """
-
-    values: Tensor
-    mask: Tensor
-
-    def entry(self, row: int) -> Tensor:
-        """The valid tokens of one sample, [layers, 2, n, K, h]."""
-        return self.values[row][:, :, self.mask[row]]
-
-    @classmethod
-    def stack(cls, samples: Sequence[Sequence[Tensor]]) -> Self | None:
-        """The entries of each of b samples, one after the other, padded to one length; None if
-        there is none.
-        """
-        if not (every := [entry for entries in samples for entry in entries]):
-            return None
-        lengths = [sum(entry.shape[2] for entry in entries) for entries in samples]
-        first = every[0]
-        values = first.new_zeros(len(samples), *first.shape[:2], max(lengths), *first.shape[3:])
-        for row, entries, length in zip(values, samples, lengths, strict=True):
-            if length:
-                row[:, :, :length] = torch.cat(list(entries), 2)
-        mask = torch.arange(max(lengths)) < torch.tensor(lengths)[:, None]
-        return cls(values, mask.to(values.device))
-
-
-@dataclass
 class MemoryTokens(TensorStruct):
     """What every neural memory hands over: at most `budget` valid tokens.
 
@@ -205,8 +174,7 @@ class MemoryTokens(TensorStruct):
     tokens belong to
         no frame, or the selection has no number of the current frame.
     losses: auxiliary losses by name, each [b], with gradients. Only training reads them
-    (`train.losses`). cache: stored keys and values of earlier chunks (`CacheMemory`); None in
-    training, and before the first chunk.
+    (`train.losses`).
     """
 
     tokens: Tensor
@@ -214,7 +182,6 @@ class MemoryTokens(TensorStruct):
     metrics: dict[str, Tensor] = field(default_factory=dict)
     ages: Tensor | None = None
     losses: dict[str, Tensor] = field(default_factory=dict)
-    cache: KeysValues | None = None
 
 
 @dataclass
@@ -263,8 +230,7 @@ class Batch(TensorStruct):
     past: past views that a memory gives along with the current ones; None for all others.
     options: [b, letters] bool; the letters offered to a policy that chooses among options. None
     means all. weight: [b] float32; multiplies each sample's loss (`data.weights`). None counts all
-    alike. labels: in training, labels of the current frame (`ReadsLabels` of integration and
-    backbone).
+    alike. labels: in training, labels of the current frame (`ReadsLabels` of a backbone).
     """
 
     images: Tensor
@@ -298,12 +264,12 @@ class Batch(TensorStruct):
 
 
 class ReadsLabels:
-    """Capability of a memory, an integration or a backbone: it learns from labels of the dataset.
+    """Capability of a memory or a backbone: it learns from labels of the dataset.
 
     reads_labels: columns of numbers in the dataset, `subtask_boundary` (1 where a sub-task begins,
     else 0), or
         `subtask_index` (how many sub-tasks have begun).
-        A memory has them by frame in `HistoryTokens.labels`, the others of the current frame in
+        A memory has them by frame in `HistoryTokens.labels`, a backbone of the current frame in
         `Batch.labels`.
     """
 

@@ -29,9 +29,9 @@ faster.
 SELECTION = ["memory/tokendrop.py", "memory/history.py"]
 HEAD = ["backbone/flow.py"]
 SAMPLING = [
-    ("policy/base.py", "act"), ("policy/mme.py", "predict_chunk"),
-    ("policy/mme.py", "sample_actions"), ("model.py", "sample"),
-    ("backbone/pi05.py", "sample"),
+    ("policy/base.py", "act"), ("policy/base.py", "choose_actions"),
+    ("policy/mme.py", "predict_chunk"), ("policy/mme.py", "sample_actions"),
+    ("model.py", "sample"), ("backbone/pi05.py", "sample"),
 ]  # fmt: skip
 ALONE = "README.md"
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mme_vla import Backbone, Batch, register
-from mme_vla.backbone.base import HasLoraTargets, Injection
+from mme_vla.backbone.base import FineTuneSpec, Injection
 from mme_vla.backbone.config import BackboneConfig
 from mme_vla.backbone.layers import Block, Span, additive_mask, attend, attention_mask
 from mme_vla.speed import Recomputes
@@ -33,7 +33,7 @@ class Layer(nn.Module):
 
 
 @register("backbone", "regression")
-class Regression(Backbone, HasLoraTargets, Recomputes):
+class Regression(Backbone, Recomputes):
     """Patches, words and memory in one sequence; a learned query for each step of the chunk reads
     it.
     """
@@ -41,7 +41,11 @@ class Regression(Backbone, HasLoraTargets, Recomputes):
     # one's own dataclass will do; integrations read `vlm.width` and the like from it
     Config = BackboneConfig
     supports = frozenset({"blocks"})
-    lora_targets, heads = ("qkv", "out"), ("head",)
+    finetune_spec = FineTuneSpec(
+        {"vision": r"vision\.|places", "vlm": r"words\.|order\.", "action": ""},
+        lora_targets=("qkv", "out"),
+        full_train=("head",),
+    )
 
     def __init__(
         self, config: BackboneConfig, extra_experts: Mapping[str, Any] | None = None
@@ -106,6 +110,3 @@ class Regression(Backbone, HasLoraTargets, Recomputes):
 
     def recompute(self, mode: bool | str) -> None:
         self._recompute = bool(mode)
-
-    def parts(self) -> Mapping[str, str]:
-        return {"vision": r"vision\.|places", "vlm": r"words\.|order\.", "action": ""}

@@ -2,6 +2,7 @@
 injects into it.
 """
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers import Block, Visibility
-from mme_vla.types import Batch, KeysValues, MemoryTokens, Noise, ReadsLabels
+from mme_vla.types import Batch, Noise
 
 Hook = Callable[[int, Tensor], Tensor]
 """`hook(layer, x)`: the input of the action expert's MLP in a layer, made from its residual stream
@@ -35,13 +36,11 @@ class LayerHooks:
 
 def bind_hook(hook: Hook | None, layer: int) -> Callable[[Tensor], Tensor] | None:
     """The hook of one layer."""
-    return (
-        hook.layers[layer]
-        if isinstance(hook, LayerHooks)
-        else None
-        if hook is None
-        else partial(hook, layer)
-    )
+    if hook is None:
+        return None
+    if isinstance(hook, LayerHooks):
+        return hook.layers[layer]
+    return partial(hook, layer)
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,6 @@ class Injection:
     visibility: which block attends to which; rows for these blocks, for those beside the actions
     and for `action`. hook: see `Hook`. condition: maps the condition [b, c] of the action expert's
     norms to a changed one. beside: blocks that run with the actions, before them, in every step.
-    past: stored keys and values, read beside the prefix as the block `cache`. They take no
-    positions.
     """
 
     blocks: Sequence[Block]
@@ -61,7 +58,36 @@ class Injection:
     hook: Hook | None = None
     condition: Callable[[Tensor], Tensor] | None = None
     beside: Sequence[Block] = ()
-    past: KeysValues | None = None
+
+
+@dataclass(frozen=True)
+class FineTuneSpec:
+    """How a backbone or a policy can be fine-tuned.
+
+    components: name → pattern of the parameters' names, in order; the first match counts, the last
+        pattern must match the remaining ones. Usual names are `vision`, `vlm`, `action`, and
+        `memory` (of a backbone: the extra experts of an integration).
+    lora_targets: linear layers that LoRA wraps by default, by the end of their name.
+    full_train: modules that train in full beside the adapters, by the end of their name.
+    lora_exclude: pattern of linear layers whose weight is read past any adapter that wraps them.
+    frozen: pattern of the parameters that never train.
+    """
+
+    components: Mapping[str, str]
+    lora_targets: Sequence[str] = ()
+    full_train: Sequence[str] = ()
+    lora_exclude: str | None = None
+    frozen: str | None = None
+
+    def component_of(self, name: str) -> str:
+        """The component of a parameter."""
+        for component, pattern in self.components.items():
+            if re.match(pattern, name):
+                return component
+        raise ValueError(
+            f"No component has the parameter {name!r}; the last pattern must match the remaining"
+            " names."
+        )
 
 
 class Backbone(nn.Module):
@@ -69,18 +95,20 @@ class Backbone(nn.Module):
 
     The model calls `embed`, lets the integration add memory to the blocks, and passes the result to
     `loss` or `sample`. Optional capabilities are classes to inherit from as well: `HasFlowHead`
-    (backbone/flow.py), `HasExtraExperts`, `HasLoraTargets`, and those of mme_vla/speed.
+    (backbone/flow.py), `HasExtraExperts`, and those of mme_vla/speed.
 
     A subclass is constructed from its sizes and the extra experts of an integration, and sets:
         Config: the dataclass of its sizes, read from the section `backbone`; integrations are built
             from it.
         supports: what an integration may use, of `blocks`, `expert`, `hook`, `condition`, `beside`,
-            `positions` (blocks at rotary positions of their own) and `cache` (`Injection.past`,
-            which needs `KeepsKeysValues`); and a memory, `past` (`Batch.past`).
+            and `positions` (blocks at rotary positions of their own); and a memory, `past`
+            (`Batch.past`).
         vision: the vision tower; its weights decide what a cache of its tokens holds.
         image_size: side of the square images, in pixels. grid: side of a view's token grid.
         vision_width: width d_vision of the tokens that a memory stores.
         horizon, action_dim: of the chunk [h, a].
+        finetune_spec: the components of its parameters, by their names inside this module, and what
+            LoRA adapts.
     """
 
     Config: ClassVar[type[Any]]
@@ -91,6 +119,7 @@ class Backbone(nn.Module):
     vision_width: int
     horizon: int
     action_dim: int
+    finetune_spec: FineTuneSpec
 
     def __init__(self, config: Any, extra_experts: Mapping[str, Any] | None = None) -> None:
         super().__init__()
@@ -145,65 +174,6 @@ class Backbone(nn.Module):
         """
         raise NotImplementedError
 
-    def parts(self) -> Mapping[str, str]:
-        """Part → pattern of its parameters' names inside this module, in order; the first match
-        decides.
-
-        Fine-tuning uses the names `vision`, `vlm`, `action`, and `memory` for the extra experts of
-        an integration.
-        """
-        raise NotImplementedError
-
-
-class HasLanguageHead:
-    """Capability of a backbone: it writes a line of text at each decision, the note `note` of its
-    next prompt.
-    """
-
-    note: str = "note"
-
-    def write(self, batch: Batch, injection: Injection) -> Tensor:
-        """Token ids [b, l] int64 of a line, 0 after its end, under the caller's autocast.
-
-        Args:
-            batch: its images are prepared. injection: the blocks of `embed` with memory added.
-        """
-        raise NotImplementedError
-
-
-class AuxiliaryLosses(ReadsLabels):
-    """Capability of an integration or a backbone: losses beside that of the actions.
-
-    A memory returns its own with its tokens (`MemoryTokens.losses`).
-    """
-
-    def losses(
-        self, batch: Batch, injection: Injection, memory: MemoryTokens | None
-    ) -> dict[str, Tensor]:
-        """Losses by name, each [b], with gradients; called in training alone.
-
-        Args:
-            batch: its images are prepared. injection: what the backbone's own loss reads. memory:
-                the memory tokens.
-        """
-        raise NotImplementedError
-
-
-class KeepsKeysValues:
-    """Capability of a backbone: it returns the keys and values that it made of a chunk's prefix."""
-
-    def sample_and_keep(
-        self,
-        batch: Batch,
-        injection: Injection,
-        noise: Mapping[str, Tensor],
-        steps: int | None = None,
-    ) -> tuple[Tensor, KeysValues]:
-        """A chunk as `Backbone.sample` returns it, and the keys and values of
-        `injection.blocks`.
-        """
-        raise NotImplementedError
-
 
 class HasExtraExperts:
     """Capability of a backbone: it runs extra experts, or has parts that a released checkpoint does
@@ -215,17 +185,3 @@ class HasExtraExperts:
         weights wait.
         """
         raise NotImplementedError
-
-
-class HasLoraTargets:
-    """Capability of a backbone: it names the layers that LoRA adapts.
-
-    lora_targets: linear layers that LoRA wraps by default. heads: modules that are trained in full
-    beside the adapters. Both name modules by the end of their name.
-    lora_exclude: pattern of linear layers whose weight is read without calling them, so that no
-    adapter can wrap them.
-    """
-
-    lora_targets: Sequence[str] = ()
-    heads: Sequence[str] = ()
-    lora_exclude: str | None = None

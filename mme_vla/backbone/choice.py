@@ -113,29 +113,34 @@ class ChoiceHead(FlowHead):
         return means
 
     def times(self, steps: int, device: torch.device) -> Tensor:
-        """Ones [steps]."""
-        return torch.ones(steps, device=device)
+        """One [1]: the network is called once, whatever `steps` is."""
+        return torch.ones(1, device=device)
 
-    def sample(
-        self,
-        predict: PredictAt,
-        noise: Tensor,
-        steps: int,
-        overlap: Overlap | None = None,
-        increments: Tensor | None = None,
-    ) -> Tensor:
-        """Scores of the letters and the other numbers, [b, h, a]."""
-        output = self._means(predict(torch.zeros_like(noise), 0).float())
-        scale = output.new_full((self.action_dim,), self.deviation)
+    def start(self, noise: Mapping[str, Tensor], steps: int, overlap: Overlap | None) -> Tensor:
+        """Zeros [b, h, a]: the network sees no noise."""
+        return torch.zeros_like(noise["noise"])
+
+    def velocity(self, predict: PredictAt, times: Tensor, noise: Mapping[str, Tensor]) -> PredictAt:
+        """The difference of x and the `scores`, at which the one step thus ends."""
+
+        def velocity(x: Tensor, index: int) -> Tensor:
+            return x - self.scores(predict(x, index), noise["noise"])
+
+        return velocity
+
+    def scores(self, output: Tensor, noise: Tensor) -> Tensor:
+        """Scores of the letters and the other numbers, [b, h, a], from the network's output."""
+        means = self._means(output.float())
+        scale = means.new_full((self.action_dim,), self.deviation)
         scale[self.choice] = self.temperature
-        return output + scale * noise
+        return means + scale * noise
 
     def log_prob(self, predict: PredictAt, chunk: Tensor, options: Tensor | None) -> Tensor:
         """Log-probability [b, h] of the choices that `ActionSpace.decide` makes of sampled chunks
         [b, h, a].
 
         Args:
-            chunk: what `sample` returned, or the executed actions as the network predicts them.
+            chunk: what was sampled, or the executed actions as the network predicts them.
             options: [b, letters] bool; the letters offered. None means all.
 
         Returns:

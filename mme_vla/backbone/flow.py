@@ -65,16 +65,6 @@ def euler_times(steps: int, device: torch.device) -> Tensor:
     return torch.stack(times)
 
 
-def euler(noise: Tensor, steps: int, velocity: Callable[[Tensor, int], Tensor]) -> Tensor:
-    """Integrate from noise to actions: x ← x − v/steps, with `velocity(x, index)` at
-    `euler_times`.
-    """
-    x = noise
-    for index in range(steps):
-        x = x - velocity(x, index).to(x.dtype) / steps
-    return x
-
-
 def normal_log_density(x: Tensor, deviation: float) -> Tensor:
     """Log-density [b] of x [b, …] under independent normal distributions of this standard
     deviation.
@@ -83,15 +73,6 @@ def normal_log_density(x: Tensor, deviation: float) -> Tensor:
     return -0.5 * (x / deviation).square().sum(1) - x.shape[1] * (
         math.log(deviation) + 0.5 * math.log(2 * math.pi)
     )
-
-
-def _check_increments(increments: Tensor, steps: int, overlap: Overlap | None) -> None:
-    require(
-        increments.shape[1] == steps,
-        f"flow_steps={steps}: backbone.head.deviation has noise for {increments.shape[1]}; set"
-        " backbone.head.steps.",
-    )
-    require(overlap is None, "backbone.head.deviation must be 0 for real-time chunking.")
 
 
 Predict = Callable[[Tensor, Tensor], Tensor]
@@ -151,11 +132,9 @@ class FlowHead:
         """
         shape = self.horizon, self.action_dim
         noise = {"noise": torch.randn(*shape, generator=generator)}
-        return noise | (
-            {"increments": torch.randn(self.steps, *shape, generator=generator)}
-            if self.deviation
-            else {}
-        )
+        if self.deviation:
+            noise["increments"] = torch.randn(self.steps, *shape, generator=generator)
+        return noise
 
     def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
         """The loss [b, h] of chunks [b, h, a]: squared error of the velocity."""
@@ -163,35 +142,34 @@ class FlowHead:
         return step_loss(predict(x_t, noise["time"]), target)
 
     def times(self, steps: int, device: torch.device) -> Tensor:
-        """The flow times [steps] at which `sample` calls the network."""
+        """The flow times at which the network is called while sampling, one an Euler step."""
         return euler_times(steps, device)
 
-    def velocity(self, predict: PredictAt, steps: int, device: torch.device) -> PredictAt:
-        """The velocity [b, h, a] at each of so many Euler steps from the network's output."""
-        return predict
+    # While sampling: from x at time 1, for each of the `times`, x ← x − velocity / steps
 
-    def sample(
-        self,
-        predict: PredictAt,
-        noise: Tensor,
-        steps: int,
-        overlap: Overlap | None = None,
-        increments: Tensor | None = None,
-    ) -> Tensor:
-        """Integrate from noise [b, h, a] to chunks; `overlap` guides them to actions that are
-        already fixed.
+    def start(self, noise: Mapping[str, Tensor], steps: int, overlap: Overlap | None) -> Tensor:
+        """The state x [b, h, a] at flow time 1.
 
-        increments: [b, steps, h, a], standard normal; `deviation` times them is added in each step.
+        Raises:
+            UserError: noise of Gaussian steps, and another number of steps or real-time chunking.
         """
-        if increments is not None:
-            _check_increments(increments, steps, overlap)
-            return self.sample_path(predict, noise, increments, self.deviation)[:, -1]
-        velocity = self.velocity(predict, steps, noise.device)
-        if overlap is not None:
-            from mme_vla.speed.rtc import rtc_guidance
+        if "increments" in noise:
+            made = noise["increments"].shape[1]
+            require(
+                made == steps,
+                f"flow_steps={steps}: backbone.head.deviation has noise for {made}; set"
+                " backbone.head.steps.",
+            )
+            require(overlap is None, "backbone.head.deviation must be 0 for real-time chunking.")
+        return noise["noise"]
 
-            velocity = rtc_guidance(velocity, overlap, self.times(steps, noise.device))
-        return euler(noise, steps, velocity)
+    def velocity(self, predict: PredictAt, times: Tensor, noise: Mapping[str, Tensor]) -> PredictAt:
+        """The velocity [b, h, a] from the network's output.
+
+        Args:
+            predict: the network's output. times: [steps]. noise: as `sampling_noise` makes it.
+        """
+        return predict
 
     # Gaussian steps, whose density is known
 
@@ -202,11 +180,13 @@ class FlowHead:
         v(x_i)/k + σ·ε_i.
 
         Args:
-            noise: x_0 [b, h, a]. increments: ε [b, k, h, a], standard normal. deviation: σ; 0 is
-                `sample` itself.
+            noise: x_0 [b, h, a]. increments: ε [b, k, h, a], standard normal. deviation: σ; 0 gives
+                plain Euler steps.
         """
         steps = increments.shape[1]
-        velocity, states = self.velocity(predict, steps, noise.device), [noise]
+        times = self.times(steps, noise.device)
+        velocity = self.velocity(predict, times, {"noise": noise})
+        states = [noise]
         for index, increment in enumerate(increments.unbind(1)):
             mean = states[-1] - velocity(states[-1], index).to(noise.dtype) / steps
             states.append(mean + deviation * increment if deviation else mean)
@@ -219,7 +199,9 @@ class FlowHead:
         Gradients reach the network's parameters, and not the states.
         """
         steps = path.shape[1] - 1
-        velocity, states = self.velocity(predict, steps, path.device), path.detach().unbind(1)
+        states = path.detach().unbind(1)
+        times = self.times(steps, path.device)
+        velocity = self.velocity(predict, times, {"noise": states[0]})
         log_prob = normal_log_density(states[0], 1.0)
         for index, (state, reached) in enumerate(pairwise(states)):
             error = reached - state + velocity(state, index).to(path.dtype) / steps
@@ -238,20 +220,18 @@ class CleanFlowHead(FlowHead):
         x_t, _ = interpolate(actions.float(), noise["noise"], noise["time"])
         return step_loss(predict(x_t, noise["time"]), actions)
 
-    def velocity(self, predict: PredictAt, steps: int, device: torch.device) -> PredictAt:
+    def velocity(self, predict: PredictAt, times: Tensor, noise: Mapping[str, Tensor]) -> PredictAt:
         """(x − clean chunk) / τ; τ is at least one step."""
-        times = self.times(steps, device)
 
         def velocity(x: Tensor, index: int) -> Tensor:
-            return (x - predict(x, index)) / times[index].clamp(min=1 / steps)
+            return (x - predict(x, index)) / times[index].clamp(min=1 / len(times))
 
         return velocity
 
 
 class HasFlowHead:
-    """Capability of a backbone: its chunks are learned and sampled by a `FlowHead`.
-
-    A subclass calls `make_head` in its constructor.
+    """Capability of a backbone: its chunks are learned and sampled by a `FlowHead`, which
+    `build_head` makes.
     """
 
     head: FlowHead
@@ -262,24 +242,9 @@ class HasFlowHead:
         """
         raise NotImplementedError
 
-    def sample_chunk(
-        self, predict: PredictAt, noise: Mapping[str, Tensor], steps: int, overlap: Overlap | None
-    ) -> Tensor:
-        """The chunk [b, h, a] that the head samples from noise as `sampling_noise` makes it."""
-        more = {"increments": noise["increments"]} if "increments" in noise else {}
-        return self.head.sample(predict, noise["noise"], steps, overlap, **more)
 
-    def make_head(self, config: Any) -> None:
-        """Build the head that `config.head` names, for the sizes and the time distribution of
-        `config`.
-        """
-        self.head = HEADS.build(
-            config.head,
-            horizon=config.horizon,
-            action_dim=config.action_dim,
-            **(
-                {}
-                if "time_distribution" in config.head
-                else {"time_distribution": config.time_distribution}
-            ),
-        )
+def build_head(config: Any) -> FlowHead:
+    """The head that `config.head` names, for the sizes and the time distribution of `config`."""
+    section = {"time_distribution": config.time_distribution, **config.head}
+    head: FlowHead = HEADS.build(section, horizon=config.horizon, action_dim=config.action_dim)
+    return head

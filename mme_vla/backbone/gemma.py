@@ -32,7 +32,6 @@ from mme_vla.backbone.layers import (
     token_positions,
 )
 from mme_vla.speed import Recompute, run_layer
-from mme_vla.types import KeysValues
 
 KeyValue = tuple[Tensor, Tensor]
 
@@ -209,42 +208,40 @@ class JointBlock(nn.Module):
         Returns:
             The updated segments (of those that asked), and this pass's keys (rotated) and values.
         """
-        of_attention, of_mlp = (
-            condition if isinstance(condition, LayerModulation) else (condition, condition)
-        )
-        querying, queries, keys, values, row = [], [], [], [], 0
+        of_attention: Tensor | Modulation | None
+        of_mlp: Tensor | Modulation | None
+        if isinstance(condition, LayerModulation):
+            of_attention, of_mlp = condition.attention, condition.mlp
+        else:
+            of_attention = of_mlp = condition
+
+        # Every expert projects its own tokens.
+        querying, queries, keys, values = [], [], [], []
+        row = 0
         for segment in segments:
             layer: ExpertLayer = self.experts[segment.expert]  # type: ignore[assignment]
             adaptive = segment.expert == self.action_expert
             rows = slice(row, row + segment.tokens.shape[1])
-            q, k, v, gate = layer.project(
-                segment.tokens, rope.rows(rows), of_attention if adaptive else None
-            )
+            of_norm = of_attention if adaptive else None
+            q, k, v, gate = layer.project(segment.tokens, rope.rows(rows), of_norm)
             keys.append(k)
             values.append(v)
             if q is not None:
-                querying.append(
-                    (
-                        segment,
-                        layer,
-                        gate,
-                        of_mlp if adaptive else None,
-                        hook if adaptive else None,
-                        rows,
-                    )
-                )
+                last = (of_mlp, hook) if adaptive else (None, None)
+                querying.append((segment, layer, gate, *last, rows))
                 queries.append(q)
             row = rows.stop
+
+        # All queries read all keys, those of earlier passes first.
         k, v = _join(keys), _join(values)
         if not querying:
             return [], (k, v)
         all_k, all_v = _after(past, k, v)
-        query_mask = (
-            mask
-            if len(querying) == len(segments)
-            else select_rows(mask, [rows for *_, rows in querying], k.dtype)
-        )
-        attended = attend(_join(queries), all_k, all_v, query_mask)
+        if len(querying) < len(segments):
+            mask = select_rows(mask, [rows for *_, rows in querying], k.dtype)
+        attended = attend(_join(queries), all_k, all_v, mask)
+
+        # Every expert finishes its own.
         pieces = attended.split([rows.stop - rows.start for *_, rows in querying], dim=1)
         updated = [
             Segment(segment.expert, layer.finish(segment.tokens, piece, gate, of, change))
@@ -262,21 +259,6 @@ class KVCache:
     layers: Sequence[KeyValue | StaticKV]
     spans: list[Span]
     mask: Tensor  # [b, past] bool
-    stored: int = 0  # leading tokens of earlier chunks, which count for no position
-
-    @classmethod
-    def of(cls, cache: KeysValues | None) -> "KVCache | None":
-        """Keys and values of earlier chunks as the block `cache`."""
-        if cache is None:
-            return None
-        layers = [(layer[:, 0], layer[:, 1]) for layer in cache.values.unbind(1)]
-        count = cache.mask.shape[1]
-        return cls(layers, [Span("cache", count)], cache.mask, count)
-
-    def new(self) -> KeysValues:
-        """All but the tokens of earlier chunks."""
-        pairs = [torch.stack([layer[0], layer[1]], 1)[:, :, self.stored :] for layer in self.layers]
-        return KeysValues(torch.stack(pairs, 1), self.mask[:, self.stored :])
 
     def preallocate(self, tokens: int) -> "KVCache":
         """The same with space behind it, in which every one of many passes of so many tokens writes
@@ -285,13 +267,13 @@ class KVCache:
         It is theirs alone: no pass can be kept (`JointTransformer.forward`), and each overwrites
         the last.
         """
-        static = [
-            StaticKV(
-                *(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, tokens)) for x in (layer[0], layer[1]))
-            )
-            for layer in self.layers
-        ]
-        return KVCache(static, self.spans, self.mask, self.stored)
+        space = (0, 0, 0, 0, 0, tokens)
+        static = []
+        for layer in self.layers:
+            keys = nn.functional.pad(layer[0], space)
+            values = nn.functional.pad(layer[1], space)
+            static.append(StaticKV(keys, values))
+        return KVCache(static, self.spans, self.mask)
 
 
 class Layout(NamedTuple):
@@ -376,15 +358,14 @@ class JointTransformer(nn.Module):
         """
         spans = [Span(block.name, len(block)) for block in blocks]
         asking = torch.cat([block.mask for block in blocks], 1)
-        before = past.mask[:, past.stored :] if past else None
+        before = past.mask if past else None
         positions = apply_custom_positions(token_positions(asking, before), blocks)
-        all_spans, valid = (
-            (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
-        )
-        mask_layout, dtype = (
-            MaskLayout.of(spans, all_spans, valid, table),
-            compute_dtype(blocks[0].tokens),
-        )
+        all_spans, valid = spans, asking
+        if past is not None:
+            all_spans = past.spans + spans
+            valid = torch.cat([past.mask, asking], 1)
+        mask_layout = MaskLayout.of(spans, all_spans, valid, table)
+        dtype = compute_dtype(blocks[0].tokens)
         mask = build_mask(mask_layout, dtype, self.attention, self._compiled)
         return Layout(
             all_spans, valid, mask, rotation(positions, self.head_dim), mask_layout, dtype
@@ -433,8 +414,7 @@ class JointTransformer(nn.Module):
         if segments:
             final = condition.final if isinstance(condition, Conditioning) else condition
             output, _ = self.final_norm(segments[-1].tokens, final)
-        stored = past.stored if past else 0
-        return output, KVCache(cached, layout.spans, layout.valid, stored) if keep else None
+        return output, KVCache(cached, layout.spans, layout.valid) if keep else None
 
 
 def _after(past: KeyValue | StaticKV | None, k: Tensor, v: Tensor) -> KeyValue:

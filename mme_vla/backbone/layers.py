@@ -26,6 +26,12 @@ to them.
 """
 
 
+def autocast(device: torch.device, dtype: torch.dtype) -> torch.autocast:
+    """The context in which network code on a device runs its matrix products in `dtype`."""
+    kind = "cpu" if device.type == "meta" else device.type
+    return torch.autocast(kind, dtype, enabled=dtype != torch.float32)
+
+
 def compute_dtype(x: Tensor) -> torch.dtype:
     """The dtype matmuls run in where `x` lives: autocast's when it is on, else the tensor's own."""
     kind = x.device.type

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -10,19 +10,18 @@ from torch.nn import functional
 
 from mme_vla.backbone.base import (
     Backbone,
+    FineTuneSpec,
     HasExtraExperts,
-    HasLoraTargets,
     Injection,
-    KeepsKeysValues,
 )
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
-from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
-from mme_vla.backbone.gemma import Conditioning, JointTransformer, KVCache, Layout
+from mme_vla.backbone.flow import HasFlowHead, Predict, build_head, time_embedding
+from mme_vla.backbone.gemma import Conditioning, JointTransformer
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, check_backend, float32_linear
 from mme_vla.backbone.siglip import VisionTower
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes, Sharded
-from mme_vla.types import Batch, KeysValues, Noise, PastViews
+from mme_vla.types import Batch, Noise, PastViews
 
 if TYPE_CHECKING:
     from mme_vla.speed.sharding import ShardGroup
@@ -33,12 +32,10 @@ class Pi05Backbone(
     Backbone,
     HasFlowHead,
     HasExtraExperts,
-    HasLoraTargets,
     HasAttentionBackends,
     Recomputes,
     Sharded,
     CapturableSampling,
-    KeepsKeysValues,
 ):
     """Vision tower, VLM expert and action expert under joint attention; chunks by flow matching.
 
@@ -46,42 +43,43 @@ class Pi05Backbone(
     """
 
     Config = BackboneConfig
-    supports = frozenset(
-        {"blocks", "expert", "hook", "condition", "beside", "positions", "cache", "past"}
+    supports = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions", "past"})
+    finetune_spec = FineTuneSpec(
+        {
+            "vision": r"vision\.",  # tower and projector
+            "vlm": r"embedding\.|.*\.experts\.vlm\.",
+            "memory": r".*\.experts\.(?!action\.)",  # extra experts of an integration
+            "action": "",
+        },
+        # The VLM's last layer has `kv` in place of `qkv`.
+        lora_targets=(
+            "experts.vlm.qkv",
+            "experts.vlm.kv",
+            "experts.vlm.out",
+            "experts.vlm.mlp.gate_up",
+            "experts.vlm.mlp.down",
+            "experts.action.qkv",
+            "experts.action.out",
+            "experts.action.mlp.gate_up",
+            "experts.action.mlp.down",
+        ),
+        full_train=("action_in", "action_out", "time_in", "time_out"),
+        # These are computed in float32 from their weight, without calling an adapter that wraps
+        # them.
+        lora_exclude=r"\.(action_in|action_out|time_in|time_out|\w*norm\.dense)$",
     )
-    heads = ("action_in", "action_out", "time_in", "time_out")
-    # The VLM's last layer has `kv` in place of `qkv`.
-    lora_targets = tuple(
-        f"experts.{expert}.{layer}"
-        for expert in ("vlm", "action")
-        for layer in (
-            "qkv",
-            *(("kv",) if expert == "vlm" else ()),
-            "out",
-            "mlp.gate_up",
-            "mlp.down",
-        )
-    )
-    # These are computed in float32 from their weight, without calling an adapter that wraps them.
-    lora_exclude = rf"\.({'|'.join(heads)}|\w*norm\.dense)$"
-    PARTS: ClassVar[Mapping[str, str]] = {
-        "vision": r"vision\.",
-        "vlm": r"embedding\.|.*\.experts\.vlm\.",
-        "memory": r".*\.experts\.(?!action\.)",
-        "action": "",
-    }
 
     def __init__(
         self, config: BackboneConfig, extra_experts: Mapping[str, ExpertConfig] | None = None
     ) -> None:
         super().__init__(config, extra_experts)
         self.config = config
-        self.vision_width, width = config.vlm.width, config.action.width
-        self.image_size, self.grid = (
-            config.vision.image_size,
-            config.vision.image_size // config.vision.patch_size,
-        )
-        self.horizon, self.action_dim = config.horizon, config.action_dim
+        width = config.action.width
+        self.vision_width = config.vlm.width
+        self.image_size = config.vision.image_size
+        self.grid = config.vision.image_size // config.vision.patch_size
+        self.horizon = config.horizon
+        self.action_dim = config.action_dim
         # The vision tower comes first: with one seed it is the same in every variant, and so is a
         # cache made by it.
         self.vision = VisionTower(config.vision, config.vlm.width)
@@ -105,7 +103,7 @@ class Pi05Backbone(
             self.time_out,
         ):
             initialise(module)
-        self.make_head(config)
+        self.head = build_head(config)
 
     def encode_images(self, images: Tensor) -> Tensor:
         """Images [n, 3, s, s] in [−1, 1] → tokens [n, 256, d]; no graph is kept while the tower is
@@ -178,11 +176,11 @@ class Pi05Backbone(
         pass.
         """
         blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
-        past = KVCache.of(injection.past)
-        layout = self.transformer.layout(blocks, injection.visibility, past)
+        layout = self.transformer.layout(blocks, injection.visibility)
         condition = self.time_condition(time)
-        condition = condition if injection.condition is None else injection.condition(condition)
-        hidden, _ = self.transformer(blocks, layout, condition, injection.hook, past)
+        if injection.condition is not None:
+            condition = injection.condition(condition)
+        hidden, _ = self.transformer(blocks, layout, condition, injection.hook)
         return self.read_velocity(hidden)
 
     # Sampling
@@ -199,93 +197,72 @@ class Pi05Backbone(
         noise: Mapping[str, Tensor],
         steps: int | None = None,
     ) -> Tensor:
-        """Integrate the flow from noise to a chunk, in `steps` Euler steps (10 by default).
+        """Integrate the flow from noise to a chunk [b, h, a], in `steps` Euler steps (10 by
+        default).
 
         All that does not depend on the flow time is computed once: memory, keys and values of the
         prefix and of the modulator, and every layer's time modulation. A step runs the action block
         alone.
         """
-        return self._integrate(batch, injection, noise, steps, self.prefill(injection))
+        steps = self.head.steps if steps is None else steps
+        x = self.head.start(noise, steps, batch.overlap)
+        times = self.head.times(steps, x.device)
 
-    @torch.no_grad()
-    def sample_and_keep(
-        self,
-        batch: Batch,
-        injection: Injection,
-        noise: Mapping[str, Tensor],
-        steps: int | None = None,
-    ) -> tuple[Tensor, KeysValues]:
-        prefix = self.prefill(injection)
-        return self._integrate(batch, injection, noise, steps, prefix), prefix.new()
+        # Prefill: one pass over images, prompt and memory leaves their keys and values.
+        layout = self.transformer.layout(injection.blocks, injection.visibility)
+        _, prefix = self.transformer(injection.blocks, layout, keep=True)
 
-    def _integrate(
-        self,
-        batch: Batch,
-        injection: Injection,
-        noise: Mapping[str, Tensor],
-        steps: int | None,
-        prefix: KVCache,
-    ) -> Tensor:
-        x, steps = noise["noise"], self.head.steps if steps is None else steps
+        # What all steps share: mask and angles, a cache with space for a step's own keys, and the
+        # time modulations of every layer.
         blocks = [*injection.beside, self.action_block(x)]
         layout = self.transformer.layout(blocks, injection.visibility, prefix)
-        past = prefix.preallocate(sum(map(len, blocks)))
+        past = prefix.preallocate(sum(len(block) for block in blocks))
         if injection.condition is None:
-            conditions, rows = self.conditions(steps), 1
+            rows = 1
+            conditions = self.conditions(len(times))
         else:  # memory changes the condition of each sample: every time for each
-            rows, condition = len(x), self.time_condition(self.head.times(steps, x.device))
-            changed = torch.cat([injection.condition(one.expand(rows, -1)) for one in condition])
-            conditions = self.transformer.conditioning(changed)
+            rows = len(x)
+            condition = [
+                injection.condition(time.expand(rows, -1)) for time in self.time_condition(times)
+            ]
+            conditions = self.transformer.conditioning(torch.cat(condition))
 
-        def velocity(x_t: Tensor, i: int) -> Tensor:
-            return self.denoise(x_t, conditions.at(i, rows), layout, past, injection)
+        def output(x_t: Tensor, index: int) -> Tensor:
+            blocks = [*injection.beside, self.action_block(x_t)]
+            condition = conditions.at(index, rows)
+            hidden, _ = self.transformer(blocks, layout, condition, injection.hook, past)
+            return self.read_velocity(hidden)
 
-        return self.sample_chunk(velocity, noise, steps, batch.overlap)
+        velocity = self.head.velocity(output, times, noise)
+        if batch.overlap is not None:
+            from mme_vla.speed.rtc import rtc_guidance
 
-    def prefill(self, injection: Injection) -> KVCache:
-        """Keys and values of the prefix, which all steps of a chunk share."""
-        past = KVCache.of(injection.past)
-        layout = self.transformer.layout(injection.blocks, injection.visibility, past)
-        _, prefix = self.transformer(injection.blocks, layout, past=past, keep=True)
-        return prefix
+            velocity = rtc_guidance(velocity, batch.overlap, times)
 
-    def denoise(
-        self,
-        x_t: Tensor,
-        condition: Tensor | Conditioning,
-        layout: Layout,
-        prefix: KVCache,
-        injection: Injection,
-    ) -> Tensor:
-        """The velocity at one flow time, from the cached prefix: the cost of one Euler step."""
-        blocks = [*injection.beside, self.action_block(x_t)]
-        hidden, _ = self.transformer(blocks, layout, condition, injection.hook, past=prefix)
-        return self.read_velocity(hidden)
+        # Euler steps from noise to actions.
+        for index in range(len(times)):
+            x = x - velocity(x, index).to(x.dtype) / len(times)
+            if "increments" in noise:
+                x = x + self.head.deviation * noise["increments"][:, index]
+        return x
 
     def conditions(self, steps: int) -> Conditioning:
         """Every layer's time modulations at the times of so many steps; kept for the next chunk
         while `keep_times`.
         """
-        if not self.keep_times:
-            return self._conditions(steps)
-        stamp = self.sampling_stamp()
-        if stamp != self._cached_stamp:
-            self._cached, self._cached_stamp = {}, stamp
-        if steps not in self._cached:
-            self._cached[steps] = self._conditions(steps)
-        return self._cached[steps]
-
-    def _conditions(self, steps: int) -> Conditioning:
-        device = next(self.parameters()).device
-        return self.transformer.conditioning(self.time_condition(self.head.times(steps, device)))
+        stamp = self.sampling_stamp() if self.keep_times else ()
+        if self.keep_times and stamp == self._cached_stamp and steps in self._cached:
+            return self._cached[steps]
+        times = self.head.times(steps, next(self.parameters()).device)
+        conditions = self.transformer.conditioning(self.time_condition(times))
+        if self.keep_times:
+            if stamp != self._cached_stamp:
+                self._cached = {}
+                self._cached_stamp = stamp
+            self._cached[steps] = conditions
+        return conditions
 
     # Optional capabilities
-
-    def parts(self) -> Mapping[str, str]:
-        """Tower and projector; embedding and VLM expert; extra experts of an integration; the rest
-        is `action`.
-        """
-        return self.PARTS
 
     def init_experts(self, names: Sequence[str]) -> None:
         """Initialise these experts in every layer."""

@@ -20,7 +20,6 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.data.cache_building import build_cache, clear_cache, estimate, process_rank
     from mme_vla.data.sources import open_sources
     from mme_vla.policy.build import build_from_config
-    from mme_vla.policy.capabilities import with_vision_memory
     from mme_vla.training.runs import start_from, weights_to_start_from
 
     if cfg.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
@@ -36,14 +35,14 @@ def main(cfg: DictConfig) -> None:
     memory = policy.to(device).memory
     if memory is None:
         raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
-    encoder = with_vision_memory(policy)
-    tower, dtype = encoder.vision_fingerprint(), str(encoder.history_dtype).removeprefix("torch.")
+    tower = policy.vision_fingerprint()
+    dtype = str(policy.history_dtype).removeprefix("torch.")
     root = Path(cfg.data.cache.root) if cfg.data.cache.root else default_cache_root()
     for source in open_sources(cfg.data.sources, policy.embodiment):
         expected = fingerprint(source, memory.storage, tower, dtype)
         folder = cache_folder(root, source, expected)
         if cfg.dry_run:
-            plan = estimate(source, memory, encoder.encode_frames, dtype, cfg.data.cache.batch_size)
+            plan = estimate(source, memory, policy.encode_frames, dtype, cfg.data.cache.batch_size)
             print(
                 f"{source.name}: {plan.frames} of {int(source.lengths.sum())} frames to encode,"
                 f" {plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process"
@@ -62,6 +61,6 @@ def main(cfg: DictConfig) -> None:
                 clear_cache(folder)
             batch_size = cfg.data.cache.batch_size
             n_encoded = build_cache(
-                source, memory, encoder.encode_frames, folder, expected, batch_size=batch_size
+                source, memory, policy.encode_frames, folder, expected, batch_size=batch_size
             )
         print(f"{source.name}: {n_encoded} episodes encoded, {len(source)} in all, at {folder}")

@@ -94,8 +94,6 @@ def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) ->
     """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where
     there is a GPU.
     """
-    from mme_vla.policy.capabilities import CompilesSampling
-
     check_choice("sampling", sampling, SAMPLING)
     on_gpu = policy.device.type == "cuda"
     if sampling == "graph" and not on_gpu:
@@ -103,20 +101,16 @@ def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) ->
             f"sampling=graph needs a GPU, and the policy is on {policy.device}: leave"
             " sampling=auto."
         )
-    compiles = isinstance(policy, CompilesSampling)
-    if sampling == "eager" or (
-        sampling == "auto" and not (on_gpu and compiles and policy.compiles_sampling)
-    ):
+    if sampling == "eager" or (sampling == "auto" and not on_gpu):
         return
-    if not isinstance(policy, CompilesSampling) or (
-        sampling == "graph" and not policy.compiles_sampling
-    ):
-        raise UserError(
-            f"sampling={sampling}: {type(policy).__name__} has no sampler that can be compiled. Set"
-            " sampling=eager."
-        )
     begun = time.perf_counter()
-    policy.compile_sampling(layers=sampling == "compiled")
+    if not policy.compile_sampling(layers=sampling == "compiled"):
+        require(
+            sampling == "auto",
+            f"sampling={sampling}: {type(policy).__name__} has no sampler that can be compiled. Set"
+            " sampling=eager.",
+        )
+        return
     logger.info("sampler compiled in %.1f s (sampling=%s)", time.perf_counter() - begun, sampling)
 
 

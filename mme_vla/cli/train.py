@@ -177,7 +177,6 @@ def _train(
     from accelerate.utils import broadcast_object_list
 
     from mme_vla.policy.build import build_from_config
-    from mme_vla.policy.capabilities import with_vision_memory
     from mme_vla.policy.finetune import (
         apply_finetuning,
         cast_frozen,
@@ -228,7 +227,7 @@ def _train(
     if holds:
         take_memory(policy.to(accelerator.device))
     encoder = broadcast_object_list(
-        [with_vision_memory(policy).vision_fingerprint() if first and policy.memory else None]
+        [policy.vision_fingerprint() if first and policy.memory else None]
     )
     local = config["data"]["cache"].get("local", False)
     with accelerator.local_main_process_first() if local else accelerator.main_process_first():

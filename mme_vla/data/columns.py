@@ -1,6 +1,4 @@
-"""Further columns of a dataset: labels and weights of samples (numbers), and notes of a prompt
-(texts).
-"""
+"""Further columns of a dataset: labels and weights of samples."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -98,7 +96,7 @@ def weight_column(source: EpisodeSource, name: str) -> np.ndarray:
     return weights
 
 
-def text_column(source: EpisodeSource, name: str, key: str = "data.texts") -> pa.ChunkedArray:
+def text_column(source: EpisodeSource, name: str, key: str) -> pa.ChunkedArray:
     """The text of every frame of a dataset; `key` names the column in messages."""
     column = _read(source, name, key)
     require(

@@ -1,6 +1,6 @@
 """The training dataset: one item is one step of an execution phase."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mme_vla.data.cache import VisionCache
-from mme_vla.data.columns import label_column, text_column, weight_column, with_labels
+from mme_vla.data.columns import label_column, weight_column, with_labels
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError, listed, require
+from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
 from mme_vla.memory.history import History
 from mme_vla.memory.transforms import FrameMap, HistoryTransform, TransformedHistory, map_frames
@@ -48,9 +48,7 @@ class Step:
 
 
 class FurtherColumns:
-    """Labels, sample weights and texts of one dataset, read and checked once; see
-    `TrainingDataset`.
-    """
+    """Labels and sample weights of one dataset, read and checked once; see `TrainingDataset`."""
 
     def __init__(
         self,
@@ -58,7 +56,6 @@ class FurtherColumns:
         labels: Sequence[str],
         memory_labels: Sequence[str],
         weights: str | None,
-        texts: Mapping[str, str],
     ) -> None:
         key = "The policy's labels"
         self._source, self._memory_labels = source, tuple(memory_labels)
@@ -68,7 +65,6 @@ class FurtherColumns:
         }
         self._current = tuple(labels)
         self._weights = None if weights is None else weight_column(source, weights)
-        self._texts = {note: text_column(source, column) for note, column in texts.items()}
 
     def items(self, episode: int, frame: int) -> dict[str, Any]:
         """What a sample at a frame has of these: `labels` and `weight`, where there are any."""
@@ -76,11 +72,6 @@ class FurtherColumns:
         labels = {name: torch.as_tensor(self._labels[name][row]) for name in self._current}
         weight = {} if self._weights is None else {"weight": torch.as_tensor(self._weights[row])}
         return ({"labels": labels} if labels else {}) | weight
-
-    def text(self, note: str, episode: int, frame: int) -> str:
-        """The text of a note at a frame."""
-        (row,) = self._source.rows(episode, np.array([frame]))
-        return str(self._texts[note][int(row)].as_py())
 
     def of_memory(self, episode: int) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
         """The labels that the memory reads, by name: values of an episode's frames [n]."""
@@ -114,7 +105,6 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         subgoal: SubgoalText | None = None,
         labels: Sequence[str] = (),
         weights: str | None = None,
-        texts: Mapping[str, str] | None = None,
         seed: int = 42,
         transforms: Sequence[HistoryTransform] = (),
     ) -> None:
@@ -135,9 +125,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             jitter: hand the memory a random generator, for memories that vary their selection in
                 training.
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
-            labels: of the current frame, that integration and backbone read; those of the memory
-                follow from it.
-            weights: the column of sample weights. texts: note of the prompt → its column of texts.
+            labels: of the current frame, that the backbone reads; those of the memory follow from
+                it.
+            weights: the column of sample weights.
             seed: of all randomness.
             transforms: of the frames of an episode, before anything reads its past.
         """
@@ -158,13 +148,6 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         )
         if subgoal is not None:
             _check_subgoals(sources, subgoal)
-        spec = processor.prompt_spec
-        lacking = sorted(set(spec.notes) - set(texts or {}))
-        require(
-            not lacking,
-            f"The prompt format {spec.name!r} reads the notes {listed(lacking)}: name their"
-            f" columns, such as data.texts={{{lacking[0] if lacking else ''}: simple_subgoal}}.",
-        )
         rate = processor.embodiment.fps
         if processor.samples.history is not None and (
             other := [s for s in sources if rate not in (None, s.fps)]
@@ -180,8 +163,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.jitter, self.subgoal, self.seed, self.epoch = jitter, subgoal, seed, 0
         self.transforms = tuple(transforms)
         self.columns = [
-            FurtherColumns(source, labels, labels_read(memory), weights, texts or {})
-            for source in sources
+            FurtherColumns(source, labels, labels_read(memory), weights) for source in sources
         ]
         selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
         self._source = np.concatenate(
@@ -333,7 +315,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         if self.mask_padding:
             item["action_mask"] = torch.from_numpy(step.recorded)
         for name, value in self.columns[step.source].items(step.episode, step.index).items():
-            item[name] = item.get(name, {}) | value if name == "labels" else value
+            item[name] = value
         if self.memory is not None:
             history: History = self.caches[step.source].history(step.episode)
             if uses_proprio(self.memory):
@@ -393,22 +375,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             subgoal=subgoal,
             past_actions=self.past_actions(step, frames),
             actions=step.actions,
-            **self._notes(step),
         )
-
-    def _notes(self, step: Step) -> dict[str, dict[str, str]]:
-        """Notes of the prompt, and the lines to write; one that the policy writes is read a
-        decision later.
-        """
-        spec, columns = self.processor.prompt_spec, self.columns[step.source]
-        before = step.index - self.processor.embodiment.action.execute
-        notes = {name: columns.text(name, step.episode, step.index) for name in spec.notes}
-        stored = {name: notes[name] for name in spec.writes}
-        for name in stored:
-            notes[name] = (
-                columns.text(name, step.episode, before) if before >= step.exec_start else ""
-            )
-        return {"notes": notes, "written": stored}
 
 
 def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> None:

@@ -9,7 +9,7 @@ from mme_vla.backbone.base import Hook, Injection
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.layers import PI05_VISIBILITY, Block, Visibility
 from mme_vla.errors import check_choice
-from mme_vla.types import KeysValues, MemoryTokens
+from mme_vla.types import MemoryTokens
 
 MEMORY_VISIBILITY: Visibility = {
     "memory": {"memory"},
@@ -54,7 +54,6 @@ class Integration(nn.Module):
             time).
         beside: blocks that stand beside the actions in every step; `visibility` needs rows for
             them.
-        past: stored keys and values, which the blocks read whose row of `visibility` names `cache`.
         required_features: what a backbone must support beside the methods overridden here
             (`Backbone.supports`).
         memory_position: `time` where its attention on memory counts frames, which needs a memory
@@ -84,9 +83,6 @@ class Integration(nn.Module):
     def beside(self, memory: MemoryTokens | None) -> Sequence[Block]:
         return ()
 
-    def past(self, memory: MemoryTokens | None) -> KeysValues | None:
-        return None
-
     def inject(self, observation: Sequence[Block], memory: MemoryTokens | None) -> Injection:
         """All that enters the backbone for one chunk, from its observation blocks and the memory's
         tokens.
@@ -97,7 +93,6 @@ class Integration(nn.Module):
             self.hook(memory),
             self.condition(memory),
             self.beside(memory),
-            self.past(memory),
         )
 
 
@@ -125,8 +120,7 @@ def ages_of(memory: MemoryTokens) -> Tensor:
 
 
 EXTENSION_POINTS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {
-    "extra_experts": "expert",
-    "past": "cache",
+    "extra_experts": "expert"
 }
 """Method of an integration → the feature that a backbone must support for it
 (`Backbone.supports`).

@@ -172,58 +172,8 @@ class MemoryModule(nn.Module):
 Memory = MemoryModule
 """The former name."""
 
-CacheEntry = tuple[int, Tensor]
-"""The frame of a chunk's observation, and keys and values [layers, 2, n, K, h] of tokens of its
-prefix.
-"""
-
 NEVER = 1_000_000
 """Frames between two whose tokens are stored, of memories that read none."""
-
-
-class CacheMemory(MemoryModule):
-    """A memory of keys and values that the backbone made of earlier prefixes
-    (`MemoryTokens.cache`).
-
-    A subclass implements `write`. It has no tokens and reads no stored frames unless it overrides
-    the other methods.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.budget = self.capacity = 0
-        self.storage = StorageSpec(1, "mean", NEVER)
-
-    def write(self, entries: Sequence[CacheEntry], new: CacheEntry) -> Sequence[CacheEntry]:
-        """What is stored after a chunk. It must change nothing in place: a chunk that fails is
-        sampled again.
-
-        Args:
-            entries: what was stored before, oldest first. new: the frame of the chunk's
-                observation, and the keys and values of its prefix.
-        """
-        raise NotImplementedError
-
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return np.zeros(0, np.int64)
-
-    def gather_selection(
-        self, history: History, step: int, rng: np.random.Generator | None = None
-    ) -> HistoryTokens:
-        return HistoryTokens(
-            torch.zeros(0, 1),
-            torch.zeros(0, 3),
-            torch.zeros(0, dtype=torch.bool),
-            torch.tensor(step),
-        )
-
-    def condition_on_prompt(
-        self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
-    ) -> HistoryTokens:
-        return history
-
-    def forward(self, history: HistoryTokens) -> MemoryTokens:
-        return MemoryTokens(history.features, history.mask)
 
 
 class StreamingMemory:

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import (
     NEVER,
-    CacheMemory,
     CompilableMemory,
     MemoryModule,
     PastViewMemory,
@@ -79,11 +78,6 @@ class JoinedMemory(
         ]
         self.members = nn.ModuleList(built)
         names = [section["name"] for section in sections]
-        require(
-            not any(isinstance(member, CacheMemory) for member in built),
-            f"memory.members={brief(names)}: a memory of keys and values (CacheMemory) cannot be"
-            " joined with others.",
-        )
         # Equal names get a number.
         self.names = [
             f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)

@@ -1,8 +1,7 @@
-"""`Policy`: the interface that training, evaluation, serving and weights use. Capabilities are in
-`capabilities.py`.
-"""
+"""`Policy`: the interface that training, evaluation, serving and weights use."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -10,16 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule
-from mme_vla.policy.acting import choose_actions
-from mme_vla.policy.capabilities import SupportsRTC
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.saving import load_policy, push_to_hub, save_policy
-from mme_vla.types import Noise
+from mme_vla.types import Noise, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -30,7 +27,8 @@ class Policy(nn.Module):
     folder to save to.
 
     A subclass registers in `POLICIES` (`policy.name` of a configuration), sets the attributes
-    below, and implements what raises NotImplementedError. Its processor defines the batches. Random
+    below that have no default, and implements what raises NotImplementedError. What it need not
+    have is a method or an attribute with a default. Its processor defines the batches. Random
     numbers are passed in (`training_noise`, `sampling_noise`), so that training resumes bit for
     bit, and the noise of an episode does not depend on its batch.
     """
@@ -47,6 +45,22 @@ class Policy(nn.Module):
     """
     action_dim: int
     """Width of a chunk inside the network; the embodiment's own actions are its first columns."""
+    history_dtype: torch.dtype = torch.bfloat16
+    """Of stored vision tokens (`encode_frames`)."""
+    loss_weights: Mapping[str, float] | None = None
+    """Weights of auxiliary losses by name, which training sets from `train.losses`. None for a
+    policy that has no such losses, and weighs no samples (`Batch.weight`).
+    """
+    sample_steps: int = 1
+    """Default steps of its sampler."""
+    supports_rtc: bool = False
+    """Whether it can sample chunks that continue an action prefix (real-time chunking)."""
+    max_actions: int | None = None
+    """Actions after which its rollouts end, beside their limit of frames."""
+    keyframes: int = 1
+    """Keyframes of a training sample, of policies that train on them."""
+    n_distractor_episodes: int = 0
+    """Unrelated episodes that it is shown before each of its own, as a stress split requires."""
 
     @property
     def device(self) -> torch.device:
@@ -75,11 +89,63 @@ class Policy(nn.Module):
             )
         return self.processor
 
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
+        """Size → its value in the processor and in the network; a checkpoint in which they differ
+        is damaged.
+        """
+        return {}
+
+    # Stored vision tokens of past frames
+
+    def require_memory(self) -> MemoryModule:
+        """Return the memory.
+
+        Raises:
+            UserError: the policy has none.
+        """
+        if self.memory is None:
+            raise UserError(
+                "This policy has no memory, so it stores no vision tokens of past frames."
+            )
+        return self.memory
+
+    def encode_frames(self, frames: np.ndarray) -> Tensor:
+        """Encode memory-view frames [n, H, W, 3] uint8 into stored tokens [n, grid², d_vision]."""
+        raise UserError(
+            f"{type(self).__name__} stores no vision tokens of past frames: it lacks"
+            " encode_frames()."
+        )
+
+    def vision_fingerprint(self) -> str:
+        """Hash what the tokens of `encode_frames`, and a cache of them, depend on."""
+        raise UserError(
+            f"{type(self).__name__} stores no vision tokens of past frames: it lacks"
+            " vision_fingerprint()."
+        )
+
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """Frames of the memory camera, beside the current ones, that acting at these steps reads,
+        so that a simulation renders no others.
+
+        Args:
+            steps: [n] current frames, video included. exec_start: the first execution frame.
+
+        Returns:
+            int64 [n], ascending and unique; None if any frame of any camera may be read.
+        """
+        return None
+
     # Training
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """Sample the random numbers for the losses of `count` samples, on the CPU: each value
         [count, …].
+        """
+        return {}
+
+    def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
+        """Random numbers [count, …] on the CPU for the images of `count` samples, beside
+        `training_noise`'s.
         """
         return {}
 
@@ -112,6 +178,17 @@ class Policy(nn.Module):
         """
         raise NotImplementedError
 
+    def compile_sampling(self, layers: bool = False) -> bool:
+        """Compile the sampler of a policy whose weights are final.
+
+        Args:
+            layers: compile the network's layers too.
+
+        Returns:
+            Whether the policy has a sampler that can be compiled.
+        """
+        return False
+
     # Episodes
 
     def start_episode(self, goal: str, seed: int = 0) -> Episode:
@@ -132,19 +209,21 @@ class Policy(nn.Module):
         if not episodes:
             n_past = self.require_processor().samples.window - 1
             return np.zeros((0, self.horizon - n_past, self.embodiment.action.width), np.float32)
-        supports_rtc = isinstance(self, SupportsRTC) and self.supports_rtc
-        if not supports_rtc and any(e.action_prefix is not None for e in episodes):
+        if not self.supports_rtc and any(e.action_prefix is not None for e in episodes):
             name = self.config.get("name", type(self).__name__)
             raise UserError(
                 f"{name} does not support real-time chunking, which needs a flow policy such as"
                 " π0.5. Leave out set_action_prefix()."
             )
-        waiting = episodes
+        return choose_actions(self, episodes, steps).actions
 
-        def predict(batch: Any, noise: Mapping[str, Tensor]) -> Tensor:
-            return self.predict_chunk(batch, waiting, noise, steps)
+    def prepare(self, episode: Episode) -> bool:
+        """Compute a part of an episode's next chunk while the robot moves; no action changes by it.
 
-        return choose_actions(self, waiting, predict).actions
+        Returns:
+            Whether more remains. A recurrent memory reads its next list of frames so.
+        """
+        return False
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         """The current observations of episodes, as a batch of the processor's kind on the policy's
@@ -262,3 +341,52 @@ class Policy(nn.Module):
         """
         options = {"private": private, "token": token, "revision": revision, "message": message}
         return push_to_hub(self, repo_id, dtype=dtype, card=card, **options)
+
+
+@dataclass(frozen=True)
+class SelectedActions:
+    """What a policy chose for n episodes.
+
+    batch: of `Policy.observation`. chunk: [n, h, a], in the network's units. actions: float32 [n,
+    h, w], as the embodiment executes them, without the steps of a chunk that lie in the past.
+    """
+
+    batch: Any
+    chunk: Tensor
+    actions: np.ndarray
+
+
+def choose_actions(
+    policy: Policy,
+    episodes: Sequence[Episode],
+    steps: int | None = None,
+    predict: Callable[[Any, Mapping[str, Tensor]], Tensor] | None = None,
+) -> SelectedActions:
+    """Choose the next chunk for episodes in one batch, with each episode's own noise.
+
+    Args:
+        steps: of an iterative sampler; its default by default.
+        predict: in place of `Policy.predict_chunk`, from the observation and its noise to the
+            normalised chunk [n, h, a].
+    """
+    processor = policy.require_processor()
+    processor.require_stats()  # before the noise or memory of an episode changes
+    batch = policy.observation(episodes)
+    noise = stack_noise([episode.draw() for episode in episodes])
+    was_training = policy.training
+    policy.eval()
+    try:
+        if predict is None:
+            chunk = policy.predict_chunk(batch, episodes, noise, steps)
+        else:
+            chunk = predict(batch, noise)
+        chunk = chunk.float().cpu()
+    finally:
+        policy.train(was_training)
+    absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
+    space = policy.embodiment.action
+    decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
+    actions = torch.stack(decided).numpy()[:, processor.samples.window - 1 :]
+    for episode, chosen in zip(episodes, actions, strict=True):
+        episode.acted(chosen)
+    return SelectedActions(batch, chunk, actions)

@@ -16,7 +16,7 @@ from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, require
 from mme_vla.integration.base import Integration, extension_points
-from mme_vla.memory.base import CacheMemory, Memory, MemoryModule, past_view_spec
+from mme_vla.memory.base import Memory, MemoryModule, past_view_spec
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import SECTIONS, policy_class
 from mme_vla.processing.base import DEFAULT as DEFAULT_PROCESSOR
@@ -68,12 +68,6 @@ def check_integrated(
         raise UserError(
             f"This configuration names {mismatch}; name both, or neither for the memoryless policy."
         )
-    reads_cache = "cache" in extension_points(type(integration))
-    require(
-        reads_cache == isinstance(memory, CacheMemory),
-        "A memory of keys and values needs an integration that reads them (`Integration.past`), and"
-        " the other way round: set integration to one that goes with the memory.",
-    )
     if memory is None:
         return
     check_past(config, memory, supports)

@@ -12,10 +12,9 @@ from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError, require
 from mme_vla.memory.base import past_view_spec, start_history, start_stream, uses_proprio
 from mme_vla.memory.history import History, OnlineHistory
-from mme_vla.policy.capabilities import with_vision_memory
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.images import PastImages
-from mme_vla.processing.normalise import check_reach, finite_array
+from mme_vla.processing.normalise import QuantileStats, check_reach, finite_array
 from mme_vla.processing.prompt import checked_goal, checked_text
 from mme_vla.speed.rtc import overlap_weights
 from mme_vla.types import FrameBatch, HistoryTokens, Overlap, PastViews
@@ -46,6 +45,10 @@ class Host(Protocol):
 
     def require_processor(self) -> "PolicyProcessor": ...
 
+    def require_memory(self) -> "MemoryModule": ...
+
+    def encode_frames(self, frames: np.ndarray) -> Tensor: ...
+
     def sampling_noise(self, generator: torch.Generator) -> dict[str, Tensor]: ...
 
 
@@ -53,7 +56,8 @@ class Episode:
     """State of one episode: goal, current view and robot state, history of past frames, noise."""
 
     def __init__(self, policy: Host, goal: str, seed: int = 0) -> None:
-        self._policy, self._robot = policy, policy.embodiment
+        self._policy = policy
+        self._robot = policy.embodiment
         self._generator = torch.Generator().manual_seed(seed)
         self._recent: list[tuple[Tensor | None, Tensor]] = []
         """Images (None: not rendered) and states of the observation's window, the current frame
@@ -63,20 +67,10 @@ class Episode:
         self.goal = checked_text(goal, "the goal")
         self.subgoal: str | None = None
         """The current language subgoal, for policies whose prompt has one; set it before `act`."""
-        self.notes: dict[str, str] = {}
-        """The notes of prompts that read some, by name; a policy that writes notes replaces its own
-        at each `act`.
-        """
-        self.written: list[dict[str, Any]] = []
-        """What the policy wrote: for each decision its frame, and the lines by name."""
         self.options: tuple[Option, ...] = ()
         """The options of policies that choose among some; set them before `act`."""
         memory = policy.memory
-        self.history = (
-            None
-            if memory is None
-            else start_history(memory, with_vision_memory(policy).encode_frames)
-        )
+        self.history = None if memory is None else start_history(memory, policy.encode_frames)
         if self.history is not None and uses_proprio(memory):
             self.history.motion = lambda frames: torch.stack(
                 [self._motion_of_frames[int(frame)] for frame in frames]
@@ -89,9 +83,8 @@ class Episode:
         spec = past_view_spec(memory)
         self._past = None if spec is None else PastImages(spec)
         self.n_observed_frames = 0
-        self._motion_of_frames: list[
-            Tensor
-        ] = []  # rows [w], one a frame, if the memory reads motion
+        self._motion_of_frames: list[Tensor] = []
+        """Rows [w], one a frame, if the memory reads motion."""
         self._chunk: np.ndarray | None = None
         self.action_prefix: ActionPrefix | None = None
         """See `set_action_prefix`."""
@@ -127,11 +120,10 @@ class Episode:
         images = {name: self._checked_view(frames, name) for name in self._robot.camera_names}
         states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
-        count, width = len(states) if states.ndim else 0, self._robot.state.width
-        even = all(
-            len(view) == (count if rendered is None else len(rendered[name]))
-            for name, view in images.items()
-        )
+        count = len(states) if states.ndim else 0
+        width = self._robot.state.width
+        shown = {name: count if rendered is None else len(rendered[name]) for name in images}
+        even = all(len(view) == shown[name] for name, view in images.items())
         if states.shape != (count, width) or not even or demo.shape not in ((), (count,)):
             counts = ", ".join(f"{len(view)} {name}" for name, view in images.items())
             raise UserError(
@@ -141,16 +133,15 @@ class Episode:
             )
         if count == 0:
             return
-        views = {
-            name: FrameBatch.of(view, None if rendered is None else rendered[name], count)
-            for name, view in images.items()
-        }
+        indices = dict.fromkeys(images) if rendered is None else rendered
+        views = {name: FrameBatch.of(view, indices[name], count) for name, view in images.items()}
         processor = self._policy.require_processor()
-        check_reach(states, None if processor.stats is None else processor.stats.state, "a state")
+        check_reach(states, self._state_stats(), "a state")
         demo, executed = self._checked_course(count, demo, actions)
         # Execution frames within the window; the current frame in any case.
         samples = processor.samples
-        recent = range(max(count - samples.window, 0) if samples.consecutive else count - 1, count)
+        first = max(count - samples.window, 0) if samples.consecutive else count - 1
+        recent = range(first, count)
         new_frames = [
             (self._prepared_images(views, i), torch.from_numpy(states[i].copy()))
             for i in recent
@@ -218,7 +209,8 @@ class Episode:
         """
         self._require_single_view()
         state = finite_array(state, "the state")
-        width, names = self._robot.state.width, self._robot.camera_names
+        width = self._robot.state.width
+        names = self._robot.camera_names
         require(
             state.shape == (width,),
             f"set_view() needs a state of {width} finite numbers, got shape {state.shape}.",
@@ -229,7 +221,7 @@ class Episode:
                 f" {', '.join(views) or 'none'}."
             )
         processor = self._policy.require_processor()
-        check_reach(state, None if processor.stats is None else processor.stats.state, "the state")
+        check_reach(state, self._state_stats(), "the state")
         self._set_window(
             [(processor.images([views[name] for name in names]), torch.from_numpy(state.copy()))]
         )
@@ -298,14 +290,11 @@ class Episode:
     @property
     def prompt(self) -> Any:
         """The processor's encoding of goal and subgoal."""
-        processor, state = (
-            self._policy.require_processor(),
-            self._recent[-1][1] if self._recent else None,
-        )
+        processor = self._policy.require_processor()
+        state = self._recent[-1][1] if self._recent else None
         goal = self._robot.action.worded(checked_goal(self.goal), self.options)
-        notes = {"notes": self.notes} if processor.prompt_spec.notes else {}
         return processor.prompt(
-            goal, subgoal=self.subgoal, state=state, past_actions=self._executed, **notes
+            goal, subgoal=self.subgoal, state=state, past_actions=self._executed
         )
 
     def set_action_prefix(self, actions: np.ndarray, delay: int = 0) -> None:
@@ -340,15 +329,12 @@ class Episode:
         use it.
         """
 
-    def acted(self, chunk: np.ndarray, notes: Mapping[str, str] | None = None) -> None:
-        """Take the chunk [h, w] of the policy, and the notes it wrote.
-
-        The frames that follow tell how much of the chunk was executed.
+    def acted(self, chunk: np.ndarray) -> None:
+        """Take the chunk [h, w] of the policy; the frames that follow show how much of it was
+        executed.
         """
-        self._chunk, self.action_prefix = chunk, None
-        if notes:
-            self.notes |= notes
-            self.written.append({"frame": self.n_observed_frames - 1, **notes})
+        self._chunk = chunk
+        self.action_prefix = None
 
     @property
     def noise_state(self) -> Tensor:
@@ -367,7 +353,12 @@ class Episode:
 
     @property
     def _memory(self) -> "MemoryModule":
-        return with_vision_memory(self._policy).require_memory()
+        return self._policy.require_memory()
+
+    def _state_stats(self) -> QuantileStats | None:
+        """Statistics of the state, once the processor has any."""
+        stats = self._policy.require_processor().stats
+        return None if stats is None else stats.state
 
     @property
     def _no_actions(self) -> np.ndarray:
@@ -400,11 +391,9 @@ class Episode:
         """
         space = self._robot.action
         if actions is None:
-            return (
-                self._no_actions
-                if self._chunk is None or space.frames is None
-                else self._chunk[:count]
-            )
+            if self._chunk is None or space.frames is None:
+                return self._no_actions
+            return self._chunk[:count]
         values = finite_array(actions, "actions")
         if space.frames is None and values.ndim:
             count = len(values)
@@ -428,7 +417,7 @@ class Episode:
         """
         if self.history is not None:
             motion = self._motion(demo, executed, states)
-            self.history.take(frames, with_vision_memory(self._policy).encode_frames)
+            self.history.take(frames, self._policy.encode_frames)
             self._motion_of_frames += motion
             if not self._video_over:
                 self.history.exec_start = self.n_observed_frames + int(demo.sum())
@@ -450,10 +439,8 @@ class Episode:
                 "This policy's memory reads the robot's own states and actions: give past frames"
                 " with their states (`Episode.observe`), not as images alone."
             )
-        actions, known = (
-            np.zeros((len(demo), self._robot.action.width), np.float32),
-            np.zeros(len(demo), bool),
-        )
+        actions = np.zeros((len(demo), self._robot.action.width), np.float32)
+        known = np.zeros(len(demo), bool)
         if self._robot.action.frames is not None:
             rows = np.flatnonzero(~demo)[: len(executed)]
             actions[rows], known[rows] = executed[: len(rows)], True
@@ -461,10 +448,11 @@ class Episode:
 
     def _prepared_images(self, views: Mapping[str, FrameBatch], frame: int) -> Tensor | None:
         """The views of a frame as the network takes them; None unless all cameras rendered it."""
-        images = [image for view in views.values() if (image := view.image(frame)) is not None]
-        return (
-            self._policy.require_processor().images(images) if len(images) == len(views) else None
-        )
+        images = [view.image(frame) for view in views.values()]
+        rendered = [image for image in images if image is not None]
+        if len(rendered) < len(images):
+            return None
+        return self._policy.require_processor().images(rendered)
 
     def _set_window(self, frames: Sequence[tuple[Tensor | None, Tensor]]) -> None:
         self._recent = [*self._recent, *frames][-self._policy.require_processor().samples.window :]
@@ -505,9 +493,9 @@ def checked_prefix(actions: np.ndarray, delay: int, horizon: int, width: int) ->
         f"set_action_prefix() needs 1 to {horizon} actions of {width} numbers, got shape"
         f" {values.shape}.",
     )
-    right = isinstance(delay, int) and not isinstance(delay, bool) and 0 <= delay <= len(values)
+    is_count = isinstance(delay, int) and not isinstance(delay, bool)
     require(
-        right,
+        is_count and 0 <= delay <= len(values),
         f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)}, the"
         " actions given.",
     )

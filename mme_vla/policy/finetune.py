@@ -9,12 +9,12 @@ action and time heads) and `memory` (memory, integration, and the memory's own e
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.base import FineTuneSpec as FineTuneSpec
 from mme_vla.errors import UserError, brief, check_choice, did_you_mean, missing_extra, require
 from mme_vla.policy.tensor_files import dtype_of
 
@@ -24,36 +24,6 @@ if TYPE_CHECKING:
 MODES = ("full", "expert_only", "lora")
 INITS: Mapping[str, Any] = {"uniform": True, "gaussian": "gaussian"}  # ours → peft's
 ADAPTER = "default"  # peft's name of the one adapter a policy carries
-
-
-@dataclass(frozen=True)
-class FineTuneSpec:
-    """How a policy can be fine-tuned.
-
-    components: name → pattern of the parameters' names, in order; the first match counts, the last
-    pattern must match
-        the remaining ones. Usual names are `vision`, `vlm`, `action` and `memory`.
-    lora_targets: linear layers that LoRA wraps by default, by the end of their name.
-    full_train: modules that train in full beside the adapters, by the end of their name.
-    lora_exclude: pattern of linear layers whose weight is read past any adapter that wraps them.
-    frozen: pattern of the parameters that never train.
-    """
-
-    components: Mapping[str, str]
-    lora_targets: Sequence[str] = ()
-    full_train: Sequence[str] = ()
-    lora_exclude: str | None = None
-    frozen: str | None = None
-
-    def component_of(self, name: str) -> str:
-        """The component of a parameter."""
-        for component, pattern in self.components.items():
-            if re.match(pattern, name):
-                return component
-        raise ValueError(
-            f"No component has the parameter {name!r}; the last pattern must match the remaining"
-            " names."
-        )
 
 
 def apply_finetuning(

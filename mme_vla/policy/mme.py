@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLanguageHead, HasLoraTargets
+from mme_vla.backbone.base import Backbone, FineTuneSpec, HasExtraExperts
 from mme_vla.backbone.building import read_backbone, shapes_only
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.backbone.layers import check_backend
@@ -20,7 +20,6 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, listed
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import (
-    CacheMemory,
     CompilableMemory,
     MatmulPrecision,
     MemoryModule,
@@ -30,12 +29,10 @@ from mme_vla.memory.base import (
     past_view_spec,
 )
 from mme_vla.memory.history import PromptConditionedHistory
-from mme_vla.model import MMEModel
+from mme_vla.model import MMEModel, unit_images
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_integrated
-from mme_vla.policy.caching import CachingEpisode, stack_caches, stage_writes
 from mme_vla.policy.episode import Episode, prefix_overlap
-from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
@@ -50,11 +47,16 @@ if TYPE_CHECKING:
 
 
 @POLICIES.register("mme")
-class MMEPolicy(MMEModel, NetworkPolicy):
+class MMEPolicy(NetworkPolicy):
     """One composition of backbone, memory and integration, as a policy. No method depends on the
     variant.
+
+    model: the network. Its modules `backbone`, `memory` and `integration` are the policy's own too.
     """
 
+    model: MMEModel
+    backbone: Backbone
+    integration: Integration
     acts_in_bfloat16 = True
     _sampler: CapturedSampling | None = None
 
@@ -80,31 +82,57 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             float32_products: how a GPU multiplies in recurrent memories, which compute in float32:
                 `ieee` or `tf32`.
         """
-        NetworkPolicy.__init__(
-            self,
+        model = MMEModel(backbone, memory, integration, transform_images=self.transform_images)
+        object.__setattr__(self, "model", model)
+        super().__init__(
             processor,
             config,
             compute_dtype=compute_dtype,
             history_dtype=history_dtype,
             augment=augment,
         )
-        self.backbone, self.memory, self.integration = backbone, memory, integration
-        self._set_backends(attention, checked_products(float32_products))
-        self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
+        # The model's modules are the policy's, so that the names of weights have no prefix and a
+        # part that is replaced in one is replaced in both.
+        self._modules = model._modules
+        self.horizon = backbone.horizon
+        self.action_dim = backbone.action_dim
         if isinstance(backbone, HasFlowHead):
-            self.sample_steps, self.supports_rtc = backbone.head.steps, backbone.head.supports_rtc
-
-    def _set_backends(self, attention: str, float32_products: str) -> None:
-        if isinstance(self.backbone, HasAttentionBackends):
-            self.backbone.set_attention_backend(attention)
+            self.sample_steps = backbone.head.steps
+            self.supports_rtc = backbone.head.supports_rtc
+        if isinstance(backbone, HasAttentionBackends):
+            backbone.set_attention_backend(attention)
         elif check_backend(attention) != "auto":
             raise UserError(
-                f"policy.attention={attention}: {type(self.backbone).__name__} has one attention"
+                f"policy.attention={attention}: {type(backbone).__name__} has one attention"
                 " backend; leave it at auto."
             )
+        checked_products(float32_products)
         for module in self.modules():
             if isinstance(module, MatmulPrecision):
                 module.float32_products = float32_products
+
+    @property
+    def compute_dtype(self) -> torch.dtype:
+        """Matrix products run in it, under autocast."""
+        return self.model.compute_dtype
+
+    @compute_dtype.setter
+    def compute_dtype(self, dtype: torch.dtype) -> None:
+        self.model.compute_dtype = dtype
+
+    @property
+    def loss_weights(self) -> Mapping[str, float]:
+        """Weights of auxiliary losses by name (`train.losses`)."""
+        return self.model.loss_weights
+
+    @loss_weights.setter
+    def loss_weights(self, weights: Mapping[str, float]) -> None:
+        self.model.loss_weights = weights
+
+    def train(self, mode: bool = True) -> Self:
+        """Set policy and model to training, or to inference."""
+        self.model.training = mode
+        return super().train(mode)
 
     @classmethod
     def from_config(
@@ -157,17 +185,21 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     # Training
 
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        return self.model.training_noise(count, generator)
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        return self.model.sampling_noise(generator)
+
     def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
         """While training with augmentation `changes` [n, …]: random numbers that change a sample's
         images.
         """
-        return (
-            {"changes": self._sample_augmentation(count, generator)}
-            if self.training and self.augment
-            else {}
-        )
+        if self.training and self.augment:
+            return {"changes": self._sample_augmentation(count, generator)}
+        return {}
 
-    def forward(  # type: ignore[override]  # returns metrics too, as all policies do
+    def forward(
         self,
         batch: Batch,
         noise: Mapping[str, Tensor] | Tensor | None = None,
@@ -178,9 +210,10 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
         Args:
             batch: with `actions`.
-            noise: as `training_noise` makes it; of a flow also its noise [b, h, a] alone, with the
-                times beside it.
-            time: flow times [b], if `noise` is a tensor.
+            noise: as `training_noise` makes it, sampled by default; of a flow also its noise [b, h,
+                a] alone, with the times beside it. In training `augmentation_params` may be beside
+                it, else they are sampled.
+            time: flow times [b], if `noise` is a tensor; sampled by default.
             memory: memory tokens; by default those of `batch.history`.
 
         Returns:
@@ -192,23 +225,17 @@ class MMEPolicy(MMEModel, NetworkPolicy):
                 "forward() computes a loss: batch.actions must hold the recorded chunk (it is"
                 " None)."
             )
+        count, generator = len(batch.actions), torch.default_generator
         values = named_noise(noise, time=time)
-        if set(self.training_noise(0, torch.default_generator)) - set(values):
-            values = self.training_noise(len(batch.actions), torch.default_generator) | values
+        if not isinstance(noise, Mapping) and time is None:
+            values = self.training_noise(count, generator) | values
         if "changes" not in values:
-            values = values | self.augmentation_params(len(batch.actions), torch.default_generator)
+            values = self.augmentation_params(count, generator) | values
         values = map_noise(values, lambda value: value.to(self.device))
         augmentation = values.pop("changes", None)
-        if memory is None:
-            with self.autocast():
-                memory = self.encode_memory(self.conditioned_history(batch))
-        losses = self.losses(batch, values, memory, augmentation)
-        loss = self.total_loss(losses)
-        metrics = {"loss": loss.detach()}
-        if len(losses) > 1:
-            metrics |= {f"losses/{name}": value.detach() for name, value in losses.items()}
-        reported = {} if memory is None else memory.metrics
-        return loss, metrics | {f"memory/{name}": value for name, value in reported.items()}
+        metrics: dict[str, Tensor] = {}
+        loss = self.model.loss(batch, values, memory, augmentation, metrics)
+        return loss, metrics
 
     def velocity(
         self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None
@@ -216,11 +243,10 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times
         [b], in one pass.
         """
+        if memory is None:
+            memory = self.model.memory_tokens(batch)
         with self.autocast():
-            memory = (
-                self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
-            )
-            injection = self.inject(self.prepare_images(batch), memory)
+            injection = self.model.inject(self.model.prepare_images(batch), memory)
             return self.backbone.velocity(injection, x_t, time)  # type: ignore[operator]
 
     def recompute(self, mode: Recompute) -> None:
@@ -256,12 +282,10 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
         """Views in [−1, 1], augmented as the cameras of the embodiment say."""
-        unit = super().transform_images(images, None)
-        return (
-            unit
-            if augmentation is None
-            else augment_views(unit, self.embodiment.augmentations, augmentation)
-        )
+        views = unit_images(images)
+        if augmentation is None:
+            return views
+        return augment_views(views, self.embodiment.augmentations, augmentation)
 
     # Sampling
 
@@ -289,20 +313,12 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         values = map_noise(named_noise(noise), lambda value: send(value, self.device))
         # Real-time chunking also runs the network backwards, which a graph does not contain.
         if self._sampler is None or self.training or batch.overlap is not None:
-            return self.sample(batch, values, steps, memory)
+            return self.model.sample(batch, values, steps, memory)
         if memory is None:
-            with self.autocast():
-                memory = self.encode_memory(self.conditioned_history(batch))
-        return self._sampler(batch, memory, values, steps or self.sample_steps)
+            memory = self.model.memory_tokens(batch)
+        return self._sampler(batch, values, steps or self.sample_steps, memory)
 
-    @property
-    def compiles_sampling(self) -> bool:
-        """Whether the backbone's sampler can be compiled."""
-        return isinstance(self.backbone, CapturableSampling) and not isinstance(
-            self.memory, CacheMemory
-        )
-
-    def compile_sampling(self, layers: bool = False) -> None:
+    def compile_sampling(self, layers: bool = False) -> bool:
         """Speed up sampling with fixed weights; chunks are equal up to the rounding of other
         kernels.
 
@@ -313,39 +329,28 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         Args:
             layers: compile the tower and the layers too, which takes a minute or more at full size.
 
-        Raises:
-            UserError: this backbone has no sampler that can be captured.
+        Returns:
+            Whether this backbone has a sampler that can be captured.
         """
         if not isinstance(self.backbone, CapturableSampling):
-            name = type(self.backbone).__name__
-            raise UserError(
-                f"The backbone {name} has no sampler that can be compiled: leave sampling=eager."
-            )
+            return False
         self.backbone.compile_sampling()
         if layers:
             self.backbone.compile(dynamic=False)
-        if self.device.type != "cuda" or not self.compiles_sampling:
-            return
-        self._sampler = CapturedSampling(self._sample, self.backbone.sampling_stamp)
+        if self.device.type != "cuda":
+            return True
+        self._sampler = CapturedSampling(self.model.sample, self.backbone.sampling_stamp)
         if self.processor is None:
-            return
+            return True
         full = self.full_batch(self.device)
         for length in range(16, self._prompt_length() + 16, 16):
             cut = replace(
                 full, prompt=full.prompt[:, :length], prompt_mask=full.prompt_mask[:, :length]
             )
             self.sample_actions(cut)
-
-    def _sample(
-        self, batch: Batch, memory: MemoryTokens | None, noise: Mapping[str, Tensor], steps: int
-    ) -> Tensor:
-        return self.sample(batch, noise, steps, memory)
+        return True
 
     # Episodes
-
-    def start_episode(self, goal: str, seed: int = 0) -> Episode:
-        kind = CachingEpisode if isinstance(self.memory, CacheMemory) else Episode
-        return kind(self, goal, seed)
 
     def observation(self, episodes: Sequence[Episode]) -> Batch:
         """The current views and prompts of running episodes."""
@@ -372,14 +377,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
     ) -> Tensor:
         """A chunk for the batch of `observation`, with the episodes' memories."""
         memory = self._memory_tokens(episodes, batch)
-        if not isinstance(self.memory, CacheMemory):
-            return self.sample_actions(batch, noise, steps, memory=memory)
-        assert memory is not None
-        memory.cache = stack_caches(episodes)
-        values = map_noise(noise, lambda value: send(value, self.device))
-        chunk, made = self.sample_and_keep(batch, values, steps, memory)
-        stage_writes(self.memory, episodes, made)
-        return chunk
+        return self.sample_actions(batch, noise, steps, memory=memory)
 
     @torch.no_grad()
     def _memory_tokens(self, episodes: Sequence[Episode], batch: Batch) -> MemoryTokens | None:
@@ -399,23 +397,6 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             return encode_histories(self.memory, histories, [e.stream for e in episodes])
 
     @torch.no_grad()
-    def write_notes(self, batch: Batch, episodes: Sequence[Episode]) -> list[dict[str, str]]:
-        """The lines that a backbone with a language head writes; nothing without one."""
-        if not isinstance(self.backbone, HasLanguageHead):
-            return [{} for _ in episodes]
-        memory, tokenizer = self._memory_tokens(episodes, batch), self.require_processor().tokenizer  # type: ignore[attr-defined]
-        if memory is not None:
-            memory.cache = stack_caches(episodes)
-        with self.autocast():
-            prepared = self.prepare_images(batch)
-            ids = self.backbone.write(prepared, self.inject(prepared, memory)).tolist()
-        lines = (
-            tokenizer.decode([token for token in row if 0 < token < tokenizer.vocab_size])
-            for row in ids
-        )
-        return [{self.backbone.note: " ".join(line.split())} for line in lines]
-
-    @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
         if not isinstance(self.memory, StreamingMemory) or episode.read is None:
             return False
@@ -424,11 +405,9 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray:
         """What the memory reads; nothing without one."""
-        return (
-            np.zeros(0, np.int64)
-            if self.memory is None
-            else self.memory.frames_read(steps, exec_start)
-        )
+        if self.memory is None:
+            return np.zeros(0, np.int64)
+        return self.memory.frames_read(steps, exec_start)
 
     def _condition_one(self, prompt: Tensor, prompt_mask: Tensor, tokens: Tensor) -> Tensor:
         """Stored tokens [n, d_vision] of one episode, read with its prompt [l]."""
@@ -445,56 +424,51 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         """A batch of one without content: all views, the longest prompt without padding, and a
         memory that is full.
         """
-        size, views, length = (
-            self.backbone.image_size,
-            len(self.embodiment.cameras),
-            self._prompt_length(),
-        )
+        size = self.backbone.image_size
+        views = len(self.embodiment.cameras)
+        length = self._prompt_length()
+        history = None
+        if self.memory is not None:
+            history = full_history(self.memory, self.backbone.vision_width, device)
         return Batch(
             images=torch.zeros(1, views, 3, size, size, dtype=torch.uint8, device=device),
             image_mask=torch.ones(1, views, dtype=torch.bool, device=device),
             prompt=torch.full((1, length), 5, device=device),
             prompt_mask=torch.ones(1, length, dtype=torch.bool, device=device),
-            history=None
-            if self.memory is None
-            else full_history(self.memory, self.backbone.vision_width, device),
+            history=history,
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
             past=full_past(past_view_spec(self.memory), views, size, device),
         )
 
     def _prompt_length(self) -> int:
-        return (
-            int(self.config["processor"]["prompt_length"]) + self.embodiment.action.options_length
-        )
+        words = int(self.config["processor"]["prompt_length"])
+        return words + self.embodiment.action.options_length
 
     def warm_up_vision(self) -> None:
         size = self.backbone.image_size
         self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 
     def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        processor = self.require_processor()
-        sizes = {
-            name: (getattr(processor, name), getattr(self.backbone, name))
-            for name in ("image_size", "action_dim")
+        processor: Any = self.require_processor()
+        backbone = self.backbone
+        return {
+            "image_size": (processor.image_size, backbone.image_size),
+            "action_dim": (processor.action_dim, backbone.action_dim),
+            "horizon": (processor.embodiment.action.horizon, backbone.horizon),
         }
-        return {**sizes, "horizon": (processor.embodiment.action.horizon, self.backbone.horizon)}
 
     @property
     def finetune_spec(self) -> FineTuneSpec:
         """The backbone's components in its order; memory, integration and its experts are the
         component `memory`.
         """
-        backbone = self.backbone
+        spec = self.backbone.finetune_spec
         components = {
-            name: rf"backbone\.(?:{pattern})" for name, pattern in backbone.parts().items()
+            name: rf"backbone\.(?:{pattern})" for name, pattern in spec.components.items()
         }
         experts = f"|{components['memory']}" if "memory" in components else ""
         components["memory"] = rf"memory\.|integration\.{experts}"
-        if not isinstance(backbone, HasLoraTargets):
-            return FineTuneSpec(components)
-        return FineTuneSpec(
-            components, backbone.lora_targets, backbone.heads, backbone.lora_exclude
-        )
+        return replace(spec, components=components)
 
 
 def mme_of(policy: Policy, what: str) -> MMEPolicy:

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.layers import autocast
 from mme_vla.errors import UserError
-from mme_vla.memory.base import MemoryModule, StreamingMemory, encode_histories
+from mme_vla.memory.base import StreamingMemory, encode_histories
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.tensor_files import dtype_of
@@ -75,20 +76,15 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
             augment: augment the current views while training.
         """
         super().__init__()
-        self.processor, self.config, self.augment = processor, dict(config or {}), augment
+        self.processor = processor
+        self.config = dict(config or {})
+        self.augment = augment
         self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
         self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
 
     def autocast(self) -> torch.autocast:
         """The context all network code runs in."""
-        kind = self.device.type if self.device.type != "meta" else "cpu"
-        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
-
-    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        """Size → its value in the processor and in the network; a checkpoint in which they differ
-        is damaged.
-        """
-        return {}
+        return autocast(self.device, self.compute_dtype)
 
     # Memory
 
@@ -96,14 +92,6 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
     def memory_tower(self) -> MemoryTower:
         """The tower of the stored vision tokens."""
         raise NotImplementedError
-
-    def require_memory(self) -> MemoryModule:
-        """Return the memory, or raise a `UserError`."""
-        if self.memory is None:
-            raise UserError(
-                "This policy has no memory, so it stores no vision tokens of past frames."
-            )
-        return self.memory
 
     def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
         """Encode selections into memory tokens; None without memory or selections."""
@@ -117,11 +105,9 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
         """Encode the histories of running episodes, with their streams; None without memory."""
         if self.memory is None:
             return None
+        histories = [episode.required_history() for episode in episodes]
+        streams = [episode.stream for episode in episodes]
         with self.autocast():
-            histories, streams = (
-                [e.required_history() for e in episodes],
-                [e.stream for e in episodes],
-            )
             return encode_histories(self.memory, histories, streams)
 
     @torch.no_grad()
@@ -134,12 +120,28 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """Frames that the memory reads; without memory, any."""
-        return None if self.memory is None else self.memory.frames_read(steps, exec_start)
+        if self.memory is None:
+            return None
+        return self.memory.frames_read(steps, exec_start)
+
+    # Cost
+
+    def full_batch(self, device: torch.device | str = "cpu") -> Any:
+        """A batch of one at its fullest: every view, the longest prompt, a full memory, actions to
+        learn from.
+        """
+        raise NotImplementedError
+
+    def warm_up_vision(self) -> None:
+        """Run the vision tower on one black memory frame."""
+        raise NotImplementedError
 
     @torch.no_grad()
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Encode memory-view frames [n, H, W, 3] uint8 into stored tokens [n, grid², d_vision]."""
-        storage, source, device = self.require_memory().storage, self.memory_tower, self.device
+        storage = self.require_memory().storage
+        source = self.memory_tower
+        device = self.device
         processor = self.require_processor()
         assert isinstance(processor, HasMemoryImages)
         empty = torch.zeros(

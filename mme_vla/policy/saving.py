@@ -17,7 +17,6 @@ from mme_vla.config.plugins import import_trusted
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, check_known, did_you_mean, require
-from mme_vla.policy.capabilities import ComparesSizes
 from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
 from mme_vla.policy.run_folders import newest_checkpoint
@@ -400,8 +399,7 @@ def check_processor(policy: "Policy", source: str) -> None:
         f" configuration of {brief(robot.name)}, or they describe it differently. The files are"
         " from two checkpoints, or one was changed.",
     )
-    sizes = policy.processor_sizes() if isinstance(policy, ComparesSizes) else {}
-    for name, (actual, expected) in sizes.items():
+    for name, (actual, expected) in policy.processor_sizes().items():
         require(
             actual == expected,
             f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The"

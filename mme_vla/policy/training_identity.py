@@ -23,7 +23,6 @@ _DATA = (
     "jitter",
     "history_transforms",
     "weights",
-    "texts",
     "narrow_ranges",
 )
 _NO_EFFECT = (

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -33,8 +33,7 @@ class Sample:
     views: camera → images [t, H, W, 3] uint8, in the embodiment's order, the current one last.
     states: [t, s]. goal: the task in words; subgoal: its current part, where the policy reads one.
     past_actions: [n, w] the robot's own actions right before the chunk. actions: [h, w] the chunk,
-    absolute. notes: texts of the prompt's notes by name. written: the lines that the policy should
-    write at this step.
+    absolute.
     """
 
     views: Mapping[str, np.ndarray]
@@ -43,8 +42,6 @@ class Sample:
     subgoal: str | None
     past_actions: np.ndarray
     actions: np.ndarray
-    notes: Mapping[str, str] = field(default_factory=dict)
-    written: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -78,8 +75,7 @@ class PromptSpec:
     encoder: what turns text into numbers, for reports. name: of the prompt format, for messages.
     reads_subgoal: whether the prompt has a subgoal. past_actions: executed actions in it.
     fingerprint: equal for two processors only if text means the same numbers to both; None if that
-    needs no check. notes: names of the notes in it; such a processor's `prompt` takes them as
-    `notes`. writes: those that the policy learns to write.
+    needs no check.
     """
 
     encoder: str
@@ -87,8 +83,6 @@ class PromptSpec:
     reads_subgoal: bool = False
     past_actions: int = 0
     fingerprint: str | None = None
-    notes: tuple[str, ...] = ()
-    writes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

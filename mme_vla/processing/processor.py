@@ -222,8 +222,6 @@ class Processor(PolicyProcessor):
             kind.reads_subgoal,
             kind.past_actions,
             tokenizer.fingerprint,
-            tuple(kind.notes),
-            tuple(kind.writes),
         )
 
     @property
@@ -276,7 +274,6 @@ class Processor(PolicyProcessor):
         subgoal: str | None = None,
         state: np.ndarray | Tensor | None = None,
         past_actions: np.ndarray | Tensor | None = None,
-        notes: Mapping[str, str] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Tokenise the prompt.
 
@@ -286,7 +283,6 @@ class Processor(PolicyProcessor):
             state: [s] raw state; formats that do not use it ignore it.
             past_actions: [n, w] absolute actions executed so far, oldest first; formats that do not
                 use them ignore them, the others read the last ones, relative to `state`.
-            notes: texts by name; those that the format reads and are not there are empty.
 
         Returns:
             ids [l] int64 and mask [l] bool.
@@ -304,11 +300,7 @@ class Processor(PolicyProcessor):
         if subgoal is not None and self.prompt_format.reads_subgoal:
             subgoal = spelled(checked_text(subgoal, "the subgoal"), self.goal_case)
             subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
-        texts = {
-            name: checked_text((notes or {}).get(name, ""), f"the note {name!r}")
-            for name in self.prompt_format.notes
-        }
-        inputs = PromptInput(goal, subgoal, normalised, past, texts)
+        inputs = PromptInput(goal, subgoal, normalised, past)
         return encode_prompt(self.prompt_format, self.tokenizer, inputs, self.longest_prompt)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
@@ -353,11 +345,7 @@ class Processor(PolicyProcessor):
         """
         state = sample.states[-1]
         prompt, prompt_mask = self.prompt(
-            sample.goal,
-            sample.subgoal,
-            state=state,
-            past_actions=sample.past_actions,
-            notes=sample.notes,
+            sample.goal, sample.subgoal, state=state, past_actions=sample.past_actions
         )
         return {
             "images": self.images([frames[-1] for frames in sample.views.values()]),
@@ -365,18 +353,7 @@ class Processor(PolicyProcessor):
             "prompt_mask": prompt_mask,
             "state": torch.from_numpy(state),
             "actions": self.actions(sample.actions, state),
-            **(
-                {"labels": {name: self.line_ids(text) for name, text in sample.written.items()}}
-                if sample.written
-                else {}
-            ),
         }
-
-    def line_ids(self, text: str) -> Tensor:
-        """Token ids [note_length] int64 of a line to write, 0 after its end."""
-        length = self.prompt_format.note_length
-        ids = self.tokenizer.encode(text, bos=False)[:length]
-        return torch.tensor(ids + [0] * (length - len(ids)))
 
     def collate(self, items: Sequence[dict[str, Any]]) -> Batch:
         return collate(items)

@@ -2,8 +2,8 @@
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -32,34 +32,23 @@ class PromptInput:
     subgoal: the language subgoal of this step, None if there is none.
     state: [d] normalised state, None if unknown.
     past_actions: [n, d] normalised actions executed last, oldest first; empty before the first.
-    notes: the notes that the format reads, by name; an empty text where there is none yet.
     """
 
     goal: str
     subgoal: str | None = None
     state: np.ndarray | None = None
     past_actions: np.ndarray | None = None
-    notes: Mapping[str, str] = field(default_factory=dict)
 
 
 class PromptFormat:
     """The interface of a prompt format.
 
     A subclass sets what it reads beside the goal and implements `pieces`.
-
-    notes: names of the notes it reads. In training they are columns of texts (`data.texts`), in an
-    episode `Episode.notes`, set by the user or written by the policy.
-    writes: those of them that the policy learns to write, one line a decision. The prompt of a
-    training sample has the line of the decision before, and the line of its own step is a label,
-    token ids [`note_length`].
     """
 
     reads_subgoal: bool = False
     reads_state: bool = False
     past_actions: int = 0  # how many executed actions it reads
-    notes: Sequence[str] = ()
-    writes: Sequence[str] = ()
-    note_length: int = 16  # tokens of a line that is learned
 
     def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return the texts in order; each is tokenised by itself."""

@@ -17,7 +17,6 @@ import numpy as np
 from mme_vla.embodiment import Option
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import PreparesChunks
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.scheduler import Act, Read, Scheduler
 
@@ -200,10 +199,8 @@ class Engine:
 
     async def _prepare(self, episode: Episode) -> None:
         """A piece of what a client's next request will need, while its robot moves."""
-        if not isinstance(policy := self.policy, PreparesChunks):
-            return
         try:
-            left = await self.call(lambda: policy.prepare(episode))
+            left = await self.call(lambda: self.policy.prepare(episode))
         except Exception:
             logger.exception(
                 "preparing an episode's next chunk failed; it will be computed on request"

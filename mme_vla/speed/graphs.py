@@ -98,8 +98,9 @@ class CapturedSampling:
     """A policy's sampler behind graphs: one `GraphSampler` for each number of steps.
 
     Args:
-        sample: (batch, memory, noise, steps) → chunks. stamp: what graphs depend on beside their
-            inputs and the places of weights; where it changes they are captured again.
+        sample: (batch, noise, steps, memory) → chunks, as `MMEModel.sample`. stamp: what graphs
+            depend on beside their inputs and the places of weights; where it changes they are
+            captured again.
     """
 
     def __init__(self, sample: Callable[..., Tensor], stamp: Callable[[], object]) -> None:
@@ -108,11 +109,13 @@ class CapturedSampling:
         self._captured_at: object = None
 
     def __call__(
-        self, batch: Batch, memory: MemoryTokens | None, noise: Mapping[str, Tensor], steps: int
+        self, batch: Batch, noise: Mapping[str, Tensor], steps: int, memory: MemoryTokens | None
     ) -> Tensor:
         """Chunks [b, h, a]."""
-        if (stamp := self._stamp()) != self._captured_at:
-            self._graphs, self._captured_at = {}, stamp
+        stamp = self._stamp()
+        if stamp != self._captured_at:
+            self._graphs = {}
+            self._captured_at = stamp
         if steps not in self._graphs:
             self._graphs[steps] = GraphSampler(lambda inputs: self._run(inputs, steps))
         inputs: dict[str, Tensor | TensorStruct] = {
@@ -124,4 +127,4 @@ class CapturedSampling:
 
     def _run(self, inputs: Inputs, steps: int) -> Tensor:
         noise = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
-        return self._sample(inputs["batch"], inputs.get("memory"), noise, steps)
+        return self._sample(inputs["batch"], noise, steps, inputs.get("memory"))

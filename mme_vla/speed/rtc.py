@@ -44,16 +44,14 @@ def strength(time: Tensor) -> Tensor:
     )
 
 
-def rtc_guidance(velocity: Velocity, overlap: Overlap | None, times: Tensor) -> Velocity:
-    """A velocity whose path ends in agreement with `overlap`; without one, the same velocity.
+def rtc_guidance(velocity: Velocity, overlap: Overlap, times: Tensor) -> Velocity:
+    """A velocity whose path ends in agreement with `overlap`.
 
     Each call then also runs the network backwards.
 
     Args:
         times: [n] flow times by index.
     """
-    if overlap is None:
-        return velocity
 
     def pulled(x: Tensor, index: int) -> Tensor:
         with torch.enable_grad():

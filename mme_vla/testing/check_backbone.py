@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 
-from mme_vla.backbone.base import Backbone, HasLoraTargets, Injection
+from mme_vla.backbone.base import Backbone, Injection
 from mme_vla.backbone.siglip import pool_grid
 from mme_vla.config.sections import read_section
 from mme_vla.registry import BACKBONES
@@ -118,24 +118,14 @@ def check_sample(backbone: Backbone, batch: Batch) -> None:
 
 def check_parts(backbone: Backbone) -> None:
     """Every parameter belongs to a part, and the parts fine-tuning freezes have parameters."""
-    import re
-
-    parts = set()
-    for name, _ in backbone.named_parameters():
-        part = next(
-            (part for part, pattern in backbone.parts().items() if re.match(pattern, name)), None
-        )
-        assert part is not None, (
-            f"no part of parts() holds {name!r}; its last pattern must match the rest."
-        )
-        parts.add(part)
+    spec = backbone.finetune_spec
+    parts = {spec.component_of(name) for name, _ in backbone.named_parameters()}
     assert {"vision", "action"} <= parts, (
-        f"parts() must name 'vision' and 'action'; parameters fall into {parts}."
+        "the components of finetune_spec must name 'vision' and 'action'; parameters fall into"
+        f" {parts}."
     )
-    if not isinstance(backbone, HasLoraTargets):
-        return
     names = [name for name, _ in backbone.named_modules()]
-    for end in (*backbone.lora_targets, *backbone.heads):
+    for end in (*spec.lora_targets, *spec.full_train):
         assert any(f".{name}".endswith(f".{end}") for name in names), (
             f"{end!r} ends no module's name."
         )

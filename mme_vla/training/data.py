@@ -15,7 +15,6 @@ from mme_vla.data.statistics import NARROW, check_ranges, compute_norm_stats
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import WeighsLosses, with_vision_memory
 from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import SubgoalText
@@ -99,26 +98,27 @@ def prepare_data(
             every=counted.every, extremes=counted.extremes, exact=counted.exact,
             video=counted.video, narrow=narrow,
         )  # fmt: skip
-    labels = labels_read(*(part for part in policy.children() if part is not policy.memory))
+    memory_parts = set() if policy.memory is None else set(policy.memory.modules())
+    labels = labels_read(*(part for part in policy.modules() if part not in memory_parts))
     require(
         data.get("weights") is None
-        or (isinstance(policy, WeighsLosses) and processor.samples.kind == "steps"),
+        or (policy.loss_weights is not None and processor.samples.kind == "steps"),
         f"data.weights={data.get('weights')}: {type(policy).__name__} does not weigh samples. Set"
         " data.weights=null.",
     )
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
     if policy.memory is not None:
-        cache, source_policy = data["cache"], with_vision_memory(policy)
-        encoder = encoder or source_policy.vision_fingerprint()
+        cache = data["cache"]
+        encoder = encoder or policy.vision_fingerprint()
         caches = [
             ensure_cache(
                 source,
                 policy.memory,
-                source_policy.encode_frames,
+                policy.encode_frames,
                 encoder,
                 root=cache["root"],
-                dtype=str(source_policy.history_dtype).removeprefix("torch."),
+                dtype=str(policy.history_dtype).removeprefix("torch."),
                 max_build_frames=cache["max_build_frames"],
                 batch_size=cache["batch_size"],
                 command=cache_command,
@@ -150,7 +150,6 @@ def prepare_data(
             subgoal=subgoal,
             labels=labels,
             weights=data.get("weights"),
-            texts=data.get("texts"),
             seed=seed,
             transforms=() if held_out else transforms,
         )

@@ -16,7 +16,6 @@ from mme_vla.data.dataset import TrainingDataset
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import AugmentsImages, WeighsLosses
 from mme_vla.speed import Recomputes
 from mme_vla.training.checkpoint import (
     checkpoint_name,
@@ -118,7 +117,7 @@ class Trainer:
             policy.to(accelerator.device)
         self.policy = policy.train()
         if settings.losses:
-            if not isinstance(policy, WeighsLosses):
+            if policy.loss_weights is None:
                 raise UserError(
                     f"train.losses: {type(policy).__name__} has no auxiliary losses. Leave it out."
                 )
@@ -215,8 +214,7 @@ class Trainer:
         # Of the whole update: the images of a sample depend neither on the number of processes nor
         # of pieces.
         generator = generator_for(settings.seed, "model", step, 0, 0)
-        if isinstance(self.policy, AugmentsImages):
-            draws = {**draws, **self.policy.augmentation_params(settings.batch_size, generator)}
+        draws = {**draws, **self.policy.augmentation_params(settings.batch_size, generator)}
         sums: dict[str, Tensor] = {}
         for piece in range(settings.accumulate):
             with window.waiting():

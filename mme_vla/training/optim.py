@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
+from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.training.parallel import like
 from mme_vla.training.settings import TrainSettings
 

@@ -45,7 +45,7 @@ def test_the_backbone_reads_coordinates_of_image_tokens() -> None:
             if not parameter.any():  # gates begin at zero
                 parameter.normal_(std=0.5)
     batch = policy.full_batch()
-    injection = policy.inject(policy.prepare_images(batch), None)
+    injection = policy.model.inject(policy.model.prepare_images(batch), None)
     images, *others = injection.blocks
     counted = torch.arange(len(images))[None, :, None].expand(-1, -1, 3)
     shifted = counted.clone()

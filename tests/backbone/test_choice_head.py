@@ -27,7 +27,7 @@ def test_choices_are_sampled_from_the_softmax_over_the_offered_letters(temperatu
     options = [Option("abcd"[i], "act") for i in OFFERED.nonzero()[:, 0].tolist()]
     one, generator, count = head(temperature=temperature), torch.Generator().manual_seed(0), 20_000
     noise = torch.stack([one.sampling_noise(generator)["noise"] for _ in range(count)])
-    chunks = one.sample(predict(OUTPUT), noise, 1)
+    chunks = one.scores(OUTPUT, noise)
     frequency = space.decide(chunks, options)[:, 0, :4].mean(0)
     expected = (LOGITS / temperature).masked_fill(~OFFERED, -torch.inf).softmax(0)
     assert (frequency - expected).abs().max() < 0.015
@@ -39,7 +39,7 @@ def test_choices_are_sampled_from_the_softmax_over_the_offered_letters(temperatu
 def test_the_log_probability_is_that_of_the_distributions() -> None:
     one, generator = head(temperature=0.5, deviation=0.1), torch.Generator().manual_seed(0)
     noise = torch.stack([one.sampling_noise(generator)["noise"] for _ in range(50)])
-    chunks = one.sample(predict(OUTPUT), noise, 1)
+    chunks = one.scores(OUTPUT, noise)
     letters = chunks[..., :4].masked_fill(~OFFERED, -torch.inf).argmax(-1)
     categorical = Categorical(logits=(LOGITS / 0.5).masked_fill(~OFFERED, -torch.inf))
     expected = categorical.log_prob(letters) + Normal(OUTPUT[0, 0, 4:], 0.1).log_prob(
@@ -54,7 +54,7 @@ def test_temperature_zero_takes_the_best_letter_and_has_no_log_probability() -> 
     noise = torch.stack(
         [one.sampling_noise(torch.Generator().manual_seed(seed))["noise"] for seed in range(20)]
     )
-    assert torch.equal(one.sample(predict(OUTPUT), noise, 1), OUTPUT.expand(20, -1, -1))
+    assert torch.equal(one.scores(OUTPUT, noise), OUTPUT.expand(20, -1, -1))
     with pytest.raises(UserError, match="temperature=0 has no log-probability"):
         one.log_prob(predict(OUTPUT), OUTPUT, None)
 

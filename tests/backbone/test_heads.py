@@ -72,7 +72,8 @@ def test_own_head_defines_noise_and_loss() -> None:
 def test_clean_flow_reads_the_output_as_the_chunk() -> None:
     backbone = built({"name": "clean_flow"})
     x = torch.full((1, 3, 4), 0.5)
-    velocity = backbone.head.velocity(lambda x_t, index: torch.zeros_like(x_t), 10, x.device)
+    times = backbone.head.times(10, x.device)
+    velocity = backbone.head.velocity(lambda x_t, index: torch.zeros_like(x_t), times, {"noise": x})
     assert torch.allclose(velocity(x, 5), x / 0.5)
 
 

@@ -28,8 +28,6 @@ TESTED_BY = {
     "docs/extend/your-robot.md": "tests/embodiment/test_your_robot.py",
     "docs/extend/export.md": "tests/policy/test_export.py",
     "docs/extend/auxiliary-losses.md": "tests/end_to_end/test_examples.py",
-    "docs/extend/cached-keys-and-values.md": "tests/end_to_end/test_examples.py",
-    "docs/extend/notes.md": "tests/end_to_end/test_examples.py",
     "docs/extend/history-transforms.md": "tests/end_to_end/test_examples.py",
     "docs/extend/trajectories.md": "tests/extras/trajectories/test_rollouts.py",
     "docs/start/first-hour.md": "tests/end_to_end/test_first_hour.py",

@@ -36,8 +36,6 @@ EXAMPLES = {
     "your-robot.md": "bimanual",
     "first-hour.md": "first_hour",
     "auxiliary-losses.md": "write_head",
-    "cached-keys-and-values.md": "fifo",
-    "notes.md": "scratchpad",
     "environments.md": "blink",
     "trajectories.md": "trajectories",
 }

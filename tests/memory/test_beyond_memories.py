@@ -369,7 +369,7 @@ def test_what_the_robot_did_is_no_vision_token_and_is_not_highlighted_beside_a_p
         policy = small_policy(name, memory=memory, backbone=FEW_TOKENS)
         policy.backbone.condition_on_prompt = lambda tokens, prompt, prompt_mask: -tokens  # type: ignore[method-assign]
         batch = random_batch(policy, valid=96)
-        history = policy.conditioned_history(batch)
+        history = policy.model.conditioned_history(batch)
         assert batch.history is not None and history is not None
         # The actions' rows come first, for they are padded on the left.
         features, n_local = (

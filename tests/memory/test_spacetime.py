@@ -140,9 +140,13 @@ def test_augmentation_changes_past_views_as_it_does_the_current_ones() -> None:
     assert batch.past is not None
     still = batch.images[:, None].expand_as(batch.past.images)
     draws_ = torch.rand(2, 7, generator=torch.Generator().manual_seed(1))
-    current = policy.prepare_images(replace(batch, past=replace(batch.past, images=still)), draws_)
+    current = policy.model.prepare_images(
+        replace(batch, past=replace(batch.past, images=still)), draws_
+    )
     views = current.images
-    assert current.past is not None and not torch.equal(views, policy.prepare_images(batch).images)
+    assert current.past is not None and not torch.equal(
+        views, policy.model.prepare_images(batch).images
+    )
     assert torch.equal(current.past.images[:, 0], views) and torch.equal(
         current.past.images[:, 1], views
     )

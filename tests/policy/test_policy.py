@@ -50,10 +50,11 @@ def test_cached_prefix_equals_the_joint_pass(policy):
     time_ = torch.full((2,), 0.7)
     prefix, injection = prefill(policy, batch)
     action = policy.backbone.action_block(noise)
-    layout = policy.backbone.transformer.layout([action], policy.integration.visibility, prefix)
-    cached = policy.backbone.denoise(
-        noise, policy.backbone.time_condition(time_), layout, prefix, injection
-    )
+    transformer = policy.backbone.transformer
+    layout = transformer.layout([action], policy.integration.visibility, prefix)
+    condition = policy.backbone.time_condition(time_)
+    hidden, _ = transformer([action], layout, condition, injection.hook, prefix)
+    cached = policy.backbone.read_velocity(hidden)
     assert (cached - policy.velocity(batch, noise, time_)).abs().max() < TOLERANCE
 
 
@@ -179,8 +180,11 @@ def test_released_modulator_starts_near_the_memoryless_policy():
 def prefill(policy, batch):
     """Keys and values of the prefix, and what the memory injects."""
     memory = policy.encode_memory(batch.history)
-    injection = policy.inject(policy.prepare_images(batch), memory)
-    return policy.backbone.prefill(injection), injection
+    injection = policy.model.inject(policy.model.prepare_images(batch), memory)
+    transformer = policy.backbone.transformer
+    layout = transformer.layout(injection.blocks, injection.visibility)
+    _, prefix = transformer(injection.blocks, layout, keep=True)
+    return prefix, injection
 
 
 @torch.no_grad()

@@ -24,17 +24,23 @@ MODELS = ["pi05", "tokendrop_expert", "framesamp_modul", "framesamp_context", "r
 def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> Tensor:
     """Sampling by the parts: every step puts its keys behind the prefix's in a new tensor."""
     backbone = policy.backbone
-    memory = policy.encode_memory(policy.conditioned_history(batch))
-    injection = policy.inject(policy.prepare_images(batch), memory)
-    prefix = backbone.prefill(injection)
+    memory = policy.model.memory_tokens(batch)
+    injection = policy.model.inject(policy.model.prepare_images(batch), memory)
+    before = backbone.transformer.layout(injection.blocks, injection.visibility)
+    _, prefix = backbone.transformer(injection.blocks, before, keep=True)
     layout = backbone.transformer.layout(
         [backbone.action_block(noise)], injection.visibility, prefix
     )
     times = backbone.time_condition(flow.euler_times(steps, noise.device))
     conditions = backbone.transformer.conditioning(times)
-    return flow.euler(
-        noise, steps, lambda x, i: backbone.denoise(x, conditions.at(i), layout, prefix, injection)
-    )
+    x = noise
+    for index in range(steps):
+        action = [backbone.action_block(x)]
+        hidden, _ = backbone.transformer(
+            action, layout, conditions.at(index), injection.hook, prefix
+        )
+        x = x - backbone.read_velocity(hidden) / steps
+    return x
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -57,14 +63,14 @@ def test_time_modulations_are_computed_once_and_anew_where_a_weight_has_changed(
     policy = small_policy("pi05").eval()
     batch, noise = random_batch(policy, 1), torch.zeros(1, 20, 32)
     calls = 0
-    original = flow.euler_times
+    original = policy.backbone.time_condition
 
-    def counting(steps: int, device: torch.device) -> Tensor:
+    def counting(times: Tensor) -> Tensor:
         nonlocal calls
         calls += 1
-        return original(steps, device)
+        return original(times)
 
-    monkeypatch.setattr(flow, "euler_times", counting)
+    monkeypatch.setattr(policy.backbone, "time_condition", counting)
     policy.compile_sampling()
     before = policy.sample_actions(batch, noise)
     policy.sample_actions(batch, noise)
@@ -74,7 +80,8 @@ def test_time_modulations_are_computed_once_and_anew_where_a_weight_has_changed(
     with torch.no_grad():
         policy.backbone.transformer.layers[1].experts["action"].mlp_norm.dense.weight.mul_(2)
     after = policy.sample_actions(batch, noise)
-    assert calls == 3 and not torch.equal(before, after)
+    assert calls == 3
+    assert not torch.equal(before, after)
     assert torch.equal(after, joined_anew(policy, batch, noise, 10))
 
 
@@ -115,7 +122,7 @@ def test_few_sizes_are_captured_and_each_batch_gets_its_reply(
     ]
     expected = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
     policy.compile_sampling()
-    policy._sampler = CapturedSampling(policy._sample, policy.backbone.sampling_stamp)
+    policy._sampler = CapturedSampling(policy.model.sample, policy.backbone.sampling_stamp)
     chunks = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
     assert captures == [4, 1, 2]
     assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(chunks, expected, strict=True))

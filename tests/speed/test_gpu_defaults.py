@@ -14,13 +14,13 @@ def test_images_are_changed_alike_however_an_update_is_divided() -> None:
     policy = small_policy("pi05").train()
     batch = random_batch(policy, 4)
     changes = policy.augmentation_params(4, torch.Generator().manual_seed(3))["changes"]
-    together = policy.prepare_images(batch, changes).images
+    together = policy.model.prepare_images(batch, changes).images
     pieces = [
-        policy.prepare_images(batch.rows(torch.tensor(rows)), changes[rows]).images
+        policy.model.prepare_images(batch.rows(torch.tensor(rows)), changes[rows]).images
         for rows in ([0], [1, 2], [3])
     ]
     assert torch.equal(torch.cat(pieces), together)
-    assert not torch.equal(together, policy.prepare_images(batch).images)
+    assert not torch.equal(together, policy.model.prepare_images(batch).images)
 
 
 def test_weights_for_acting_are_rounded_where_they_may_be(

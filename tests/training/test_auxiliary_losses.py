@@ -15,14 +15,15 @@ import torch
 
 from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.backbone.base import AuxiliaryLosses, Injection
 from mme_vla.data.columns import BOUNDARY, label_column
+from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.memory.base import stack_history
 from mme_vla.testing.small import open_gates, random_batch, small_policy, unit_stats
+from mme_vla.training.data import prepare_data
 from mme_vla.training.settings import TrainSettings
-from mme_vla.types import Batch, Labels, MemoryTokens
+from mme_vla.types import Batch, Labels, ReadsLabels
 
 EXAMPLE = REPOSITORY / "examples" / "write_head"
 TABLE = "data/chunk-000/file-000.parquet"
@@ -54,6 +55,23 @@ def loss_of(
     )
     loss.backward()
     return loss.detach(), metrics
+
+
+def prepared(policy: MMEPolicy, folder: Path, **options: object) -> TrainingDataset:
+    data = {
+        "name": "sample",
+        "sources": ["sample"],
+        "val_fraction": 0.0,
+        "val_episodes": [],
+        "action_offset": 0,
+        "mask_padding": False,
+        "jitter": False,
+        "cache": {"root": str(folder), "batch_size": 32, "max_build_frames": 5000},
+        **options,
+    }
+    dataset = prepare_data(policy, data, 0, say=lambda line: None).train
+    assert isinstance(dataset, TrainingDataset)
+    return dataset
 
 
 def gradients(policy: MMEPolicy) -> dict[str, torch.Tensor]:
@@ -108,36 +126,19 @@ def test_weights_multiply_a_samples_loss_after_its_mean() -> None:
     assert first != second
 
 
-def test_integration_and_backbone_may_return_losses() -> None:
-    class Sums(type(small_policy("framesamp_modul").integration), AuxiliaryLosses):  # type: ignore[misc]
-        reads_labels = ("speed",)
-
-        def losses(
-            self, batch: Batch, injection: Injection, memory: MemoryTokens | None
-        ) -> dict[str, torch.Tensor]:
-            return {"speed": batch.labels["speed"] * memory.tokens.square().mean((1, 2))}
-
-    policy = small_policy("framesamp_modul").train()
-    policy.integration.__class__ = Sums
-    batch = replace(random_batch(policy, valid=32), labels=Labels(speed=torch.tensor([1.0, 2.0])))
-    assert loss_of(policy, batch)[1]["losses/speed"] > 0
+def test_a_backbone_has_the_labels_of_the_current_frame(tmp_path: Path) -> None:
+    policy = small_policy("pi05")
+    kind = type(policy.backbone)
+    policy.backbone.__class__ = type(
+        "Reader", (kind, ReadsLabels), {"reads_labels": ("frame_index",)}
+    )
+    items = [prepared(policy, tmp_path)[index] for index in (10, 150)]
+    batch = policy.require_processor().collate(items)
+    assert batch.labels["frame_index"].tolist() == [item["place"][2] for item in items]
 
 
 def test_labels_lie_at_the_frames_of_the_tokens(policy: MMEPolicy, tmp_path: Path) -> None:
-    from mme_vla.training.data import prepare_data
-
-    data = {
-        "name": "sample",
-        "sources": ["sample"],
-        "val_fraction": 0.0,
-        "val_episodes": [],
-        "action_offset": 0,
-        "mask_padding": False,
-        "jitter": False,
-        "weights": "frame_index",
-        "cache": {"root": str(tmp_path), "batch_size": 32, "max_build_frames": 5000},
-    }
-    dataset = prepare_data(policy, data, 0, say=lambda line: None).train
+    dataset = prepared(policy, tmp_path, weights="frame_index")
     item = dataset[150]
     source, episode, frame = item["place"]
     texts = [

@@ -32,7 +32,6 @@ from mme_vla.evaluation.store import (
     read_records,
 )
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, ShowsDistractors
 from mme_vla.policy.saving import composition_digest
 from mme_vla.policy.training_identity import identity_of
 from mme_vla.processing.prompt import subgoal_kind
@@ -177,7 +176,7 @@ def evaluate(
     """
     policy.require_processor().require_stats()
     check_subgoals(policy, subgoals)
-    check_sessions(settings.split, _n_distractors(policy))
+    check_sessions(settings.split, policy.n_distractor_episodes)
     if base is make_env:
         environment(settings.env).check_embodiment(policy.embodiment)
     run = claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
@@ -223,26 +222,21 @@ def evaluate(
     return Evaluation(_done(output, jobs, facts, shard), workload)
 
 
-def _n_distractors(policy: Policy) -> int:
-    return policy.n_distractor_episodes if isinstance(policy, ShowsDistractors) else 0
-
-
 def _environments(
     policy: Policy, output: Path, settings: RolloutSettings, base: Callable[..., Any], workers: int
 ) -> VecEnv:
     robot = policy.embodiment
-    limit = policy.max_actions if isinstance(policy, LimitsActions) else None
     options: dict[str, Any] = {
         "base": base,
         "max_steps": settings.max_steps,
         "robot": robot,
-        "max_actions": settings.max_actions or limit,
+        "max_actions": settings.max_actions or policy.max_actions,
     }
     if base is make_env:
         options["env"] = settings.env
         options["render"] = settings.render
         options["action_space"] = robot.action.space
-        options["sessions"] = _n_distractors(policy)
+        options["sessions"] = policy.n_distractor_episodes
         if settings.only_possible:
             options["only_possible"] = True
         for name in robot.readings:
@@ -264,7 +258,6 @@ def run_settings(
     How many workers or shards there are, and on which machine, does not belong to it; nor does the
     batch size, though batches may change the last bits of an action.
     """
-    sample_steps = policy.sample_steps if isinstance(policy, SamplesInSteps) else 1
     decisive = {
         "model": facts.model,
         "checkpoint": facts.checkpoint,
@@ -273,7 +266,7 @@ def run_settings(
         "dtype": str(next(policy.parameters()).dtype).removeprefix("torch."),
         "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
         "execute": settings.execute or policy.embodiment.action.execute,
-        "flow_steps": settings.flow_steps or sample_steps,
+        "flow_steps": settings.flow_steps or policy.sample_steps,
         "seed": settings.seed,
         "split": settings.split,
         "env": settings.env,

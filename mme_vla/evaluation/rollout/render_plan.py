@@ -19,7 +19,6 @@ from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.memory.base import past_view_spec, union_frames
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import frames_read
 from mme_vla.subgoal import SubgoalPredictor
 
 EVERY = range(2**31)  # Whatever frames there are
@@ -114,7 +113,7 @@ class RenderPlan:
         """
         lists = []
         for step in steps:
-            read = frames_read(self._policy, np.array([step]), exec_start)
+            read = self._policy.frames_read(np.array([step]), exec_start)
             if read is None:
                 return None
             lists.append(read[read != step])
@@ -129,4 +128,4 @@ class RenderPlan:
         if anywhere:
             return self._read_before(exec_start + np.arange(most + LONGEST_MOTION), exec_start)
         apart = min(self._settings.execute or action.execute, action.horizon)
-        return frames_read(self._policy, exec_start + np.arange(0, most, apart), exec_start)
+        return self._policy.frames_read(exec_start + np.arange(0, most, apart), exec_start)

@@ -28,7 +28,6 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import PreparesChunks
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.subgoal import SubgoalPredictor
@@ -282,9 +281,7 @@ class Rollout:
             if isinstance(step, Act):
                 self._act(step.batch)
             elif isinstance(step, Prepare):
-                if isinstance(self.policy, PreparesChunks) and self.policy.prepare(
-                    step.work.episode
-                ):
+                if self.policy.prepare(step.work.episode):
                     self._scheduler.later[step.work] = None
             else:
                 step.work.read()

@@ -8,22 +8,22 @@ is. That makes a training step on stored tokens cheap enough for a laptop.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.base import (
     Backbone,
+    FineTuneSpec,
     HasExtraExperts,
-    HasLoraTargets,
     Hook,
     Injection,
     bind_hook,
 )
 from mme_vla.backbone.choice import ChoiceHead
 from mme_vla.backbone.config import ExpertConfig, check_positive
-from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
+from mme_vla.backbone.flow import HasFlowHead, Predict, build_head, time_embedding
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, attend
 from mme_vla.backbone.pi05 import initialise
 from mme_vla.errors import check_choice, check_multiple, require
@@ -215,7 +215,7 @@ class Context(NamedTuple):
 
 
 @BACKBONES.register("nano")
-class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recomputes):
+class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
     """A pretrained convolutional tower, and layers of action tokens that read the context; chunks
     by flow matching.
 
@@ -226,17 +226,19 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
     vision: ConvTower | PlaceTower
     Config = NanoConfig
     supports = frozenset({"blocks", "expert", "hook"})
-    lora_targets = ("qkv", "read_q", "out", "read_out", "up", "down")
-    heads = ("action_in", "action_out", "state_in", "prompt_in")
-    lora_exclude = r"\.\w*norm\.dense$"
-    PARTS: ClassVar[Mapping[str, str]] = {
-        "vision": r"vision\.",
-        "vlm": (
-            r"embedding\.|goal_reader\.|places\.|views\.|positions\.|see\.|see_in\.|prompt_in\.|columns\.vlm\."
-        ),
-        "memory": r"columns\.",
-        "action": "",
-    }
+    finetune_spec = FineTuneSpec(
+        {
+            "vision": r"vision\.",
+            "vlm": (  # words and images
+                r"embedding\.|goal_reader\.|places\.|views\.|positions\.|see\.|see_in\.|prompt_in\.|columns\.vlm\."
+            ),
+            "memory": r"columns\.",  # of an integration's extra experts
+            "action": "",
+        },
+        lora_targets=("qkv", "read_q", "out", "read_out", "up", "down"),
+        full_train=("action_in", "action_out", "state_in", "prompt_in"),
+        lora_exclude=r"\.\w*norm\.dense$",
+    )
 
     def __init__(
         self, config: NanoConfig, extra_experts: Mapping[str, ExpertConfig] | None = None
@@ -293,7 +295,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         self.pointer = (
             Pointer(action_width, width, GOAL_QUERIES) if config.point == "objects" else None
         )
-        self.make_head(config)
+        self.head = build_head(config)
         require(
             self.pointer is None
             or (isinstance(self.head, ChoiceHead) and len(self.head.numbers) == 2),
@@ -425,13 +427,23 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
     ) -> Tensor:
         """A normalised chunk [b, h, a] in so many Euler steps, 10 by default."""
         steps = steps or self.head.steps
-        context, start = self.read_context(batch, injection), noise["noise"]
-        times = self.head.times(steps, start.device)
+        context = self.read_context(batch, injection)
+        x = self.head.start(noise, steps, batch.overlap)
+        times = self.head.times(steps, x.device)
 
         def clean(x: Tensor, index: int) -> Tensor:
             return self.denoise(context, x, times[index].expand(len(x)), 1)
 
-        return self.sample_chunk(clean, noise, steps, batch.overlap)
+        velocity = self.head.velocity(clean, times, noise)
+        if batch.overlap is not None:
+            from mme_vla.speed.rtc import rtc_guidance
+
+            velocity = rtc_guidance(velocity, batch.overlap, times)
+        for index in range(len(times)):
+            x = x - velocity(x, index).to(x.dtype) / len(times)
+            if "increments" in noise:
+                x = x + self.head.deviation * noise["increments"][:, index]
+        return x
 
     def predictor(self, batch: Batch, injection: Injection) -> Predict:
         context = self.read_context(batch, injection)
@@ -511,12 +523,6 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
 
     def recompute(self, mode: Recompute) -> None:
         """No effect: a layer's activations are a chunk's few tokens."""
-
-    def parts(self) -> Mapping[str, str]:
-        """Tower; words and images; columns of an integration's extra experts; the rest
-        is `action`.
-        """
-        return self.PARTS
 
 
 def _waves(state: Tensor) -> Tensor:

@@ -30,7 +30,6 @@ from mme_vla.extras.probing.report import Findings
 from mme_vla.extras.probing.run import OFFLINE, ONLINE, ProbePlan, run_probe
 from mme_vla.extras.probing.writing import required_frames, score_writing
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import with_vision_memory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.utils import require_earlier, to_json, write_atomically, write_json
@@ -406,7 +405,7 @@ def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
 
 def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any] | str:
     """The score of writing on demonstrations of the card's scenes, or why there is none."""
-    memory, env = with_vision_memory(policy).require_memory(), environment("mme_vla")
+    memory, env = policy.require_memory(), environment("mme_vla")
     try:
         frames = required_frames(memory)
         specs = (env.episode(job.task, job.split, job.episode) for job in plan.jobs)

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.memory.base import CacheMemory, stack_history
+from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import FrameScores, History
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import WritableMemory, with_vision_memory
+from mme_vla.policy.capabilities import WritableMemory
 from mme_vla.policy.episode import Episode
 from mme_vla.types import HistoryTokens
 
@@ -225,7 +225,7 @@ class SelectionChannel(Channel):
 
     def __init__(self, policy: Policy) -> None:
         super().__init__(policy)
-        self._memory = with_vision_memory(policy).require_memory()
+        self._memory = policy.require_memory()
 
     def read(
         self, episode: Episode, step: int | None = None, only: np.ndarray | None = None
@@ -311,7 +311,7 @@ class WritableChannel(Channel):
 
 def channel_of(policy: Policy) -> Channel:
     """The way to what this policy remembers."""
-    if policy.memory is not None and not isinstance(policy.memory, CacheMemory):
+    if policy.memory is not None:
         return SelectionChannel(policy)
     episode = policy.start_episode("")
     return (

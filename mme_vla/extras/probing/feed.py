@@ -17,13 +17,6 @@ from mme_vla.extras.probing.recordings import Recording, all_recordings, stored_
 from mme_vla.memory.base import MemoryModule
 from mme_vla.memory.transforms import HistoryTransform, map_frames
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import (
-    LimitsActions,
-    SamplesInSteps,
-    WritesNotes,
-    frames_read,
-    with_vision_memory,
-)
 from mme_vla.policy.episode import Episode, Host
 from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.types import Noise
@@ -112,7 +105,6 @@ class FedEpisode(Episode):
         super().__init__(host, goal, seed)
         self._host, self.seed = host, seed
         self.inner = host.inner.start_episode(goal, seed)
-        self.notes, self.written = self.inner.notes, self.inner.written
         self.exec_start: int | None = None
         self._counts: np.ndarray = np.zeros(0, np.int64)
         self._starts: np.ndarray = np.zeros(0, np.int64)
@@ -198,8 +190,8 @@ class FedEpisode(Episode):
     def state(self) -> Tensor:
         return self.inner.state
 
-    def acted(self, chunk: np.ndarray, notes: Mapping[str, str] | None = None) -> None:
-        self.inner.acted(chunk, notes)
+    def acted(self, chunk: np.ndarray) -> None:
+        self.inner.acted(chunk)
 
     def add_frames(self, *_: Any, **__: Any) -> None:
         """Not offered: a feed decides on whole observations."""
@@ -230,8 +222,9 @@ class FedPolicy(Policy):
         self.inner, self.feed, self.sessions = inner, feed, list(sessions)[: feed.sessions]
         self.memory, self.processor, self.config = inner.memory, inner.processor, dict(inner.config)
         self.horizon, self.action_dim = inner.horizon, inner.action_dim
-        self.sample_steps = inner.sample_steps if isinstance(inner, SamplesInSteps) else 1
-        self.max_actions = inner.max_actions if isinstance(inner, LimitsActions) else None
+        self.history_dtype = inner.history_dtype
+        self.sample_steps = inner.sample_steps
+        self.max_actions = inner.max_actions
 
     @property
     def before(self) -> int:
@@ -249,18 +242,14 @@ class FedPolicy(Policy):
     ) -> Tensor:
         return self.inner.sample_actions(batch, draws, steps)
 
-    @property
-    def history_dtype(self) -> torch.dtype:
-        return with_vision_memory(self.inner).history_dtype
-
     def require_memory(self) -> MemoryModule:
-        return with_vision_memory(self.inner).require_memory()
+        return self.inner.require_memory()
 
     def vision_fingerprint(self) -> str:
-        return with_vision_memory(self.inner).vision_fingerprint()
+        return self.inner.vision_fingerprint()
 
     def encode_frames(self, frames: np.ndarray) -> Tensor:
-        return with_vision_memory(self.inner).encode_frames(frames)
+        return self.inner.encode_frames(frames)
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """The episode's frames that the policy reads through the feed; None for all, where the feed
@@ -269,9 +258,7 @@ class FedPolicy(Policy):
         if self.feed.drops:
             return None
         displayed = self.feed.displayed(steps, exec_start, self.before)
-        reads = frames_read(
-            self.inner, displayed, self.feed.first_executed(exec_start, self.before)
-        )
+        reads = self.inner.frames_read(displayed, self.feed.first_executed(exec_start, self.before))
         if reads is None:
             return None
         paused = np.flatnonzero(
@@ -295,11 +282,6 @@ class FedPolicy(Policy):
         return self.inner.predict_chunk(
             batch, [inner_episode(episode) for episode in episodes], draws, steps
         )
-
-    def write_notes(self, batch: Any, episodes: Sequence[Episode]) -> Sequence[Mapping[str, str]]:
-        if not isinstance(self.inner, WritesNotes):
-            return [{} for _ in episodes]
-        return self.inner.write_notes(batch, [inner_episode(episode) for episode in episodes])
 
 
 def inner_episode(episode: Episode) -> Episode:

@@ -12,7 +12,6 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.extras.methods.sam2act.keyframes import EpisodeKeyframes, file_of
 from mme_vla.memory.base import frames_scored, past_view_spec
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import frames_read
 
 SUBGOAL = "simple_subgoal"  # The column whose changes separate sub-tasks
 
@@ -153,7 +152,7 @@ def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
     if (
         memory is None
         or past_view_spec(memory) is not None
-        or frames_read(policy, np.zeros(1, np.int64), 0) is None
+        or policy.frames_read(np.zeros(1, np.int64), 0) is None
     ):
         return None
     return np.union1d(memory.storage.stored_frames(length), frames_scored(memory, length))

@@ -142,11 +142,10 @@ def _predictor(
 ) -> Callable[[Tensor, int], Tensor]:
     """The network's output by the index of a step. Observation and memory are read once."""
     times = _head(policy).times(steps, policy.device)
+    if memory is None:
+        memory = policy.model.memory_tokens(batch)
+    batch = policy.model.prepare_images(batch)
     with policy.autocast():
-        memory = (
-            policy.encode_memory(policy.conditioned_history(batch)) if memory is None else memory
-        )
-        batch = policy.prepare_images(batch)
         assert isinstance(policy.backbone, HasFlowHead)
-        predict = policy.backbone.predictor(batch, policy.inject(batch, memory))
+        predict = policy.backbone.predictor(batch, policy.model.inject(batch, memory))
     return lambda x, index: predict(x, times[index].expand(len(x)))

@@ -26,7 +26,7 @@ from mme_vla.evaluation.rollout.runner import Ending, Rollout, RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.trajectories.log_prob import SamplePath, log_prob, sample_path
 from mme_vla.memory.base import stack_history
-from mme_vla.policy.acting import choose_actions
+from mme_vla.policy.base import choose_actions
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.registry import REWARDS
 from mme_vla.types import Batch, HistoryTokens, Labels, TensorStruct
@@ -220,7 +220,7 @@ def with_view_tokens(policy: MMEPolicy, batch: Batch, size: int = 32) -> Batch:
     tokens = []
     with policy.autocast():
         for start in range(0, len(batch.prompt), size):
-            images = policy.prepare_images(
+            images = policy.model.prepare_images(
                 batch.rows(slice(start, start + size)).to(policy.device)
             ).images
             tokens.append(
@@ -314,7 +314,7 @@ class _Collector(Rollout):
                 return paths[0].chunk
             return policy.predict_chunk(observation, episodes, noise, self.settings.flow_steps)
 
-        selection = choose_actions(policy, episodes, predict)
+        selection = choose_actions(policy, episodes, predict=predict)
         rows, path = seen[0], paths[0] if paths else None
         execute = self.settings.execute or policy.embodiment.action.execute
         log_probs = None

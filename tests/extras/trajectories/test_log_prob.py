@@ -8,6 +8,7 @@ from mme_vla.backbone.flow import FlowHead
 from mme_vla.errors import UserError
 from mme_vla.extras.trajectories.log_prob import path_log_prob, sample_path
 from mme_vla.testing.small import random_batch, small_policy
+from mme_vla.types import stack_noise
 
 
 def test_the_log_probability_of_a_path_is_the_density_of_the_joint_normal() -> None:
@@ -76,13 +77,20 @@ def test_a_head_with_deviation_samples_the_path_of_its_noise() -> None:
         return 0.7 * x
 
     path = head.sample_path(linear, noise["noise"], noise["increments"], 0.3)
-    assert torch.equal(
-        head.sample(linear, noise["noise"], steps, increments=noise["increments"]), path[:, -1]
-    )
-    base = head.sample(linear, noise["noise"], steps)
-    assert torch.equal(
-        head.sample_path(linear, noise["noise"], noise["increments"], 0.0)[:, -1], base
-    )
+    x = noise["noise"]
+    for index in range(steps):
+        x = x - 0.7 * x / steps + 0.3 * noise["increments"][:, index]
+    assert torch.allclose(path[:, -1], x)
+    assert torch.equal(head.start(noise, steps, None), noise["noise"])
     assert set(FlowHead(horizon=2, action_dim=3).sampling_noise(generator)) == {"noise"}
     with pytest.raises(UserError, match="flow_steps=5"):
-        head.sample(linear, noise["noise"], 5, increments=noise["increments"])
+        head.start(noise, 5, None)
+
+
+def test_a_backbone_whose_head_has_a_deviation_samples_the_path_of_its_noise() -> None:
+    policy = small_policy("pi05", **{"+backbone.head.deviation": 0.2})
+    batch = random_batch(policy, batch=2)
+    noise = stack_noise([policy.sampling_noise(torch.default_generator) for _ in range(2)])
+    chunk = policy.sample_actions(batch, noise)
+    path = sample_path(policy, batch, 0.2, **noise)
+    assert (path.chunk - chunk).abs().max() < 1e-5

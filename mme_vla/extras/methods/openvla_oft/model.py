@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection
+from mme_vla.backbone.base import Backbone, FineTuneSpec, HasExtraExperts, Injection
 from mme_vla.backbone.layers import Block, additive_mask
 from mme_vla.extras.methods.openvla_oft.config import OpenVlaConfig
 from mme_vla.extras.methods.prismatic import Prismatic
@@ -75,7 +75,7 @@ class TokenSequence:
 
 
 @BACKBONES.register("openvla")
-class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sharded):
+class OpenVlaBackbone(Backbone, HasExtraExperts, Recomputes, Sharded):
     """`<s>`, images, state, memory, words, a slot of zeros for each number of the chunk, `</s>`.
 
     Nothing is causal and no block is hidden from another, so an integration's visibility table has
@@ -85,13 +85,12 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
 
     Config = OpenVlaConfig
     supports = frozenset({"blocks"})
-    lora_targets = (
+    LORA_TARGETS = (
         *("patch_embed.proj", "attn.qkv", "attn.proj", "mlp.fc1", "mlp.fc2"),
         *("attn_pool.q", "attn_pool.kv", "attn_pool.proj"),
         *("projector.fc1", "projector.fc2", "projector.fc3"),
         *("q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj", "lm_head"),
     )
-    PARTS: ClassVar[Mapping[str, str]] = {"vision": r"vlm\.vision\.", "vlm": r"vlm\.", "action": ""}
 
     def __init__(
         self, config: OpenVlaConfig, extra_experts: Mapping[str, Any] | None = None
@@ -106,6 +105,9 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
         self.state_token = StateToken(config.state_dim, width) if config.state_dim else None
         self.head = ActionHead(width, config.action_dim)
         self.heads = ("head",) if self.state_token is None else ("state_token", "head")
+        # Towers; projector and language model; state token and head.
+        components = {"vision": r"vlm\.vision\.", "vlm": r"vlm\.", "action": ""}
+        self.finetune_spec = FineTuneSpec(components, self.LORA_TARGETS, self.heads)
 
     def init_experts(self, names: Sequence[str]) -> None:
         """Draw the head and the state's token, which OpenVLA itself has nothing of."""
@@ -246,10 +248,6 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
             *self.vlm.language.model.layers,
         ):
             module.compile(**options)
-
-    def parts(self) -> Mapping[str, str]:
-        """Towers; projector and language model; state token and head."""
-        return self.PARTS
 
 
 def absolute_error(predicted: Tensor, actions: Tensor) -> Tensor:

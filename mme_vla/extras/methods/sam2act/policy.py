@@ -223,7 +223,7 @@ class SAM2ActPolicy(NetworkPolicy):
         return cls(SAM2ActNetwork(sizes), processor, config, **policy_options(cls, config))
 
     @property
-    def max_actions(self) -> int | None:
+    def max_actions(self) -> int | None:  # type: ignore[override]  # known once it has a processor
         """Waypoints of an episode, which its clock counts to."""
         return None if self.processor is None else self.processor.waypoints
 

@@ -190,27 +190,19 @@ class SubtaskPolicy(MMEPolicy):
 
     def _context(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Embeddings [b, n, d] of current images and prompt, and their mask [b, n]."""
-        blocks = self.backbone.embed(self.prepare_images(batch))
+        blocks = self.backbone.embed(self.model.prepare_images(batch))
         return torch.cat([block.tokens for block in blocks], 1), torch.cat(
             [block.mask for block in blocks], 1
         )
 
-    def losses(
-        self,
-        batch: Batch,
-        noise: Mapping[str, Tensor],
-        memory: MemoryTokens | None = None,
-        augmentation: Tensor | None = None,
-    ) -> dict[str, Tensor]:
-        """The losses of `MMEModel` under the recorded words, in place of a memory, and their cross
-        entropy `words`.
+    def forward(self, batch: Batch, *args: Any, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
+        """The action's loss under the recorded words, and the weighted cross entropy of these.
 
         Each word's counts as much as its sample (`Batch.weight`).
         """
         if not isinstance(batch, SubtaskBatch) or batch.words is None or batch.words_mask is None:
             raise ValueError(
-                "A loss is computed from recorded words: the batch must hold those of its sub-tasks"
-                " (SubtaskBatch)."
+                "forward() computes a loss: the batch must hold the words of its sub-tasks."
             )
         if batch.words.shape[1] > self.subtask.longest + 1:
             raise UserError(
@@ -227,17 +219,15 @@ class SubtaskPolicy(MMEPolicy):
         words = (
             losses if batch.weight is None else losses * batch.weight[:, None]
         ).sum() / mask.sum()
-        return {
-            **super().losses(batch, noise, MemoryTokens(hidden[:, 1:], mask), augmentation),
-            "words": words,
+        memory = MemoryTokens(hidden[:, 1:], mask)
+        action, metrics = super().forward(batch, *args, **{**options, "memory": memory})
+        loss = action + self.subtask_weight * words
+        return loss, {
+            **metrics,
+            "loss": loss.detach(),
+            "action": action.detach(),
+            "words": words.detach(),
         }
-
-    def total_loss(self, losses: Mapping[str, Tensor]) -> Tensor:
-        """What training minimises: the other losses, and `subtask_weight` times that
-        of the words.
-        """
-        others = {name: value for name, value in losses.items() if name != "words"}
-        return super().total_loss(others) + self.subtask_weight * losses["words"]
 
     @torch.no_grad()
     def sample_actions(self, batch: Batch, *args: Any, **options: Any) -> Tensor:

@@ -22,7 +22,7 @@ from mme_vla.evaluation.results.paper import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
-from mme_vla.policy.capabilities import CountsCost
+from mme_vla.policy.network import NetworkPolicy
 
 
 def count_model(model: str, budget: int | None = None, backbone: str | None = None) -> ModelCost:
@@ -32,7 +32,7 @@ def count_model(model: str, budget: int | None = None, backbone: str | None = No
     """
     _check_attention_is_counted()
     policy = on_meta(model, budget, backbone)
-    assert isinstance(policy, CountsCost)
+    assert isinstance(policy, NetworkPolicy)
     batch, memory = policy.full_batch("meta"), policy.memory
     return ModelCost(
         model=model,
@@ -91,7 +91,7 @@ def _streamed(policy: Policy, batch: Any) -> int | None:
 
 
 def _frames(policy: Policy) -> int:
-    if policy.memory is None or not isinstance(policy, CountsCost):
+    if policy.memory is None or not isinstance(policy, NetworkPolicy):
         return 0
     n_encoded = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
     return n_encoded * flops(policy.warm_up_vision)

@@ -19,7 +19,6 @@ from mme_vla.config.composition import compose
 from mme_vla.config.plugins import import_trusted
 from mme_vla.errors import UserError
 from mme_vla.policy.build import build_from_config
-from mme_vla.policy.capabilities import SupportsRTC
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.saving import (
     CONFIG,
@@ -168,9 +167,7 @@ class MMEVLAPolicy(PreTrainedPolicy):
         was executed.
         """
         return (
-            isinstance(self.model, SupportsRTC)
-            and self.model.supports_rtc
-            and self.model.require_processor().prompt_spec.past_actions == 0
+            self.model.supports_rtc and self.model.require_processor().prompt_spec.past_actions == 0
         )
 
     def _see(self, batch: Mapping[str, Any]) -> list[Row]:

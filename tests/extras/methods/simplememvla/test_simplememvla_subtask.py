@@ -49,7 +49,7 @@ def test_sample_weights_weigh_the_words_too() -> None:
     one = policy.full_batch()
     samples = [replace(one, words=torch.full_like(one.words, word)) for word in (1, 2)]
     noise = policy.training_noise(1, torch.Generator().manual_seed(0))
-    losses = [policy(sample, noise)[1]["losses/words"] for sample in samples]
+    losses = [policy(sample, noise)[1]["words"] for sample in samples]
     assert losses[0] != losses[1]
     rows = replace(join(samples), weight=torch.tensor([0.0, 3.0]))
     words, mask = (
@@ -57,22 +57,7 @@ def test_sample_weights_weigh_the_words_too() -> None:
     )
     both = SubtaskBatch(**vars(rows), words=words, words_mask=mask)
     noises = {name: torch.cat([value, value]) for name, value in noise.items()}
-    assert torch.allclose(policy(both, noises)[1]["losses/words"], 1.5 * losses[1])
-
-
-@pytest.mark.parametrize("training", [False, True])
-def test_the_loss_is_what_calling_the_policy_returns_with_the_words_in_it(training: bool) -> None:
-    policy: Any = build_policy(
-        "pi05_subtask", policy={"subtask_weight": 0.5, "augment": False}, seed=0
-    ).train(training)
-    batch, noise = policy.full_batch(), policy.training_noise(1, torch.Generator().manual_seed(0))
-    total, metrics = policy(batch, noise)
-    assert torch.equal(policy.loss(batch, noise), total) and torch.equal(
-        metrics["loss"], total.detach()
-    )
-    assert torch.allclose(total, metrics["losses/action"] + 0.5 * metrics["losses/words"])
-    policy.loss(batch, noise).backward()
-    assert policy.subtask.words.weight.grad.abs().max() > 0
+    assert torch.allclose(policy(both, noises)[1]["words"], 1.5 * losses[1])
 
 
 def test_words_end_at_the_limit_or_before() -> None:

@@ -1,0 +1,97 @@
+"""A policy has a model: the same modules under the same names, the same loss, and a short way to a
+sampled chunk.
+"""
+
+import copy
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mme_vla import MMEPolicy
+from mme_vla.testing.small import moving_frames, random_batch, small_policy
+
+
+@pytest.fixture
+def policy() -> MMEPolicy:
+    return small_policy("framesamp_modul", memory={"budget": 64})
+
+
+def test_weights_have_the_names_of_the_model_without_a_prefix(policy: MMEPolicy) -> None:
+    assert policy.state_dict().keys() == policy.model.state_dict().keys()
+    assert {name.split(".")[0] for name in policy.state_dict()} == {
+        "backbone",
+        "memory",
+        "integration",
+    }
+
+
+def test_a_part_that_is_replaced_is_replaced_in_the_model(policy: MMEPolicy) -> None:
+    other = small_policy("framesamp_modul", memory={"budget": 32}).memory
+    policy.memory = other
+    assert policy.model.memory is other
+    twin = copy.deepcopy(policy)
+    assert twin.model.memory is twin.memory is not other
+
+
+def test_mode_and_precision_are_those_of_the_model(policy: MMEPolicy) -> None:
+    for mode in (True, False):
+        assert policy.train(mode) is policy
+        assert policy.model.training is policy.training is policy.memory.training is mode
+    policy.compute_dtype = torch.bfloat16
+    policy.loss_weights = {"write": 0.5}
+    assert policy.model.compute_dtype == torch.bfloat16
+    assert policy.model.loss_weights == {"write": 0.5}
+
+
+def test_the_loss_of_a_policy_is_that_of_its_model(policy: MMEPolicy) -> None:
+    policy.eval()
+    batch = random_batch(policy, batch=2, valid=64)
+    noise = policy.training_noise(2, torch.Generator().manual_seed(0))
+    loss, metrics = policy(batch, noise)
+    assert torch.equal(loss, policy.model(batch, noise))
+    assert torch.equal(metrics["loss"], loss)
+
+
+def test_missing_noise_is_sampled(policy: MMEPolicy) -> None:
+    policy.eval()
+    batch = random_batch(policy, batch=2, valid=64)
+    torch.manual_seed(3)
+    sampled = policy(batch)[0]
+    torch.manual_seed(3)
+    noise = policy.training_noise(2, torch.default_generator)
+    assert torch.equal(sampled, policy(batch, noise)[0])
+    assert torch.equal(sampled, policy(batch, noise["noise"], noise["time"])[0])
+
+
+def test_a_chunk_takes_six_calls_in_four_files(
+    policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_velocity: Callable[..., Any] = policy.backbone.read_velocity
+    stacks: list[traceback.StackSummary] = []
+
+    def watched(hidden: torch.Tensor) -> torch.Tensor:
+        stacks.append(traceback.extract_stack())
+        return read_velocity(hidden)
+
+    monkeypatch.setattr(policy.backbone, "read_velocity", watched)
+    episode = policy.start_episode("press the button")
+    frames = moving_frames(1)
+    episode.observe({"front": frames, "wrist": frames}, np.zeros((1, 8), np.float32))
+    policy.act([episode])
+    calls = [frame for frame in stacks[0] if "mme_vla" in Path(frame.filename).parts]
+    names = [frame.name for frame in calls]
+    assert names == [
+        "act",
+        "choose_actions",
+        "predict_chunk",
+        "sample_actions",
+        "sample",  # of the model
+        "sample",  # of the backbone, which has the Euler steps
+        "output",
+    ]
+    assert len({frame.filename for frame in calls}) == 4
