@@ -37,7 +37,7 @@ import torch
 from mme_vla import build_policy
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.config.composition import compose
-from mme_vla.memory.base import past_view_spec, stack_history
+from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.images import past_views, stack_past
@@ -171,7 +171,7 @@ def make_batch(
 
 def past_of(policy: MMEPolicy, selected: Sequence[Stream], steps: np.ndarray) -> PastViews | None:
     """Past views of the one camera, where the memory gives the vision tower any."""
-    past_spec = past_view_spec(policy.memory)
+    past_spec = None if policy.memory is None else policy.memory.past_view_spec
     if past_spec is None:
         return None
     prepare = policy.require_processor().images

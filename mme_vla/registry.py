@@ -231,7 +231,9 @@ class Registry[T]:
         """
         options = {key: value for key, value in section.items() if key != "name"}
         entry: Any = self[section["name"]]
-        makers = entry.__mro__ if isinstance(entry, type) else (entry,)
+        makers = list(entry.__mro__ if isinstance(entry, type) else (entry,))
+        for maker in list(makers):
+            makers += vars(maker).get("option_types", ())  # structs that it builds from options
         kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
         parameters = [
             p

@@ -32,7 +32,7 @@ from mme_vla.extras.probing.run import probed_folder
 from mme_vla.integration.base import Integration
 from mme_vla.integration.context import Context, MemoryExpert
 from mme_vla.integration.modulator import Modulator
-from mme_vla.memory.base import MemoryModule, make_scorer
+from mme_vla.memory.base import MemoryModule
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.rmt import RMT
@@ -60,7 +60,7 @@ MEMORIES: dict[str, tuple[type[MemoryModule], dict[str, Any], str]] = {
 def replay(memory: MemoryModule, source: EpisodeSource) -> OnlineHistory:
     """The history of the whole episode, as an episode in closed loop builds it."""
     frames = source.frames(EPISODE, np.arange(int(source.lengths[EPISODE])))
-    history = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[EPISODE]))
+    history = OnlineHistory(memory.storage, memory.make_scorer(), int(source.exec_starts[EPISODE]))
     stored = history.to_encode(len(frames))
     history.append(frames, torch.zeros(len(stored), memory.storage.grid**2, 1))
     return history

@@ -11,7 +11,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.cli.command import cli
 from mme_vla.errors import UserError, printable
-from mme_vla.memory.base import make_scorer
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -214,7 +213,7 @@ def draw_memory(
     from mme_vla.memory.history import OnlineHistory
 
     frames = source.frames(episode, np.arange(step + 1))
-    history = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[episode]))
+    history = OnlineHistory(memory.storage, memory.make_scorer(), int(source.exec_starts[episode]))
     stored, patches = history.to_encode(len(frames)), memory.storage.grid**2
     history.append(frames, torch.zeros(len(stored), patches, 1))  # selections do not read tokens
     motion = normalised_states(source.states(episode, 0, step + 1))

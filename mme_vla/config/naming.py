@@ -10,7 +10,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 # The memory that several memories make (`mme_vla.memory.joined`, configs/memory/joined.yaml)
 JOINED = "joined"
-BUDGET = 512  # Memory tokens of a policy unless it says otherwise, as in the paper
+DEFAULT_BUDGET = 512
+"""Memory tokens of a policy that sets no budget, as in the paper."""
 
 _SEVERAL = re.compile(r"/?memory=(\[.*\])")
 
@@ -57,7 +58,7 @@ def join_memories(cfg: DictConfig) -> DictConfig:
     """
     if isinstance(cfg.get("memory"), ListConfig):
         members = OmegaConf.to_container(cfg.memory, resolve=True)
-        cfg.memory = {"name": JOINED, "budget": BUDGET, "members": members}
+        cfg.memory = {"name": JOINED, "budget": DEFAULT_BUDGET, "members": members}
     return cfg
 
 

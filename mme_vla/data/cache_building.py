@@ -35,7 +35,7 @@ from mme_vla.data.cache import (
 from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, require
-from mme_vla.memory.base import Memory, frames_scored, make_scorer
+from mme_vla.memory.base import Memory
 from mme_vla.utils import draft_of, remove_drafts, sum_line, write_atomically, write_json
 
 PAGE = 4096  # bytes
@@ -164,8 +164,10 @@ class _Chunk:
 def _chunks(
     source: EpisodeSource, episode: int, memory: Memory, batch_size: int
 ) -> Iterator[_Chunk]:
-    spec, length, scorer = memory.storage, int(source.lengths[episode]), make_scorer(memory)
-    stored, scored = stored_frames(source, episode, memory.storage), frames_scored(memory, length)
+    spec, length = memory.storage, int(source.lengths[episode])
+    stored = stored_frames(source, episode, memory.storage)
+    scorer = memory.make_scorer()
+    scored = np.zeros(0, np.int64) if scorer is None else scorer.frames_scored(length)
     span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
     for start in range(0, length, span):
         stop = min(start + span, length)
@@ -283,7 +285,7 @@ def ensure_cache(
         command: that command, for messages.
     """
     coded = source.lossy.get(source.robot.memory_camera)
-    if coded is not None and make_scorer(memory) is not None:
+    if coded is not None and memory.make_scorer() is not None:
         log.warning(
             "%s: its videos are coded as %s, and this memory scores patches by how little they"
             " change: what compression changes passes for motion. Convert the recordings with"

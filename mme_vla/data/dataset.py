@@ -14,7 +14,7 @@ from mme_vla.data.cache import VisionCache
 from mme_vla.data.columns import label_column, weight_column, with_labels
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, require
-from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
+from mme_vla.memory.base import Memory
 from mme_vla.memory.history import History
 from mme_vla.memory.transforms import FrameMap, HistoryTransform, TransformedHistory, map_frames
 from mme_vla.processing.base import PolicyProcessor, Sample, motion_rows
@@ -318,7 +318,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             item[name] = value
         if self.memory is not None:
             history: History = self.caches[step.source].history(step.episode)
-            if uses_proprio(self.memory):
+            if self.memory.uses_proprio:
                 history.motion = partial(self._motion, step.source, step.episode)
                 history.state_width = self.processor.embodiment.state.width
             if frames is not None:
@@ -328,7 +328,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             item["history"] = with_labels(
                 selection, self.columns[step.source].of_memory(step.episode), real
             )
-            if (spec := past_view_spec(self.memory)) is not None:
+            if (spec := self.memory.past_view_spec) is not None:
                 read = partial(self._images, step.source, step.episode, frames)
                 item["past"] = past_views(spec, now, read, self.processor.images)
         return item

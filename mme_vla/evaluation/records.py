@@ -76,7 +76,7 @@ class RolloutDetails:
     video_frames: observed frames of the conditioning video. actions_sha256: digest of the executed
     actions. suite: the task's, where its environment has suites. refused: what the environment says
     of an episode that failed. video: name of the file. process: where the chain of sub-tasks broke.
-    events: what happened, and when. notes: that the policy wrote. subgoals: their score.
+    events: what happened, and when. subgoals: their score.
     """
 
     env: str
@@ -89,7 +89,6 @@ class RolloutDetails:
     video: str | None = None
     process: Mapping[str, Any] | None = None
     events: Sequence[Mapping[str, Any]] = ()
-    notes: Sequence[Mapping[str, Any]] = ()
     subgoals: Mapping[str, Any] | None = None
 
     def to_dict(self) -> dict[str, Any]:

@@ -24,19 +24,17 @@ see memory.
 
 def memory_visibility(prompt_sees_memory: bool) -> Visibility:
     """Return the table, with or without that one word."""
-    return (
-        MEMORY_VISIBILITY
-        if prompt_sees_memory
-        else {**MEMORY_VISIBILITY, "prompt": PI05_VISIBILITY["prompt"]}
-    )
+    if prompt_sees_memory:
+        return MEMORY_VISIBILITY
+    return {**MEMORY_VISIBILITY, "prompt": PI05_VISIBILITY["prompt"]}
 
 
-POSITIONS = ("slot", "time")
+MEMORY_POSITIONS = ("slot", "time")
 
 
 def checked_position(memory_position: str) -> str:
-    """The value of `integration.memory_position`."""
-    check_choice("integration.memory_position", memory_position, POSITIONS)
+    """The value of `integration.memory_position`; raises `UserError` unless it is one."""
+    check_choice("integration.memory_position", memory_position, MEMORY_POSITIONS)
     return memory_position
 
 
@@ -52,12 +50,11 @@ class Integration(nn.Module):
             alone computed now.
         condition: what becomes of the condition of the action expert's norms (the embedded flow
             time).
-        beside: blocks that stand beside the actions in every step; `visibility` needs rows for
-            them.
+        beside: blocks that enter with the actions in every step; `visibility` needs rows for them.
         required_features: what a backbone must support beside the methods overridden here
             (`Backbone.supports`).
         memory_position: `time` where its attention on memory counts frames, which needs a memory
-            whose tokens tell their ages; `slot` where it counts tokens.
+            that is `timed`; `slot` where it counts tokens.
     """
 
     memory_width: int = 0
@@ -84,8 +81,10 @@ class Integration(nn.Module):
         return ()
 
     def inject(self, observation: Sequence[Block], memory: MemoryTokens | None) -> Injection:
-        """All that enters the backbone for one chunk, from its observation blocks and the memory's
-        tokens.
+        """Collect what enters the backbone for one chunk.
+
+        Args:
+            observation: the backbone's blocks. memory: the memory's tokens; None without memory.
         """
         return Injection(
             self.blocks(observation, memory),
@@ -106,14 +105,15 @@ def explicit_positions(memory: MemoryTokens, memory_position: str) -> Tensor | N
     """
     if memory_position == "slot":
         return None
-    return memory.mask.sum(1, keepdim=True) - 1 - ages_of(memory)
+    current_frame = memory.mask.sum(1, keepdim=True) - 1
+    return current_frame - ages_of(memory)
 
 
 def ages_of(memory: MemoryTokens) -> Tensor:
     """How many frames ago each memory token's frame was, [b, budget]."""
     if memory.ages is None:
         raise ValueError(
-            "memory_position=time: these memory tokens tell no ages (HistoryTokens.step was not"
+            "memory_position=time: these memory tokens have no ages (HistoryTokens.step was not"
             " given)."
         )
     return memory.ages
@@ -131,16 +131,16 @@ def extension_points(kind: type[Integration]) -> frozenset[str]:
     """The features of a backbone that an integration uses, known before it is built to the
     backbone's sizes.
     """
-    overridden = {
-        point
-        for name, point in EXTENSION_POINTS.items()
-        if getattr(kind, name) is not getattr(Integration, name)
-    }
-    return kind.required_features | overridden
+    features = set(kind.required_features)
+    for name, feature in EXTENSION_POINTS.items():
+        is_overridden = getattr(kind, name) is not getattr(Integration, name)
+        if is_overridden:
+            features.add(feature)
+    return frozenset(features)
 
 
 def required(memory: MemoryTokens | None) -> MemoryTokens:
-    """The memory tokens, which must be there."""
+    """The memory tokens; raises `ValueError` if there are none."""
     if memory is None:
         raise ValueError(
             "This policy has a memory: batch.history must hold its selection (it is None)."

@@ -20,7 +20,7 @@ MUTUAL: Visibility = {
     **dict.fromkeys(("memory", "images", "prompt"), frozenset({"memory", "images", "prompt"})),
     "action": MEMORY_VISIBILITY["action"],
 }
-"""Memory as one of the things that are seen: no block of the prefix is hidden from another."""
+"""No block of the prefix is hidden from another, memory included."""
 
 
 @INTEGRATIONS.register("context")
@@ -44,17 +44,16 @@ class Context(Integration):
                 LeRobot's tokens of past states do.
         """
         super().__init__(backbone)
+        sees_everything = getattr(backbone, "everything_sees_everything", False)
         require(
-            not (not prompt_sees_memory and getattr(backbone, "everything_sees_everything", False)),
+            prompt_sees_memory or not sees_everything,
             "integration.prompt_sees_memory=false hides memory from the prompt, but in this"
             " backbone every token sees every other: leave it true.",
         )
-        self.memory_width, self.memory_position = (
-            backbone.vlm.width,
-            checked_position(memory_position),
-        )
+        self.memory_width = backbone.vlm.width
+        self.memory_position = checked_position(memory_position)
         require(
-            not (mutual and (memory_position == "time" or not prompt_sees_memory)),
+            not mutual or (memory_position == "slot" and prompt_sees_memory),
             "integration.mutual=true puts memory between images and prompt, where all see each"
             " other: that goes with memory_position=slot and prompt_sees_memory=true alone.",
         )
@@ -65,8 +64,10 @@ class Context(Integration):
         memory = required(memory)
         positions = explicit_positions(memory, self.memory_position)
         block = Block("memory", memory.tokens, memory.mask, "vlm", positions)
-        before = 1 + [block.name for block in observation].index("images") if self.mutual else 0
-        return [*observation[:before], block, *observation[before:]]
+        if not self.mutual:
+            return [block, *observation]
+        after_images = [block.name for block in observation].index("images") + 1
+        return [*observation[:after_images], block, *observation[after_images:]]
 
 
 @INTEGRATIONS.register("expert")
@@ -81,18 +82,22 @@ class MemoryExpert(Integration):
         prompt_sees_memory: bool = True,
         memory_position: str = "slot",
     ) -> None:
-        """`width` defaults to the action expert's, `mlp_dim` to twice the width: 1024 and 2048 at
-        full size.
+        """Take the sizes of the memory's expert.
 
-        The others are as `Context` has them.
+        Args:
+            width: None is the action expert's, 1024 at full size.
+            mlp_dim: None is twice the width.
+            prompt_sees_memory, memory_position: see `Context`.
         """
         super().__init__(backbone)
-        self.memory_width = backbone.action.width if width is None else width
+        if width is None:
+            width = backbone.action.width
+        if mlp_dim is None:
+            mlp_dim = 2 * width
+        self.memory_width = width
         self.memory_position = checked_position(memory_position)
         self.visibility = memory_visibility(prompt_sees_memory)
-        self._expert = ExpertConfig(
-            self.memory_width, 2 * self.memory_width if mlp_dim is None else mlp_dim
-        )
+        self._expert = ExpertConfig(width, mlp_dim)
         check_positive(self._expert, "integration.")
 
     def extra_experts(self) -> dict[str, ExpertConfig]:

@@ -33,16 +33,19 @@ class FiLM(PooledIntegration):
         """Build it.
 
         Args:
-            backbone: sizes, of no concern here. width: of the memory tokens and of the vector.
+            backbone: sizes, which are not used. width: of the memory tokens and of the vector.
         """
         super().__init__(backbone)
         check_integer("integration.width", width)
-        self.memory_width = self.feature_width = width
-        self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, width)
+        self.memory_width = width
+        self.feature_width = width
+        self.norm = nn.LayerNorm(width)
+        self.out = nn.Linear(width, width)
 
     def feature(self, memory: MemoryTokens | None) -> Tensor:
-        features = required(memory)
-        counted = features.mask[..., None].to(features.tokens.dtype)
-        # Tokens where the mask is False are undefined: zero them before they are weighed.
-        tokens = features.tokens.masked_fill(~features.mask[..., None], 0)
-        return self.out(self.norm(tokens.sum(1) / counted.sum(1).clamp(min=1)))
+        memory = required(memory)
+        mask = memory.mask[..., None]
+        # Tokens where the mask is False are undefined: zero them before they are summed.
+        total = memory.tokens.masked_fill(~mask, 0).sum(1)
+        count = mask.to(memory.tokens.dtype).sum(1).clamp(min=1)
+        return self.out(self.norm(total / count))

@@ -1,5 +1,5 @@
-"""Memory as modulator: each action layer's MLP input is scaled and shifted by what it recalls
-(paper, section 4.3).
+"""Memory as modulator: each action layer's MLP input is scaled and shifted by what the layer reads
+from memory (paper, section 4.3).
 """
 
 from functools import partial
@@ -25,7 +25,7 @@ from mme_vla.types import MemoryTokens
 
 
 class ModulatorLayer(nn.Module):
-    """One layer's cross-attention on memory and the linear map from what it read to (a, β)."""
+    """One layer's cross-attention on memory, and the linear map from its output to (a, β)."""
 
     def __init__(
         self, width: int, heads: int, kv_heads: int, head_dim: int, exact_identity: bool
@@ -46,23 +46,22 @@ class ModulatorLayer(nn.Module):
         """Memory [b, m, d] → rotated keys and values [b, m, K, h]: once per chunk, whatever the
         number of steps.
 
-        Queries stand after all memory slots, padding included; positions [b, m] of the memory's own
-        are on that line.
+        Queries have positions after all memory slots, padding included; `positions` [b, m] count
+        from the same origin. None numbers the slots.
         """
+        if positions is None:
+            positions = _positions(0, memory)
         kv = self.kv(self.norm(memory)[0]).unflatten(-1, (-1, self.head_dim))
         k, v = kv.chunk(2, dim=-2)
-        return rotate(
-            k, rotation(_positions(0, memory) if positions is None else positions, self.head_dim)
-        ), v
+        return rotate(k, rotation(positions, self.head_dim)), v
 
     def read_memory(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
-        """r: what actions [b, h, d] read from memory; queries stand after all memory slots, padding
-        included.
+        """r: what actions [b, h, d] read from memory; their positions come after all memory slots,
+        padding included.
         """
         q = self.q(self.norm(x)[0]).unflatten(-1, (-1, self.head_dim))
-        return self.out(
-            attend(rotate(q, rotation(_positions(k.shape[1], x), self.head_dim)), k, v, mask)
-        )
+        q = rotate(q, rotation(_positions(k.shape[1], x), self.head_dim))
+        return self.out(attend(q, k, v, mask))
 
     def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
         """x̂ = rms(x)·(1 + a) + β with (a, β) = W r + b."""
@@ -100,35 +99,27 @@ class Modulator(Integration):
                 past, and one.
         """
         super().__init__(backbone)
-        self.memory_width, self.memory_position = (
-            backbone.action.width,
-            checked_position(memory_position),
+        self.memory_width = backbone.action.width
+        self.memory_position = checked_position(memory_position)
+        head_dim = head_dim or backbone.head_dim
+        self.layers = nn.ModuleList(
+            ModulatorLayer(self.memory_width, num_heads, num_kv_heads, head_dim, exact_identity)
+            for _ in range(backbone.depth)
         )
-        sizes = (
-            self.memory_width,
-            num_heads,
-            num_kv_heads,
-            head_dim or backbone.head_dim,
-            exact_identity,
-        )
-        self.layers = nn.ModuleList(ModulatorLayer(*sizes) for _ in range(backbone.depth))
 
     def hook(self, memory: MemoryTokens | None) -> Hook:
         memory = required(memory)
         tokens = memory.tokens.to(compute_dtype(memory.tokens))
-        positions = (
-            None if self.memory_position == "slot" else tokens.shape[1] - 1 - ages_of(memory)
-        )
-        mask = additive_mask(
-            memory.mask[:, None], tokens.dtype
-        )  # b 1 1 m: every action sees the same keys
-        cached = [layer.keys_values(tokens, positions) for layer in self.layers]  # type: ignore[operator]
-        return LayerHooks(
-            [
-                partial(layer, k=k, v=v, mask=mask)
-                for layer, (k, v) in zip(self.layers, cached, strict=True)
-            ]
-        )
+        positions = None
+        if self.memory_position == "time":
+            positions = tokens.shape[1] - 1 - ages_of(memory)
+        # Every action sees the same keys: b 1 1 m.
+        mask = additive_mask(memory.mask[:, None], tokens.dtype)
+        hooks = []
+        for layer in self.layers:
+            k, v = layer.keys_values(tokens, positions)  # type: ignore[operator]
+            hooks.append(partial(layer, k=k, v=v, mask=mask))
+        return LayerHooks(hooks)
 
 
 def _positions(start: int, x: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """`MemoryModule`: choose stored tokens, then encode them into at most `budget` memory tokens."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -47,28 +47,37 @@ class MemoryModule(nn.Module):
 
     A subclass implements `select` and `forward`, and sets:
         budget: most memory tokens it returns; 0 for a memory of past views alone.
-        capacity: most stored tokens it may select (`budget` unless the encoder reads more than it
-            writes); selections are padded to it unless `padded_length` says otherwise.
+        capacity: most stored tokens it selects (`budget` unless the encoder reads more than it
+            writes).
         storage: what is stored of each frame.
-        lazy: encode a frame of an episode when it is first read, for memories that read few of
-            their stored frames.
-        pad_left: padding comes before the tokens (recurrent memories) instead of after them.
+
+    Attributes with a default:
+        pad_left: 0 pads a selection after its tokens, up to `capacity`. k pads it before them, up
+            to a multiple of k tokens (recurrent memories).
         timed: each memory token belongs to one frame, whose age is in `MemoryTokens.ages`; required
             by `integration.memory_position=time`.
+        lazy: encode a frame of an episode when it is first read, for memories that read few of
+            their stored frames.
+        uses_proprio: it reads states and actions (`History.motion_rows`) instead of, or beside,
+            stored tokens.
+        past_view_spec: past views that it gives the backbone beside the current ones
+            (`Batch.past`); None for none.
         reporting: set from outside for updates that are logged; `forward` then fills
             `MemoryTokens.metrics`.
 
-    Optional capabilities are classes to inherit from as well: `StreamingMemory`, `ScoringMemory`,
-    `ProprioMemory`, `PastViewMemory`, `CompilableMemory`, `MatmulPrecision`, and `ReadsLabels`
-    (types.py) of a memory whose `MemoryTokens.losses` need labels.
+    A memory that chooses by scores of raw frames overrides `make_scorer`. One that carries a state
+    through an episode overrides `start_stream`, `encode` and `prepare`. One whose
+    `MemoryTokens.losses` need labels also inherits `ReadsLabels` (types.py).
     """
 
     budget: int
     capacity: int
     storage: StorageSpec
-    pad_left: bool = False
+    pad_left: int = 0
     timed: bool = False
     lazy: bool = False
+    uses_proprio: bool = False
+    past_view_spec: PastViewSpec | None = None
     reporting: bool = False
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -105,7 +114,7 @@ class MemoryModule(nn.Module):
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         """Encode the selection [b, n, d_vision] into memory tokens [b, budget, d].
 
-        n is `capacity`, unless `padded_length` returns less.
+        n is `capacity`, or less in a memory with `pad_left`.
         """
         raise NotImplementedError
 
@@ -122,7 +131,15 @@ class MemoryModule(nn.Module):
             int64 [n], ascending, each once.
         """
         length = int(max(steps, default=-1)) + 1
-        return union_frames([self.storage.stored_frames(length), frames_scored(self, length)])
+        stored = self.storage.stored_frames(length)
+        scorer = self.make_scorer()
+        if scorer is None:
+            return stored
+        return union_frames([stored, scorer.frames_scored(length)])
+
+    def make_scorer(self) -> FrameScorer | None:
+        """A new scorer of raw frames for one episode; None if it needs no scores."""
+        return None
 
     def condition_on_prompt(
         self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
@@ -130,69 +147,45 @@ class MemoryModule(nn.Module):
         """A selection as the backbone reads it with a prompt: `condition` [b, n, d_vision] of its
         vision tokens.
         """
-        return (
-            history
-            if uses_proprio(self)
-            else replace(history, features=condition(history.features))
-        )
-
-    def padded_length(self, count: int) -> int:
-        """The length to which a selection of `count` tokens is padded; only left-padded memories
-        may change it.
-        """
-        return self.capacity
+        if self.uses_proprio:  # its features are states and actions
+            return history
+        return replace(history, features=condition(history.features))
 
     def gather_selection(
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> HistoryTokens:
-        """Select, gather and pad: the unbatched tokens of one step ([padded_length, …]), ready to
-        be stacked.
-        """
+        """Select, gather and pad: the unbatched tokens of one step [n, …], ready to be stacked."""
         indices = self.select(history, step, rng)
         if len(indices) > self.capacity:
             raise ValueError(
                 f"{type(self).__name__}.select returned {len(indices)} tokens; at most"
-                f" {self.capacity}."
+                f" {self.capacity}, its capacity."
             )
         features = history.gather(indices)
-        positions = torch.from_numpy(token_positions(history.timed(indices), self.storage.grid)).to(
-            features.device
+        device = features.device
+        positions = torch.from_numpy(token_positions(history.timed(indices), self.storage.grid))
+        selection = HistoryTokens(
+            features,
+            positions.to(device),
+            torch.ones(len(indices), dtype=torch.bool, device=device),
+            torch.tensor(int(history.times(np.array(step))), device=device),
         )
-        missing = self.padded_length(len(indices)) - len(indices)
-        before, after = (missing, 0) if self.pad_left else (0, missing)
-        mask = torch.ones(len(indices), dtype=torch.bool, device=features.device)
-        return HistoryTokens(
-            features=nn.functional.pad(features, (0, 0, before, after)),
-            positions=nn.functional.pad(positions, (0, 0, before, after)),
-            mask=nn.functional.pad(mask, (before, after)),
-            step=torch.tensor(int(history.times(np.array(step))), device=features.device),
-        )
-
-
-Memory = MemoryModule
-"""The former name."""
-
-NEVER = 1_000_000
-"""Frames between two whose tokens are stored, of memories that read none."""
-
-
-class StreamingMemory:
-    """Capability of a memory: it carries a state through an episode, so that a step costs its new
-    frames alone.
-    """
+        return pad_selection(selection, padded_length(self, len(indices)), bool(self.pad_left))
 
     def start_stream(self) -> Any:
-        """A new state for one episode."""
-        raise NotImplementedError
+        """A new state for one episode; None if it carries none."""
+        return None
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         """Memory tokens [n, budget, d] of n running episodes at their latest frames, equal to
         `forward`'s.
 
         Args:
-            histories: one per episode. streams: their states, updated in place.
+            histories: one per episode. streams: their states of `start_stream`, updated in place.
         """
-        raise NotImplementedError
+        selections = [self.gather_selection(history, len(history) - 1) for history in histories]
+        tokens: MemoryTokens = self(stack_history(selections))
+        return tokens
 
     def prepare(self, history: History, stream: Any) -> bool:
         """Do a part of the work of the next `encode` while the robot moves. It must not change any
@@ -207,108 +200,63 @@ class StreamingMemory:
         return False
 
 
-class ScoringMemory:
-    """Capability of a memory: it chooses by scores of raw frames."""
-
-    def make_scorer(self) -> FrameScorer | None:
-        """A new scorer for one episode; None for none."""
-        raise NotImplementedError
-
-    def frames_scored(self, length: int) -> np.ndarray:
-        """Which of the first `length` frames the scorer needs: by default all."""
-        return np.arange(length)
+Memory = MemoryModule
+"""The former name."""
 
 
-class ProprioMemory:
-    """Capability of a memory: it reads proprioception and motion (`History.motion`), with stored
-    tokens or without.
+def take_options[T](kind: type[T], options: dict[str, Any]) -> T:
+    """Build a dataclass of options from the keywords that are its fields. These are removed from
+    `options`.
+
+    A class that does so lists the dataclass in `option_types`, so that the registry can name its
+    fields in messages.
     """
-
-    uses_proprio: bool = True
-
-
-class PastViewMemory:
-    """Capability of a memory: it gives the backbone past views along with the current ones
-    (`Batch.past`).
-    """
-
-    past_view_spec: PastViewSpec | None = None
+    values = {}
+    for field in fields(kind):  # type: ignore[arg-type]
+        if field.name in options:
+            values[field.name] = options.pop(field.name)
+    return kind(**values)
 
 
-class CompilableMemory:
-    """Capability of a memory: it has many small operations to compile in place."""
-
-    def compile(self, **options: Any) -> None:
-        """Compile them. `options` are `torch.compile`'s."""
-        raise NotImplementedError
-
-
-class MatmulPrecision:
-    """Capability of a module that computes in float32: how a GPU multiplies there, `ieee` or
-    `tf32`.
-    """
-
-    float32_products: str = "ieee"
-
-
-def make_scorer(memory: MemoryModule) -> FrameScorer | None:
-    """A new scorer for one episode; None if the memory needs no scores."""
-    return memory.make_scorer() if isinstance(memory, ScoringMemory) else None
-
-
-def frames_scored(memory: MemoryModule, length: int) -> np.ndarray:
-    """Which of the first `length` frames the memory's scorer needs; int64, ascending."""
-    return memory.frames_scored(length) if isinstance(memory, ScoringMemory) else np.arange(0)
-
-
-def uses_proprio(memory: MemoryModule | None) -> bool:
-    """Whether the memory reads proprioception and motion."""
-    return isinstance(memory, ProprioMemory) and memory.uses_proprio
-
-
-def past_view_spec(memory: MemoryModule | None) -> PastViewSpec | None:
-    """The past views that the memory gives the backbone; None for none."""
-    return memory.past_view_spec if isinstance(memory, PastViewMemory) else None
-
-
-def start_stream(memory: MemoryModule | None) -> Any:
-    """A new streaming state for one episode; None if the memory has none."""
-    return memory.start_stream() if isinstance(memory, StreamingMemory) else None
+NEVER = 1_000_000
+"""Frames between two whose tokens are stored, of memories that read none."""
 
 
 def start_history(memory: MemoryModule, encode: Callable[[np.ndarray], Tensor]) -> OnlineHistory:
     """An empty history for one episode; `encode` maps frames [n, H, W, 3] uint8 to
     stored tokens.
     """
-    scorer = make_scorer(memory)
-    return (
-        LazyHistory(memory.storage, encode, scorer)
-        if memory.lazy
-        else OnlineHistory(memory.storage, scorer)
+    scorer = memory.make_scorer()
+    if memory.lazy:
+        return LazyHistory(memory.storage, encode, scorer)
+    return OnlineHistory(memory.storage, scorer)
+
+
+def padded_length(memory: MemoryModule, count: int) -> int:
+    """The length to which a selection of `count` tokens is padded."""
+    if not memory.pad_left:
+        return memory.capacity
+    multiples = -(-count // memory.pad_left)
+    return min(multiples * memory.pad_left, memory.capacity)
+
+
+def pad_selection(selection: HistoryTokens, length: int, left: bool) -> HistoryTokens:
+    """Pad an unbatched selection with zeros to `length` tokens, before them or after them."""
+    missing = length - len(selection.mask)
+    ends = (missing, 0) if left else (0, missing)
+    return HistoryTokens(
+        features=nn.functional.pad(selection.features, (0, 0, *ends)),
+        positions=nn.functional.pad(selection.positions, (0, 0, *ends)),
+        mask=nn.functional.pad(selection.mask, ends),
+        step=selection.step,
     )
-
-
-def encode_histories(
-    memory: MemoryModule, histories: Sequence[History], streams: Sequence[Any]
-) -> MemoryTokens:
-    """Memory tokens [n, budget, d] of n running episodes at their latest frames.
-
-    Args:
-        histories: one per episode. streams: their states of `start_stream`, updated in place.
-    """
-    if isinstance(memory, StreamingMemory):
-        return memory.encode(histories, streams)
-    tokens: MemoryTokens = memory(
-        stack_history([memory.gather_selection(h, len(h) - 1) for h in histories])
-    )
-    return tokens
 
 
 def full_history(
     memory: MemoryModule, d_vision: int, device: torch.device | str = "cpu"
 ) -> HistoryTokens:
-    """A selection [1, n, d_vision] of zeros at its greatest length."""
-    n = memory.padded_length(memory.capacity)
+    """A selection [1, capacity, d_vision] of zeros."""
+    n = memory.capacity
     return HistoryTokens(
         torch.zeros(1, n, d_vision, device=device),
         torch.zeros(1, n, 3, device=device),
@@ -319,12 +267,15 @@ def full_history(
 
 def union_frames(lists: Sequence[np.ndarray]) -> np.ndarray:
     """All frames of some lists, ascending, each once; int64 [n]."""
-    return np.unique(np.concatenate(lists)) if lists else np.zeros(0, np.int64)
+    if not lists:
+        return np.zeros(0, np.int64)
+    return np.unique(np.concatenate(lists))
 
 
 def all_patches(frames: np.ndarray, grid: int) -> np.ndarray:
     """All patches of some frames as (frame, patch) [n·grid², 2], frame by frame."""
-    return np.stack(np.meshgrid(frames, np.arange(grid**2), indexing="ij"), axis=-1).reshape(-1, 2)
+    frame, patch = np.meshgrid(frames, np.arange(grid**2), indexing="ij")
+    return np.stack([frame, patch], axis=-1).reshape(-1, 2)
 
 
 def token_positions(indices: np.ndarray, grid: int) -> np.ndarray:
@@ -335,9 +286,9 @@ def token_positions(indices: np.ndarray, grid: int) -> np.ndarray:
     """
     frame, patch = indices[:, 0], indices[:, 1]
     cell = POSITION_GRID / grid
-    return np.stack(
-        [frame, (patch // grid + 0.5) * cell, (patch % grid + 0.5) * cell], axis=1
-    ).astype(np.float32)
+    row = (patch // grid + 0.5) * cell
+    column = (patch % grid + 0.5) * cell
+    return np.stack([frame, row, column], axis=1).astype(np.float32)
 
 
 def stack_history(
@@ -349,23 +300,30 @@ def stack_history(
     length = max(len(item.mask) for item in items)
 
     def stack(rows: Sequence[Tensor]) -> Tensor:
-        around = [0, 0] * (rows[0].ndim - 1)
-        return torch.stack(
-            [nn.functional.pad(row, (*around, length - len(row), 0)) for row in rows]
-        ).to(device)
+        padded = []
+        for row in rows:
+            other_axes = [0, 0] * (row.ndim - 1)
+            padded.append(nn.functional.pad(row, (*other_axes, length - len(row), 0)))
+        return torch.stack(padded).to(device)
 
+    labels = Labels()
+    for name in items[0].labels:
+        labels[name] = stack([item.labels[name] for item in items])
+    step = None
     steps = [item.step for item in items if item.step is not None]
-    step = torch.stack(steps).to(device) if len(steps) == len(items) else None
-    labels = Labels(
-        {name: stack([item.labels[name] for item in items]) for name in items[0].labels}
+    if len(steps) == len(items):
+        step = torch.stack(steps).to(device)
+    return HistoryTokens(
+        features=stack([item.features for item in items]),
+        positions=stack([item.positions for item in items]),
+        mask=stack([item.mask for item in items]),
+        step=step,
+        labels=labels,
     )
-    features, positions, mask = (
-        stack([getattr(item, name) for item in items]) for name in ("features", "positions", "mask")
-    )
-    return HistoryTokens(features, positions, mask, step, labels)
 
 
-TEMPORAL_BASE, SPATIAL_BASE = 10_000.0, 1_000.0
+TEMPORAL_BASE = 10_000.0
+SPATIAL_BASE = 1_000.0
 
 
 def position_features(positions: Tensor, dim: int) -> Tensor:
@@ -386,17 +344,15 @@ def position_features(positions: Tensor, dim: int) -> Tensor:
         f"position_dim={dim} must be a multiple of 6 (three axes, sin and cos) from 12 on.",
     )
     ramp = torch.arange(w, device=positions.device, dtype=torch.float32) / (w - 1)
-    frequencies = torch.stack(
-        [TEMPORAL_BASE**-ramp, SPATIAL_BASE**-ramp, SPATIAL_BASE**-ramp]
-    )  # 3 w
+    temporal = TEMPORAL_BASE**-ramp
+    spatial = SPATIAL_BASE**-ramp
+    frequencies = torch.stack([temporal, spatial, spatial])  # 3 w
     angles = positions.float()[..., None] * frequencies
     return torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
 
 
 POSITIONS = ("time_space", "space", "none")
-"""What a memory's tokens say of their frame, row and column: all three, row and
-column, or nothing.
-"""
+"""Which of its frame, row and column a memory token encodes: all three, row and column, or none."""
 
 
 class FeatureEncoder(nn.Module):
@@ -418,45 +374,48 @@ class FeatureEncoder(nn.Module):
         positions: str | None = None,
     ):
         super().__init__()
-        self.positions = POSITIONS[0] if positions is None else positions
+        self.positions = "time_space" if positions is None else positions
         check_choice("memory.positions", self.positions, POSITIONS)
         for name, size in (("position_dim", position_dim), ("position_hidden", position_hidden)):
             require(
                 size is None or size >= 1,
                 f"memory.{name}={size}: must be at least 1, or null for its default.",
             )
-        self.position_dim = max(48, 6 * (d_vision // 16)) if position_dim is None else position_dim
-        hidden = self.position_dim if position_hidden is None else position_hidden
-        none = self.positions == "none"
-        self.position = None if none else nn.Linear(self.position_dim, hidden)
-        self.project = nn.Linear(d_vision + hidden * (not none), width)
-        for layer in (self.position, self.project):
-            if layer is not None:
-                nn.init.normal_(layer.weight, std=0.02)
-                nn.init.zeros_(layer.bias)
+        if position_dim is None:
+            position_dim = max(48, 6 * (d_vision // 16))
+        if position_hidden is None:
+            position_hidden = position_dim
+        self.position_dim = position_dim
+        self.position: nn.Linear | None = None
+        if self.positions == "none":
+            self.project = nn.Linear(d_vision, width)
+        else:
+            self.position = nn.Linear(position_dim, position_hidden)
+            self.project = nn.Linear(d_vision + position_hidden, width)
+        for layer in self.children():
+            assert isinstance(layer, nn.Linear)
+            nn.init.normal_(layer.weight, std=0.02)
+            nn.init.zeros_(layer.bias)
 
-    def places(self, positions: Tensor) -> Tensor:
+    def embed_positions(self, positions: Tensor) -> Tensor:
         """Position features [b, n, position_dim] of positions [b, n, 3], float32."""
-        places = position_features(positions, self.position_dim)
+        features = position_features(positions, self.position_dim)
         if self.positions == "space":
-            places = torch.cat([torch.zeros_like(places[..., : self.position_dim // 3]),
-                                places[..., self.position_dim // 3 :]], -1)  # fmt: skip
-        return places
+            features[..., : self.position_dim // 3] = 0
+        return features
 
-    def encode(self, features: Tensor, places: Tensor) -> Tensor:
-        """Encode features [b, n, d_vision] with ready-made position features [b, n,
-        position_dim].
-        """
+    def encode(self, features: Tensor, embedded: Tensor) -> Tensor:
+        """Encode features [b, n, d_vision] whose positions are embedded [b, n, position_dim]."""
         if self.position is None:
             return self.project(features.to(self.project.weight.dtype))
-        place = nn.functional.silu(self.position(places.to(self.position.weight.dtype)))
-        return self.project(torch.cat([features.to(place.dtype), place], dim=-1))
+        position = nn.functional.silu(self.position(embedded.to(self.position.weight.dtype)))
+        return self.project(torch.cat([features.to(position.dtype), position], dim=-1))
 
     def forward(self, features: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """Encode features at positions [b, n, 3]; padding gets zero position features, not those of
         (0, 0, 0).
         """
-        return self.encode(features, self.places(positions) * mask[..., None])
+        return self.encode(features, self.embed_positions(positions) * mask[..., None])
 
 
 class PerceptualMemory(MemoryModule):

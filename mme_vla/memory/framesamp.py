@@ -19,7 +19,9 @@ def evenly_spaced_frames(step: int, count: int) -> np.ndarray:
     """
     if step < count:
         return np.arange(step + 1)
-    return np.linspace(0, step, count).astype(np.int64) if count > 1 else np.array([step])
+    if count == 1:
+        return np.array([step])
+    return np.linspace(0, step, count).astype(np.int64)
 
 
 def evenly_spaced_stored_frames(storage: StorageSpec, step: int, count: int) -> np.ndarray:

@@ -1,8 +1,7 @@
 """The history store: one episode's pooled vision tokens, grown online or read from the cache.
 
-Both forms answer the same three questions: which frames are there (`len`), what did the scorer say
-of them (`scores`), and what are the tokens at these (frame, patch) pairs (`gather`). A memory
-cannot tell them apart.
+Both forms have the same three members: the number of frames (`len`), the scorer's rows (`scores`),
+and the tokens at some (frame, patch) pairs (`gather`). A memory cannot tell them apart.
 """
 
 import ast
@@ -23,15 +22,14 @@ from mme_vla.types import FrameBatch
 
 @dataclass(frozen=True)
 class StorageSpec:
-    """What a memory wants kept of every frame. It is data, so that a cache can be named after it.
+    """What is stored of each frame for a memory. It is data, so that a cache can be named after it.
 
-    grid: side of the pooled token grid (a view's tokens are pooled to grid×grid before they are
-    stored); it divides the
-        backbone's (`check_grid`).
+    grid: side of the pooled token grid: a view's tokens are pooled to grid×grid before they are
+        stored. It divides the backbone's (`check_grid`).
     pooling: `mean` (as released) or `max` (paper, section 4.2).
     keep_every: frame 0 and frames k·keep_every − 1 are kept; 1 keeps all. Others are never encoded.
     scorer: key of the frame scorer whose rows are stored beside the tokens (`FrameScorer.key`);
-    empty for none.
+        empty for none.
     """
 
     grid: int
@@ -43,9 +41,9 @@ class StorageSpec:
         check_sizes("memory", grid=self.grid)
         check_choice("memory.pooling", self.pooling, ("mean", "max"))
         every = self.keep_every
-        whole = isinstance(every, int) and every >= 1
+        is_whole = isinstance(every, int) and every >= 1
         require(
-            whole,
+            is_whole,
             f"memory: keeping every {every}th frame is not possible: give a whole number, at"
             " least 1.",
         )
@@ -81,14 +79,14 @@ class FrameScorer:
         """A hash of the code of the class and its bases, without comments, docstrings and helper
         functions.
         """
+        classes = cls.__mro__[: cls.__mro__.index(FrameScorer)]
         code = []
-        for part in cls.__mro__[: cls.__mro__.index(FrameScorer)]:
-            tree = ast.parse(textwrap.dedent(inspect.getsource(part)))
+        for scorer in classes:
+            tree = ast.parse(textwrap.dedent(inspect.getsource(scorer)))
             for node in ast.walk(tree):
-                if (
-                    isinstance(node, ast.FunctionDef | ast.ClassDef)
-                    and ast.get_docstring(node) is not None
-                ):
+                if not isinstance(node, ast.FunctionDef | ast.ClassDef):
+                    continue
+                if ast.get_docstring(node) is not None:
                     node.body = node.body[1:] or [ast.Pass()]
             code.append(ast.unparse(tree))
         return hashlib.sha256("\n".join(code).encode()).hexdigest()[:8]
@@ -102,9 +100,15 @@ class FrameScorer:
         digest = self.digest()
         if digest in FORMER_KEYS:
             return FORMER_KEYS[digest].format(**options)
-        return "-".join(
-            [type(self).__name__.lower(), *(f"{k}{v}" for k, v in options.items()), digest]
-        )
+        settings = [f"{name}{value}" for name, value in options.items()]
+        return "-".join([type(self).__name__.lower(), *settings, digest])
+
+    def frames_scored(self, length: int) -> np.ndarray:
+        """Which of the first `length` frames the scorer needs, ascending; by default all.
+
+        Frames that are neither scored nor stored are not rendered.
+        """
+        return np.arange(length)
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
         """Take one RGB frame [H, W, 3] uint8 of the memory view; return a score per patch [grid²]
@@ -115,7 +119,7 @@ class FrameScorer:
 
 @dataclass
 class FrameScores:
-    """Rows a scorer gave: `frames` [m] ascending, `values` [m, patches] float32."""
+    """Rows that a scorer returned: `frames` [m] ascending, `values` [m, patches] float32."""
 
     frames: np.ndarray
     values: np.ndarray
@@ -134,8 +138,8 @@ class History:
     """One episode's stored tokens. `exec_start` is the index of the first execution frame (0
     without a video).
 
-    `motion` gives what the robot felt and did at frames [n], [n, w] float32, normalised, the first
-    `state_width` of them its state; both are there for a `ProprioMemory`.
+    motion: proprioception and actions at frames [n], normalised: [n, w] float32, the first
+        `state_width` numbers the robot's state. Set for memories that declare `uses_proprio`.
     """
 
     motion: Callable[[np.ndarray], Tensor] | None = None
@@ -148,7 +152,7 @@ class History:
         self.exec_start = exec_start
 
     def __len__(self) -> int:
-        """Number of frames seen, kept or not."""
+        """Number of frames observed, kept or not."""
         raise NotImplementedError
 
     @property
@@ -173,7 +177,8 @@ class History:
         before them.
         """
         starts = np.array(self.clock_starts)
-        times: np.ndarray = frames - starts[np.searchsorted(starts, frames, side="right") - 1]
+        restart = np.searchsorted(starts, frames, side="right") - 1
+        times: np.ndarray = frames - starts[restart]
         return times
 
     def timed(self, indices: np.ndarray) -> np.ndarray:
@@ -181,13 +186,17 @@ class History:
         return np.stack([self.times(indices[:, 0]), indices[:, 1]], axis=1)
 
     def stored(self, indices: np.ndarray) -> Tensor:
-        """`gather` without what a prompt does to tokens: what a selection may look at, in training
-        as in episodes.
+        """`gather` without the prompt's conditioning: what `select` may read, in training as in
+        episodes.
         """
         return self.gather(indices)
 
     def motion_rows(self, frames: np.ndarray) -> Tensor:
-        """What the robot felt and did at frames [n]: [n, w] float32."""
+        """Proprioception and actions at frames [n]: [n, w] float32, normalised.
+
+        Raises:
+            UserError: the history has none.
+        """
         if self.motion is None:
             raise UserError(
                 "This memory reads the robot's own states and actions, and this history has none of"
@@ -200,20 +209,27 @@ class History:
         return self.motion_rows(frames)[:, : self.state_width]
 
     def _row_of(self, frames: np.ndarray, stored: np.ndarray) -> np.ndarray:
-        rows = np.minimum(np.searchsorted(stored, frames), max(len(stored) - 1, 0))
-        if len(frames) and (len(stored) == 0 or (stored[rows] != frames).any()):
-            lost = sorted(set(np.asarray(frames).tolist()) - set(stored.tolist()))
+        """Rows of frames [n] among the stored ones [m].
+
+        Raises:
+            UserError: one of them is not stored.
+        """
+        rows = np.searchsorted(stored, frames)
+        # Frames later than all stored ones have a row behind the last, whose frame is −1.
+        is_missing = np.append(stored, -1)[rows] != frames
+        if is_missing.any():
+            missing = np.unique(frames[is_missing])
             raise UserError(
-                f"The history holds no tokens of frames {lost[:5]}: it has seen {len(self)} frames"
-                f" and keeps frame 0 and every {self.spec.keep_every}th, as far as they were"
-                " rendered. The memory selects frames that its StorageSpec does not keep, or that"
-                " its `frames_read` does not name, which are not rendered."
+                f"The history holds no tokens of frames {missing[:5].tolist()}: it has seen"
+                f" {len(self)} frames and keeps frame 0 and every {self.spec.keep_every}th, as far"
+                " as they were rendered. The memory selects frames that its StorageSpec does not"
+                " keep, or that its `frames_read` does not name, which are not rendered."
             )
         return rows
 
 
 class CachedHistory(History):
-    """Tokens read from disk: only the rows a selection names are touched.
+    """Tokens read from disk: only the rows that a selection names are read.
 
     tokens: array-like [kept, patches, d_vision] (usually a memory map); bfloat16 is stored as its
     uint16 bits.
@@ -229,8 +245,10 @@ class CachedHistory(History):
         exec_start: int = 0,
     ) -> None:
         super().__init__(spec, exec_start)
-        self._tokens, self._stored_frames, self._length = tokens, stored_frames, length
-        self._scores = scores if scores is not None else FrameScores.empty(spec.grid**2)
+        self._tokens = tokens
+        self._stored_frames = stored_frames
+        self._length = length
+        self._scores = FrameScores.empty(spec.grid**2) if scores is None else scores
 
     def __len__(self) -> int:
         return self._length
@@ -245,8 +263,10 @@ class CachedHistory(History):
 
     def gather(self, indices: np.ndarray) -> Tensor:
         rows = self._row_of(indices[:, 0], self._stored_frames)
-        picked = torch.from_numpy(np.ascontiguousarray(self._tokens[rows, indices[:, 1]]))
-        return picked.view(torch.bfloat16) if picked.dtype == torch.uint16 else picked
+        tokens = torch.from_numpy(np.ascontiguousarray(self._tokens[rows, indices[:, 1]]))
+        if tokens.dtype == torch.uint16:
+            return tokens.view(torch.bfloat16)
+        return tokens
 
 
 class OnlineHistory(History):
@@ -264,14 +284,15 @@ class OnlineHistory(History):
         self._stored_frames: list[int] = []
         self._tokens: Tensor | None = None
         self._scores = FrameScores.empty(spec.grid**2)
-        self._scored = 0  # rows in use
+        self._n_scores = 0  # rows in use
 
     def __len__(self) -> int:
         return self._length
 
     @property
     def scores(self) -> FrameScores:
-        return FrameScores(self._scores.frames[: self._scored], self._scores.values[: self._scored])
+        count = self._n_scores
+        return FrameScores(self._scores.frames[:count], self._scores.values[:count])
 
     @property
     def stored_frames(self) -> np.ndarray:
@@ -284,8 +305,10 @@ class OnlineHistory(History):
             rendered: offsets of those that have an image; by default all.
         """
         stored = self.spec.stored_frames(self._length + count)
-        stored = stored[stored >= self._length] - self._length
-        return stored if rendered is None else np.intersect1d(stored, rendered)
+        offsets = stored[stored >= self._length] - self._length
+        if rendered is None:
+            return offsets
+        return np.intersect1d(offsets, rendered)
 
     def append(
         self,
@@ -302,33 +325,35 @@ class OnlineHistory(History):
             rendered: offsets [n] of the images among the frames, of which there are `count`; by
                 default they are all.
         """
-        count = len(frames) if count is None else count
-        offsets, numbers = (
-            self.to_encode(count, rendered),
-            np.arange(count) if rendered is None else rendered,
-        )
+        if count is None:
+            count = len(frames)
+        offsets = self.to_encode(count, rendered)
         if len(tokens) != len(offsets):
             raise ValueError(
                 f"append() got tokens of {len(tokens)} frames, expected {len(offsets)}: see"
                 " to_encode()."
             )
-        self._score(frames, numbers)
+        self._score(frames, np.arange(count) if rendered is None else rendered)
         if len(tokens):
-            self._grow(len(self._stored_frames) + len(tokens), tokens)
+            start = len(self._stored_frames)
+            stop = start + len(tokens)
+            self._grow(stop, tokens)
             assert self._tokens is not None
-            self._tokens[len(self._stored_frames) : len(self._stored_frames) + len(tokens)] = tokens
+            self._tokens[start:stop] = tokens
             self._stored_frames.extend((offsets + self._length).tolist())
         self._length += count
 
-    def _note_score(self, frame: int, values: np.ndarray) -> None:
-        if self._scored == len(self._scores.frames):
-            more = max(self._scored, 16)
+    def _add_score(self, frame: int, values: np.ndarray) -> None:
+        row = self._n_scores
+        if row == len(self._scores.frames):
+            more = max(row, 16)
             self._scores = FrameScores(
                 np.concatenate([self._scores.frames, np.zeros(more, np.int64)]),
                 np.concatenate([self._scores.values, np.zeros((more, len(values)), np.float32)]),
             )
-        self._scores.frames[self._scored], self._scores.values[self._scored] = frame, values
-        self._scored += 1
+        self._scores.frames[row] = frame
+        self._scores.values[row] = values
+        self._n_scores += 1
 
     def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
         """Add frames in order, through `encode`: images [n, H, W, 3] → tokens [n, patches,
@@ -337,32 +362,36 @@ class OnlineHistory(History):
         stored = frames.select(self.to_encode(frames.length, frames.index))
         self.append(frames.images, encode(stored), frames.index, frames.length)
 
-    def _score(self, frames: Sequence[np.ndarray] | np.ndarray, numbers: np.ndarray) -> None:
-        """Show the scorer the next frames that have an image; `numbers` says which they are."""
+    def _score(self, frames: Sequence[np.ndarray] | np.ndarray, offsets: np.ndarray) -> None:
+        """Score the next frames that have an image.
+
+        Args:
+            frames: images [n, H, W, 3] uint8. offsets: their offsets [n] from the next frame.
+        """
         if self._scorer is None:
             return
-        numbered = zip((numbers + self._length).tolist(), frames, strict=True)
-        for number, frame in numbered:
-            if (values := self._scorer(number, frame)) is not None:
-                self._note_score(number, values)
+        for frame, image in zip((offsets + self._length).tolist(), frames, strict=True):
+            values = self._scorer(frame, image)
+            if values is not None:
+                self._add_score(frame, values)
 
     def _grow(self, needed: int, like: Tensor) -> None:
         capacity = 0 if self._tokens is None else len(self._tokens)
         if needed <= capacity:
             return
-        grown = like.new_empty((max(needed, 2 * capacity, 16), *like.shape[1:]))
+        larger = like.new_empty((max(needed, 2 * capacity, 16), *like.shape[1:]))
         if self._tokens is not None:
-            grown[: len(self._stored_frames)] = self._tokens[: len(self._stored_frames)]
-        self._tokens = grown
+            used = len(self._stored_frames)
+            larger[:used] = self._tokens[:used]
+        self._tokens = larger
 
     def gather(self, indices: np.ndarray) -> Tensor:
         if self._tokens is None:
             raise UserError("The history is empty: observe at least one frame before acting.")
-        rows = self._row_of(indices[:, 0], np.asarray(self._stored_frames, np.int64))
         device = self._tokens.device
-        return self._tokens[
-            torch.as_tensor(rows, device=device), torch.as_tensor(indices[:, 1], device=device)
-        ]
+        rows = torch.as_tensor(self._row_of(indices[:, 0], self.stored_frames), device=device)
+        patches = torch.as_tensor(indices[:, 1], device=device)
+        return self._tokens[rows, patches]
 
 
 class PromptConditionedHistory(History):
@@ -372,8 +401,10 @@ class PromptConditionedHistory(History):
 
     def __init__(self, source: History, condition: Callable[[Tensor], Tensor]) -> None:
         super().__init__(source.spec, source.exec_start)
-        self._source, self._condition = source, condition
-        self.motion, self.state_width = source.motion, source.state_width
+        self._source = source
+        self._condition = condition
+        self.motion = source.motion
+        self.state_width = source.state_width
         self.clock_starts = source.clock_starts
 
     def __len__(self) -> int:
@@ -395,7 +426,8 @@ class PromptConditionedHistory(History):
 
 
 class LazyHistory(OnlineHistory):
-    """Frames wait as images in the CPU's memory; their tokens stay on the device that encoded them.
+    """Frames are kept as images in the CPU's memory until they are read. Their tokens stay on the
+    device that encoded them.
 
     A recurrent memory reads one frame in sixteen: the vision tower then runs sixteen times less. An
     image of 256×256 takes 192 KiB, less than its 8×8 tokens at full width would on the GPU.
@@ -419,14 +451,12 @@ class LazyHistory(OnlineHistory):
     def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
         """Add frames in order, without encoding any."""
         offsets = self.to_encode(frames.length, frames.index)
-        # Copies: a view would keep the whole message alive that a frame came in.
-        new = {
-            int(frame): image.copy()
-            for frame, image in zip(offsets + self._length, frames.select(offsets), strict=True)
-        }
+        images = frames.select(offsets)
         self._score(frames.images, frames.index)
-        self._waiting |= new
-        self._stored_frames += new
+        for frame, image in zip((offsets + self._length).tolist(), images, strict=True):
+            # A copy: a view would keep the whole message alive that a frame came in.
+            self._waiting[frame] = image.copy()
+            self._stored_frames.append(frame)
         self._length += frames.length
 
     def append(
@@ -443,16 +473,17 @@ class LazyHistory(OnlineHistory):
         """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch), encoding the frames
         that wait.
         """
-        frames, rows = np.unique(indices[:, 0], return_inverse=True)
-        self._row_of(
-            frames, np.asarray(self._stored_frames, np.int64)
-        )  # says which frames are missing
-        new = [int(frame) for frame in frames if int(frame) in self._waiting]
-        if new:
-            tokens = self._encode(np.stack([self._waiting[frame] for frame in new]))
-            for frame, row in zip(new, tokens, strict=True):
+        unique_frames, rows = np.unique(indices[:, 0], return_inverse=True)
+        self._row_of(unique_frames, self.stored_frames)  # raises if one is missing
+        frames = unique_frames.tolist()
+        waiting = [frame for frame in frames if frame in self._waiting]
+        if waiting:
+            tokens = self._encode(np.stack([self._waiting[frame] for frame in waiting]))
+            for frame, row in zip(waiting, tokens, strict=True):
                 self._encoded[frame] = row
                 del self._waiting[frame]
-        read = torch.stack([self._encoded[int(frame)] for frame in frames])
-        places = (torch.as_tensor(part, device=read.device) for part in (rows, indices[:, 1]))
-        return read[tuple(places)]
+        encoded = torch.stack([self._encoded[frame] for frame in frames])
+        device = encoded.device
+        return encoded[
+            torch.as_tensor(rows, device=device), torch.as_tensor(indices[:, 1], device=device)
+        ]

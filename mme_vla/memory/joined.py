@@ -1,6 +1,4 @@
-"""Several memories under one budget, side by side: their tokens stand one after the other (beyond
-the paper).
-"""
+"""Several memories under one budget: their tokens follow one another (beyond the paper)."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -14,20 +12,10 @@ from torch import Tensor, nn
 from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import (
     NEVER,
-    CompilableMemory,
     MemoryModule,
-    PastViewMemory,
     PastViewSpec,
-    ProprioMemory,
-    ScoringMemory,
-    StreamingMemory,
-    encode_histories,
-    frames_scored,
-    make_scorer,
-    past_view_spec,
-    start_stream,
+    pad_selection,
     union_frames,
-    uses_proprio,
 )
 from mme_vla.memory.history import FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
@@ -37,23 +25,16 @@ SHARE_UNIT = 16  # shares are multiples of it, so that they hold whole frames of
 
 
 @MEMORIES.register("joined")
-class JoinedMemory(
-    MemoryModule,
-    StreamingMemory,
-    ScoringMemory,
-    ProprioMemory,
-    PastViewMemory,
-    CompilableMemory,
-    ReadsLabels,
-):
+class JoinedMemory(MemoryModule, ReadsLabels):
     """Each member selects and encodes as if it were alone, within its share of the budget.
 
-    The history keeps what serves all of them: a grid of which all of theirs are pooled when they
-    are read (exact but for the rounding of what is stored), and every frame that anyone keeps.
+    The history stores what serves all of them: a grid of which all of theirs are pooled when they
+    are read (exact but for the rounding of what is stored), and every frame that a member keeps.
 
-    Selections lie one after the other in `HistoryTokens`, each padded as its member pads. One
-    member's may vary in length, and comes first, where batches pad the shorter ones; all others are
-    padded to their capacity.
+    Selections follow one another in `HistoryTokens`, each padded as its member pads. The length of
+    the first may vary: batches pad the shorter ones. All others are padded to their capacity, so
+    that `capacity` is the sum of the members'. `select` returns more rows than that where a member
+    reads a coarser grid than is stored.
     """
 
     def __init__(
@@ -79,119 +60,118 @@ class JoinedMemory(
         self.members = nn.ModuleList(built)
         names = [section["name"] for section in sections]
         # Equal names get a number.
-        self.names = [
-            f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)
-        ]
+        self.names = []
+        for i, name in enumerate(names):
+            count = names[: i + 1].count(name)
+            self.names.append(name if count == 1 else f"{name}_{count}")
         self.storage = common_storage(
-            dict(zip(self.names, [member.storage for member in built], strict=True))
+            {name: member.storage for name, member in zip(self.names, built, strict=True)}
         )
         self.budget = sum(member.budget for member in built)
-        self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
-        self.pad_left = any(member.pad_left for member in built)
+        self.capacity = sum(member.capacity for member in built)
+        self.pad_left = self.capacity if any(member.pad_left for member in built) else 0
         self.timed = all(member.timed for member in built)
-        self.uses_proprio = any(uses_proprio(member) for member in built)
+        self.uses_proprio = any(member.uses_proprio for member in built)
         self.reads_labels = labels_read(*built)
         self.lazy = all(member.lazy for member in built)
         self.past_view_spec = single_past_view_spec(
-            {n: past_view_spec(m) for n, m in zip(self.names, built, strict=True)}
+            {name: member.past_view_spec for name, member in zip(self.names, built, strict=True)}
         )
-        # Indices of the members in the order in which their selections lie.
+        # Indices of the members in the order in which their selections follow one another.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
-
-    def compile(self, **options: Any) -> None:
-        for member in self.memories:
-            if isinstance(member, CompilableMemory):
-                member.compile(**options)
 
     def select(
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
-        """What any member remembers, as the stored tokens it is made of."""
-        indices = [
-            finer(member.select(view, step, rng), member.storage.grid, self.storage.grid)
-            for member, view in zip(self.memories, self._views(history), strict=True)
-        ]
-        return np.unique(np.concatenate(indices), axis=0)
+        """What all members select, as the stored tokens of which theirs are pooled."""
+        selections = []
+        for member, view in zip(self.memories, self._views(history), strict=True):
+            indices = member.select(view, step, rng)
+            selections.append(finer(indices, member.storage.grid, self.storage.grid))
+        return np.unique(np.concatenate(selections), axis=0)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return union_frames([member.frames_read(steps, exec_start) for member in self.memories])
 
-    def frames_scored(self, length: int) -> np.ndarray:
-        return union_frames([frames_scored(member, length) for member in self.memories])
-
     def make_scorer(self) -> FrameScorer | None:
         for member in self.memories:
-            scorer = make_scorer(member)
+            scorer = member.make_scorer()
             if scorer is not None:
                 return _Upsampled(scorer, member.storage.grid, self.storage.grid)
         return None
 
-    def padded_length(self, count: int) -> int:
-        first, *others = (self.memories[i] for i in self._order)
-        return first.padded_length(min(count, first.capacity)) + sum(
-            member.capacity for member in others
-        )
-
     def gather_selection(
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> HistoryTokens:
-        memories, views = self.memories, self._views(history)
-        parts = []
-        for place, i in enumerate(self._order):
+        memories = self.memories
+        views = self._views(history)
+        first, *others = self._order
+        parts = [memories[first].gather_selection(views[first], step, rng)]
+        for i in others:
             part = memories[i].gather_selection(views[i], step, rng)
-            parts.append(_padded(part, memories[i]) if place else part)
-        features, positions, mask = (
-            torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS
+            parts.append(pad_selection(part, memories[i].capacity, bool(memories[i].pad_left)))
+        return HistoryTokens(
+            features=torch.cat([part.features for part in parts]),
+            positions=torch.cat([part.positions for part in parts]),
+            mask=torch.cat([part.mask for part in parts]),
+            step=parts[0].step,
         )
-        return HistoryTokens(features, positions, mask, parts[0].step)
 
     def condition_on_prompt(
         self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
     ) -> HistoryTokens:
-        parts = [
-            self.memories[i].condition_on_prompt(piece, condition)
-            for i, piece in self._pieces(history)
-        ]
-        return replace(history, features=torch.cat([part.features for part in parts], 1))
+        features = []
+        for i, selection in self._split(history):
+            features.append(self.memories[i].condition_on_prompt(selection, condition).features)
+        return replace(history, features=torch.cat(features, 1))
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         memories = self.memories
         outputs: dict[int, MemoryTokens] = {}
-        for i, piece in self._pieces(history):
+        for i, selection in self._split(history):
             memories[i].reporting = self.reporting
-            outputs[i] = memories[i](piece)
-        return self._joined([outputs[i] for i in range(len(memories))])
+            outputs[i] = memories[i](selection)
+        return self._join([outputs[i] for i in range(len(memories))])
 
-    def _pieces(self, history: HistoryTokens) -> list[tuple[int, HistoryTokens]]:
-        """Each member's number and selection, in the order in which they lie."""
-        fixed = [self.memories[i].capacity for i in self._order[1:]]
-        lengths = [history.mask.shape[1] - sum(fixed), *fixed]
-        pieces = zip(*(getattr(history, name).split(lengths, 1) for name in _FIELDS), strict=True)
-        labels = [Labels() for _ in self._order]
-        for name, values in history.labels.items():
-            for piece, part in zip(labels, values.split(lengths, 1), strict=True):
-                piece[name] = part
-        return [
-            (i, HistoryTokens(f, p, m, history.step, of))
-            for i, (f, p, m), of in zip(self._order, pieces, labels, strict=True)
-        ]
+    def _split(self, history: HistoryTokens) -> list[tuple[int, HistoryTokens]]:
+        """Each member's index and selection, in the order in which they follow one another."""
+        first, *others = self._order
+        lengths = {i: self.memories[i].capacity for i in others}
+        lengths[first] = history.mask.shape[1] - sum(lengths.values())
+        selections = []
+        start = 0
+        for i in self._order:
+            stop = start + lengths[i]
+            selection = HistoryTokens(
+                features=history.features[:, start:stop],
+                positions=history.positions[:, start:stop],
+                mask=history.mask[:, start:stop],
+                step=history.step,
+                labels=Labels({k: values[:, start:stop] for k, values in history.labels.items()}),
+            )
+            selections.append((i, selection))
+            start = stop
+        return selections
 
     def start_stream(self) -> tuple[Any, ...]:
-        return tuple(start_stream(member) for member in self.memories)
+        return tuple(member.start_stream() for member in self.memories)
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         views = [self._views(history) for history in histories]
-        return self._joined([
-            encode_histories(member, [view[i] for view in views], [stream[i] for stream in streams])
-            for i, member in enumerate(self.memories)
-        ])  # fmt: skip
+        outputs = []
+        for i, member in enumerate(self.memories):
+            member_histories = [view[i] for view in views]
+            member_streams = [stream[i] for stream in streams]
+            outputs.append(member.encode(member_histories, member_streams))
+        return self._join(outputs)
 
     def prepare(self, history: History, stream: Any) -> bool:
+        is_left = False
         members = zip(self.memories, self._views(history), stream, strict=True)
-        left = [
-            m.prepare(view, piece) for m, view, piece in members if isinstance(m, StreamingMemory)
-        ]
-        return any(left)
+        for member, view, member_stream in members:
+            if member.prepare(view, member_stream):
+                is_left = True
+        return is_left
 
     @property
     def memories(self) -> list[MemoryModule]:
@@ -201,73 +181,81 @@ class JoinedMemory(
     def _views(self, history: History) -> list[History]:
         return [CoarserHistory(history, member.storage) for member in self.memories]
 
-    def _joined(self, outputs: Sequence[MemoryTokens]) -> MemoryTokens:
-        pairs = list(zip(self.names, outputs, strict=True))
-        metrics = {
-            f"{name}/{key}": value for name, of in pairs for key, value in of.metrics.items()
-        }
-        losses = {f"{name}/{key}": value for name, of in pairs for key, value in of.losses.items()}
-        member_ages = [f.ages for f in outputs if f.ages is not None]
-        ages = torch.cat(member_ages, 1) if len(member_ages) == len(outputs) else None
-        tokens, mask = (
-            torch.cat([f.tokens for f in outputs], 1),
-            torch.cat([f.mask for f in outputs], 1),
-        )
+    def _join(self, outputs: Sequence[MemoryTokens]) -> MemoryTokens:
+        """The members' tokens, one after the other; their metrics and losses under their names."""
+        metrics: dict[str, Tensor] = {}
+        losses: dict[str, Tensor] = {}
+        for name, output in zip(self.names, outputs, strict=True):
+            metrics |= {f"{name}/{key}": value for key, value in output.metrics.items()}
+            losses |= {f"{name}/{key}": value for key, value in output.losses.items()}
+        ages = None
+        member_ages = [output.ages for output in outputs if output.ages is not None]
+        if len(member_ages) == len(outputs):
+            ages = torch.cat(member_ages, 1)
+        tokens = torch.cat([output.tokens for output in outputs], 1)
+        mask = torch.cat([output.mask for output in outputs], 1)
         return MemoryTokens(tokens, mask, metrics, ages, losses)
 
 
-_FIELDS = ("features", "positions", "mask")
-
-
 class CoarserHistory(History):
-    """A history as a memory sees it that wants a coarser grid than is stored."""
+    """A history as a member reads it that needs a coarser grid than is stored."""
 
-    def __init__(self, stored: History, spec: StorageSpec) -> None:
-        super().__init__(spec, stored.exec_start)
-        self._stored, self.motion, self.state_width = stored, stored.motion, stored.state_width
-        self.clock_starts = stored.clock_starts
+    def __init__(self, source: History, spec: StorageSpec) -> None:
+        super().__init__(spec, source.exec_start)
+        self._source = source
+        self.motion = source.motion
+        self.state_width = source.state_width
+        self.clock_starts = source.clock_starts
 
     def __len__(self) -> int:
-        return len(self._stored)
+        return len(self._source)
 
     @property
     def scores(self) -> FrameScores:
-        scores, grid, fine = self._stored.scores, self.spec.grid, self._stored.spec.grid
-        rows = scores.values.reshape(-1, fine, fine)[:, :: fine // grid, :: fine // grid]
+        scores = self._source.scores
+        grid, fine = self.spec.grid, self._source.spec.grid
+        every = fine // grid
+        rows = scores.values.reshape(-1, fine, fine)[:, ::every, ::every]
         return FrameScores(scores.frames, rows.reshape(-1, grid**2))
 
     @property
     def stored_frames(self) -> np.ndarray:
-        return self._stored.stored_frames
+        return self._source.stored_frames
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        return self._pooled(indices, self._stored.gather)
+        return self._pooled(indices, self._source.gather)
 
     def stored(self, indices: np.ndarray) -> Tensor:
-        return self._pooled(indices, self._stored.stored)
+        return self._pooled(indices, self._source.stored)
 
     def _pooled(self, indices: np.ndarray, gather: Callable[[np.ndarray], Tensor]) -> Tensor:
-        parts = (self._stored.spec.grid // self.spec.grid) ** 2
-        pooled = gather(finer(indices, self.spec.grid, self._stored.spec.grid))
+        fine = self._source.spec.grid
+        tokens = gather(finer(indices, self.spec.grid, fine))
+        parts = (fine // self.spec.grid) ** 2
         if parts == 1:
-            return pooled
-        cells = pooled.unflatten(0, (-1, parts)).float()
-        return (cells.mean(1) if self.spec.pooling == "mean" else cells.amax(1)).to(pooled.dtype)
+            return tokens
+        cells = tokens.unflatten(0, (-1, parts)).float()
+        pooled = cells.mean(1) if self.spec.pooling == "mean" else cells.amax(1)
+        return pooled.to(tokens.dtype)
 
 
 class _Upsampled(FrameScorer):
-    """A member's scorer, its rows spread over the finer grid that is stored."""
+    """A member's scorer, its rows expanded to the finer grid that is stored."""
 
     def __init__(self, scorer: FrameScorer, grid: int, fine: int) -> None:
-        self._scorer, self._grid, self._times = scorer, grid, fine // grid
+        self._scorer = scorer
+        self._grid = grid
+        self._times = fine // grid
+
+    def frames_scored(self, length: int) -> np.ndarray:
+        return self._scorer.frames_scored(length)
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
         row = self._scorer(frame_index, frame)
         if row is None:
             return None
-        return np.kron(
-            row.reshape(self._grid, self._grid), np.ones((self._times, self._times), row.dtype)
-        ).reshape(-1)
+        cells = row.reshape(self._grid, self._grid)
+        return np.kron(cells, np.ones((self._times, self._times), row.dtype)).reshape(-1)
 
 
 def finer(indices: np.ndarray, grid: int, fine: int) -> np.ndarray:
@@ -277,8 +265,9 @@ def finer(indices: np.ndarray, grid: int, fine: int) -> np.ndarray:
     times = fine // grid
     row, column = np.divmod(indices[:, 1], grid)
     inside = np.arange(times)
-    rows = (row[:, None] * times + inside)[:, :, None]
-    patches = rows * fine + (column[:, None] * times + inside)[:, None, :]
+    rows = row[:, None] * times + inside  # n k
+    columns = column[:, None] * times + inside
+    patches = rows[:, :, None] * fine + columns[:, None, :]  # n k k
     return np.stack([np.repeat(indices[:, 0], times**2), patches.reshape(-1)], axis=1)
 
 
@@ -288,40 +277,47 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict
         not isinstance(members, str | Mapping) and len(members) >= 2,
         f"memory.members={brief(members)}: name at least two, such as [framesamp, ttt].",
     )
-    sections: list[dict[str, Any]] = [
-        dict(m) if isinstance(m, Mapping) else {"name": m} for m in members
-    ]
-    for section in sections:
+    sections: list[dict[str, Any]] = []
+    for member in members:
+        section: dict[str, Any] = {"name": member}
+        if isinstance(member, Mapping):
+            section = dict(member)
         require(
             isinstance(section.get("name"), str) and section["name"] != "joined",
             f"memory.members: {brief(section)} is no memory to join; give a name, or {{name: …}}.",
         )
+        sections.append(section)
+    open_sections = [section for section in sections if section.get("budget") is None]
     taken = sum(section.get("budget") or 0 for section in sections)
-    open_ones = [section for section in sections if section.get("budget") is None]
-    share = (budget - taken) // max(len(open_ones), 1)
-    share -= share % SHARE_UNIT if share >= SHARE_UNIT else 0
-    if taken > budget or (open_ones and share < 1):
-        requested = ", ".join(f"{s['name']} {s.get('budget') or 'an even share'}" for s in sections)
+    share = (budget - taken) // max(len(open_sections), 1)
+    if share >= SHARE_UNIT:
+        share -= share % SHARE_UNIT
+    if taken > budget or (open_sections and share < 1):
+        requests = [f"{s['name']} {s.get('budget') or 'an even share'}" for s in sections]
         raise UserError(
-            f"memory.budget={budget} is less than its members use ({requested}): lower their"
-            " budgets, or raise it."
+            f"memory.budget={budget} is less than its members use ({', '.join(requests)}): lower"
+            " their budgets, or raise it."
         )
-    return [
-        {**section, "budget": share} if section in open_ones else section for section in sections
-    ]
+    for section in open_sections:
+        section["budget"] = share
+    return sections
 
 
 def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
-    """What has to be stored so that every one of these memories finds what it wants; some store
-    nothing.
+    """What has to be stored so that each of these memories finds what it reads; some store nothing.
+
+    Raises:
+        UserError: they pool in different ways, or score frames differently.
     """
-    stored = {name: spec for name, spec in specs.items() if spec.keep_every != NEVER} or dict(specs)
-    (first, one), *_ = stored.items()
+    stored = {name: spec for name, spec in specs.items() if spec.keep_every != NEVER}
+    if not stored:
+        stored = dict(specs)
+    first_name, first = next(iter(stored.items()))
     for name, other in stored.items():
         require(
-            other.pooling == one.pooling,
-            f"{first} stores {one} and {name} {other}: one history pools in one way. Set the same "
-            f"pooling for both, such as {{name: {name}, pooling: {one.pooling}}}.",
+            other.pooling == first.pooling,
+            f"{first_name} stores {first} and {name} {other}: one history pools in one way. Set the"
+            f" same pooling for both, such as {{name: {name}, pooling: {first.pooling}}}.",
         )
     scorers = {name: spec.scorer for name, spec in stored.items() if spec.scorer}
     if len(set(scorers.values())) > 1:
@@ -330,25 +326,19 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
             " one history keeps one set of scores: set the same grid and stride for both, or join"
             " only one of them."
         )
-    grid = math.lcm(*(spec.grid for spec in stored.values()))
-    every = math.gcd(*(spec.keep_every for spec in stored.values()))
-    return StorageSpec(grid, one.pooling, every, next(iter(scorers.values()), ""))
+    return StorageSpec(
+        grid=math.lcm(*(spec.grid for spec in stored.values())),
+        pooling=first.pooling,
+        keep_every=math.gcd(*(spec.keep_every for spec in stored.values())),
+        scorer=next(iter(scorers.values()), ""),
+    )
 
 
 def single_past_view_spec(specs: Mapping[str, PastViewSpec | None]) -> PastViewSpec | None:
-    """What the one member gives that looks back; None where none does."""
+    """The past views of the one member that has any; None where none has."""
     defined = {name: spec for name, spec in specs.items() if spec is not None}
     require(
         len(defined) <= 1,
         f"{' and '.join(defined)} each give the vision tower past views: join only one of them.",
     )
     return next(iter(defined.values()), None)
-
-
-def _padded(part: HistoryTokens, member: MemoryModule) -> HistoryTokens:
-    """A selection at its member's capacity."""
-    missing = member.capacity - len(part.mask)
-    ends = (missing, 0) if member.pad_left else (0, missing)
-    pad = nn.functional.pad
-    features, positions = pad(part.features, (0, 0, *ends)), pad(part.positions, (0, 0, *ends))
-    return HistoryTokens(features, positions, pad(part.mask, ends), part.step)

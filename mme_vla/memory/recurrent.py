@@ -1,15 +1,16 @@
 """Base of the recurrent memories: frames update a small state, and the state is read as memory
 tokens.
 
-Two forms of the same computation: `forward` runs a full window, for training; `init_state`,
-`update` and `read` take it frame by frame, which `encode` uses while an episode's frame list grows.
+There are two forms of the same computation. `forward` runs a full window, for training.
+`init_state`, `update` and `read` run frame by frame: `encode` uses them while an episode's frame
+list grows.
 """
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,12 +20,10 @@ from torch.utils.checkpoint import checkpoint
 from mme_vla.config.devices import float32_products
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import (
-    CompilableMemory,
     FeatureEncoder,
-    MatmulPrecision,
     MemoryModule,
-    StreamingMemory,
     all_patches,
+    take_options,
     token_positions,
     union_frames,
 )
@@ -60,10 +59,12 @@ def recurrent_frames(
         int64 [n].
     """
     frames = np.union1d([0], np.arange(every - 1, step + 1, every))
-    last, apart = len(frames) - 1, stride // every
+    spacing = stride // every
+    last = len(frames) - 1
     start = min(int(np.searchsorted(frames, exec_start)), last)
-    execution = np.arange(start + (last - start) % apart, last + 1, apart)
-    past = frames[np.concatenate([video_frames(start, max_video, apart), execution])]
+    video = video_frames(start, max_video, spacing)
+    execution = np.arange(start + (last - start) % spacing, last + 1, spacing)
+    past = frames[np.concatenate([video, execution])]
     return np.union1d(past, [step])[-max_steps:]
 
 
@@ -96,9 +97,47 @@ def jittered(
     """
     past, step = frames[:-1], frames[-1]
     shifted = past + rng.integers(-jitter, jitter + 1, len(past))
-    video = past < exec_start
-    low, high = np.where(video, 0, exec_start), np.where(video, min(exec_start, step) - 1, step - 1)
-    return np.append(np.unique(np.clip(shifted, low, high)), step)
+    is_video = past < exec_start
+    lowest = np.where(is_video, 0, exec_start)
+    highest = np.where(is_video, min(exec_start, step) - 1, step - 1)
+    return np.append(np.unique(np.clip(shifted, lowest, highest)), step)
+
+
+@dataclass(frozen=True)
+class FrameSchedule:
+    """Options of a recurrent memory: which frames it reads.
+
+    max_steps, max_video, stride, every: see `recurrent_frames`.
+    jitter: in training, past frames move at random by up to this many frames, if the data hand over
+        randomness (`data.jitter`).
+    """
+
+    max_steps: int = 64
+    max_video: int = 40
+    stride: int = 16
+    every: int = 1
+    jitter: int = 0
+
+    def __post_init__(self) -> None:
+        check_sizes(
+            "memory", max_steps=self.max_steps, max_video=self.max_video, stride=self.stride
+        )
+        check_every(self.every, self.stride)
+        require(
+            0 <= 2 * self.jitter < self.stride,
+            f"memory.jitter={self.jitter} must be less than half of memory.stride={self.stride}.",
+        )
+        require(
+            self.every == 1 or not self.jitter,
+            f"memory.jitter={self.jitter} moves frames away from those of memory.every="
+            f"{self.every}: set memory.jitter=0 or memory.every=1.",
+        )
+
+    def frames(self, step: int, exec_start: int) -> np.ndarray:
+        """Frames read at `step`, ascending and ending with `step`; int64 [n]."""
+        return recurrent_frames(
+            step, exec_start, self.max_steps, self.max_video, self.stride, self.every
+        )
 
 
 State = tuple[Tensor, ...]
@@ -111,8 +150,10 @@ continue one.
 
 
 @dataclass(eq=False)
-class Taken:
-    """A state (None before the first frame) and the frames [n] that it has taken, in order."""
+class Snapshot:
+    """A state (None before the first frame) and the frames [n] that it was updated with, in
+    order.
+    """
 
     frames: np.ndarray
     state: State | None = None
@@ -127,38 +168,37 @@ class RecurrentStream:
     before it to that one.
     """
 
-    snapshots: list[Taken] = field(default_factory=list)
+    snapshots: list[Snapshot] = field(default_factory=list)
     updates: int = 0
     last_step: int | None = None
     pace: int | None = None
 
-    def decides(self, step: int) -> None:
-        """Note that a decision is made at `step`."""
+    def record_decision(self, step: int) -> None:
+        """Update `last_step` and `pace` at a decision."""
         if self.last_step is not None and step > self.last_step:
             self.pace = step - self.last_step
         self.last_step = step
 
-    def continued(self, frames: np.ndarray) -> Taken:
-        """The state that has taken the longest beginning of these frames; a fresh one where none
-        has.
+    def longest_start(self, frames: np.ndarray) -> Snapshot:
+        """The snapshot that was updated with the longest beginning of these frames; a fresh one
+        where there is none. It becomes the last used.
         """
-        fitting = [
-            taken
-            for taken in self.snapshots
-            if np.array_equal(frames[: len(taken.frames)], taken.frames)
-        ]
-        best = max(fitting, key=lambda taken: len(taken.frames), default=Taken(frames[:0]))
-        self.snapshots = [*(taken for taken in self.snapshots if taken is not best), best][
-            -MAX_SNAPSHOTS:
-        ]
+        matching = []
+        for snapshot in self.snapshots:
+            if np.array_equal(frames[: len(snapshot.frames)], snapshot.frames):
+                matching.append(snapshot)
+        fresh = Snapshot(frames[:0])
+        best = max(matching, key=lambda snapshot: len(snapshot.frames), default=fresh)
+        others = [snapshot for snapshot in self.snapshots if snapshot is not best]
+        self.snapshots = [*others, best][-MAX_SNAPSHOTS:]
         return best
 
 
 def pieces(count: int, chunk: int) -> Iterator[int]:
     """How many frames enter together: chunks, and the newest alone.
 
-    A state that was prepared before the newest frame was there has so been through the same steps,
-    to the bit, as one that takes them all at once.
+    A state that was prepared before the newest frame arrived has so been through the same steps, to
+    the bit, as one that takes them all at once.
     """
     for start in range(0, count - 1, chunk):
         yield min(chunk, count - 1 - start)
@@ -173,7 +213,7 @@ Statistics = dict[str, Tensor]
 class RecurrentLayer(nn.Module):
     """How a frame changes the state, in float32 whatever surrounds it. Subclasses choose.
 
-    window: most frames at the end of a list whose outputs `read` hands over; None where `following`
+    window: most frames at the end of a list whose outputs `read` returns; None where `following`
     may count further.
     """
 
@@ -206,11 +246,18 @@ class RecurrentLayer(nn.Module):
         return {}
 
 
-class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPrecision):
-    """Encoder → recurrent layer → output projection. Subclasses supply the layer."""
+class RecurrentMemory(MemoryModule):
+    """Encoder → recurrent layer → output projection. Subclasses supply the layer.
 
-    pad_left = True
+    Besides its own arguments it takes those of `FrameSchedule` and `FeatureEncoder`.
+
+    float32_products: how a GPU multiplies in the layer, which computes in float32: `ieee` or
+        `tf32`. Set from outside (`policy.float32_products`).
+    """
+
+    option_types: ClassVar[tuple[type, ...]] = (FrameSchedule, FeatureEncoder)
     lazy = True
+    float32_products: str = "ieee"
 
     def __init__(
         self,
@@ -222,16 +269,9 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         grid: int = 8,
         pooling: str = "mean",
         *,
-        max_steps: int = 64,
-        max_video: int = 40,
-        stride: int = 16,
-        every: int = 1,
-        jitter: int = 0,
         chunk: int = 8,
         recompute: bool = True,
-        position_dim: int | None = None,
-        position_hidden: int | None = None,
-        positions: str | None = None,
+        **options: Any,
     ) -> None:
         """Put the parts together.
 
@@ -240,39 +280,23 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
             layer: the recurrence, at width `hidden`.
             budget: memory tokens handed over.
             grid, pooling: a remembered frame is grid×grid tokens.
-            max_steps, max_video, stride, every: see `recurrent_frames`.
-            jitter: in training, past frames move at random by up to this many frames, if the data
-                hand over randomness (`data.jitter`).
             chunk: frames that are recomputed together in the backward pass; windows are padded to a
-                multiple of it.
+                multiple of it, since the steps of a short episode are few.
             recompute: False keeps what the backward pass needs: faster, and the memory of all
                 chunks instead of one.
-            position_dim, position_hidden: widths of the position features and their layer; None
-                follows `d_vision`.
-            positions: of `POSITIONS`; None: `time_space`.
+            options: fields of `FrameSchedule`; and `position_dim`, `position_hidden` and
+                `positions` of the `FeatureEncoder`.
         """
         super().__init__()
-        check_sizes("memory", max_steps=max_steps, max_video=max_video, stride=stride, chunk=chunk)
-        check_every(every, stride)
-        require(
-            0 <= 2 * jitter < stride,
-            f"memory.jitter={jitter} must be less than half of memory.stride={stride}.",
-        )
-        require(
-            every == 1 or not jitter,
-            f"memory.jitter={jitter} moves frames away from those of memory.every={every}: set"
-            " memory.jitter=0 or memory.every=1.",
-        )
-        self.budget, self.capacity = budget, max_steps * grid**2
+        self.schedule = take_options(FrameSchedule, options)
+        check_sizes("memory", chunk=chunk)
+        self.budget = budget
+        self.capacity = self.schedule.max_steps * grid**2
+        self.pad_left = chunk * grid**2
         self.storage = StorageSpec(grid, pooling)
-        self.max_steps, self.max_video, self.stride, self.every = (
-            max_steps,
-            max_video,
-            stride,
-            every,
-        )
-        self.jitter, self.chunk, self.recompute = jitter, chunk, recompute
-        self.encoder = FeatureEncoder(d_vision, hidden, position_dim, position_hidden, positions)
+        self.chunk = chunk
+        self.recompute = recompute
+        self.encoder = FeatureEncoder(d_vision, hidden, **options)
         self.layer = layer
         self._compiled: Callable[..., tuple[State, Statistics]] | None = None
         self.output = nn.Linear(hidden, width)
@@ -285,29 +309,18 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
         """Frames read at `step`, ascending; the last is `step`."""
-        limits = (self.max_steps, self.max_video, self.stride, self.every)
-        frames = recurrent_frames(step, history.exec_start, *limits)
-        return (
-            frames
-            if rng is None or not self.jitter
-            else jittered(frames, history.exec_start, self.jitter, rng)
-        )
+        frames = self.schedule.frames(step, history.exec_start)
+        if rng is None or not self.schedule.jitter:
+            return frames
+        return jittered(frames, history.exec_start, self.schedule.jitter, rng)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        limits = (self.max_steps, self.max_video, self.stride, self.every)
-        return union_frames([recurrent_frames(int(step), exec_start, *limits) for step in steps])
+        return union_frames([self.schedule.frames(int(step), exec_start) for step in steps])
 
     def select(
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
         return all_patches(self.frames(history, step, rng), self.storage.grid)
-
-    def padded_length(self, count: int) -> int:
-        """Whole chunks: the steps of a short episode are few, and nothing changes but the time they
-        take.
-        """
-        chunk = self.chunk * self.storage.grid**2
-        return min(-(-count // chunk) * chunk, self.capacity)
 
     # The window
 
@@ -324,50 +337,45 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         Gradients flow through every step. With `recompute` only the states between chunks are kept
         for them.
         """
-        # Statistics are wanted of one update in many: not worth compiling for.
+        # Statistics are needed of one update in many: not worth compiling for.
         compiled = None if self.reporting else self._compiled
+        is_compiling = torch.compiler.is_compiling()
         advance = self.layer.advance if compiled is None else partial(compiled, self.layer)
-        # Within the step, which the backward pass computes again; a graph has no place for a switch
-        # of the process.
-        step = (
-            advance
-            if torch.compiler.is_compiling()
-            else partial(_multiplying, self.float32_products, advance)
-        )
-        window = self.layer.window
+        step = advance
+        if not is_compiling:
+            # Within the step, which the backward pass computes again; a graph has no place for a
+            # switch of the process.
+            step = partial(_advance_with, self.float32_products, advance)
         start = self.init_state(len(x))
         # All chunks are laid out alike, whatever the window's length: they share one code.
         state = tuple(tensor.contiguous() for tensor in start)
-        # A CPU skips the windows that have no frame yet, unless `read` hands over this chunk. A GPU
-        # would synchronise to know which.
-        skips = x.device.type == "cpu" and not (
-            self.reporting or compiled or torch.compiler.is_compiling()
-        )
-        statistics, following = [], x.shape[1]
+        # A CPU skips the windows that have no frame yet, unless `read` returns outputs of this
+        # chunk. A GPU would synchronise to know which.
+        skips_empty = x.device.type == "cpu" and not (self.reporting or compiled or is_compiling)
+        window = self.layer.window
+        statistics = []
+        remaining = x.shape[1]
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
-            following -= part.shape[1]
-            counted = following if window is None else min(following, window)
+            remaining -= part.shape[1]
+            following = remaining if window is None else min(remaining, window)
             rows = None
-            if skips and window is not None and following >= window:
-                rows = valid[:, : x.shape[1] - following].any(1).nonzero()[:, 0]
-            entering = (
-                (*state, part, real)
-                if rows is None
-                else tuple(t[rows] for t in (*state, part, real))
-            )
-            *before, part, real = (tensor.contiguous() for tensor in entering)
-            inputs = (tuple(before), part, real, counted, self.reporting)
+            if skips_empty and window is not None and remaining >= window:
+                rows = valid[:, : x.shape[1] - remaining].any(1).nonzero()[:, 0]
+            inputs = (*state, part, real)
+            if rows is not None:
+                inputs = tuple(tensor[rows] for tensor in inputs)
+            *entering, part, real = (tensor.contiguous() for tensor in inputs)
+            arguments = (tuple(entering), part, real, following, self.reporting)
             if torch.is_grad_enabled() and self.recompute:
-                after, numbers = checkpoint(
-                    step, *inputs, use_reentrant=False, preserve_rng_state=False
+                updated, numbers = checkpoint(
+                    step, *arguments, use_reentrant=False, preserve_rng_state=False
                 )
             else:
-                after, numbers = step(*inputs)
+                updated, numbers = step(*arguments)
             if rows is not None:
-                after = tuple(
-                    old.index_copy(0, rows, new) for old, new in zip(state, after, strict=True)
-                )
-            state = after
+                pairs = zip(state, updated, strict=True)
+                updated = tuple(old.index_copy(0, rows, new) for old, new in pairs)
+            state = updated
             statistics.append(numbers)
         tokens = self.read(state)
         if self.reporting:
@@ -410,73 +418,77 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         """Memory tokens of running episodes.
 
-        While an episode's frame list extends one that its stream has taken, only the new frames
-        enter. Where it does not (replans at an uneven pace, or a list that lost its first frames
-        and was not prepared), a fresh state takes the whole list. A current frame that no later
-        list has (`every`) enters a copy of the stream's state. Episodes with equally many new
+        While an episode's frame list extends one that its stream was updated with, only the new
+        frames enter. Where it does not (replans at an uneven pace, or a list that lost its first
+        frames and was not prepared), a fresh state takes the full list. A current frame that no
+        later list has (`every`) enters a copy of the stream's state. Episodes with equally many new
         frames go through the layer together.
         """
-        pending: dict[int, list[int]] = defaultdict(list)
-        states, entering = [], []
+        snapshots: list[Snapshot] = []
+        entering: list[np.ndarray] = []
+        groups: dict[int, list[int]] = defaultdict(list)  # number of new frames → episodes
         for i, (history, stream) in enumerate(zip(histories, streams, strict=True)):
             step = len(history) - 1
-            stream.decides(step)
+            stream.record_decision(step)
             frames = self.frames(history, step)
-            states.append(stream.continued(frames))
-            entering.append(frames[len(states[i].frames) :])
-            pending[len(entering[i])].append(i)
-            stream.updates += len(entering[i])
-        for count, group in pending.items():
-            at = 0
+            snapshot = stream.longest_start(frames)
+            new = frames[len(snapshot.frames) :]
+            stream.updates += len(new)
+            snapshots.append(snapshot)
+            entering.append(new)
+            groups[len(new)].append(i)
+        for count, group in groups.items():
+            start = 0
             for size in pieces(count, self.chunk):
-                if at == count - 1:
-                    for i in group:
-                        states[i] = (
-                            states[i] if len(histories[i]) % self.every == 0 else replace(states[i])
-                        )
-                self._enter([(histories[i], states[i], entering[i][at : at + size]) for i in group])
-                at += size
-        return self.read(_stack([taken.state or self.init_state(1) for taken in states]))
+                stop = start + size
+                for i in group:
+                    if stop == count and len(histories[i]) % self.schedule.every != 0:
+                        snapshots[i] = replace(snapshots[i])
+                self._enter([(histories[i], snapshots[i], entering[i][start:stop]) for i in group])
+                start = stop
+        return self.read(_stack([self._state_of(snapshot) for snapshot in snapshots]))
 
     def prepare(self, history: History, stream: Any) -> bool:
         """Let a chunk of frames enter that the next decision's list has before its newest one.
 
         The next decision is expected as long after the last one as that came after the one before.
-        There is something to do where its list does not extend one that was taken: once a list is
-        full its first frames go, and the released computation begins anew behind them at every
-        decision.
+        Work is left where its list does not extend an earlier one: once a list is full its first
+        frames are dropped, and the released computation begins anew behind them at every decision.
         """
         if stream.last_step is None:
             return False
-        expected = self.frames(history, stream.last_step + (stream.pace or self.stride))[:-1]
+        next_step = stream.last_step + (stream.pace or self.schedule.stride)
+        expected = self.frames(history, next_step)[:-1]
         expected = expected[expected < len(history)]
         if not len(expected):
             return False
-        taken = stream.continued(expected)
-        new = expected[len(taken.frames) :][: self.chunk]
+        snapshot = stream.longest_start(expected)
+        new = expected[len(snapshot.frames) :][: self.chunk]
         if len(new):
-            self._enter([(history, taken, new)])
+            self._enter([(history, snapshot, new)])
             stream.updates += len(new)
-        return len(taken.frames) < len(expected)
+        return len(snapshot.frames) < len(expected)
 
-    def _enter(self, group: Sequence[tuple[History, Taken, np.ndarray]]) -> None:
-        """Let equally many new frames enter each of these states."""
-        state = _stack([taken.state or self.init_state(1) for _, taken, _ in group])
-        indices = [all_patches(new, self.storage.grid) for _, _, new in group]
-        features = torch.stack(
-            [history.gather(at) for (history, _, _), at in zip(group, indices, strict=True)]
-        )
-        pairs = zip(group, indices, strict=True)
-        positions = np.stack(
-            [token_positions(history.timed(at), self.storage.grid) for (history, _, _), at in pairs]
-        )
-        everywhere = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
+    def _enter(self, group: Sequence[tuple[History, Snapshot, np.ndarray]]) -> None:
+        """Update each of these snapshots with equally many new frames."""
+        grid = self.storage.grid
+        states, features, positions = [], [], []
+        for history, snapshot, frames in group:
+            indices = all_patches(frames, grid)
+            states.append(self._state_of(snapshot))
+            features.append(history.gather(indices))
+            positions.append(token_positions(history.timed(indices), grid))
+        x = torch.stack(features)
+        mask = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
         state = self.update(
-            state, features, torch.from_numpy(positions).to(features.device), everywhere
+            _stack(states), x, torch.from_numpy(np.stack(positions)).to(x.device), mask
         )
-        for i, (_, taken, new) in enumerate(group):
-            taken.state = tuple(tensor[i : i + 1] for tensor in state)
-            taken.frames = np.append(taken.frames, new)
+        for i, (_, snapshot, frames) in enumerate(group):
+            snapshot.state = tuple(tensor[i : i + 1] for tensor in state)
+            snapshot.frames = np.append(snapshot.frames, frames)
+
+    def _state_of(self, snapshot: Snapshot) -> State:
+        return self.init_state(1) if snapshot.state is None else snapshot.state
 
     def _by_frame(self, x: Tensor) -> Tensor:
         return x.unflatten(1, (-1, self.storage.grid**2))
@@ -485,11 +497,11 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
     def _metrics(statistics: Sequence[Statistics], valid: Tensor) -> dict[str, Tensor]:
         """Mean over the real frames of a batch."""
         count = valid.sum().clamp(min=1)
-        names = statistics[0] if statistics else {}
-        return {
-            name: (torch.cat([s[name] for s in statistics], 1) * valid).sum() / count
-            for name in names
-        }
+        metrics = {}
+        for name in statistics[0]:
+            numbers = torch.cat([chunk[name] for chunk in statistics], 1)  # b t
+            metrics[name] = (numbers * valid).sum() / count
+        return metrics
 
 
 def _stack(states: Sequence[State]) -> State:
@@ -500,14 +512,14 @@ def full_precision(x: Tensor) -> torch.autocast:
     """The context recurrent layers run in: no autocast, so that hundreds of small steps do not
     round.
     """
-    return torch.autocast(x.device.type if x.device.type != "meta" else "cpu", enabled=False)
+    device_type = "cpu" if x.device.type == "meta" else x.device.type
+    return torch.autocast(device_type, enabled=False)
 
 
 def linear(layer: nn.Linear, x: Tensor) -> Tensor:
     """Apply a linear layer in float32, whatever its weights are stored in."""
-    return nn.functional.linear(
-        x, layer.weight.float(), None if layer.bias is None else layer.bias.float()
-    )
+    bias = None if layer.bias is None else layer.bias.float()
+    return nn.functional.linear(x, layer.weight.float(), bias)
 
 
 def layer_norm(norm: nn.LayerNorm, x: Tensor) -> Tensor:
@@ -522,6 +534,8 @@ def default_hidden(d_vision: int, hidden: int | None) -> int:
     return hidden or max(64, d_vision // 4)
 
 
-def _multiplying(how: str, advance: Callable[..., Any], *inputs: Any) -> tuple[State, Statistics]:
-    with float32_products(how):
+def _advance_with(
+    products: str, advance: Callable[..., Any], *inputs: Any
+) -> tuple[State, Statistics]:
+    with float32_products(products):
         return advance(*inputs)

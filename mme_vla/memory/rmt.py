@@ -1,4 +1,4 @@
-"""RMT: memory as a fixed set of slots that look at every frame and at each other (paper, section
+"""RMT: memory as a fixed set of slots that attend to every frame and to each other (paper, section
 4.2).
 """
 
@@ -57,12 +57,15 @@ class RMTLayer(RecurrentLayer):
         )
         check_choice("memory.rotation", rotation, ROTATIONS)
         check_choice("memory.attention_dtype", attention_dtype, ATTENTION_DTYPES)
-        self.head_dim, self.kv_heads = hidden // heads, kv_heads
-        self.rotation, self.attention_dtype = rotation, ATTENTION_DTYPES[attention_dtype]
+        self.head_dim = hidden // heads
+        self.kv_heads = kv_heads
+        self.rotation = rotation
+        self.attention_dtype = ATTENTION_DTYPES[attention_dtype]
         self.q = nn.Linear(hidden, hidden, bias=False)
         self.kv = nn.Linear(hidden, 2 * kv_heads * self.head_dim, bias=False)
         self.out = nn.Linear(hidden, hidden, bias=False)
-        self.pre_norm, self.post_norm = nn.LayerNorm(hidden, eps=EPS), nn.LayerNorm(hidden, eps=EPS)
+        self.pre_norm = nn.LayerNorm(hidden, eps=EPS)
+        self.post_norm = nn.LayerNorm(hidden, eps=EPS)
         self.slots = nn.Parameter(torch.randn(budget, hidden) * hidden**-0.5)
         for layer, std in ((self.q, 0.02), (self.kv, 0.02), (self.out, 0.005)):
             nn.init.normal_(layer.weight, std=std)
@@ -74,29 +77,34 @@ class RMTLayer(RecurrentLayer):
         self, state: State, x: Tensor, valid: Tensor, following: int = 0, statistics: bool = False
     ) -> tuple[State, Statistics]:
         with full_precision(x):
-            (slots,), patches, changes = state, x.shape[2], []
+            (slots,) = state
+            patches = x.shape[2]
             # Recomputed, not stored: frame tokens come first, and any number of slots after them.
             rope = angles(patches + slots.shape[1], self.head_dim, x.device)[:, None]  # n 1 h/2
             cos, sin = rope.cos(), rope.sin()
-            of_frame, of_slots = (cos[:patches], sin[:patches]), (cos[patches:], sin[patches:])
-            kv = self.kv.weight.float()
-            qkv = torch.cat(
-                [self.q.weight.float(), kv]
-            )  # projected and rotated together: fewer small operations
-            frame_k, frame_v = self._heads(
-                layer_norm(self.pre_norm, x.float()), kv, of_frame
-            )  # b t p kv h
+            frame_rope = (cos[:patches], sin[:patches])
+            slot_rope = (cos[patches:], sin[patches:])
+            kv_weight = self.kv.weight.float()
+            # Projected and rotated together: fewer small operations.
+            qkv_weight = torch.cat([self.q.weight.float(), kv_weight])
+            frames = layer_norm(self.pre_norm, x.float())
+            frame_k, frame_v = self._heads(frames, kv_weight, frame_rope)  # b t p kv h
+            changes = []
             for t in range(x.shape[1]):
-                qk, v = self._heads(layer_norm(self.pre_norm, slots.float()), qkv, of_slots)
-                q, k = qk.tensor_split([-self.kv_heads], -2)
-                k, v = torch.cat([frame_k[:, t], k], 1), torch.cat([frame_v[:, t], v], 1)
+                normed = layer_norm(self.pre_norm, slots.float())
+                slot_qk, slot_v = self._heads(normed, qkv_weight, slot_rope)
+                q, slot_k = slot_qk.tensor_split([-self.kv_heads], -2)
+                k = torch.cat([frame_k[:, t], slot_k], 1)
+                v = torch.cat([frame_v[:, t], slot_v], 1)
                 output = linear(self.out, self._attend(q, k, v)) + slots.float()
                 updated = layer_norm(self.post_norm, output).to(slots.dtype)
                 new = torch.where(valid[:, t, None, None], updated, slots)
                 if statistics:
                     changes.append(_relative_distance(slots, new))
                 slots = new
-            return (slots,), {"slot_change": torch.stack(changes, 1)} if statistics else {}
+            if statistics:
+                return (slots,), {"slot_change": torch.stack(changes, 1)}
+            return (slots,), {}
 
     def read(self, state: State) -> tuple[Tensor, Tensor]:
         (slots,) = state
@@ -144,12 +152,10 @@ def attend_rounded(q: Tensor, k: Tensor, v: Tensor, dtype: torch.dtype) -> Tenso
     a window.
     """
     q, k, v = q.to(dtype), k.to(dtype), v.to(dtype)
-    weights = (
-        ((q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)).softmax(-1).to(dtype)
-    )
-    if (
-        q.device.type == "cpu"
-    ):  # sums are float32 either way, and many CPUs only emulate products of bfloat16
+    scores = (q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)
+    weights = scores.softmax(-1).to(dtype)
+    if q.device.type == "cpu":
+        # Sums are float32 either way, and many CPUs only emulate products of bfloat16.
         return (weights.float() @ v.float()).to(dtype).float()
     return (weights @ v).float()
 
@@ -189,8 +195,9 @@ class RMT(RecurrentMemory):
         """
         check_sizes("memory", budget=budget)
         hidden = default_hidden(d_vision, hidden)
-        heads = heads or next(
-            n for n in range(max(2, hidden // 64), 0, -1) if hidden % (2 * n) == 0 or n == 1
-        )
+        if not heads:
+            heads = max(2, hidden // 64)
+            while heads > 1 and hidden % (2 * heads):
+                heads -= 1
         layer = RMTLayer(hidden, heads, kv_heads, budget, rotation, attention_dtype)
         super().__init__(d_vision, width, layer, hidden, budget, **options)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError, check_sizes, require
-from mme_vla.memory.base import PerceptualMemory, ScoringMemory
+from mme_vla.memory.base import PerceptualMemory
 from mme_vla.memory.history import FORMER_KEYS, FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
 
@@ -28,6 +28,10 @@ class ChangeScorer(FrameScorer):
     def __post_init__(self) -> None:
         self._reference: np.ndarray | None = None
 
+    def frames_scored(self, length: int) -> np.ndarray:
+        frames = np.arange(length)
+        return frames[(frames == 0) | ((frames + 1) % self.stride == 0)]
+
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
         """Score one frame [H, W, 3] uint8, or keep it as a reference."""
         if frame_index and (frame_index + 1) % self.stride:
@@ -38,7 +42,8 @@ class ChangeScorer(FrameScorer):
                 f"A {height}×{width} frame does not divide into {self.grid}×{self.grid} patches."
             )
         image = frame.astype(np.float32) / 255 * 2 - 1
-        reference, self._reference = self._reference, image
+        reference = self._reference
+        self._reference = image
         if reference is None or frame_index == 0:
             # A stride of 1 scores frame 0 too, against itself: no patch passes the threshold.
             return None
@@ -47,11 +52,11 @@ class ChangeScorer(FrameScorer):
         return cells.mean(axis=(1, 3, 4), dtype=np.float32).reshape(-1)
 
 
-FORMER_KEYS["4a0a7e45"] = "change{grid}x{grid}-every{stride}"
+FORMER_KEYS["c7f24220"] = "change{grid}x{grid}-every{stride}"
 
 
 @MEMORIES.register("tokendrop")
-class TokenDrop(PerceptualMemory, ScoringMemory):
+class TokenDrop(PerceptualMemory):
     """The `budget` highest-scored patches up to now, the first frame's among them, in
     time order.
     """
@@ -92,21 +97,16 @@ class TokenDrop(PerceptualMemory, ScoringMemory):
     def make_scorer(self) -> ChangeScorer:
         return ChangeScorer(self.storage.grid, self.stride)
 
-    def frames_scored(self, length: int) -> np.ndarray:
-        return self.storage.stored_frames(length)
-
     def select(
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
         patches = self.storage.grid**2
-        # none lies later, so that the best `budget` of all are the best of the best `candidates`
         if self.causal:
-            return most_changed(
-                ranked_patches(history.scores.until(step), patches, self.budget), step, self.budget
-            )
-        return most_changed(
-            ranked_patches(history.scores, patches, self.candidates), step, self.budget
-        )
+            # No candidate is later than `step`: the best `budget` of all are those of the list.
+            ranked = ranked_patches(history.scores.until(step), patches, self.budget)
+        else:
+            ranked = ranked_patches(history.scores, patches, self.candidates)
+        return most_changed(ranked, step, self.budget)
 
 
 def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
@@ -115,19 +115,18 @@ def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
     This is what a heap of that size holds after all frames have passed; the first frame's patches
     rank highest.
     """
-    changed = scores.values >= THRESHOLD
-    beside = max(limit - patches, 0)  # places that the first frame leaves
-    if (
-        np.count_nonzero(changed) > beside > 0
-    ):  # sort no more than can stay: an episode's length costs next to nothing
-        flat = scores.values.reshape(-1)
-        changed &= scores.values >= np.partition(flat, len(flat) - beside)[len(flat) - beside]
-    row, patch = np.nonzero(changed)
+    is_candidate = scores.values >= THRESHOLD
+    # Sort no more patches than can stay beside the first frame's, however long the episode is.
+    n_others = max(limit - patches, 0)
+    if np.count_nonzero(is_candidate) > n_others > 0:
+        values = scores.values.reshape(-1)
+        nth = len(values) - n_others
+        is_candidate &= scores.values >= np.partition(values, nth)[nth]
+    row, patch = np.nonzero(is_candidate)
+    first_frame_scores = np.full(patches, FIRST_FRAME_SCORE, np.float32)
     frame = np.concatenate([np.zeros(patches, np.int64), scores.frames[row]])
     patch = np.concatenate([np.arange(patches), patch])
-    score = np.concatenate(
-        [np.full(patches, FIRST_FRAME_SCORE, np.float32), scores.values[changed]]
-    )
+    score = np.concatenate([first_frame_scores, scores.values[is_candidate]])
     order = np.lexsort((patch, frame, score))[-limit:]
     return np.stack([frame[order], patch[order]], axis=1)
 

@@ -1,7 +1,6 @@
-"""Transforms of a history: which frames a policy learns from, and at which times it takes them to
-be.
+"""Transforms of a history: which frames a policy learns from, and which times they have.
 
-One object says how often each frame of an episode is observed. In training a dataset applies it to
+A transform sets how often each frame of an episode is observed. In training a dataset applies it to
 everything that a sample reads of the past (`data.history_transforms`), and a probe applies the same
 object to a running episode.
 """
@@ -46,8 +45,8 @@ class HistoryTransform:
         return np.ones(length, np.int64)
 
     def perturb(self, rows: Tensor, rng: np.random.Generator | None = None) -> Tensor:
-        """Tokens [n, d] of past frames, or what the robot felt and did at them, as
-        they are read.
+        """Change tokens [n, d] of past frames, or their proprioception and actions, as they are
+        read.
         """
         return rows
 
@@ -70,17 +69,19 @@ class RepeatFrame(HistoryTransform):
     def repeats(
         self, length: int, exec_start: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
-        counts = np.ones(length, np.int64)
-        count, place = self.frames, exec_start + (self.at or 0)
+        count = self.frames
+        frame = exec_start + (self.at or 0)
         if rng is not None:
-            selection, count = (
-                rng.random() < self.p,
-                int(rng.integers(1, self.frames + 1)) if self.frames else 0,
-            )
-            place = int(rng.integers(length)) if self.at is None else place
-            count = count if selection else 0
-        if place < length:
-            counts[place] += count
+            has_pause = rng.random() < self.p
+            if self.frames:
+                count = int(rng.integers(1, self.frames + 1))
+            if self.at is None:
+                frame = int(rng.integers(length))
+            if not has_pause:
+                count = 0
+        counts = np.ones(length, np.int64)
+        if frame < length:
+            counts[frame] += count
         return counts
 
 
@@ -117,7 +118,8 @@ class DropFrames(HistoryTransform):
     ) -> np.ndarray:
         if rng is not None:
             return (rng.random(length) >= self.share).astype(np.int64)
-        return 1 - np.diff(np.floor(np.arange(length + 1) * self.share)).astype(np.int64)
+        n_dropped = np.floor(np.arange(length + 1) * self.share)  # of the frames before each
+        return 1 - np.diff(n_dropped).astype(np.int64)
 
 
 @HISTORY_TRANSFORMS.register("noise")
@@ -133,7 +135,8 @@ class Noise(HistoryTransform):
     def perturb(self, rows: Tensor, rng: np.random.Generator | None = None) -> Tensor:
         if rows.numel() < 2:
             return rows
-        rng = np.random.default_rng(0) if rng is None else rng
+        if rng is None:
+            rng = np.random.default_rng(0)
         noise = torch.from_numpy(rng.standard_normal(tuple(rows.shape), np.float32)).to(rows.device)
         return (rows + self.std * rows.float().std() * noise).to(rows.dtype)
 
@@ -143,8 +146,7 @@ def build_transform(entry: Any) -> HistoryTransform:
     section: Mapping[str, Any] = {"name": entry} if isinstance(entry, str) else entry
     kind: Any = HISTORY_TRANSFORMS[section["name"]]
     if not is_dataclass(kind):
-        made: HistoryTransform = HISTORY_TRANSFORMS.build(section)
-        return made
+        return cast(HistoryTransform, HISTORY_TRANSFORMS.build(section))
     options = {key: value for key, value in section.items() if key != "name"}
     read: Any = read_section(kind, options, f"history_transforms.{section['name']}")  # type: ignore[arg-type]
     return cast(HistoryTransform, read)
@@ -152,17 +154,19 @@ def build_transform(entry: Any) -> HistoryTransform:
 
 def build_transforms(entries: Any) -> tuple[HistoryTransform, ...]:
     """The transforms that a configuration lists, in the order in which they act."""
+    if entries is None:
+        return ()
+    is_list = isinstance(entries, Sequence) and not isinstance(entries, str)
     require(
-        entries is None
-        or (
-            isinstance(entries, Sequence)
-            and not isinstance(entries, str)
-            and all(isinstance(e, str) or (isinstance(e, Mapping) and "name" in e) for e in entries)
-        ),
+        is_list and all(_names_transform(entry) for entry in entries),
         f"history_transforms={entries}: write a list of names or of mappings with a name, such as"
         " [repeat_frame] or [{name: speed, factor: 2}].",
     )
-    return tuple(build_transform(entry) for entry in entries or ())
+    return tuple(build_transform(entry) for entry in entries)
+
+
+def _names_transform(entry: Any) -> bool:
+    return isinstance(entry, str) or (isinstance(entry, Mapping) and "name" in entry)
 
 
 @dataclass(frozen=True)
@@ -170,8 +174,8 @@ class FrameMap:
     """The one map from the frames of a transformed episode to those that were recorded.
 
     real: int64 [n], ascending; the recorded frame of each transformed one, up to the current one.
-    exec_start: the first transformed frame of the execution. transforms, rng: what made it, and
-    perturbs what is read.
+    exec_start: the first transformed frame of the execution. transforms, rng: they made the map,
+    and perturb what is read.
     """
 
     real: np.ndarray
@@ -183,10 +187,11 @@ class FrameMap:
         """The last transformed frame that shows each of these recorded ones, or one before it;
         int64, at least 0.
         """
-        return np.maximum(np.searchsorted(self.real, frames, side="right") - 1, 0)
+        last = np.searchsorted(self.real, frames, side="right") - 1
+        return np.maximum(last, 0)
 
     def perturb(self, rows: Tensor) -> Tensor:
-        """What is read of the past, as the transforms change it."""
+        """Change rows [n, d] of past frames by all transforms."""
         for transform in self.transforms:
             rows = transform.perturb(rows, self.rng)
         return rows
@@ -205,7 +210,8 @@ def map_frames(
         rng: see `HistoryTransform.repeats`. keep: frames that stay whatever the transforms leave
             out: those at which the policy decides.
     """
-    real, retained = np.arange(length), np.asarray(keep, np.int64)
+    real = np.arange(length)
+    retained = np.asarray(keep, np.int64)
     for transform in transforms:
         start = int(np.searchsorted(real, exec_start))
         counts = np.array(transform.repeats(len(real), start, rng), np.int64)
@@ -228,7 +234,8 @@ class TransformedHistory(History):
 
     def __init__(self, source: History, frames: FrameMap) -> None:
         super().__init__(source.spec, frames.exec_start)
-        self._source, self._frames = source, frames
+        self._source = source
+        self._frames = frames
         self.state_width = source.state_width
         if source.motion is not None:
             self.motion = self._motion
@@ -239,10 +246,11 @@ class TransformedHistory(History):
     @property
     def scores(self) -> FrameScores:
         """The scores of the frames that are left, each at the first time it is shown."""
-        scores, real = self._source.scores, self._frames.real
-        at = np.searchsorted(real, scores.frames)
-        there = (at < len(real)) & (real[np.minimum(at, len(real) - 1)] == scores.frames)
-        return FrameScores(at[there], scores.values[there])
+        scores = self._source.scores
+        real = self._frames.real
+        first = np.searchsorted(real, scores.frames)
+        is_left = np.append(real, -1)[first] == scores.frames
+        return FrameScores(first[is_left], scores.values[is_left])
 
     @property
     def stored_frames(self) -> np.ndarray:
@@ -251,10 +259,9 @@ class TransformedHistory(History):
     def gather(self, indices: np.ndarray) -> Tensor:
         stored = self._source.stored_frames
         real = self._frames.real[indices[:, 0]]
-        places = np.maximum(np.searchsorted(stored, real, side="right") - 1, 0)
-        return self._frames.perturb(
-            self._source.gather(np.stack([stored[places], indices[:, 1]], 1))
-        )
+        newest = np.maximum(np.searchsorted(stored, real, side="right") - 1, 0)
+        tokens = self._source.gather(np.stack([stored[newest], indices[:, 1]], 1))
+        return self._frames.perturb(tokens)
 
     def _motion(self, frames: np.ndarray) -> Tensor:
         return self._frames.perturb(self._source.motion_rows(self._frames.real[frames]))

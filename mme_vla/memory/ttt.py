@@ -29,7 +29,7 @@ Weights = tuple[Tensor, Tensor]
 
 
 class InnerOutput(NamedTuple):
-    """The inner model's answer at some tokens, and what the gradient needs of the way there."""
+    """The inner model's output at some tokens, and intermediate values that the gradient needs."""
 
     output: Tensor
     unit: Tensor  # z / rms(z)
@@ -47,6 +47,8 @@ class TTTLayer(RecurrentLayer):
     State: W [b, h, d/h, d/h], b [b, h, d/h], the outputs of the last frames [b, r, p, d] and which
     of these were real [b, r]. W and b are carried in the dtype their initial values are stored in.
     """
+
+    window: int
 
     def __init__(
         self,
@@ -68,13 +70,13 @@ class TTTLayer(RecurrentLayer):
             positive, "memory.base_rate, memory.max_rate and memory.max_grad_norm must be above 0."
         )
         width = hidden // heads
-        self.heads, self.budget, self.patches, self.window = (
-            heads,
-            budget,
-            patches,
-            -(-budget // patches),
-        )
-        self.base_rate, self.max_rate, self.max_grad_norm = base_rate, max_rate, max_grad_norm
+        self.heads = heads
+        self.budget = budget
+        self.patches = patches
+        self.window = -(-budget // patches)
+        self.base_rate = base_rate
+        self.max_rate = max_rate
+        self.max_grad_norm = max_grad_norm
         self.q, self.k, self.v, self.out = (nn.Linear(hidden, hidden, bias=False) for _ in range(4))
         self.q_norm, self.k_norm, self.v_norm = (nn.LayerNorm(width, eps=EPS) for _ in range(3))
         self.out_norm = nn.LayerNorm(hidden, eps=EPS)
@@ -82,14 +84,10 @@ class TTTLayer(RecurrentLayer):
         self.weight = nn.Parameter(torch.randn(heads, width, width) * width**-0.5)
         self.bias = nn.Parameter(torch.zeros(heads, width))
         self.inner_norm = nn.Parameter(torch.zeros(heads, 2, width))  # N's scale and shift
-        for layer, std in (
-            (self.q, 0.02),
-            (self.k, 0.02),
-            (self.rate, 0.02),
-            (self.v, 0.01),
-            (self.out, 0.01),
-        ):
-            nn.init.normal_(layer.weight, std=std)
+        for layer in (self.q, self.k, self.rate):
+            nn.init.normal_(layer.weight, std=0.02)
+        for layer in (self.v, self.out):
+            nn.init.normal_(layer.weight, std=0.01)
         nn.init.zeros_(self.rate.bias)
 
     @property
@@ -98,12 +96,12 @@ class TTTLayer(RecurrentLayer):
         return math.log(math.expm1(self.base_rate))
 
     def initial(self, batch: int) -> State:
-        window = -(-self.budget // self.patches)
         outputs = self.weight.new_zeros(
-            batch, window, self.patches, self.out.out_features, dtype=torch.float32
+            batch, self.window, self.patches, self.out.out_features, dtype=torch.float32
         )
-        window_valid = torch.zeros(batch, window, dtype=torch.bool, device=outputs.device)
-        weight, bias = (p.expand(batch, *p.shape) for p in (self.weight, self.bias))
+        window_valid = torch.zeros(batch, self.window, dtype=torch.bool, device=outputs.device)
+        weight = self.weight.expand(batch, *self.weight.shape)
+        bias = self.bias.expand(batch, *self.bias.shape)
         return weight, bias, outputs, window_valid
 
     def advance(
@@ -117,38 +115,34 @@ class TTTLayer(RecurrentLayer):
             v = layer_norm(self.v_norm, self._by_head(linear(self.v, x)))
             raw = nn.functional.softplus(linear(self.rate, x) + self.rate_constant)  # b t p h
             rate = raw.clamp(0, self.max_rate).transpose(2, 3)[..., None]  # b t h p 1
-            read = min(
-                steps, max(window - following, 0)
-            )  # only these frames' outputs are still in the window at the end
-            first_read = steps - read
+            # Only the outputs of the last frames are still in the window at the end.
+            n_read = min(steps, max(window - following, 0))
+            first_read = steps - n_read
             q = layer_norm(self.q_norm, self._by_head(linear(self.q, x[:, first_read:])))
-            answers, numbers = [], []
+            head_outputs = []
+            numbers: list[Statistics] = []
             for t in range(steps):
                 real = valid[:, t, None, None]
-                before, updated = (
-                    (weight, bias),
-                    self.learn(weight, bias, k[:, t], v[:, t], rate[:, t]),
-                )
-                weight = torch.where(real[..., None], updated[0], weight)
-                bias = torch.where(real, updated[1], bias)
+                before = (weight, bias)
+                new_weight, new_bias, norms = self.learn(weight, bias, k[:, t], v[:, t], rate[:, t])
+                weight = torch.where(real[..., None], new_weight, weight)
+                bias = torch.where(real, new_bias, bias)
                 if t >= first_read:
                     query = q[:, t - first_read]
                     output = self.inner(weight, bias, query).output + query
-                    answers.append(torch.where(real[..., None], output, 0))
+                    head_outputs.append(torch.where(real[..., None], output, 0))
                 if statistics:
-                    numbers.append(
-                        self._statistics(before, (weight, bias), k[:, t], v[:, t], updated[2])
-                    )
-            if read:
-                mixed = torch.stack(answers, 1).transpose(2, 3).flatten(3)  # b t p d
+                    after = (weight, bias)
+                    numbers.append(self._statistics(before, after, k[:, t], v[:, t], norms))
+            if n_read:
+                mixed = torch.stack(head_outputs, 1).transpose(2, 3).flatten(3)  # b t p d
                 y = x[:, first_read:] + linear(self.out, layer_norm(self.out_norm, mixed))
                 outputs = torch.cat([outputs, y], 1)[:, -window:]
                 window_valid = torch.cat([window_valid, valid[:, first_read:]], 1)[:, -window:]
-            per_step = {
-                name: torch.stack([n[name] for n in numbers], 1)
-                for name in (numbers[0] if numbers else ())
-            }
+            per_step: Statistics = {}
             if statistics:
+                for name in numbers[0]:
+                    per_step[name] = torch.stack([frame[name] for frame in numbers], 1)
                 per_step["step_size"] = rate.detach().mean((2, 3, 4))
                 per_step["clipped_rates"] = (raw.detach() > self.max_rate).float().mean((2, 3))
             return (weight, bias, outputs, window_valid), per_step
@@ -178,23 +172,19 @@ class TTTLayer(RecurrentLayer):
         before clipping.
         """
         output, unit, inverse_rms = self.inner(weight, bias, k)
+        # The gradient of the loss with respect to kW + b, through the norm.
         error = (output - (v - k)) * (1 + self.inner_norm[:, 0, None].float())
-        delta = (
-            rate * inverse_rms * (error - unit * (error * unit).mean(-1, keepdim=True))
-        )  # b h p w
-        of_weight, of_bias = k.transpose(-1, -2) @ delta, delta.sum(-2)
-        norms = torch.stack(
-            [
-                torch.linalg.vector_norm(of_weight, dim=(-2, -1)),
-                torch.linalg.vector_norm(of_bias, dim=-1),
-            ],
-            -1,
-        )
-        factor = torch.where(
-            norms > self.max_grad_norm, self.max_grad_norm / (norms + INNER_EPS), 1.0
-        )
-        new_weight = weight.float() - of_weight * factor[..., :1, None]
-        new_bias = bias.float() - of_bias * factor[..., 1:]
+        centred = error - unit * (error * unit).mean(-1, keepdim=True)
+        delta = rate * inverse_rms * centred  # b h p w
+        weight_gradient = k.transpose(-1, -2) @ delta
+        bias_gradient = delta.sum(-2)
+        weight_norm = torch.linalg.vector_norm(weight_gradient, dim=(-2, -1))
+        bias_norm = torch.linalg.vector_norm(bias_gradient, dim=-1)
+        norms = torch.stack([weight_norm, bias_norm], -1)
+        limit = self.max_grad_norm
+        factor = torch.where(norms > limit, limit / (norms + INNER_EPS), 1.0)
+        new_weight = weight.float() - weight_gradient * factor[..., :1, None]
+        new_bias = bias.float() - bias_gradient * factor[..., 1:]
         return new_weight.to(weight.dtype), new_bias.to(bias.dtype), norms
 
     @torch.no_grad()
@@ -245,7 +235,7 @@ class TTT(RecurrentMemory):
         require(
             0 < budget <= max_steps * grid**2,
             f"memory.budget={budget} must lie between 1 and memory.max_steps × grid² ="
-            f" {max_steps * grid**2}: TTT hands over one token for each it reads.",
+            f" {max_steps * grid**2}: TTT returns one token for each that it reads.",
         )
         hidden = default_hidden(d_vision, hidden)
         layer = TTTLayer(hidden, heads, budget, grid**2, base_rate, max_rate, max_grad_norm)

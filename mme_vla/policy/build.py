@@ -16,7 +16,7 @@ from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, require
 from mme_vla.integration.base import Integration, extension_points
-from mme_vla.memory.base import Memory, MemoryModule, past_view_spec
+from mme_vla.memory.base import Memory, MemoryModule
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import SECTIONS, policy_class
 from mme_vla.processing.base import DEFAULT as DEFAULT_PROCESSOR
@@ -76,7 +76,7 @@ def check_integrated(
 
 def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) -> None:
     """Make sure that the backbone reads past views if the memory gives them."""
-    if past_view_spec(memory) is not None and "past" not in supports:
+    if memory.past_view_spec is not None and "past" not in supports:
         raise UserError(
             f"The memory {config['memory']['name']!r} gives the vision tower past views along with"
             f" the current ones, and the tower of the backbone {config['backbone']['name']!r} sees"

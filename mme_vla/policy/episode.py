@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError, require
-from mme_vla.memory.base import past_view_spec, start_history, start_stream, uses_proprio
+from mme_vla.memory.base import start_history
 from mme_vla.memory.history import History, OnlineHistory
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.images import PastImages
@@ -71,16 +71,16 @@ class Episode:
         """The options of policies that choose among some; set them before `act`."""
         memory = policy.memory
         self.history = None if memory is None else start_history(memory, policy.encode_frames)
-        if self.history is not None and uses_proprio(memory):
+        if self.history is not None and memory is not None and memory.uses_proprio:
             self.history.motion = lambda frames: torch.stack(
                 [self._motion_of_frames[int(frame)] for frame in frames]
             )
             self.history.state_width = policy.embodiment.state.width
-        self.stream = start_stream(memory)
+        self.stream = None if memory is None else memory.start_stream()
         """State of a streaming memory between two `act`s."""
         self.read: History | None = None
         """The history as the last `act` read it, conditioned on the prompt."""
-        spec = past_view_spec(memory)
+        spec = None if memory is None else memory.past_view_spec
         self._past = None if spec is None else PastImages(spec)
         self.n_observed_frames = 0
         self._motion_of_frames: list[Tensor] = []
@@ -432,7 +432,7 @@ class Episode:
         self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None
     ) -> list[Tensor]:
         """Rows of motion of the next frames, if the memory reads them."""
-        if not uses_proprio(self._memory):
+        if not self._memory.uses_proprio:
             return []
         if states is None:
             raise UserError(

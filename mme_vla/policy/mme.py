@@ -20,15 +20,11 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, listed
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import (
-    CompilableMemory,
-    MatmulPrecision,
     MemoryModule,
-    StreamingMemory,
-    encode_histories,
     full_history,
-    past_view_spec,
 )
 from mme_vla.memory.history import PromptConditionedHistory
+from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.model import MMEModel, unit_images
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_integrated
@@ -108,7 +104,7 @@ class MMEPolicy(NetworkPolicy):
             )
         checked_products(float32_products)
         for module in self.modules():
-            if isinstance(module, MatmulPrecision):
+            if isinstance(module, RecurrentMemory):
                 module.float32_products = float32_products
 
     @property
@@ -263,8 +259,9 @@ class MMEPolicy(NetworkPolicy):
         memory.
         """
         self.backbone.compile(**options)
-        if isinstance(self.memory, CompilableMemory):
-            self.memory.compile(**options)
+        for module in self.modules():
+            if isinstance(module, RecurrentMemory):
+                module.compile(**options)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
         """The backbone's groups. Memory and integration are in none: they are small, and compute in
@@ -394,11 +391,11 @@ class MMEPolicy(NetworkPolicy):
             ]
             for episode, history in zip(episodes, histories, strict=True):
                 episode.read = history
-            return encode_histories(self.memory, histories, [e.stream for e in episodes])
+            return self.memory.encode(histories, [e.stream for e in episodes])
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
-        if not isinstance(self.memory, StreamingMemory) or episode.read is None:
+        if self.memory is None or episode.read is None:
             return False
         with self.autocast():
             return self.memory.prepare(episode.read, episode.stream)
@@ -430,6 +427,7 @@ class MMEPolicy(NetworkPolicy):
         history = None
         if self.memory is not None:
             history = full_history(self.memory, self.backbone.vision_width, device)
+        past_view_spec = None if self.memory is None else self.memory.past_view_spec
         return Batch(
             images=torch.zeros(1, views, 3, size, size, dtype=torch.uint8, device=device),
             image_mask=torch.ones(1, views, dtype=torch.bool, device=device),
@@ -437,7 +435,7 @@ class MMEPolicy(NetworkPolicy):
             prompt_mask=torch.ones(1, length, dtype=torch.bool, device=device),
             history=history,
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            past=full_past(past_view_spec(self.memory), views, size, device),
+            past=full_past(past_view_spec, views, size, device),
         )
 
     def _prompt_length(self) -> int:

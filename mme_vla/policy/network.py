@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.layers import autocast
 from mme_vla.errors import UserError
-from mme_vla.memory.base import StreamingMemory, encode_histories
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.tensor_files import dtype_of
@@ -108,12 +107,12 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
         histories = [episode.required_history() for episode in episodes]
         streams = [episode.stream for episode in episodes]
         with self.autocast():
-            return encode_histories(self.memory, histories, streams)
+            return self.memory.encode(histories, streams)
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
         """Read a piece of what the next memory tokens need; return whether more remain."""
-        if not isinstance(self.memory, StreamingMemory) or not episode.n_observed_frames:
+        if self.memory is None or not episode.n_observed_frames:
             return False
         with self.autocast():
             return self.memory.prepare(episode.required_history(), episode.stream)

@@ -9,14 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.memory.base import (
-    Memory,
-    encode_histories,
-    make_scorer,
-    stack_history,
-    start_stream,
-    uses_proprio,
-)
+from mme_vla.memory.base import Memory, stack_history
 from mme_vla.memory.history import CachedHistory, FrameScores, History, OnlineHistory
 from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import moving_frames
@@ -57,57 +50,66 @@ def check_memory(name: str, frames: int = 48, **options: Any) -> None:
 
 
 class Episode:
-    """One synthetic episode, as a cache holds it and as it comes frame by frame; equal tokens in
-    both.
+    """One synthetic episode, as read from a cache and as observed frame by frame, with equal tokens
+    in both.
     """
 
     exec_start = 20
 
     def __init__(self, memory: Memory, frames: int, seed: int = 0) -> None:
-        self.memory, self.length = memory, frames
+        self.memory = memory
+        self.length = frames
         self.images = moving_frames(frames, seed=seed)
         generator = torch.Generator().manual_seed(seed)
         self.tokens = torch.randn(frames, memory.storage.grid**2, D_VISION, generator=generator)
         self.motion = torch.randn(frames, MOTION, generator=generator)
 
     def cached(self, length: int | None = None) -> CachedHistory:
-        """The whole episode, or its first `length` frames, as read from a cache."""
-        length = self.length if length is None else length
-        spec, scorer = self.memory.storage, make_scorer(self.memory)
+        """The full episode, or its first `length` frames, as read from a cache."""
+        if length is None:
+            length = self.length
+        spec = self.memory.storage
         stored = spec.stored_frames(length)
-        rows = [] if scorer is None else [(t, scorer(t, self.images[t])) for t in range(length)]
-        scored = [(t, values) for t, values in rows if values is not None]
-        scores = (
-            FrameScores(np.array([t for t, _ in scored]), np.stack([v for _, v in scored]))
-            if scored
-            else None
-        )
         history = CachedHistory(
-            spec, self.tokens[stored].numpy(), stored, length, scores, self.exec_start
+            spec, self.tokens[stored].numpy(), stored, length, self._scores(length), self.exec_start
         )
-        return self._moving(history)
+        return self._with_motion(history)
 
-    def _moving(self, history: _Kind) -> _Kind:
-        """The history with what the robot felt and did, where its memory reads that."""
-        history.motion, history.state_width = (
-            self.motion.__getitem__ if uses_proprio(self.memory) else None,
-            STATE,
-        )
+    def _scores(self, length: int) -> FrameScores | None:
+        """Scores of the first `length` frames; None where there are none."""
+        scorer = self.memory.make_scorer()
+        if scorer is None:
+            return None
+        frames, values = [], []
+        for frame in range(length):
+            row = scorer(frame, self.images[frame])
+            if row is not None:
+                frames.append(frame)
+                values.append(row)
+        if not frames:
+            return None
+        return FrameScores(np.array(frames), np.stack(values))
+
+    def _with_motion(self, history: _Kind) -> _Kind:
+        """The history with proprioception and actions, where its memory reads them."""
+        history.state_width = STATE
+        if self.memory.uses_proprio:
+            history.motion = self.motion.__getitem__
         return history
+
+    def _empty(self) -> OnlineHistory:
+        scorer = self.memory.make_scorer()
+        return self._with_motion(OnlineHistory(self.memory.storage, scorer, self.exec_start))
 
     def online(self, piece: int, until: int | None = None) -> OnlineHistory:
         """The first `until` frames as an environment delivers them, `piece` at a time."""
-        history = self._moving(
-            OnlineHistory(self.memory.storage, make_scorer(self.memory), self.exec_start)
-        )
+        history = self._empty()
         self.extend(history, piece, self.length if until is None else until)
         return history
 
     def sparse(self, rendered: np.ndarray, until: int) -> OnlineHistory:
         """The first `until` frames, of which only some have an image."""
-        history = self._moving(
-            OnlineHistory(self.memory.storage, make_scorer(self.memory), self.exec_start)
-        )
+        history = self._empty()
         tokens = self.tokens[history.to_encode(until, rendered)]
         history.append(self.images[rendered], tokens, rendered, until)
         return history
@@ -124,20 +126,15 @@ def check_selection(memory: Memory, frames: int) -> None:
     """`select`: in bounds, in time order, blind to the future, repeatable, the same offline and
     online.
     """
-    episode, patches = Episode(memory, frames), memory.storage.grid**2
+    episode = Episode(memory, frames)
+    patches = memory.storage.grid**2
     full = episode.cached()
     for step in (0, 1, 15, 16, 17, 39, frames - 1):
         selection = memory.select(full, step)
-        assert (
-            selection.ndim == 2
-            and selection.shape[1] == 2
-            and np.issubdtype(selection.dtype, np.integer)
-        ), (
+        is_pairs = selection.ndim == 2 and selection.shape[1] == 2
+        assert is_pairs and np.issubdtype(selection.dtype, np.integer), (
             f"select must return whole numbers [n, 2] of (frame, patch); at step {step} it gave"
             f" {selection.dtype} {selection.shape}."
-        )
-        assert len(selection) <= memory.capacity, (
-            f"select chose {len(selection)} tokens; capacity is {memory.capacity}."
         )
         assert len(selection) > 0, (
             f"select chose nothing at step {step}: the current frame at least is always there."
@@ -152,15 +149,17 @@ def check_selection(memory: Memory, frames: int) -> None:
             f"at step {step} the selection is not in time order."
         )
         stored = set(memory.storage.stored_frames(step + 1).tolist())
-        selected_frames = set() if uses_proprio(memory) else set(selection[:, 0].tolist())
+        # A memory that reads states may select frames that have no tokens.
+        selected_frames = set() if memory.uses_proprio else set(selection[:, 0].tolist())
         assert selected_frames <= stored, "select chose frames that the StorageSpec does not keep."
+        check_length(memory, full, step)
         again = memory.select(full, step)
         assert np.array_equal(selection, again), (
             "without rng, select must make the same choice every time."
         )
         short = memory.select(episode.cached(step + 1), step)
         assert np.array_equal(selection, short), (
-            f"what comes after step {step} changed what select chose there."
+            f"frames after step {step} changed what select chose there."
         )
         read = memory.frames_read([step], episode.exec_start)
         assert selected_frames <= set(read.tolist()), (
@@ -176,9 +175,19 @@ def check_selection(memory: Memory, frames: int) -> None:
         assert np.array_equal(memory.select(history, frames - 1), offline), (
             f"with frames arriving {piece} at a time select chose otherwise than offline."
         )
-    rng = np.random.default_rng(0)
-    assert len(memory.select(full, frames - 1, rng)) <= memory.capacity, (
-        "with rng, select chose too many tokens."
+    check_length(memory, full, frames - 1, np.random.default_rng(0))
+
+
+def check_length(
+    memory: Memory, history: History, step: int, rng: np.random.Generator | None = None
+) -> None:
+    """A selection has at most `capacity` tokens."""
+    try:
+        length = len(memory.gather_selection(history, step, rng).mask)
+    except ValueError as error:
+        raise AssertionError(str(error)) from error
+    assert length <= memory.capacity, (
+        f"gather_selection returned {length} tokens; capacity is {memory.capacity}."
     )
 
 
@@ -187,7 +196,7 @@ def _encoded(memory: Memory, history: HistoryTokens) -> MemoryTokens:
     return memory(history)
 
 
-def _recalled(memory: Memory, history: History, *steps: int) -> HistoryTokens:
+def _gathered(memory: Memory, history: History, *steps: int) -> HistoryTokens:
     return stack_history([memory.gather_selection(history, step) for step in steps])
 
 
@@ -200,7 +209,7 @@ def check_encoding(memory: Memory, frames: int) -> None:
     learns.
     """
     full = Episode(memory, frames).cached()
-    history = _recalled(memory, full, 2, frames - 1)  # the first with padding, if it is shorter
+    history = _gathered(memory, full, 2, frames - 1)  # the first with padding, if it is shorter
     encoded = _encoded(memory, history)
     shape = (2, memory.budget, WIDTH)
     assert encoded.tokens.shape == shape, (
@@ -212,11 +221,12 @@ def check_encoding(memory: Memory, frames: int) -> None:
     assert encoded.mask.any(1).all(), "a row has no valid memory token."
     assert torch.isfinite(_valid(encoded)).all(), "a valid memory token is not finite."
 
-    hidden = replace(
+    padded = replace(
         history, features=history.features.clone(), positions=history.positions.clone()
     )
-    hidden.features[~history.mask], hidden.positions[~history.mask] = 1e3, 77.0
-    error = float((_valid(_encoded(memory, hidden)) - _valid(encoded)).abs().max())
+    padded.features[~history.mask] = 1e3
+    padded.positions[~history.mask] = 77.0
+    error = float((_valid(_encoded(memory, padded)) - _valid(encoded)).abs().max())
     assert error <= TOLERANCE, f"what is in padding changed the memory tokens by {error:.2g}."
 
     alone = _encoded(memory, history.rows(slice(1, None)))
@@ -230,36 +240,33 @@ def check_encoding(memory: Memory, frames: int) -> None:
         "forward does not read the features."
     )
 
-    was = {name: parameter.requires_grad for name, parameter in memory.named_parameters()}
+    trainable = {name: parameter.requires_grad for name, parameter in memory.named_parameters()}
     memory.requires_grad_(True)
-    live = memory(history)
-    (live.tokens * live.mask[..., None]).square().sum().backward()
-    idle = [name for name, parameter in memory.named_parameters() if parameter.grad is None]
+    _valid(memory(history)).square().sum().backward()
+    unused = [name for name, parameter in memory.named_parameters() if parameter.grad is None]
     memory.zero_grad(set_to_none=True)
     for name, parameter in memory.named_parameters():
-        parameter.requires_grad_(was[name])
-    assert not idle, f"no gradient reaches {', '.join(idle)}: remove these parameters, or use them."
+        parameter.requires_grad_(trainable[name])
+    assert not unused, (
+        f"no gradient reaches {', '.join(unused)}: remove these parameters, or use them."
+    )
 
 
 @torch.no_grad()
 def check_streaming(memory: Memory, frames: int) -> None:
-    """`encode_histories`: an episode that grows gives the tokens of the complete one."""
+    """`encode`: an episode that grows gives the tokens of the complete one."""
     first, second = Episode(memory, frames, seed=1), Episode(memory, frames, seed=2)
     histories = [first.online(16, 16), second.online(16, 16)]
-    streams = [start_stream(memory) for _ in histories]
+    streams = [memory.start_stream() for _ in histories]
     for until in (16, 32, 37, frames):
         for episode, history in zip((first, second), histories, strict=True):
             episode.extend(history, 16, until)
-        streamed = encode_histories(memory, histories, streams)
-        fresh = _encoded(
-            memory,
-            stack_history(
-                [memory.gather_selection(history, len(history) - 1) for history in histories]
-            ),
-        )
+        streamed = memory.encode(histories, streams)
+        selections = [memory.gather_selection(history, len(history) - 1) for history in histories]
+        fresh = _encoded(memory, stack_history(selections))
         error = float((_valid(streamed) - _valid(fresh)).abs().max())
         assert error <= TOLERANCE, (
-            f"after {until} frames the stream's tokens differ from a fresh look by {error:.2g}."
+            f"after {until} frames the stream's tokens differ from `forward`'s by {error:.2g}."
         )
 
 
@@ -274,10 +281,9 @@ def check_rebuilding(name: str, options: dict[str, Any], memory: Memory) -> None
     assert names == expected, f"made on meta it has other tensors: {sorted(names ^ expected)}."
     copy: Memory = MEMORIES.build({"name": name, **options}, d_vision=D_VISION, width=WIDTH)
     copy.load_state_dict(memory.state_dict())
-    history = _recalled(memory, Episode(memory, 40).cached(), 39)
-    error = float(
-        (_valid(_encoded(copy.eval(), history)) - _valid(_encoded(memory, history))).abs().max()
-    )
+    history = _gathered(memory, Episode(memory, 40).cached(), 39)
+    again, first = _encoded(copy.eval(), history), _encoded(memory, history)
+    error = float((_valid(again) - _valid(first)).abs().max())
     assert error <= TOLERANCE, (
         f"with the same weights a second one gives other tokens (by {error:.2g})."
     )

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import compose
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.memory.base import make_scorer, past_view_spec
+from mme_vla.memory.base import padded_length
 from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.mme import MMEPolicy, mme_of
@@ -126,7 +126,7 @@ def random_history(
     patches, d = policy.memory.storage.grid**2, policy.backbone.vision_width
     if policy.memory.pad_left:
         valid = -(-valid // patches) * patches
-    n = policy.memory.padded_length(valid)
+    n = padded_length(policy.memory, valid)
     mask = torch.zeros(batch, n, dtype=torch.bool)
     mask[:, slice(n - valid, n) if policy.memory.pad_left else slice(valid)] = True
     features = torch.randn(batch, n, d, generator=generator) * mask[..., None]
@@ -160,7 +160,7 @@ def random_past(policy: MMEPolicy, batch: int, seed: int = 0) -> PastViews | Non
     if policy.memory is None:
         return None
     views = len(policy.embodiment.cameras)
-    past = full_past(past_view_spec(policy.memory), views, policy.backbone.image_size, "cpu")
+    past = full_past(policy.memory.past_view_spec, views, policy.backbone.image_size, "cpu")
     if past is None:
         return None
     generator = torch.Generator().manual_seed(seed + 1)
@@ -188,7 +188,7 @@ def moving_frames(count: int, size: int = 64, seed: int = 0) -> np.ndarray:
 def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -> CachedHistory:
     """What a cache of this whole episode would hold, encoded in one go."""
     memory = policy.require_memory()
-    spec, scorer = memory.storage, make_scorer(memory)
+    spec, scorer = memory.storage, memory.make_scorer()
     stored_frames = spec.stored_frames(len(frames))
     tokens = policy.encode_frames(frames[stored_frames])
     rows = [] if scorer is None else [(t, scorer(t, frame)) for t, frame in enumerate(frames)]
@@ -209,7 +209,7 @@ def online_history(
 ) -> OnlineHistory:
     """The same episode as an environment would deliver it, `chunk` frames at a time."""
     memory = policy.require_memory()
-    history = OnlineHistory(memory.storage, make_scorer(memory), exec_start)
+    history = OnlineHistory(memory.storage, memory.make_scorer(), exec_start)
     for start in range(0, len(frames), chunk):
         part = frames[start : start + chunk]
         history.append(part, policy.encode_frames(part[history.to_encode(len(part))]))

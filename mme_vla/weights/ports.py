@@ -14,7 +14,6 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, require
-from mme_vla.memory.base import past_view_spec
 from mme_vla.memory.extensions.spacetime import SpaceTime
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
@@ -107,7 +106,7 @@ def window_of(policy: Policy) -> dict[str, bool | int]:
         return dict.fromkeys(WINDOW_MEMORY, False)
     settings = {"frames": memory.frames, "stride": memory.stride, "every": memory.every}
     memory_settings = {
-        "use_visual_memory": past_view_spec(memory) is not None,
+        "use_visual_memory": memory.past_view_spec is not None,
         "use_proprioceptive_memory": memory.states is not None,
     }
     return memory_settings | {

@@ -24,7 +24,6 @@ from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
-from mme_vla.memory.base import make_scorer
 from mme_vla.memory.history import OnlineHistory
 
 COMMAND = "mme-vla cache model=mine data=here"
@@ -59,7 +58,7 @@ def test_cached_and_online_histories_are_the_same(
     for episode in range(3):
         history = cache.history(episode)
         online = OnlineHistory(
-            memory.storage, make_scorer(memory), int(source.exec_starts[episode])
+            memory.storage, memory.make_scorer(), int(source.exec_starts[episode])
         )
         for t in range(int(source.lengths[episode])):
             frame = source.frames(episode, [t])

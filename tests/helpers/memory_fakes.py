@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.memory.base import MemoryModule, ScoringMemory
+from mme_vla.memory.base import MemoryModule
 from mme_vla.memory.history import FrameScorer, History, StorageSpec
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -23,7 +23,7 @@ def encode(frames: np.ndarray, grid: int = 2) -> Tensor:
     return colours @ torch.randn(3, WIDTH, generator=torch.Generator().manual_seed(0))
 
 
-class MeanBrightness:
+class MeanBrightness(FrameScorer):
     """Scores every third frame by its cells' brightness."""
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
@@ -32,7 +32,7 @@ class MeanBrightness:
         return cells.reshape(-1).astype(np.float32) if frame_index % 3 == 0 else None
 
 
-class LastFrames(MemoryModule, ScoringMemory):
+class LastFrames(MemoryModule):
     """Remembers the newest kept frames, the brighter of them first in line where there
     are scores.
     """

@@ -32,7 +32,9 @@ def test_entries_stored_at_once_equal_those_stored_one_by_one(consolidation: str
             count, 4
         )
         query = torch.randn(1, 2, 8)
-        together = bank.ask(query, entries[row : row + 1], at[row : row + 1], there[row : row + 1])
+        together = bank.retrieve_from(
+            query, entries[row : row + 1], at[row : row + 1], there[row : row + 1]
+        )
         torch.testing.assert_close(together, bank.retrieve([state], query))
 
 

@@ -43,3 +43,9 @@ def test_another_rule_or_option_has_another_key() -> None:
     }
     assert len(keys) == 5
     assert Brightness().key.startswith("brightness-every2-")
+
+
+def test_a_scorer_names_the_frames_that_it_needs() -> None:
+    assert Brightness().frames_scored(4).tolist() == [0, 1, 2, 3], "all, unless it says otherwise"
+    assert ChangeScorer(8, 4).frames_scored(9).tolist() == [0, 3, 7]
+    assert TokenDrop(64, 32, stride=4).frames_read([8], 0).tolist() == [0, 3, 7]

@@ -11,7 +11,7 @@ import torch
 from helpers.golden import error, load, params, vision_config
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.siglip import VisionTower, pool_grid
-from mme_vla.memory.base import make_scorer, position_features
+from mme_vla.memory.base import position_features
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.tokendrop import TokenDrop, most_changed, ranked_patches
@@ -57,7 +57,7 @@ def tokens(buffer):
 
 def history_of(memory, frames, tokens, until: int) -> OnlineHistory:
     """An online history fed one frame at a time up to and including `until`."""
-    history = OnlineHistory(memory.storage, make_scorer(memory))
+    history = OnlineHistory(memory.storage, memory.make_scorer())
     pooled = pool_grid(tokens, memory.storage.grid)
     for t in range(until + 1):
         n_required = history.to_encode(1) + t

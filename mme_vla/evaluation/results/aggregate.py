@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.envs.metadata import is_other
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import UserError, did_you_mean, require
@@ -139,9 +140,6 @@ def resampled_means(
                 values[:, i][sampled].mean(1) * share[:, i] for i in range(values.shape[1])
             )
     return means / len(tasks)
-
-
-DEFAULT_BUDGET = 512
 
 
 @dataclass(frozen=True)

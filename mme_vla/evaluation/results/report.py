@@ -8,8 +8,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.evaluation.results import plots
-from mme_vla.evaluation.results.aggregate import DEFAULT_BUDGET, Method, Results
+from mme_vla.evaluation.results.aggregate import Method, Results
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.curves import CAPTION, process_tables
 from mme_vla.evaluation.results.paper import chunk_flops

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
@@ -87,7 +88,6 @@ def choose_shard(text: str | None, environment: Mapping[str, str] | None = None)
     return shard
 
 
-DEFAULT_BUDGET = 512
 VIDEOS = "videos"
 
 
@@ -369,7 +369,7 @@ def facts_of(
 
 
 def memory_budget(policy: Policy) -> int | None:
-    """Memory tokens, where they are not the usual 512."""
+    """Memory tokens; None where they are `DEFAULT_BUDGET`."""
     budget = None if policy.memory is None else policy.memory.budget
     return None if budget == DEFAULT_BUDGET else budget
 

@@ -17,7 +17,7 @@ from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.memory.base import past_view_spec, union_frames
+from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
 
@@ -44,7 +44,7 @@ class RenderPlan:
         self._hold_steps = sum(event.hold for event in events)
         self._resampled = any(not event.placed for event in events)
         memory = policy.memory
-        every = past_view_spec(memory) is not None
+        every = memory is not None and memory.past_view_spec is not None
         self._cameras = self._robot.camera_names if every else (self._robot.memory_camera,)
         self._reads = cache(self._reads_of)
         # Depth and poses of cameras come with every frame.

@@ -355,7 +355,6 @@ class Rollout:
             video=running.video,
             process=running.process,
             events=running.events.log,
-            notes=running.episode.written,
             subgoals=None if running.trace is None else running.trace.score.to_dict(),
         )
         return EpisodeRecord(

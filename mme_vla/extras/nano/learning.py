@@ -23,7 +23,7 @@ from mme_vla.extras.nano.backbone import NanoBackbone
 from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.extras.nano.tokens import FrameTokens, tokenize
 from mme_vla.extras.nano.tower import reflect, reflect_points
-from mme_vla.memory.base import Memory, stack_history, uses_proprio
+from mme_vla.memory.base import Memory, stack_history
 from mme_vla.memory.history import CachedHistory, History
 from mme_vla.memory.transforms import HistoryTransform, TransformedHistory, map_frames
 from mme_vla.policy.mme import MMEPolicy
@@ -112,7 +112,7 @@ class Reflection:
 
         goals: of all decisions. sides: words of goals that depend on where left or forward is.
         """
-        if not p or uses_proprio(policy.memory):
+        if not p or (policy.memory is not None and policy.memory.uses_proprio):
             return None
         space, stats = policy.embodiment.action, policy.require_processor().stats
         backbone = policy.backbone
@@ -453,9 +453,8 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
     history = CachedHistory(
         memory.storage, stored, frames, demonstration.length, scores, demonstration.exec_start
     )
-    if uses_proprio(
-        policy.memory
-    ):  # an action is a motion of many frames here, so the states alone tell what was done
+    if memory.uses_proprio:
+        # An action is a motion of many frames here, so the states alone tell what was done.
         length = demonstration.length
         nothing = np.zeros((length, policy.embodiment.action.width), np.float32)
         states, unknown = demonstration.states[:length], np.zeros(length, bool)

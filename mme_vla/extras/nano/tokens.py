@@ -17,7 +17,6 @@ from torch import Tensor
 
 from mme_vla.errors import require
 from mme_vla.extras.nano.demonstrations import Demonstration
-from mme_vla.memory.base import frames_scored, make_scorer
 from mme_vla.memory.history import FrameScores
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.mme import MMEPolicy, mme_of
@@ -133,9 +132,9 @@ def tokenize(
 
 def _scores(memory: "Memory", images: Mapping[int, np.ndarray]) -> FrameScores:
     """The scores of these frames by the memory's scorer, as in an episode."""
-    scorer = make_scorer(memory)
+    scorer = memory.make_scorer()
     assert scorer is not None
-    read = frames_scored(memory, max(images) + 1).tolist()
+    read = scorer.frames_scored(max(images) + 1).tolist()
     scored_rows = {frame: scorer(frame, images[frame]) for frame in read if frame in images}
     rows = {frame: values for frame, values in scored_rows.items() if values is not None}
     if not rows:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.extras.methods.sam2act.keyframes import EpisodeKeyframes, file_of
-from mme_vla.memory.base import frames_scored, past_view_spec
+from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
 
 SUBGOAL = "simple_subgoal"  # The column whose changes separate sub-tasks
@@ -151,8 +151,12 @@ def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
     memory = policy.memory
     if (
         memory is None
-        or past_view_spec(memory) is not None
+        or memory.past_view_spec is not None
         or policy.frames_read(np.zeros(1, np.int64), 0) is None
     ):
         return None
-    return np.union1d(memory.storage.stored_frames(length), frames_scored(memory, length))
+    frames = [memory.storage.stored_frames(length)]
+    scorer = memory.make_scorer()
+    if scorer is not None:
+        frames.append(scorer.frames_scored(length))
+    return union_frames(frames)

@@ -16,7 +16,7 @@ import torch
 from mme_vla.data.statistics import normalised_states
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.evidence import EvidenceEpisode
-from mme_vla.memory.base import MemoryModule, frames_scored, make_scorer, stack_history
+from mme_vla.memory.base import MemoryModule, stack_history
 from mme_vla.memory.history import CachedHistory, FrameScores, History
 from mme_vla.processing.normalise import normalize
 
@@ -246,7 +246,8 @@ def required_frames(memory: MemoryModule) -> frozenset[int]:
     """The frames that have to be rendered for a memory to select: scored ones, and all stored if it
     reads tokens.
     """
-    frames = frames_scored(memory, LONGEST)
+    scorer = memory.make_scorer()
+    frames = np.zeros(0, np.int64) if scorer is None else scorer.frames_scored(LONGEST)
     if reads_tokens(memory):
         frames = np.union1d(frames, memory.storage.stored_frames(LONGEST))
     return frozenset(frames.tolist())
@@ -264,7 +265,7 @@ def memory_selection(
         states: of the robot, normalised [t, s]. policy: makes the tokens; None where the memory
             reads none to choose.
     """
-    stored, scorer = memory.storage.stored_frames(episode.length), make_scorer(memory)
+    stored, scorer = memory.storage.stored_frames(episode.length), memory.make_scorer()
     rows = (
         {} if scorer is None else {t: scorer(t, episode.images[t]) for t in sorted(episode.images)}
     )

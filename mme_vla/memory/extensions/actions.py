@@ -1,16 +1,16 @@
-"""Actions: an LSTM over what the robot itself felt and did; no image is read (CAMP).
+"""Actions: an LSTM over proprioception and actions; no image is read (CAMP).
 
 After "Remember what you did?" (CAMP, arXiv 2606.21188), whose code is not public: a recurrent
 memory of the robot's own actions is a strong history where scenes look alike. The paper trains it
 first to reconstruct the past actions (their low frequencies, quantised) and then conditions a
-diffusion policy on its code; a memory here has no loss of its own, so this one learns from the
-action loss alone. That it is an LSTM of two layers, reads states beside actions, also those of the
-conditioning video, every `stride` frames, and says what it knows in `budget` tokens, are choices of
-ours.
+diffusion policy on its code. This memory learns from the action loss alone. Our own choices are
+the LSTM of two layers, that it reads states beside actions and those of the conditioning video too,
+every `stride` frames, and that it returns `budget` tokens.
 
 A frame's row is [state | action that led to it, relative to that state | 1], both normalised as the
-policy's are; where no own action led to it (the video, the first frame) the last two are 0. On a
-robot whose action is a motion of many frames they are 0 everywhere: the states say where it went.
+policy's are. Where no action of the robot led to it (the video, the first frame) the last two are
+0. On a robot whose action is a motion of many frames they are 0 everywhere: the states show where
+it went.
 """
 
 import math
@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, check_sizes
-from mme_vla.memory.base import NEVER, ProprioMemory
+from mme_vla.memory.base import NEVER
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.recurrent import (
     RecurrentLayer,
@@ -39,13 +39,12 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 class MotionRows(History):
-    """A history as such a memory sees it: its tokens are rows, padded with zeros to the width of a
-    token.
+    """A history whose tokens are rows of numbers, padded with zeros to the width of a token.
 
     Args:
-        source: what is there. read: frames [n] → rows [n, w] float32. width: of a token.
-        memory: its name, for what is said where a row is too long. device: where rows are wanted;
-            None leaves them.
+        source: the episode's history. read: frames [n] → rows [n, w] float32. width: of a token.
+        memory: its name, for the error where a row is too long. device: to which rows are moved;
+            None leaves them where they are.
     """
 
     def __init__(
@@ -58,13 +57,11 @@ class MotionRows(History):
     ) -> None:
         super().__init__(source.spec, source.exec_start)
         self.clock_starts = source.clock_starts
-        self._source, self._read, self._width, self._memory, self._device = (
-            source,
-            read,
-            width,
-            memory,
-            device,
-        )
+        self._source = source
+        self._read = read
+        self._width = width
+        self._memory = memory
+        self._device = device
 
     def __len__(self) -> int:
         return len(self._source)
@@ -84,18 +81,18 @@ class LSTMLayer(RecurrentLayer):
     """An LSTM of several layers. State: hidden and cell states, each [b, layers, hidden], 0 at
     first.
 
-    Fresh cells forget at rates of their own, from half of what they hold a frame to a share in
-    `longest` of it, evenly in the logarithm (after Tallec and Ollivier, arXiv 1804.11188): with the
-    usual bias of 1 nothing of a video would be left after a hundred frames, and no loss could tell
-    what there was to keep.
+    Fresh cells forget at different rates, from half of their value a frame to one part in `longest`
+    of it, evenly in the logarithm (after Tallec and Ollivier, arXiv 1804.11188). With the default
+    bias of 1 nothing of a video would be left after a hundred frames, and no loss could teach what
+    to keep.
     """
 
     def __init__(self, hidden: int, layers: int, budget: int, longest: int) -> None:
         super().__init__()
-        self.hidden, self.budget = hidden, budget
-        self.norm = nn.LayerNorm(
-            hidden
-        )  # a fresh encoder's outputs are small: the gates would hardly move
+        self.hidden = hidden
+        self.budget = budget
+        # A fresh encoder's outputs are small: without a norm the gates would hardly move.
+        self.norm = nn.LayerNorm(hidden)
         inputs = [nn.Linear(hidden, 4 * hidden) for _ in range(layers)]
         self.inputs = nn.ModuleList(inputs)
         self.recurrent = nn.ModuleList(
@@ -105,11 +102,10 @@ class LSTMLayer(RecurrentLayer):
         # What is the same for every history must not be most of a token: norms above leave its
         # direction alone.
         nn.init.zeros_(self.tokens.bias)
+        keep_biases = torch.linspace(0, math.log(max(longest - 1, 2)), hidden)
         with torch.no_grad():
             for gates in inputs:
-                gates.bias[hidden : 2 * hidden] = torch.linspace(
-                    0, math.log(max(longest - 1, 2)), hidden
-                )
+                gates.bias[hidden : 2 * hidden] = keep_biases
 
     def initial(self, batch: int) -> State:
         zeros = self.tokens.weight.new_zeros(
@@ -121,12 +117,14 @@ class LSTMLayer(RecurrentLayer):
         self, state: State, x: Tensor, valid: Tensor, following: int = 0, statistics: bool = False
     ) -> tuple[State, Statistics]:
         with full_precision(x):
-            normed, (hidden, cells) = layer_norm(self.norm, x.float()[:, :, 0]), state
-            after: list[tuple[Tensor, Tensor]] = []
+            hidden, cells = state
+            layer_input = layer_norm(self.norm, x.float()[:, :, 0])  # b t d
+            new_hidden, new_cells = [], []
             for i, (inputs, recurrent) in enumerate(zip(self.inputs, self.recurrent, strict=True)):
                 h, c = hidden[:, i], cells[:, i]
-                entering, outputs = linear(inputs, normed), []  # type: ignore[arg-type]
-                for t in range(normed.shape[1]):
+                entering = linear(inputs, layer_input)  # type: ignore[arg-type]
+                outputs = []
+                for t in range(layer_input.shape[1]):
                     gates = entering[:, t] + linear(recurrent, h)  # type: ignore[arg-type]
                     let_in, keep, new, out = gates.chunk(4, -1)
                     cell = keep.sigmoid() * c + let_in.sigmoid() * new.tanh()
@@ -134,12 +132,10 @@ class LSTMLayer(RecurrentLayer):
                     c = torch.where(real, cell, c)
                     h = torch.where(real, out.sigmoid() * cell.tanh(), h)
                     outputs.append(h)
-                normed = torch.stack(outputs, 1)
-                after.append((h, c))
-            return (
-                torch.stack([h for h, _ in after], 1),
-                torch.stack([c for _, c in after], 1),
-            ), {}
+                layer_input = torch.stack(outputs, 1)
+                new_hidden.append(h)
+                new_cells.append(c)
+            return (torch.stack(new_hidden, 1), torch.stack(new_cells, 1)), {}
 
     def read(self, state: State) -> tuple[Tensor, Tensor]:
         tokens = linear(self.tokens, state[0][:, -1]).unflatten(-1, (self.budget, self.hidden))
@@ -147,8 +143,10 @@ class LSTMLayer(RecurrentLayer):
 
 
 @MEMORIES.register("actions")
-class ActionMemory(RecurrentMemory, ProprioMemory):
-    """`budget` tokens of what an LSTM makes of the robot's own states and actions."""
+class ActionMemory(RecurrentMemory):
+    """`budget` tokens of an LSTM over the robot's states and actions."""
+
+    uses_proprio = True
 
     def __init__(
         self,
@@ -187,10 +185,9 @@ class ActionMemory(RecurrentMemory, ProprioMemory):
         return super().gather_selection(self._motion_rows(history), step, rng)
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
-        return super().encode(
-            [self._motion_rows(history, self.output.weight.device) for history in histories],
-            streams,
-        )
+        device = self.output.weight.device
+        rows = [self._motion_rows(history, device) for history in histories]
+        return super().encode(rows, streams)
 
     def prepare(self, history: History, stream: Any) -> bool:
         return super().prepare(self._motion_rows(history, self.output.weight.device), stream)

@@ -1,8 +1,7 @@
 """Anchors: the first frame and the last ones, the floor that a memory has to exceed.
 
 After the anchors of EventVLA, which keeps frame 0 and two frames of the last second beside its
-keyframes. There is nothing here that decides what to write, so any memory that does is compared
-with it.
+keyframes. It does not decide what to write, so memories that do are compared with it.
 """
 
 from typing import Any
@@ -46,10 +45,11 @@ class Anchors(FrameMemory, PerceptualMemory):
         check_every(every, spacing, "spacing")
         frames = budget_frames(budget, grid, at_least=2)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling), **encoder)
-        self.recent, self.spacing, self.every = frames - 1, spacing, every
+        self.recent = frames - 1
+        self.spacing = spacing
+        self.every = every
 
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """Frame 0 and the last ones, ascending."""
-        return np.union1d(
-            [0], recurrent_frames(step, 0, self.recent, stride=self.spacing, every=self.every)
-        )
+        recent = recurrent_frames(step, 0, self.recent, stride=self.spacing, every=self.every)
+        return np.union1d([0], recent)

@@ -1,8 +1,9 @@
-"""A small pre-norm transformer block that memories put together: some tokens read others, then an
-MLP.
+"""Parts that memories share: a small pre-norm transformer block in which some tokens read others,
+and the base of memories that select whole frames.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,22 +11,37 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.config.devices import fused_kernels
-from mme_vla.errors import require
+from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import MemoryModule, all_patches, union_frames
 from mme_vla.memory.history import History
+from mme_vla.memory.recurrent import default_hidden
 
 MLP = 4
 """Width of a block's MLP, in widths of its tokens."""
 
 
-def heads_of(hidden: int, heads: int | None) -> int:
-    """So many heads; None is one for each 64 of `hidden`, at least 2."""
-    heads = heads or max(2, hidden // 64)
-    require(
-        heads >= 1 and hidden % heads == 0,
-        f"memory.heads={heads} does not divide memory.hidden={hidden}.",
-    )
-    return heads
+@dataclass(frozen=True)
+class ReaderOptions:
+    """Options of the small transformer by which a memory reads.
+
+    layers: number of blocks. hidden: their width; None is a quarter of `d_vision`, at least 64.
+    heads: None is one for each 64 of `hidden`, at least 2.
+    """
+
+    layers: int = 2
+    hidden: int | None = None
+    heads: int | None = None
+
+    def sizes(self, d_vision: int) -> tuple[int, int]:
+        """Width and heads, where they are not set those that follow from `d_vision`."""
+        check_sizes("memory", layers=self.layers)
+        hidden = default_hidden(d_vision, self.hidden)
+        heads = self.heads or max(2, hidden // 64)
+        require(
+            heads >= 1 and hidden % heads == 0,
+            f"memory.heads={heads} does not divide memory.hidden={hidden}.",
+        )
+        return hidden, heads
 
 
 class ReadingBlock(nn.Module):
@@ -34,24 +50,22 @@ class ReadingBlock(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.head_dim = width // heads
-        self.norm, self.context_norm, self.mlp_norm = (
-            nn.LayerNorm(width),
-            nn.LayerNorm(width),
-            nn.LayerNorm(width),
-        )
-        self.q, self.kv, self.out = (
-            nn.Linear(width, width),
-            nn.Linear(width, 2 * width),
-            nn.Linear(width, width),
-        )
-        self.up, self.down = nn.Linear(width, MLP * width), nn.Linear(MLP * width, width)
+        self.norm = nn.LayerNorm(width)
+        self.context_norm = nn.LayerNorm(width)
+        self.mlp_norm = nn.LayerNorm(width)
+        self.q = nn.Linear(width, width)
+        self.kv = nn.Linear(width, 2 * width)
+        self.out = nn.Linear(width, width)
+        self.up = nn.Linear(width, MLP * width)
+        self.down = nn.Linear(MLP * width, width)
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor) -> Tensor:
-        """Let x [b, q, d] read context [b, k, d] where mask, bool [b, q, k], says so; a row of no
-        one's reads all.
+        """Let x [b, q, d] read context [b, k, d] where mask, bool [b, q, k], is True; a row without
+        a True reads all.
         """
         q = self.q(self.norm(x)).unflatten(-1, (-1, self.head_dim))
-        k, v = self.kv(self.context_norm(context)).unflatten(-1, (-1, self.head_dim)).chunk(2, -2)
+        kv = self.kv(self.context_norm(context)).unflatten(-1, (-1, self.head_dim))
+        k, v = kv.chunk(2, -2)
         q, k, v = (part.transpose(1, 2) for part in (q, k, v))
         # A row that may read nothing is padding: reading all keeps it finite.
         key_mask = (mask | ~mask.any(-1, keepdim=True))[:, None]
@@ -75,12 +89,12 @@ def by_frame(x: Tensor, patches: int) -> Tensor:
 
 def rows_at(x: Tensor, at: Tensor) -> Tensor:
     """The rows at [b, k] of x [b, n, …]: [b, k, …]."""
-    index = at.view(*at.shape, *[1] * (x.ndim - 2)).expand(-1, -1, *x.shape[2:])
-    return torch.gather(x, 1, index)
+    index = at.view(*at.shape, *[1] * (x.ndim - 2))
+    return torch.gather(x, 1, index.expand(-1, -1, *x.shape[2:]))
 
 
 class FrameMemory(MemoryModule):
-    """A subclass says which frames; all tokens of these are selected, and as many as there are."""
+    """Selects all tokens of the frames that a subclass names."""
 
     lazy = True  # most frames are never selected
 
@@ -97,6 +111,3 @@ class FrameMemory(MemoryModule):
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
         return all_patches(self.selected_frames(step, history.exec_start), self.storage.grid)
-
-    def padded_length(self, count: int) -> int:
-        return count if self.pad_left else self.capacity

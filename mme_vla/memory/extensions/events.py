@@ -24,7 +24,7 @@ import numpy as np
 from torch import Tensor
 
 from mme_vla.errors import check_sizes, require
-from mme_vla.memory.base import PerceptualMemory, ProprioMemory, ScoringMemory, all_patches
+from mme_vla.memory.base import PerceptualMemory, all_patches
 from mme_vla.memory.framesamp import budget_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.tokendrop import ChangeScorer
@@ -33,10 +33,10 @@ from mme_vla.types import HistoryTokens
 
 
 @MEMORIES.register("events")
-class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
-    """The first frame, the newest stored one, and at most `budget / grid² − 2` at which something
-    happened.
-    """
+class Events(PerceptualMemory):
+    """The first frame, the newest stored one, and at most `budget / grid² − 2` frames of events."""
+
+    uses_proprio = True
 
     def __init__(
         self,
@@ -65,13 +65,12 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
         frames = budget_frames(budget, grid, at_least=2)
         storage = StorageSpec(grid, pooling, stride, ChangeScorer(grid, stride).key)
         super().__init__(d_vision, width, budget, storage, **encoder)
-        self.frames, self.gripper, self.gripper_state = frames, gripper, gripper_state
+        self.frames = frames
+        self.gripper = gripper
+        self.gripper_state = gripper_state
 
     def make_scorer(self) -> ChangeScorer:
         return ChangeScorer(self.storage.grid, self.storage.keep_every)
-
-    def frames_scored(self, length: int) -> np.ndarray:
-        return self.storage.stored_frames(length)
 
     def select(
         self, history: History, step: int, rng: np.random.Generator | None = None
@@ -86,20 +85,26 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
         more than fit.
         """
         states = history.proprio(frames).numpy().astype(np.float64)
-        count, number = states.shape[1], self.gripper_state
+        count = states.shape[1]
         require(
-            -count <= number < count,
-            f"memory.gripper_state={number}: the robot's state has {count} numbers. Name the"
-            " gripper's, from 0.",
+            -count <= self.gripper_state < count,
+            f"memory.gripper_state={self.gripper_state}: the robot's state has {count} numbers."
+            " Name the gripper's, from 0.",
         )
-        arm, gripper = np.delete(states, self.gripper_state, 1), states[:, self.gripper_state]
-        closes = np.abs(np.diff(gripper, prepend=gripper[:1])) >= self.gripper
+        # The gripper opens or closes.
+        gripper = states[:, self.gripper_state]
+        moves_gripper = np.abs(np.diff(gripper, prepend=gripper[:1])) >= self.gripper
+        # The arm comes to rest.
+        arm = np.delete(states, self.gripper_state, 1)
         speed = np.linalg.norm(np.diff(arm, axis=0, prepend=arm[:1]), axis=1)
-        scores, change = history.scores.until(int(frames[-1])), np.zeros(len(frames))
+        # The image changes, as a share of the greatest change.
+        scores = history.scores.until(int(frames[-1]))
+        change = np.zeros(len(frames))
         change[np.searchsorted(frames, scores.frames)] = scores.values.mean(1, dtype=np.float64)
         change[0] = change[min(1, len(change) - 1)]  # no frame comes before the first
-        novelty = np.where(peaks(change), change / max(change.max(), np.finfo(float).tiny), 0)
-        value = closes + peaks(-speed) + novelty
+        greatest = max(change.max(), np.finfo(float).tiny)
+        novelty = np.where(peaks(change), change / greatest, 0)
+        value = moves_gripper + peaks(-speed) + novelty
         value[[0, -1]] = np.inf
         best = np.argsort(-value, kind="stable")[: self.frames]
         return np.sort(best[value[best] > 0])
@@ -107,6 +112,7 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
     def condition_on_prompt(
         self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]
     ) -> HistoryTokens:
+        # States choose the frames; the features are vision tokens.
         return replace(history, features=condition(history.features))
 
 

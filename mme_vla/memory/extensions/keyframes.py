@@ -1,12 +1,12 @@
-"""Keyframes: a write head says at which frames a sub-task begins, and these frames are kept whole
-(EventVLA).
+"""Keyframes: a write head predicts at which frames a sub-task begins, and these frames are kept
+whole (EventVLA).
 
 After EventVLA, whose head predicts keyframes from the hidden state of an action chunk, keeps those
-that are certain enough beside a few anchors, and suppresses neighbours. A memory here stands before
-the language model, so that the head reads what a frame looks like and how it differs from the
-stored frame before it. What it learns from are the sub-tasks of the dataset: a stored frame is a
+that are certain enough beside a few anchors, and suppresses neighbours. A memory here is computed
+before the language model, so the head reads the mean of a frame's tokens and its difference from
+the stored frame before it. Its labels are the sub-tasks of the dataset: a stored frame is a
 keyframe where a sub-task has begun since the stored frame before it. Without labels the action loss
-alone teaches it, through a straight-through sigmoid as in `learned_topk`.
+alone trains it, through a straight-through sigmoid as in `learned_topk`.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens, ReadsLabels
 
 LABEL = "subtask_index"
-LOWEST = 1e4  # beyond any score
+LARGE = 1e4  # beyond any score
 
 
 @MEMORIES.register("keyframes")
@@ -68,8 +68,11 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         )
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
         hidden = default_hidden(d_vision, hidden)
-        self.frames, self.pool, self.capacity = frames, pool, pool * grid**2
-        self.read, self.write = nn.Linear(2 * d_vision, hidden), nn.Linear(hidden, 1)
+        self.capacity = pool * grid**2
+        self.frames = frames
+        self.pool = pool
+        self.read = nn.Linear(2 * d_vision, hidden)
+        self.write = nn.Linear(hidden, 1)
 
     def selected_frames(self, step: int) -> np.ndarray:
         """The frames that the head reads at `step`, ascending, the newest stored one among them."""
@@ -89,25 +92,22 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         valid = by_frame(history.mask, patches)[..., 0]
         scores = self.scores(history.features)
         top_frames = self.top_frames(scores, valid)
-        tokens = (
-            top_frames[..., None] * patches + torch.arange(patches, device=top_frames.device)
-        ).flatten(1)
-        features, positions, mask = (
-            rows_at(part, tokens) for part in (history.features, history.positions, history.mask)
-        )
-        # One in the forward pass, the sigmoid in the backward pass.
-        worth = rows_at(scores, top_frames).sigmoid()
-        worth = (worth + (1 - worth).detach()).repeat_interleave(patches, 1)
-        encoded = self.encoder(features, positions, mask)
-        ages = None if history.ages is None else rows_at(history.ages, tokens)
+        patch = torch.arange(patches, device=top_frames.device)
+        indices = (top_frames[..., None] * patches + patch).flatten(1)
+        mask = rows_at(history.mask, indices)
+        features = rows_at(history.features, indices)
+        positions = rows_at(history.positions, indices)
+        tokens = self.encoder(features, positions, mask)
+        # The weight is 1 in the forward pass, and the sigmoid in the backward pass.
+        weight = rows_at(scores, top_frames).sigmoid()
+        weight = (weight + (1 - weight).detach()).repeat_interleave(patches, 1)
+        tokens = tokens * weight[..., None].to(tokens.dtype)
+        ages = None if history.ages is None else rows_at(history.ages, indices)
         losses = {}
         if LABEL in history.labels:
-            losses["write"] = write_loss(
-                scores, by_frame(history.labels[LABEL], patches)[..., 0], valid
-            )
-        return MemoryTokens(
-            encoded * worth[..., None].to(encoded.dtype), mask, ages=ages, losses=losses
-        )
+            subtask = by_frame(history.labels[LABEL], patches)[..., 0]
+            losses["write"] = write_loss(scores, subtask, valid)
+        return MemoryTokens(tokens, mask, ages=ages, losses=losses)
 
     def scores(self, features: Tensor) -> Tensor:
         """Logits [b, t] float32: whether a sub-task has begun since the frame before; features [b,
@@ -116,9 +116,8 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         with full_precision(features):
             means = by_frame(features.float(), self.storage.grid**2).mean(2)
             change = torch.diff(means, dim=1, prepend=means[:, :1])
-            return linear(
-                self.write, functional.silu(linear(self.read, torch.cat([means, change], -1)))
-            )[..., 0]
+            hidden = functional.silu(linear(self.read, torch.cat([means, change], -1)))
+            return linear(self.write, hidden)[..., 0]
 
     def top_frames(self, scores: Tensor, valid: Tensor) -> Tensor:
         """Which frames are kept: int64 [b, frames], ascending, padding last.
@@ -126,11 +125,12 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         Highest scores first, those lower than a neighbour's after all others. The first frame and
         the newest in any case.
         """
-        ranks = scores.detach().masked_fill(~valid, -2 * LOWEST)
-        highest = functional.max_pool1d(ranks[:, None], 3, 1, 1)[:, 0]
-        ranks = ranks - LOWEST * (ranks < highest)
+        ranks = scores.detach().masked_fill(~valid, -2 * LARGE)
+        highest = functional.max_pool1d(ranks[:, None], kernel_size=3, stride=1, padding=1)[:, 0]
+        ranks = ranks - LARGE * (ranks < highest)
         newest = valid.sum(1, keepdim=True) - 1
-        ranks = ranks.scatter(1, torch.cat([torch.zeros_like(newest), newest], 1), LOWEST)
+        ends = torch.cat([torch.zeros_like(newest), newest], 1)
+        ranks = ranks.scatter(1, ends, LARGE)
         return ranks.topk(self.frames, dim=1).indices.sort(1).values
 
 
@@ -145,8 +145,8 @@ def write_loss(scores: Tensor, subtask: Tensor, valid: Tensor) -> Tensor:
     losses = functional.binary_cross_entropy_with_logits(
         scores, begins.to(scores.dtype), reduction="none"
     )
-    sides = [
-        (losses * side).sum(1) / side.sum(1).clamp(min=1)
-        for side in (begins & valid, ~begins & valid)
-    ]
-    return (sides[0] + sides[1]) / 2
+    is_keyframe = begins & valid
+    is_other = ~begins & valid
+    keyframe_loss = (losses * is_keyframe).sum(1) / is_keyframe.sum(1).clamp(min=1)
+    other_loss = (losses * is_other).sum(1) / is_other.sum(1).clamp(min=1)
+    return (keyframe_loss + other_loss) / 2

@@ -1,33 +1,33 @@
-"""Moment: a few learned tokens ask every frame, and a small causal encoder puts their outputs in
+"""Moment: a few learned queries read every frame, and a small causal encoder puts their outputs in
 context (HAMLET).
 
 After "HAMLET: Switch your Vision-Language-Action Model into a History-Aware Policy" (arXiv
 2510.00695): four moment tokens a time step, a memory module of two causal layers over the steps,
-the four of the current step read by the action head. Three things are otherwise here, because a
-memory stands before the language model and has no loss of its own: the tokens ask the frame's
-stored vision tokens, not the language model; they begin at random, without the paper's
-time-contrastive stage; and the outputs of the encoder for all steps are handed over, the current
-ones last, so that an integration may look at a moment at its time. The paper looks back four steps;
-this memory as far as its budget goes.
+the four of the current step read by the action head. Three things differ here, because a memory is
+computed before the language model and has no loss of its own. The queries read the frame's stored
+vision tokens, not the language model. They begin at random, without the paper's time-contrastive
+stage. And the outputs of the encoder for all steps are returned, the current ones last, so that an
+integration may read a moment at its time. The paper uses the last four steps, this memory as many
+as its budget holds.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from mme_vla.errors import check_sizes, require
-from mme_vla.memory.base import FeatureEncoder
+from mme_vla.memory.base import FeatureEncoder, take_options
 from mme_vla.memory.extensions.attending import (
     FrameMemory,
+    ReaderOptions,
     ReadingBlock,
     by_frame,
-    heads_of,
     not_later,
 )
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.recurrent import check_every, default_hidden, recurrent_frames
+from mme_vla.memory.recurrent import check_every, recurrent_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -38,7 +38,8 @@ class Moment(FrameMemory):
     its own.
     """
 
-    pad_left = True
+    option_types: ClassVar[tuple[type, ...]] = (ReaderOptions, FeatureEncoder)
+    pad_left = 1
     timed = True
 
     def __init__(
@@ -51,86 +52,78 @@ class Moment(FrameMemory):
         pooling: str = "mean",
         stride: int = 16,
         every: int = 1,
-        *,
-        layers: int = 2,
-        hidden: int | None = None,
-        heads: int | None = None,
-        **encoder: Any,
+        **options: Any,
     ) -> None:
         """Put the parts together.
 
         Args:
             d_vision: width of a vision token. width: of a memory token, given by the integration.
             budget: most memory tokens; budget / moments frames are read.
-            moments: learned tokens that ask every frame.
+            moments: learned queries that read every frame.
             grid, pooling: a frame that is read is grid×grid tokens.
             stride, every: frames between two that are read, and how they are counted
                 (`recurrent_frames`; up to 5/8 of them from the video).
-            layers, hidden, heads: of the causal encoder; its width is by default a quarter of
-                `d_vision`, at least 64.
-            encoder: `position_dim`, `position_hidden` and `positions` of the `FeatureEncoder`.
+            options: `ReaderOptions` of the causal encoder; `position_dim`, `position_hidden` and
+                `positions` of the `FeatureEncoder`.
         """
         super().__init__()
-        check_sizes("memory", moments=moments, stride=stride, layers=layers)
+        check_sizes("memory", moments=moments, stride=stride)
         check_every(every, stride)
         require(
             budget % moments == 0 < budget,
             f"memory.budget={budget} must be a multiple of memory.moments={moments}.",
         )
-        hidden = default_hidden(d_vision, hidden)
-        heads = heads_of(hidden, heads)
-        self.budget, self.moments, self.steps = budget, moments, budget // moments
-        self.stride, self.every = stride, every
+        causal = take_options(ReaderOptions, options)
+        hidden, heads = causal.sizes(d_vision)
+        self.budget = budget
+        self.moments = moments
+        self.steps = budget // moments
+        self.stride = stride
+        self.every = every
         self.storage = StorageSpec(grid, pooling)
         self.capacity = self.steps * grid**2
-        self.encoder = FeatureEncoder(d_vision, hidden, **encoder)
+        self.encoder = FeatureEncoder(d_vision, hidden, **options)
         self.questions = nn.Parameter(torch.randn(moments, hidden) * hidden**-0.5)
         self.ask = ReadingBlock(hidden, heads)
-        self.layers = nn.ModuleList(ReadingBlock(hidden, heads) for _ in range(layers))
-        self.norm, self.output = nn.LayerNorm(hidden), nn.Linear(hidden, width)
+        self.layers = nn.ModuleList(ReadingBlock(hidden, heads) for _ in range(causal.layers))
+        self.norm = nn.LayerNorm(hidden)
+        self.output = nn.Linear(hidden, width)
 
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The frames read at `step`, the last of them `step`."""
-        return recurrent_frames(
-            step, exec_start, self.steps, max(5 * self.steps // 8, 1), self.stride, self.every
-        )
+        max_video = max(5 * self.steps // 8, 1)
+        return recurrent_frames(step, exec_start, self.steps, max_video, self.stride, self.every)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2
-        x = by_frame(
-            self.encoder(history.features, history.positions, history.mask), patches
-        )  # b t p d
+        x = self.encoder(history.features, history.positions, history.mask)
+        x = by_frame(x, patches)  # b t p d
         valid = by_frame(history.mask, patches)[..., 0]  # b t
         rows, frames = valid.shape
-        questions = self.questions.to(x.dtype).repeat(rows * frames, 1, 1)
-        everything = torch.ones(
+        # The queries read each frame by itself.
+        queries = self.questions.to(x.dtype).repeat(rows * frames, 1, 1)
+        reads_all = torch.ones(
             rows * frames, self.moments, patches, dtype=torch.bool, device=x.device
         )
-        tokens = (
-            self.ask(questions, x.flatten(0, 1), everything)
-            .unflatten(0, (rows, frames))
-            .flatten(1, 2)
-        )
-        frame_mask = self._of_frames(valid)
-        order = (
-            torch.arange(frames, device=x.device)
-            .repeat_interleave(self.moments)[None]
-            .expand(rows, -1)
-        )
-        mask = not_later(order, order) & frame_mask[:, None, :]
+        moments = self.ask(queries, x.flatten(0, 1), reads_all)
+        tokens = moments.unflatten(0, (rows, frames)).flatten(1, 2)  # b t·m d
+        # Each token reads those of its frame and of earlier ones.
+        token_mask = valid.repeat_interleave(self.moments, 1)
+        order = torch.arange(frames, device=x.device).repeat_interleave(self.moments)
+        order = order[None].expand(rows, -1)
+        mask = not_later(order, order) & token_mask[:, None, :]
         for layer in self.layers:
             tokens = layer(tokens, tokens, mask)
-        ages = history.ages
-        if ages is not None:
-            ages = self._padded(self._of_frames(by_frame(ages, patches)[..., 0]))
+        tokens = self.output(self.norm(tokens))
+        # Padding in front, up to the budget.
+        missing = self.budget - tokens.shape[1]
+        ages = None
+        if history.ages is not None:
+            frame_ages = by_frame(history.ages, patches)[..., 0]
+            ages = frame_ages.repeat_interleave(self.moments, 1)
+            ages = nn.functional.pad(ages, (missing, 0))
         return MemoryTokens(
-            self._padded(self.output(self.norm(tokens))), self._padded(frame_mask), ages=ages
+            tokens=nn.functional.pad(tokens, (0, 0, missing, 0)),
+            mask=nn.functional.pad(token_mask, (missing, 0)),
+            ages=ages,
         )
-
-    def _of_frames(self, x: Tensor) -> Tensor:
-        """What is known of frames [b, t], of their tokens [b, t·moments]."""
-        return x.repeat_interleave(self.moments, 1)
-
-    def _padded(self, x: Tensor) -> Tensor:
-        """[b, n, …] with padding in front, as long as the budget."""
-        return nn.functional.pad(x, (*[0, 0] * (x.ndim - 2), self.budget - x.shape[1], 0))

@@ -1,7 +1,6 @@
 """Present: the current frame's tokens alone, as if they were memory.
 
-A control, not a memory: a policy with it has the parameters and the updates of one that remembers,
-and no past.
+A control: a policy with it has the parameters and the updates of one with a memory, and no past.
 """
 
 from collections.abc import Sequence
@@ -37,9 +36,9 @@ class Present(PerceptualMemory):
             budget: maximum number of memory tokens, at least grid²; None for grid².
         """
         check_sizes("memory", grid=grid)
-        enough = budget is None or budget >= grid**2
+        is_enough = budget is None or budget >= grid**2
         require(
-            enough,
+            is_enough,
             f"memory.budget={budget} does not hold the {grid}×{grid} tokens of a frame: {grid**2}.",
         )
         super().__init__(d_vision, width, grid**2, StorageSpec(grid, pooling), **encoder)

@@ -62,7 +62,8 @@ class Pyramid(FrameMemory, PerceptualMemory):
         """The frames kept at `step`, ascending: frame 0, and k·stride − 1 within the window of each
         stride.
         """
-        windows, newest = [np.zeros(1, np.int64)], step
+        windows = [np.zeros(1, np.int64)]
+        newest = step
         for stride, size in zip(self.strides, self.sizes, strict=True):
             oldest = newest - stride * size
             frames = np.arange(max(oldest + 1, 0), newest + 1)

@@ -2,14 +2,15 @@
 is sampled.
 
 After the retrieval step of SoumilRathi/robomme-interference (at 48d62faa, read and not copied): a
-history is cut where the cosine between neighbouring frames falls below a threshold, a chunk is
-worth its highest cosine with the frame that asks, and the best chunk's span is handed to the
-policy's own sampler. There frames were embedded by SigLIP anew; here a frame is the mean of its
-stored tokens, which are there already, so their threshold of 0.923 does not carry over. Choices of
-ours: a chunk ends with the conditioning video and has at most `longest` frames; the chunk that
-holds the current frame always looks like it, and is therefore not asked but fills what is left
-over; as many chunks are taken, in the order of likeness, as the budget holds; and of the chunk that
-does not fit whole, evenly spaced frames.
+history is cut where the cosine between neighbouring frames falls below a threshold, the score of a
+chunk is its highest cosine with the current frame, and the best chunk's span is passed to the
+policy's own sampler. There frames were embedded by SigLIP anew. Here a frame is the mean of its
+stored tokens, so their threshold of 0.923 does not carry over.
+
+Choices of ours: a chunk ends with the conditioning video and has at most `longest` frames. The
+chunk of the current frame always looks like it, so it is not scored but fills what is left over. As
+many chunks are taken, in the order of likeness, as the budget holds, and of the chunk that does not
+fit whole, evenly spaced frames.
 """
 
 from typing import Any
@@ -48,7 +49,7 @@ class Retrieval(PerceptualMemory):
         Args:
             grid, pooling: a remembered frame is grid×grid tokens.
             every: frames 0 and k·every − 1 are stored, compared and remembered; 1: all. The newest
-                of them asks.
+                of them is the query.
             cut: a new chunk begins where two neighbouring stored frames have a cosine below it. −1
                 never cuts.
             longest: most stored frames of a chunk.
@@ -60,24 +61,26 @@ class Retrieval(PerceptualMemory):
         )
         check_sizes("memory", longest=longest)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
-        self.frames, self.cut, self.longest = frames, cut, longest
+        self.frames = frames
+        self.cut = cut
+        self.longest = longest
 
     def select(
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
         frames = self.storage.stored_frames(step + 1)
         if len(frames) > self.frames:
-            frames = frames[
-                self.alike(self.frame_features(history, frames), frames >= history.exec_start)
-            ]
+            features = self.frame_features(history, frames)
+            frames = frames[self.alike(features, frames >= history.exec_start)]
         return all_patches(frames, self.storage.grid)
 
     def frame_features(self, history: History, frames: np.ndarray) -> Tensor:
-        """What stored frames [n] look like: [n, d_vision] of length 1, from their tokens as they
-        are stored.
+        """The mean of the tokens of stored frames [n] as they are stored: [n, d_vision], of length
+        1.
         """
         tokens = history.stored(all_patches(frames, self.storage.grid)).float()
-        return torch.nn.functional.normalize(tokens.unflatten(0, (len(frames), -1)).mean(1), dim=-1)
+        means = tokens.unflatten(0, (len(frames), -1)).mean(1)
+        return torch.nn.functional.normalize(means, dim=-1)
 
     def alike(self, features: Tensor, execution: np.ndarray) -> np.ndarray:
         """Which frames are remembered.
@@ -89,27 +92,30 @@ class Retrieval(PerceptualMemory):
         Returns:
             int64 [`frames`], ascending, the newest last.
         """
-        near = (features[1:] * features[:-1]).sum(1).cpu().numpy()
+        neighbours = (features[1:] * features[:-1]).sum(1).cpu().numpy()
         likeness = (features @ features[-1]).cpu().numpy()
-        chunks = chunks_of(near < self.cut, execution, self.longest)
+        chunks = chunks_of(neighbours < self.cut, execution, self.longest)
         ranked = sorted(chunks[:-1], key=lambda chunk: -likeness[chunk].max())
-        taken, remaining = [np.array([len(features) - 1])], self.frames - 1
+        # The current frame first, and the other frames of its chunk last.
+        taken = [np.array([len(features) - 1])]
+        remaining = self.frames - 1
         for chunk in [*ranked, chunks[-1][:-1]]:
-            if remaining and len(chunk):
-                picked = (
-                    chunk
-                    if len(chunk) <= remaining
-                    else chunk[evenly_spaced_frames(len(chunk) - 1, remaining)]
-                )
-                taken.append(picked)
-                remaining -= len(picked)
+            if not remaining or not len(chunk):
+                continue
+            if len(chunk) > remaining:
+                chunk = chunk[evenly_spaced_frames(len(chunk) - 1, remaining)]
+            taken.append(chunk)
+            remaining -= len(chunk)
         return np.sort(np.concatenate(taken))
 
 
 def chunks_of(cuts: np.ndarray, execution: np.ndarray, longest: int) -> list[np.ndarray]:
-    """Split n frames where `cuts` [n − 1] says so, where the video ends, and into pieces of at most
+    """Split n frames where `cuts` [n − 1] is True, where the video ends, and into pieces of at most
     `longest`.
     """
     ends = cuts | (np.diff(execution.astype(int)) != 0)
-    runs = np.split(np.arange(len(execution)), np.flatnonzero(ends) + 1)
-    return [run[start : start + longest] for run in runs for start in range(0, len(run), longest)]
+    chunks = []
+    for run in np.split(np.arange(len(execution)), np.flatnonzero(ends) + 1):
+        for start in range(0, len(run), longest):
+            chunks.append(run[start : start + longest])
+    return chunks

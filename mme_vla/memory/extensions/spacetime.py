@@ -3,15 +3,15 @@ option of π0.5).
 
 After MEM's short-horizon memory (arXiv 2603.03596) as LeRobot's π0.5 has it (`use_visual_memory`,
 `use_proprioceptive_memory`; huggingface/lerobot#4076, read and not copied): six frames a second
-apart; every fourth layer of the tower lets each patch look at the same patch of the frames before
-it, with the layer's own weights, and what the tower made of past frames is dropped above the last
-such layer. So the prefix is no longer than before, and no weight is added. Each frame's state,
-normalised and padded with zeros, becomes one token through one linear layer.
+apart. In every fourth layer of the tower each patch attends to the same patch of the frames before
+it, with the layer's own weights. Past frames are dropped above the last such layer. So the prefix
+is no longer than before, and no weight is added. Each frame's state, normalised and padded with
+zeros, becomes one token through one linear layer.
 
-LeRobot takes the state out of the prompt where states are tokens; here prompts hold none unless a
-format asks for it. There the tokens stand between images and words; here the integration says where
-they go, and `integration.mutual=true` of `context` puts them there. Frames of the conditioning
-video are past frames as any other.
+LeRobot takes the state out of the prompt where states are tokens. Here prompts hold none unless
+their format has one. There the tokens are between images and words. Here the integration places
+them, and `integration.mutual=true` of `context` puts them there. Frames of the conditioning video
+are past frames as any other.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,14 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, check_sizes, require
-from mme_vla.memory.base import (
-    NEVER,
-    MemoryModule,
-    PastViewMemory,
-    PastViewSpec,
-    ProprioMemory,
-    union_frames,
-)
+from mme_vla.memory.base import NEVER, MemoryModule, PastViewSpec, union_frames
 from mme_vla.memory.extensions.actions import MotionRows
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
@@ -36,11 +29,11 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 @MEMORIES.register("spacetime")
-class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
+class SpaceTime(MemoryModule):
     """Views of `frames` frames for the tower, and their states as so many tokens; `select` names
     the frames.
 
-    No cache serves it: it would have to hold the features of every frame of every camera in each
+    It has no cache, which would have to store the features of every frame of every camera in each
     layer that attends over time, where others store one pooled grid of one camera. So images are
     read anew, in training too.
     """
@@ -77,17 +70,20 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
             "memory.views=false and memory.states=false leave nothing to remember: set one of"
             " them.",
         )
-        enough = budget is None or not states or budget >= frames
+        is_enough = budget is None or not states or budget >= frames
         require(
-            enough,
+            is_enough,
             f"memory.budget={budget}: the states of memory.frames={frames} are as many tokens.",
         )
         require(
             not states or state_dim <= d_vision,
             f"memory.state_dim={state_dim}: tokens {d_vision} wide carry the states.",
         )
-        self.frames, self.stride, self.every = frames, stride, every
-        self.width, self.state_dim = width, state_dim
+        self.frames = frames
+        self.stride = stride
+        self.every = every
+        self.width = width
+        self.state_dim = state_dim
         self.d_vision = d_vision
         self.past_view_spec = PastViewSpec(frames, stride, every) if views else None
         self.uses_proprio = states
@@ -104,36 +100,31 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
     def select(
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
-        frames: np.ndarray = step - self.stride * np.arange(
-            self.frames - 1 if self.budget else -1, -1, -1
-        )
+        if not self.budget:  # views alone
+            return np.zeros((0, 2), np.int64)
+        frames: np.ndarray = step - self.stride * np.arange(self.frames - 1, -1, -1)
         frames = frames[frames >= 0]
         return np.stack([frames, np.zeros_like(frames)], 1)
 
     def gather_selection(
         self, history: History, step: int, rng: np.random.Generator | None = None
     ) -> HistoryTokens:
-        return super().gather_selection(
-            MotionRows(history, self._proprio_rows(history), self.d_vision, "spacetime"), step, rng
-        )
+        rows = MotionRows(history, self._proprio_rows(history), self.d_vision, "spacetime")
+        return super().gather_selection(rows, step, rng)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         if self.states is None:
             tokens = history.features.new_zeros(*history.mask.shape, self.width)
             return MemoryTokens(tokens, history.mask, ages=history.ages)
-        weight, ages = self.states.weight, history.ages
-        tokens = self.states(
-            history.features[..., : self.state_dim].to(weight)
-        )  # an episode's states are on the CPU
-        return MemoryTokens(
-            tokens,
-            history.mask.to(weight.device),
-            ages=None if ages is None else ages.to(weight.device),
-        )
+        # An episode's states are on the CPU.
+        weight = self.states.weight
+        tokens = self.states(history.features[..., : self.state_dim].to(weight))
+        ages = None if history.ages is None else history.ages.to(weight.device)
+        return MemoryTokens(tokens, history.mask.to(weight.device), ages=ages)
 
     def _proprio_rows(self, history: History) -> Callable[[np.ndarray], Tensor]:
-        """Rows that stand for frames [n]: the robot's states, at most as wide as their layer;
-        nothing without them.
+        """A function from frames [n] to the robot's states, at most as wide as their layer; zeros
+        where no states are read.
         """
 
         def rows(frames: np.ndarray) -> Tensor:

@@ -20,7 +20,6 @@ from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.envs.episodes import spans
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.errors import require
-from mme_vla.memory.base import past_view_spec
 from mme_vla.registry import MEMORIES
 
 if TYPE_CHECKING:
@@ -80,7 +79,7 @@ class FrameChoice:
         if self.memory is not None:
             read = self.read(np.array(numbers, np.int64), video)
             for camera in (
-                CAMERAS if past_view_spec(_build(self.memory)) is not None else (MEMORY_CAMERA,)
+                CAMERAS if _build(self.memory).past_view_spec is not None else (MEMORY_CAMERA,)
             ):
                 frames[camera] |= read
         return RenderRequest(frames, now=())

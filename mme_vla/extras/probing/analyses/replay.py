@@ -15,7 +15,7 @@ from mme_vla.data.statistics import compute_norm_stats, normalised_states
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, figure, svg
 from mme_vla.extras.probing.recordings import Recording
-from mme_vla.memory.base import Memory, make_scorer
+from mme_vla.memory.base import Memory
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.episode import Episode
@@ -192,7 +192,7 @@ def selection_sheets(
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     frames = source.frames(episode, np.arange(length))
     history, patches = (
-        OnlineHistory(memory.storage, make_scorer(memory), start),
+        OnlineHistory(memory.storage, memory.make_scorer(), start),
         memory.storage.grid**2,
     )
     motion = normalised_states(source.states(episode, 0, length))
