@@ -19,7 +19,7 @@ from mme_vla import UserError
 from mme_vla.cli import board as board_command
 from mme_vla.cli import nano as nano_command
 from mme_vla.envs.metadata import episodes
-from mme_vla.evaluation.results.aggregate import percentiles
+from mme_vla.evaluation.results.statistics import percentiles
 from mme_vla.evaluation.store import claim_run, read_folders
 from mme_vla.nano import board_page
 from mme_vla.nano.board import Board, Row, homogeneity, kendall, pooled, smallest_p, spearman
