@@ -29,7 +29,7 @@ from mme_vla.envs.base import Environment, EpisodeEnv, Hold
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Interval, aggregate, wilson
+from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.curves import distinct_parts
 from mme_vla.evaluation.results.events import (
     event_curves,
@@ -38,6 +38,7 @@ from mme_vla.evaluation.results.events import (
     matched_methods,
 )
 from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.statistics import Interval, wilson
 from mme_vla.evaluation.rollout.evaluation import evaluate_events
 from mme_vla.evaluation.rollout.events import Event, EventCourse, event_arms, read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings

@@ -9,19 +9,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
 from helpers.rollout_fakes import save_records
 from mme_vla import UserError
 from mme_vla.cli.results import main
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results import paper
-from mme_vla.evaluation.results.aggregate import Results, aggregate, bootstrap, wilson
-from mme_vla.evaluation.results.compare import compare, compare_all, holm, sign_test
+from mme_vla.evaluation.results.aggregate import Results, aggregate
+from mme_vla.evaluation.results.compare import compare, compare_all
 from mme_vla.evaluation.results.paper import demo_records
 from mme_vla.evaluation.results.report import policy_facts, training_details
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, TASK_FACTS, Protocol, tasks_of
+from mme_vla.evaluation.results.statistics import (
+    bootstrap,
+    holm,
+    mean_interval,
+    paired_interval,
+    sign_test,
+    tango,
+    unpaired_difference,
+    wilson,
+)
 from mme_vla.evaluation.results.tables import (
     Table,
+    comparison_table,
     leaderboard,
     overview,
     to_csv,
@@ -139,6 +151,51 @@ def test_sign_test_and_holm_are_the_textbooks() -> None:
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
 
 
+def test_wilson_is_scipys_and_a_mean_over_equal_tasks_is_that_of_all_their_episodes() -> None:
+    assert wilson(0.3, 10) == pytest.approx(tuple(binomtest(3, 10).proportion_ci(method="wilson")))
+    tasks = [np.zeros((3, 1)), np.zeros((3, 1))]
+    assert mean_interval(tasks) == pytest.approx(wilson(0, 6))
+
+
+def test_the_ends_of_tangos_interval_have_the_score_of_its_level() -> None:
+    assert tango(0, 0, 3) == pytest.approx((-0.5615, 0.5615), abs=1e-4)
+    low, high = tango(12, 2, 50)
+    for end in (low, high):  # at an end the score is the normal quantile
+        b = -14 + (100 - 12 + 2) * end
+        q = (np.sqrt(b * b + 8 * 50 * 2 * end * (1 - end)) - b) / 200
+        score = (10 - 50 * end) / np.sqrt(50 * (2 * q + end * (1 - end)))
+        assert abs(score) == pytest.approx(1.95996, abs=1e-3)
+
+
+def test_intervals_of_a_difference_never_contradict_the_sign_test() -> None:
+    for n in (1, 3, 5, 6, 12, 40):
+        for won in range(0, n + 1, 1 + n // 8):
+            for lost in range(0, n - won + 1, 1 + n // 8):
+                gaps = np.array([1] * won + [-1] * lost + [0] * (n - won - lost), float)
+                low, high = paired_interval({"a": gaps})
+                assert -1 <= low < high <= 1, "of no width"
+                assert low <= gaps.mean() <= high
+                assert (low <= 0 <= high) == (sign_test(won, lost) >= 0.05), (won, lost, n)
+
+
+def test_an_interval_of_a_paired_difference_covers_the_truth_at_any_number_of_episodes() -> None:
+    rng = np.random.default_rng(2)
+    for n in (3, 20, 200):
+        covered = 0
+        for _ in range(100):
+            gaps = rng.choice([-1.0, 0.0, 1.0], n, p=[0.1, 0.5, 0.4])
+            low, high = paired_interval({"a": gaps})
+            covered += low <= 0.3 <= high
+        assert covered >= 90, n
+
+
+def test_few_scenes_with_equal_outcomes_are_no_certainty_unpaired() -> None:
+    interval, p = unpaired_difference([np.ones((3, 1))], [np.zeros((3, 1))])
+    assert interval.low < 0.2 and interval.high == 1.0 and 0.01 < p < 0.05
+    (interval, p) = unpaired_difference([np.zeros((3, 1))], [np.zeros((3, 1))])
+    assert interval.low < -0.3 and interval.high > 0.3 and p == 1.0
+
+
 # Aggregation
 
 
@@ -248,6 +305,26 @@ def test_a_comparison_pairs_the_episodes() -> None:
     assert (other.wins, other.losses) == (30, 20)
     assert not other.significant
     assert "no significant difference" in other.verdict
+
+
+@pytest.mark.parametrize("first, low", [([0, 0, 0], -100.0), ([1, 1, 1], -56.15)])
+def test_three_episodes_are_too_few_to_tell(first: list[int], low: float) -> None:
+    protocol = Protocol(("BinFill",), episodes=3)
+    made = records("a", {"BinFill": first}) + records("b", {"BinFill": [1, 1, 1]})
+    (result,) = compare_all([tuple(aggregate(made, protocol).methods)], protocol)
+    assert result.interval.low == pytest.approx(low, abs=0.01) and result.interval.high > 40
+    assert "a against b: too few episodes to tell (p = " in result.verdict
+    assert comparison_table([result]).rows[0][-1] == "too few episodes"
+
+
+def test_six_episodes_are_enough_for_one_comparison_and_not_for_two() -> None:
+    protocol = Protocol(("BinFill",), episodes=6)
+    made = records("a", {"BinFill": [1] * 6}) + records("b", {"BinFill": [0] * 6})
+    first, second = aggregate(made, protocol).methods
+    (alone,) = compare_all([(first, second)], protocol)
+    assert alone.significant and alone.interval.low > 0
+    both = compare_all([(first, second), (second, first)], protocol)
+    assert not any(comparison.testable for comparison in both)
 
 
 def test_several_comparisons_are_corrected(demo: Results) -> None:

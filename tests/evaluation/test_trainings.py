@@ -8,9 +8,10 @@ import pytest
 
 from helpers.rollout_fakes import quick_policy
 from mme_vla.evaluation.records import EpisodeRecord, merge
-from mme_vla.evaluation.results.aggregate import aggregate, bootstrap
+from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import compare
 from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.statistics import bootstrap
 from mme_vla.evaluation.results.tables import leaderboard, overview, runs_table
 from mme_vla.evaluation.rollout.evaluation import facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings

@@ -4,14 +4,13 @@ Nothing incomplete is averaged: a run enters a figure only if it has every episo
 about, and a figure says how many of its episodes there are.
 """
 
-import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from statistics import NormalDist
-from typing import Any, NamedTuple
+from functools import cached_property
 
 import numpy as np
+import pandas as pd
 
 from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.envs.metadata import is_other
@@ -38,108 +37,26 @@ from mme_vla.evaluation.results.scopes import (
     suites_of,
     tasks_of,
 )
-
-Outcomes = np.ndarray  # Successes [episodes, runs]: every run on the same episodes
-
-
-class Interval(NamedTuple):
-    """A confidence interval."""
-
-    low: float
-    high: float
+from mme_vla.evaluation.results.statistics import Interval, bootstrap, mean_interval, mean_std
 
 
-def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
-    """Mean and sample standard deviation (divisor n − 1), as the released aggregation; one value
-    has none.
+def record_table(records: Sequence[EpisodeRecord]) -> pd.DataFrame:
+    """The records as one table, a row each, in their order.
+
+    Columns: `run`, `task`, `episode`, `difficulty`, `outcome`, `success` (0 or 1), and `record`,
+    the record itself. Figures, comparisons and curves are made of it by grouping.
     """
-    array = np.asarray(values, np.float64)
-    return float(array.mean()), float(array.std(ddof=1)) if len(array) > 1 else None
-
-
-def wilson(rate: float, trials: float, confidence: float = 0.95) -> Interval:
-    """Wilson's score interval of a proportion; `trials` may be an effective number."""
-    z = NormalDist().inv_cdf(0.5 + confidence / 2)
-    centre = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
-    half = (
-        z
-        / (1 + z * z / trials)
-        * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-    )
-    return Interval(max(0.0, centre - half), min(1.0, centre + half))
-
-
-def effective_trials(outcomes: Outcomes) -> float:
-    """How many independent trials the repeats of the same episodes are worth.
-
-    Runs of one episode share its scene, so they are not independent: p(1−p) over the variance of
-    the mean that the differences between episodes show, never less than the episodes and never more
-    than all trials.
-    """
-    episodes, runs = outcomes.shape
-    p = outcomes.mean()
-    if runs == 1 or episodes == 1:
-        return float(episodes)
-    variance = outcomes.mean(1).var(ddof=1) / episodes
-    worth = p * (1 - p) / variance if variance > 0 else (0.0 if p in (0, 1) else math.inf)
-    return float(np.clip(worth, episodes, episodes * runs))
-
-
-def task_interval(outcomes: Outcomes, confidence: float = 0.95) -> Interval:
-    """Wilson's interval of one task, for the effective number of trials of all its runs."""
-    return wilson(float(outcomes.mean()), effective_trials(outcomes), confidence)
-
-
-def bootstrap(
-    tasks: Mapping[str, Sequence[np.ndarray]],
-    confidence: float = 0.95,
-    samples: int = 10_000,
-    seed: int = 0,
-) -> Interval:
-    """Percentile interval of a mean over tasks, resampling episodes within each task, and trainings
-    for all.
-
-    tasks: see `resampled_means`. The figure of several methods is the sum of theirs.
-    """
-    return percentiles(resampled_means(tasks, samples, seed).sum(0), confidence)
-
-
-def percentiles(values: np.ndarray, confidence: float = 0.95) -> Interval:
-    """The interval between two percentiles of resampled values; NaNs, which are not defined in a
-    sample, left out.
-    """
-    tail = (1 - confidence) / 2
-    low, high = np.nanquantile(values, [tail, 1 - tail])
-    return Interval(float(low), float(high))
-
-
-def resampled_means(
-    tasks: Mapping[str, Sequence[np.ndarray]], samples: int, seed: int
-) -> np.ndarray:
-    """Means over tasks of each method [methods, samples], of episodes sampled within each task, and
-    of trainings.
-
-    tasks: for each task one array of [episodes, trainings] a method, already averaged over the runs
-    of a training: an episode is sampled with all of them, for all methods alike. Of one training
-    none is sampled.
-    """
-    rng = np.random.default_rng(seed)
-    counts = [values.shape[1] for values in next(iter(tasks.values()))]
-    one = rng if max(counts) == 1 else np.random.default_rng([seed, 1])
-    # How often each training is sampled, as shares: [samples, trainings] a method.
-    shares = [
-        one.multinomial(n, np.full(n, 1 / n), samples) / n if n > 1 else np.ones((samples, 1))
-        for n in counts
-    ]
-    means = np.zeros((len(counts), samples))
-    for of_methods in tasks.values():
-        n_episodes = len(of_methods[0])
-        sampled = rng.integers(0, n_episodes, (samples, n_episodes))
-        for method, (values, share) in enumerate(zip(of_methods, shares, strict=True)):
-            means[method] += sum(
-                values[:, i][sampled].mean(1) * share[:, i] for i in range(values.shape[1])
-            )
-    return means / len(tasks)
+    columns = {
+        "run": [record.run for record in records],
+        "task": [record.task for record in records],
+        "episode": [record.episode for record in records],
+        "difficulty": [record.difficulty for record in records],
+        "outcome": [record.outcome for record in records],
+        "success": [float(record.success) for record in records],
+    }
+    table = pd.DataFrame(columns)
+    table["record"] = pd.Series(list(records), index=table.index, dtype=object)
+    return table
 
 
 @dataclass(frozen=True)
@@ -204,8 +121,8 @@ class Method:
     """All runs of one model by one recipe, with the figures of every scope in
     `figures[kind][name]`.
 
-    recipe, data: digests of what its trainings share; None where records do not name them.
-    event: what happened in the rollouts; None for the plain ones.
+    table: its part of `record_table`. recipe, data: digests of what its trainings share; None where
+    records do not name them. event: what happened in the rollouts; None for the plain ones.
     repeated, flipped: see `Comparison`.
     """
 
@@ -214,6 +131,7 @@ class Method:
     subgoal: str | None
     memory_budget: int | None
     runs: list[Run]
+    table: pd.DataFrame
     paper: PaperMethod | None
     composition: str | None = None
     recipe: str | None = None
@@ -236,6 +154,35 @@ class Method:
     def complete(self) -> bool:
         return all(run.complete for run in self.runs)
 
+    @cached_property
+    def success(self) -> pd.DataFrame:
+        """Success of every episode, a column for each of `runs` by its number: 1, 0, or NaN where
+        the run lacks the episode. The index is (task, episode), in order.
+        """
+        numbers = {run.key: number for number, run in enumerate(self.runs)}
+        table = self.table.assign(number=[numbers[run] for run in self.table["run"]])
+        return table.pivot(index=["task", "episode"], columns="number", values="success")
+
+    @property
+    def rates(self) -> pd.DataFrame:
+        """Of every episode that all runs have: the share of each training's runs that solved it."""
+        return over_trainings(self.success.dropna(), self.runs)
+
+
+def over_trainings(success: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
+    """Means over the runs of each training, a column a training.
+
+    success: columns are numbers in `runs`.
+    """
+    seeds = [_training_seed(runs[number]) for number in success.columns]
+    names = {seed: name for name, seed in enumerate(dict.fromkeys(seeds))}
+    groups = [names[seed] for seed in seeds]
+    return success.T.groupby(groups).mean().T
+
+
+def _training_seed(run: Run) -> int | None:
+    return None if run.key.training is None else run.key.training.seed
+
 
 def by_training(runs: Iterable[Run]) -> list[list[Run]]:
     """Runs by the seed of their training, in their order; one group where records do not name their
@@ -243,9 +190,7 @@ def by_training(runs: Iterable[Run]) -> list[list[Run]]:
     """
     groups: dict[int | None, list[Run]] = {}
     for run in runs:
-        groups.setdefault(None if run.key.training is None else run.key.training.seed, []).append(
-            run
-        )
+        groups.setdefault(_training_seed(run), []).append(run)
     return list(groups.values())
 
 
@@ -310,23 +255,27 @@ def aggregate(
         f" {protocol.episodes - 1}).",
     )
     _check_environments(counted)
-    groups: dict[tuple[Any, ...], list[Run]] = {}
-    for key, members in by_run(counted).items():
-        run = Run(key, {record.key: record for record in members}, protocol)
-        trained = (None, None) if key.training is None else (key.training.recipe, key.training.data)
-        group = key.model, key.subgoal, key.memory_budget, key.composition, *trained, key.event
-        groups.setdefault(group, []).append(run)
-    methods = [_method(runs, protocol, *group) for group, runs in groups.items()]
+    by_run(counted)  # refuses runs of mixed settings
+    table = record_table(counted)
+    table["method"] = [_method_key(run) for run in table["run"]]
+    methods = [_method(members, protocol) for _, members in table.groupby("method", sort=False)]
     repeats = repeated_episodes(records)
     for method in methods:
-        counts = [repeats[run.key] for run in method.runs if run.key in repeats]
-        method.repeated, method.flipped = (
-            (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
-        )
-    apart = _tell_apart(methods)
-    return Results(
-        methods, protocol, [*apart, *_notes(methods, protocol, len(selected) - len(inside))]
-    )
+        for run in method.runs:
+            repeated, flipped = repeats.get(run.key, (0, 0))
+            method.repeated += repeated
+            method.flipped += flipped
+    notes = _tell_apart(methods)
+    notes += _notes(methods, protocol, len(selected) - len(inside))
+    return Results(methods, protocol, notes)
+
+
+def _method_key(run: RunKey) -> RunKey:
+    """What the runs of one method share: not the checkpoint, the seeds or the split."""
+    training = run.training
+    if training is not None:
+        training = replace(training, seed=None, weights=None)
+    return run._replace(checkpoint="", model_seed=0, split="", training=training)
 
 
 def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[int, int]]:
@@ -335,169 +284,149 @@ def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[in
 
     An episode whose records are not of the same scene was not repeated.
     """
-    episodes: dict[RunKey, dict[EpisodeKey, list[EpisodeRecord]]] = {}
-    for record in records:
-        if record.outcome != "error":
-            episodes.setdefault(record.run, {}).setdefault(record.key, []).append(record)
+    table = record_table([record for record in records if record.outcome != "error"])
     counts: dict[RunKey, tuple[int, int]] = {}
-    for run, of_run in episodes.items():
-        for key in pair([of_run]).keys:
-            results = [record.outcome for record in of_run[key]]
-            if len(results) > 1:
-                repeated, flipped = counts.get(run, (0, 0))
-                counts[run] = repeated + 1, flipped + (len(set(results)) > 1)
+    for (run, _, _), members in table.groupby(["run", "task", "episode"], sort=False):
+        if len(members) < 2 or not pair([{0: list(members["record"])}]).keys:
+            continue
+        repeated, flipped = counts.get(run, (0, 0))
+        flipped += int(members["outcome"].nunique() > 1)
+        counts[run] = (repeated + 1, flipped)
     return counts
 
 
 def _tell_apart(methods: Sequence[Method]) -> list[str]:
     """Give methods of one name but different configurations labels of their own, and say so."""
+    kinds = {
+        "composition": "configurations",
+        "recipe": "recipes of training",
+        "data": "datasets",
+    }
     notes = []
-    for label in [
-        name for name, count in Counter(method.label for method in methods).items() if count > 1
-    ]:
+    counts = Counter(method.label for method in methods)
+    for label in [label for label, count in counts.items() if count > 1]:
         same = [method for method in methods if method.label == label]
-        names = [
-            name
-            for name in ("composition", "recipe", "data")
-            if len({getattr(m, name) for m in same}) > 1
-        ]
+        names = [name for name in kinds if len({getattr(m, name) for m in same}) > 1]
+        lacking = False
         for method in same:
-            digests = [(getattr(method, name) or "unrecorded")[:10] for name in names]
-            method.label = "#".join([label, *digests])
-        kinds = {
-            "composition": "configurations",
-            "recipe": "recipes of training",
-            "data": "datasets",
-        }
-        what = (
-            "configurations"
-            if "composition" in names
-            else " and ".join(kinds[name] for name in names)
-        )
-        lacking = any(getattr(method, name) is None for method in same for name in names)
-        notes.append(
+            digests = [getattr(method, name) for name in names]
+            lacking = lacking or None in digests
+            method.label = "#".join([label, *((d or "unrecorded")[:10] for d in digests)])
+        if "composition" in names:
+            what = kinds["composition"]
+        else:
+            what = " and ".join(kinds[name] for name in names)
+        note = (
             f"{len(same)} different {what} are called {label}; they are not averaged:"
             f" {', '.join(method.label for method in same)} (the digest of"
             f" `{'` and `'.join(names)}` in their records"
-            + ("; records without it are of an earlier version)." if lacking else ").")
         )
+        if lacking:
+            note += "; records without it are of an earlier version"
+        notes.append(f"{note}).")
     return notes
 
 
-def _method(
-    runs: list[Run],
-    protocol: Protocol,
-    model: str,
-    subgoal: str | None,
-    budget: int | None,
-    composition: str | None,
-    recipe: str | None,
-    data: str | None,
-    event: str | None,
-) -> Method:
-    papers = (
-        event is None
-        and budget in (None, DEFAULT_BUDGET)
-        and not any(is_other(run.key.split) for run in runs)
+def _method(table: pd.DataFrame, protocol: Protocol) -> Method:
+    """One method from its part of the table, with its figures."""
+    runs = []
+    for key, members in table.groupby("run", sort=False):
+        records = {record.key: record for record in members["record"]}
+        runs.append(Run(key, records, protocol))
+    runs.sort(
+        key=lambda run: (
+            _training_seed(run) or 0,
+            str(run.key.checkpoint).zfill(12),
+            run.key.model_seed,
+        )
     )
-    known = paper.paper_method(model, subgoal) if papers else None
-    label = model if subgoal is None else f"{model}+{subgoal}"
-    label = label if budget is None else f"{label}@{budget}"
-    label = label if event is None else f"{label} · {event}"
-    runs = sorted(
-        runs, key=lambda run: (_seed(run), str(run.key.checkpoint).zfill(12), run.key.model_seed)
+    key = runs[0].key
+    known = None
+    other_scenes = any(is_other(run.key.split) for run in runs)
+    if key.event is None and key.memory_budget in (None, DEFAULT_BUDGET) and not other_scenes:
+        known = paper.paper_method(key.model, key.subgoal)
+    label = key.model
+    if key.subgoal is not None:
+        label += f"+{key.subgoal}"
+    if key.memory_budget is not None:
+        label += f"@{key.memory_budget}"
+    if key.event is not None:
+        label += f" · {key.event}"
+    method = Method(
+        label,
+        key.model,
+        key.subgoal,
+        key.memory_budget,
+        runs,
+        table,
+        known,
+        composition=key.composition,
+        recipe=None if key.training is None else key.training.recipe,
+        data=None if key.training is None else key.training.data,
+        event=key.event,
     )
-    method = Method(label, model, subgoal, budget, runs, known, composition, recipe, data, event)
+    # Every episode that a run is to have, in order; NaN where it lacks it.
+    expected = pd.MultiIndex.from_product([protocol.tasks, range(protocol.episodes)])
+    success = method.success.reindex(expected.set_names(["task", "episode"]))
     for scope in scopes(protocol):
         reported = _reported(known, scope, protocol)
-        figure = _figure(
-            runs, scope.tasks, protocol, lambda run, task: run.successes(task), reported
-        )
+        figure = _figure(success.loc[list(scope.tasks)], method, protocol, reported)
         method.figures.setdefault(scope.kind, {})[scope.name] = figure
-    difficulties = {key: record.difficulty for run in runs for key, record in run.records.items()}
-    complete_tasks = {
-        task for task in protocol.averaged for run in runs if run.successes(task) is not None
-    }
+    # An episode that no run has may be of any difficulty, and keeps the figures incomplete.
+    levels = table.groupby(["task", "episode"])["difficulty"].first().reindex(success.index)
+    averaged = success.index.get_level_values("task").isin(protocol.averaged)
     for level in DIFFICULTIES:
-        level_tasks = {key.task for key, of in difficulties.items() if of == level} & set(
-            protocol.averaged
-        )
-        # A task without the level is left out; one that is not whole yet may have it, and keeps the
-        # figure incomplete.
-        tasks = tuple(
-            task for task in protocol.averaged if task in level_tasks or task not in complete_tasks
-        )
-        if level_tasks:
-            figure = _figure(runs, tasks, protocol, _of_difficulty(level, difficulties), None)
+        if (averaged & (levels == level)).any():
+            rows = averaged & (levels.isna() | (levels == level))
+            figure = _figure(success[rows], method, protocol, None)
             method.figures.setdefault("difficulty", {})[level] = figure
     return method
 
 
-def _seed(run: Run) -> int:
-    return 0 if run.key.training is None else run.key.training.seed or 0
-
-
-def _of_difficulty(
-    level: str, difficulties: dict[EpisodeKey, str]
-) -> Callable[[Run, str], list[bool] | None]:
-    def pick(run: Run, task: str) -> list[bool] | None:
-        outcomes = run.successes(task)
-        if outcomes is None:
-            return None
-        return [won for e, won in enumerate(outcomes) if difficulties[EpisodeKey(task, e)] == level]
-
-    return pick
-
-
 def _figure(
-    runs: Sequence[Run],
-    tasks: tuple[str, ...],
-    protocol: Protocol,
-    pick: Callable[[Run, str], list[bool] | None],
-    reported: PaperResult | None,
+    success: pd.DataFrame, method: Method, protocol: Protocol, reported: PaperResult | None
 ) -> Figure:
-    """A figure over whole tasks, from the runs that have all of them."""
-    per_run = [[pick(run, task) for task in tasks] for run in runs]
-    full = [run for run, of_tasks in zip(runs, per_run, strict=True) if None not in of_tasks]
-    complete = [
-        [task for task in of_tasks if task is not None]
-        for of_tasks in per_run
-        if None not in of_tasks
-    ]
-    done = [record for run in runs for key, record in run.records.items() if key.task in tasks]
-    counts = {
-        "runs": len(runs), "complete": len(complete), "done": len(done),
-        "expected": len(runs) * len(tasks) * protocol.episodes,
-    }  # fmt: skip
-    if not complete:
-        partial = 100 * sum(record.success for record in done) / len(done) if done else None
-        return Figure(None, None, None, **counts, partial=partial, paper=reported)
-    matrices = [
-        np.array([run[i] for run in complete], np.float64).T for i in range(len(tasks))
-    ]  # episodes × runs
-    place = {id(run): number for number, run in enumerate(full)}
-    rows = [[place[id(run)] for run in members] for members in by_training(full)]
-    trainings = [
-        np.stack([matrix[:, row].mean(1) for row in rows], 1) for matrix in matrices
-    ]  # episodes × trainings
-    units = trainings if len(rows) > 1 else matrices
-    mean, std = mean_std(
-        [float(np.mean([unit[:, r].mean() for unit in units])) for r in range(units[0].shape[1])]
+    """A figure from the runs that have all its episodes.
+
+    success: these episodes, as `Method.success` has them.
+    """
+    done = success.notna()
+    complete = success.loc[:, done.all()]
+    n_runs = len(success.columns)
+    n_complete = len(complete.columns)
+    n_done = int(done.to_numpy().sum())
+    if not n_complete:
+        partial = float(100 * success.stack().mean()) if n_done else None
+        return Figure(
+            None, None, None, n_runs, 0, n_done, success.size, partial=partial, paper=reported
+        )
+    trainings = over_trainings(complete, method.runs)
+    several = len(trainings.columns) > 1
+    units = trainings if several else complete
+    rates = units.groupby(level="task").mean().mean()
+    mean, std = mean_std(list(rates))
+    interval = mean_interval(list(by_task(units).values()), protocol.confidence)
+    if several:
+        outcomes = {task: [values] for task, values in by_task(trainings).items()}
+        sampled = bootstrap(outcomes, protocol.confidence, protocol.samples, protocol.seed)
+        interval = interval.widen(sampled)
+    return Figure(
+        100 * mean,
+        None if std is None else 100 * std,
+        interval.percent,
+        n_runs,
+        n_complete,
+        n_done,
+        success.size,
+        paper=reported,
     )
-    if len(tasks) == 1 and len(rows) == 1:
-        interval = task_interval(matrices[0], protocol.confidence)
-    else:
-        episodes = {task: [matrix] for task, matrix in zip(tasks, trainings, strict=True)}
-        interval = bootstrap(episodes, protocol.confidence, protocol.samples, protocol.seed)
-        if (
-            interval.low == interval.high
-        ):  # all episodes of a task alike, as with no success at all: nothing to draw
-            trials = sum(map(len, trainings))
-            interval = wilson(
-                float(np.mean([values.mean() for values in trainings])), trials, protocol.confidence
-            )
-    percent = Interval(100 * interval.low, 100 * interval.high)
-    return Figure(100 * mean, None if std is None else 100 * std, percent, **counts, paper=reported)
+
+
+def by_task(success: pd.DataFrame) -> dict[str, np.ndarray]:
+    """The values of each task [episodes, columns], in the order of the tasks."""
+    return {
+        str(task): members.to_numpy() for task, members in success.groupby(level="task", sort=False)
+    }
 
 
 def _reported(known: PaperMethod | None, scope: Scope, protocol: Protocol) -> PaperResult | None:
@@ -510,7 +439,9 @@ def _reported(known: PaperMethod | None, scope: Scope, protocol: Protocol) -> Pa
         return None
     if scope.kind == "average":
         return paper.average(known.name)
-    return (paper.suite_mean if scope.kind == "suite" else paper.group_mean)(known.name, scope.name)
+    if scope.kind == "suite":
+        return paper.suite_mean(known.name, scope.name)
+    return paper.group_mean(known.name, scope.name)
 
 
 def _check_environments(records: Sequence[EpisodeRecord]) -> None:
@@ -539,7 +470,7 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
                 notes.append(
                     f"{run.key}: {errors} episodes ended in an error and count as failures."
                 )
-        if method.repeated:
+        if method.flipped:
             notes.append(
                 f"{method.label}: {method.repeated:,} episodes were run more than once with the"
                 f" same weights and seed; {method.flipped:,} of them did not always end alike"

@@ -8,24 +8,23 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from mme_vla.envs.metadata import BASE, read_variant
 from mme_vla.envs.subtasks import MOTION, OPERATIONS, ProcessScore
 from mme_vla.errors import require
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, merge
-from mme_vla.evaluation.results.aggregate import Interval, Results, wilson
+from mme_vla.evaluation.results.aggregate import Results, record_table
 from mme_vla.evaluation.results.plots import COLOURS, figure, svg
+from mme_vla.evaluation.results.statistics import Interval, wilson
 from mme_vla.evaluation.results.tables import Table, task_tables
 
 
 @dataclass(frozen=True)
-class Point:
-    """Success of a model on a task at one place of a dial. interval: Wilson's, over distinct
-    episodes; in percent.
-    """
+class Share:
+    """Successes among episodes. interval: Wilson's, over distinct episodes; in percent."""
 
-    turned: float
     won: int
     episodes: int
     interval: Interval
@@ -34,6 +33,29 @@ class Point:
     def rate(self) -> float:
         """In percent."""
         return 100 * self.won / self.episodes
+
+    def __str__(self) -> str:
+        return f"{self.won}/{self.episodes}"
+
+    @property
+    def span(self) -> str:
+        """The interval as text."""
+        return f"[{self.interval.low:.1f}, {self.interval.high:.1f}]"
+
+
+@dataclass(frozen=True)
+class Point(Share):
+    """Success of a model on a task at one place of a dial."""
+
+    turned: float
+
+
+def count_successes(table: pd.DataFrame, confidence: float) -> Share:
+    """Count the successes of a part of `record_table` that has one row at least."""
+    won = int(table["success"].sum())
+    distinct = len({(r.split, r.key) for r in table["record"]})
+    interval = wilson(won / len(table), distinct, confidence)
+    return Share(won, len(table), interval.percent)
 
 
 Curves = dict[tuple[str, str, str], list[Point]]  # (model, task, dial) → points, ascending
@@ -88,38 +110,34 @@ def curves_of(
         whether a dial leaves the scene as it is, so that only equal scenes are counted; one that
         changes the scene keeps the episode's number and seed alone.
     """
-    groups: dict[tuple[str, str, str, float], dict[float, list[EpisodeRecord]]] = {}
-    for record in records:
-        if (at := place(record)) is not None:
-            group = groups.setdefault((str(at.run), record.task, at.dial, at.zero), {})
-            group.setdefault(at.turned, []).append(record)
+    table = record_table(records)
+    table["run"] = [str(run) for run in table["run"]]
+    places = [place(record) for record in records]
+    placed = table[[at is not None for at in places]].copy()
+    for name in Place._fields:
+        placed[name] = [getattr(at, name) for at in places if at is not None]
+    placed["run"] = [str(run) for run in placed["run"]]
     curves: Curves = {}
-    for (run, task, dial, zero), places in groups.items():
-        baseline = [r for r in records if r.task == task and str(r.run) == run]
-        if baseline and zero not in places:
-            places[zero] = baseline
-        common = set.intersection(*({r.episode for r in there} for there in places.values()))
+    for (run, task, dial, zero), members in placed.groupby(
+        ["run", "task", "dial", "zero"], sort=False
+    ):
+        points = dict(list(members.groupby("turned")))
+        baseline = table[(table["run"] == run) & (table["task"] == task)]
+        if zero not in points and not baseline.empty:
+            points[zero] = baseline
+        sides = [at.groupby("episode", sort=False)["record"].apply(list) for at in points.values()]
+        common = set.intersection(*(set(side.index) for side in sides))
         if same_scenes:
-            common = set(pair([_by_episode(there) for there in places.values()]).keys)
-        curves[run, task, dial] = [
-            _point(turned, [r for r in there if r.episode in common], confidence)
-            for turned, there in sorted(places.items())
-            if common
-        ]
-    return {name: points for name, points in curves.items() if points}
-
-
-def _by_episode(records: Sequence[EpisodeRecord]) -> dict[int, list[EpisodeRecord]]:
-    episodes: dict[int, list[EpisodeRecord]] = {}
-    for record in records:
-        episodes.setdefault(record.episode, []).append(record)
-    return episodes
-
-
-def _point(turned: float, records: Sequence[EpisodeRecord], confidence: float) -> Point:
-    won = sum(record.success for record in records)
-    low, high = wilson(won / len(records), len({record.episode for record in records}), confidence)
-    return Point(turned, won, len(records), Interval(100 * low, 100 * high))
+            common = set(pair([side.to_dict() for side in sides]).keys)
+        if not common:
+            continue
+        curves[run, task, dial] = []
+        for turned in sorted(points):
+            at = points[turned]
+            share = count_successes(at[at["episode"].isin(common)], confidence)
+            point = Point(share.won, share.episodes, share.interval, turned)
+            curves[run, task, dial].append(point)
+    return curves
 
 
 def stress_table(curves: Curves, title: str = "Success over the dials") -> Table:
@@ -127,9 +145,8 @@ def stress_table(curves: Curves, title: str = "Success over the dials") -> Table
     rows = []
     for (run, task, dial), points in sorted(curves.items()):
         for p in points:
-            interval = f"[{p.interval.low:.1f}, {p.interval.high:.1f}]"
             rows.append(
-                [run, task, dial, f"{p.turned:g}", str(p.episodes), f"{p.rate:.1f}", interval]
+                [run, task, dial, f"{p.turned:g}", str(p.episodes), f"{p.rate:.1f}", p.span]
             )
     return Table(title, ["run", "task", "dial", "at", "episodes", "success (%)", "interval"], rows)
 
@@ -138,11 +155,10 @@ def stress_figures(curves: Curves, unit: str = "more than in the benchmark") -> 
     """For each task and dial a curve of every run, as SVG."""
     figures = {}
     for task, dial in dict.fromkeys((task, dial) for _, task, dial in sorted(curves)):
-        runs = {
-            run: [(p.turned, p.rate, p.interval) for p in points]
-            for (run, its, of), points in curves.items()
-            if (its, of) == (task, dial)
-        }
+        runs = {}
+        for (run, of_task, of_dial), points in curves.items():
+            if (of_task, of_dial) == (task, dial):
+                runs[run] = [(p.turned, p.rate, p.interval) for p in points]
         figures[f"{task}, {dial}"] = curve_figure(runs, f"{dial}: {unit}")
     return figures
 
@@ -157,24 +173,21 @@ def curve_figure(
     runs: name → amount, success in percent and its interval. label: of the amount. training: its
     shaded range.
     """
-    with figure((5.6, 3.0 + 0.2 * (len(runs) + (training is not None)))) as (canvas, (axes,)):
+    labels = distinct_parts(list(runs))
+    height = 3.0 + 0.2 * len(runs)
+    if training is not None:
+        height += 0.2
+    with figure((5.6, height)) as (canvas, (axes,)):
         if training is not None:
             axes.axvspan(*training, color="0.9", label="training range")
-        for i, (name, points) in enumerate(
-            zip(distinct_parts(list(runs)), runs.values(), strict=True)
-        ):
-            amounts, rates, intervals = zip(*points, strict=True)
-            below = [
-                max(rate - interval.low, 0) for rate, interval in zip(rates, intervals, strict=True)
-            ]
-            above = [
-                max(interval.high - rate, 0)
-                for rate, interval in zip(rates, intervals, strict=True)
-            ]
+        for i, (name, points) in enumerate(zip(labels, runs.values(), strict=True)):
+            amounts = [amount for amount, _, _ in points]
+            rates = np.array([rate for _, rate, _ in points])
+            low, high = np.array([interval for _, _, interval in points]).T
             axes.errorbar(
                 amounts,
                 rates,
-                [below, above],
+                np.maximum([rates - low, high - rates], 0),
                 fmt="-o",
                 ms=5,
                 capsize=3,
@@ -192,9 +205,12 @@ def distinct_parts(runs: Sequence[str]) -> list[str]:
     """The names of runs without what all of them share, for a legend; of one run its first part,
     the model.
     """
-    parts = [run.split(", ") for run in runs]
-    shared = set.intersection(*map(set, parts)) if len(parts) > 1 else set(parts[0][1:])
-    return [", ".join(part for part in its if part not in shared) for its in parts]
+    names = [run.split(", ") for run in runs]
+    if len(names) > 1:
+        shared = set.intersection(*(set(parts) for parts in names))
+    else:
+        shared = set(names[0][1:])
+    return [", ".join(part for part in parts if part not in shared) for parts in names]
 
 
 EXTRA = "process"  # Where a record keeps it
@@ -218,13 +234,8 @@ def process_tables(results: Results) -> list[Table]:
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:
-    scores = [score for record in records if (score := process_of(record)) is not None]
+    scores = [score for score in map(process_of, records) if score is not None]
     progress = 100 * np.mean([score.done / max(score.of, 1) for score in scores])
     ends = Counter(score.operation or score.broke or "success" for score in scores)
-    counts = [ends[kind] for kind in ("success", *OPERATIONS, MOTION, "stuck")]
-    return [
-        name,
-        str(len(scores)),
-        f"{progress:.1f}",
-        *("–" if not count else str(count) for count in counts),
-    ]
+    counts = [str(ends[kind] or "–") for kind in ("success", *OPERATIONS, MOTION, "stuck")]
+    return [name, str(len(scores)), f"{progress:.1f}", *counts]

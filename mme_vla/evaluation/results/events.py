@@ -14,8 +14,9 @@ from mme_vla.errors import require
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Method, Results
-from mme_vla.evaluation.results.compare import show_p, sign_test
+from mme_vla.evaluation.results.compare import show_p
 from mme_vla.evaluation.results.curves import Curves, Place, curves_of
+from mme_vla.evaluation.results.statistics import sign_test
 from mme_vla.evaluation.results.tables import Table
 from mme_vla.evaluation.rollout.events import split_words
 from mme_vla.policy.training_identity import TrainingIdentity

@@ -7,9 +7,10 @@ run a policy, 1,600 steps allowed, from `hongzefu/robomme_benchmark_MotionJEPA`,
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
+
+import numpy as np
 
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task, require_simulator
@@ -17,9 +18,9 @@ from mme_vla.envs.metadata import BASE, HARD, TWIN, read_variant
 from mme_vla.envs.rows import OOD, TIERS
 from mme_vla.envs.scene_hash import scene_digest
 from mme_vla.evaluation.pairing import pair
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, by_run, merge
-from mme_vla.evaluation.results.aggregate import Interval, repeated_episodes, wilson
-from mme_vla.evaluation.results.curves import curve_figure
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, merge
+from mme_vla.evaluation.results.aggregate import record_table, repeated_episodes
+from mme_vla.evaluation.results.curves import Share, count_successes, curve_figure
 from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
 from mme_vla.evaluation.results.tables import Table
@@ -42,35 +43,6 @@ AMOUNTS: dict[str, tuple[str, str, tuple[int, int]]] = {
 """Task → what grows in harder scenes, the value that says it, and its range in the training
 episodes.
 """
-
-
-@dataclass(frozen=True)
-class Share:
-    """Successes among episodes, with Wilson's interval in percent."""
-
-    won: int
-    episodes: int
-    interval: Interval
-
-    @classmethod
-    def of(cls, records: Sequence[EpisodeRecord], confidence: float) -> "Share":
-        """Count the records; one at least."""
-        won = sum(record.success for record in records)
-        low, high = wilson(won / len(records), len(records), confidence)
-        return cls(won, len(records), Interval(100 * low, 100 * high))
-
-    @property
-    def rate(self) -> float:
-        """In percent."""
-        return 100 * self.won / self.episodes
-
-    def __str__(self) -> str:
-        return f"{self.won}/{self.episodes}"
-
-    @property
-    def span(self) -> str:
-        """The interval as text."""
-        return f"[{self.interval.low:.1f}, {self.interval.high:.1f}]"
 
 
 def base_of(split: str) -> str:
@@ -99,30 +71,30 @@ def tier_tables(
         *(row["method"] for row in published),
     ]
     tables = []
-    for run, members in by_run(merged).items():
+    for run, members in record_table(merged).groupby("run", sort=False):
+        parts = {task: members[members["task"] == task] for task in PAPER_ORDER}
+        parts = {task: part for task, part in parts.items() if not part.empty}
+        parts["all"] = members
         rows = []
-        for task in (*(t for t in PAPER_ORDER if any(r.task == t for r in members)), "all"):
-            mine = [r for r in members if task in ("all", r.task)]
-            cells = [[r for r in mine if r.difficulty == tier] for tier in TIERS]
-            share = Share.of(mine, confidence)
-            known = [_published(row, task) for row in published]
-            rows.append(
-                [
-                    task,
-                    *(str(Share.of(cell, confidence)) if cell else "–" for cell in cells),
-                    str(share),
-                    f"{share.rate:.1f}",
-                    share.span,
-                    *known,
-                ]
-            )
+        for task, part in parts.items():
+            row = [task]
+            for tier in TIERS:
+                cell = part[part["difficulty"] == tier]
+                row.append("–" if cell.empty else str(count_successes(cell, confidence)))
+            share = count_successes(part, confidence)
+            row += [str(share), f"{share.rate:.1f}", share.span]
+            row += [_published(line, task) for line in published]
+            rows.append(row)
+        last = len(rows) - 1
         title = f"{run} on RoboMME-OOD; published: {SOURCE}"
-        tables.append(Table(title, columns, rows, {len(rows) - 1}, {len(rows) - 1}))
+        tables.append(Table(title, columns, rows, {last}, {last}))
     return tables
 
 
 def _published(row: dict[str, str], task: str) -> str:
-    episodes = int(row["episodes"]) * (len(PAPER_ORDER) if task == "all" else 1)
+    episodes = int(row["episodes"])
+    if task == "all":
+        episodes *= len(PAPER_ORDER)
     return f"{100 * int(row[task]) / episodes:.1f}"
 
 
@@ -136,9 +108,10 @@ def hard_table(
     if not merged:
         return None
     rows = []
-    for run, members in by_run(merged).items():
-        share = Share.of(members, confidence)
+    for run, members in record_table(merged).groupby("run", sort=False):
+        share = count_successes(members, confidence)
         rows.append([str(run), str(share), f"{share.rate:.1f}", share.span])
+    n_runs = len(rows)
     for row in paper_table("hard"):
         won = [int(n) for n in row["won"].split()]
         rate = 100 * sum(won) / len(won) / int(row["episodes"])
@@ -151,7 +124,7 @@ def hard_table(
             ]
         )
     columns = ["run", "successes", "%", f"{100 * confidence:g} %"]
-    return Table(f"Hard test episodes; published: {SOURCE}", columns, rows, {len(by_run(merged))})
+    return Table(f"Hard test episodes; published: {SOURCE}", columns, rows, {n_runs})
 
 
 def twin_table(
@@ -166,33 +139,34 @@ def twin_table(
     """
     merged = merge(records, conflicts)
     repeats = repeated_episodes(records)
-    runs = by_run(merged)
-    rows, notes = [], list[str]()
+    table = record_table(merged)
+    table["key"] = [record.key for record in merged]
+    runs = dict(list(table.groupby("run", sort=False)))
+    rows = []
+    notes: list[str] = []
     for run, members in runs.items():
         twin = run._replace(split=TWIN if run.split == BASE else f"{TWIN}:{run.split}")
-        sides = [
-            {record.key: [record] for record in side} for side in (members, runs.get(twin, []))
-        ]
-        pairing = pair(sides)
-        notes += pairing.notes(f"{run} and its twin")
-        pairs = [(sides[0][key][0], sides[1][key][0]) for key in pairing.keys]
-        if not pairs:
+        if twin not in runs:
             continue
-        base, visible = (Share.of(side, confidence) for side in zip(*pairs, strict=True))
-        better = sum(b.success and not a.success for a, b in pairs)
-        worse = sum(a.success and not b.success for a, b in pairs)
-        repeated, flipped = (
-            sum(n) for n in zip(repeats.get(run, (0, 0)), repeats.get(twin, (0, 0)), strict=True)
-        )
+        sides = [part.set_index("key", drop=False) for part in (members, runs[twin])]
+        pairing = pair([{key: [r] for key, r in side["record"].items()} for side in sides])
+        notes += pairing.notes(f"{run} and its twin")
+        if not pairing.keys:
+            continue
+        base, visible = (side[side["key"].isin(pairing.keys)] for side in sides)
+        gaps = visible["success"] - base["success"]
+        base_share = count_successes(base, confidence)
+        visible_share = count_successes(visible, confidence)
+        repeated, flipped = np.sum([repeats.get(side, (0, 0)) for side in (run, twin)], axis=0)
         rows.append(
             [
                 str(run),
-                str(len(pairs)),
-                f"{base.rate:.1f} {base.span}",
-                f"{visible.rate:.1f} {visible.span}",
-                f"{visible.rate - base.rate:+.1f}",
-                f"{100 - visible.rate:.1f}",
-                f"{better} : {worse}",
+                str(len(gaps)),
+                f"{base_share.rate:.1f} {base_share.span}",
+                f"{visible_share.rate:.1f} {visible_share.span}",
+                f"{visible_share.rate - base_share.rate:+.1f}",
+                f"{100 - visible_share.rate:.1f}",
+                f"{(gaps > 0).sum()} : {(gaps < 0).sum()}",
                 f"{flipped} of {repeated}" if repeated else "none run twice",
             ]
         )
@@ -258,22 +232,25 @@ def extrapolation(
     Twins, splits with sessions, and scenes that cannot be built or are other ones here are left
     out.
     """
-    groups: dict[tuple[str, str], dict[int, list[EpisodeRecord]]] = {}
+    counted = []
+    amounts = []
     for record in merge(records, conflicts):
         variant = read_variant(record.split)
-        if record.task not in AMOUNTS or (
-            variant is not None and (variant.twin or variant.sessions)
-        ):
+        if variant is not None and (variant.twin or variant.sessions):
+            continue
+        if record.task not in AMOUNTS:
             continue
         amount = amount_of(record.task, record.split, record.key, record.named_scene)
-        if amount is None:
-            continue
-        at = str(record.run._replace(split=BASE)), record.task
-        groups.setdefault(at, {}).setdefault(amount, []).append(record)
-    return {
-        at: {amount: Share.of(members, confidence) for amount, members in sorted(by_amount.items())}
-        for at, by_amount in groups.items()
-    }
+        if amount is not None:
+            counted.append(record)
+            amounts.append(amount)
+    table = record_table(counted)
+    table["run"] = [str(run._replace(split=BASE)) for run in table["run"]]
+    table["amount"] = amounts
+    curves: Extrapolation = {}
+    for (run, task, amount), members in table.groupby(["run", "task", "amount"]):
+        curves.setdefault((run, task), {})[amount] = count_successes(members, confidence)
+    return curves
 
 
 def extrapolation_table(curves: Extrapolation) -> Table | None:
@@ -306,10 +283,9 @@ def extrapolation_figures(curves: Extrapolation) -> dict[str, str]:
     figures = {}
     for task in dict.fromkeys(task for _, task in sorted(curves)):
         kind, _, (least, most) = AMOUNTS[task]
-        runs = {
-            run: [(amount, share.rate, share.interval) for amount, share in points.items()]
-            for (run, of), points in curves.items()
-            if of == task
-        }
+        runs = {}
+        for (run, of_task), points in curves.items():
+            if of_task == task:
+                runs[run] = [(amount, p.rate, p.interval) for amount, p in points.items()]
         figures[f"{task}, {kind}"] = curve_figure(runs, kind, (least - 0.5, most + 0.5))
     return figures

@@ -66,15 +66,13 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     """
     protocol = results.protocol
     methods, runs = len(results.methods), sum(len(method.runs) for method in results.methods)
-    sub = f"{methods} method{'s' * (methods > 1)}, {runs} run{'s' * (runs > 1)} of "
-    sub += (
-        f"{len(protocol.averaged)} tasks × {protocol.episodes} episodes ·"
+    subtitle = (
+        f"{_count(methods, 'method')}, {_count(runs, 'run')} of"
+        f" {len(protocol.averaged)} tasks × {protocol.episodes} episodes ·"
         f" {datetime.now(UTC):%Y-%m-%d}"
     )
-    average, whiskers = (
-        overview(results),
-        f"Whiskers: {100 * protocol.confidence:g} % intervals. Black lines: the paper.",
-    )
+    average = overview(results)
+    whiskers = f"Whiskers: {100 * protocol.confidence:g} % intervals. Black lines: the paper."
     difficulty = "Mean over tasks of the episodes of a difficulty."
     rings = (
         "Rings: the paper's averages. Neither subgoal predictors nor the encoding of past frames"
@@ -117,7 +115,11 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
         Section("Runs", folded=[(f"{runs} runs", runs_table(results))]),
         Section("How the numbers are made", paragraphs=_method_text(results)),
     ]
-    return html_page(title, sections, sub, results.notes)
+    return html_page(title, sections, subtitle, results.notes)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"1 {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _method_text(results: Results) -> list[str]:
@@ -131,15 +133,17 @@ def _method_text(results: Results) -> list[str]:
             f" Episodes that ended in an error {errors}."
         ),
         (
-            f"Intervals ({100 * protocol.confidence:g} %): per task Wilson's, for the number of"
-            " independent trials that all runs are worth; elsewhere a bootstrap over episodes"
-            f" within tasks ({protocol.samples:,} samples, seed {protocol.seed}). They describe"
-            " other episodes of the same tasks, the deviation other seeds."
+            f"Intervals ({100 * protocol.confidence:g} %) are Wilson's, for the number of"
+            " independent episodes that all runs and tasks are worth. With several trainings they"
+            " are at least as wide as a bootstrap over episodes within tasks and over trainings"
+            f" ({protocol.samples:,} samples, seed {protocol.seed}). They describe other episodes"
+            " of the same tasks, the deviation other seeds."
         ),
         (
             "Comparisons pair the episodes of the same scenes: an exact sign test on the episodes"
             " that one method solves in more of its runs than the other (McNemar's test where each"
-            " has one run), corrected by Holm for the number of pairs."
+            " has one run), corrected by Holm for the number of pairs. The interval of a difference"
+            " is the wider of Tango's score interval and the exact one of the sign test."
         ),
     ]
 

@@ -1,16 +1,17 @@
 """The result tables, and their spellings: terminal, Markdown, LaTeX, CSV."""
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import pandas as pd
+
 from mme_vla.errors import printable
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Figure, Interval, Method, Results, by_training
+from mme_vla.evaluation.results.aggregate import Figure, Method, Results, by_training
 from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.results.scopes import PAPER_SEEDS
+from mme_vla.evaluation.results.statistics import Interval
 from mme_vla.utils.pages import escape_markdown
 
 if TYPE_CHECKING:
@@ -43,16 +44,18 @@ def task_tables(
     """
     tables = []
     for method in results.methods:
-        records = [
-            record for run in method.runs for record in run.records.values() if key in record.extra
-        ]
-        by_task = {task: [r for r in records if r.task == task] for task in results.protocol.tasks}
-        rows = [row(task, members) for task, members in by_task.items() if members]
-        if records:
-            rows.append(row("all", records))
-            tables.append(
-                Table(f"{method.label}: {title}", columns, rows, {len(rows) - 1}, {len(rows) - 1})
-            )
+        has_extra = [key in record.extra for record in method.table["record"]]
+        table = method.table[has_extra]
+        if table.empty:
+            continue
+        by_task = table.groupby("task")["record"]
+        rows = []
+        for task in results.protocol.tasks:
+            if task in by_task.groups:
+                rows.append(row(task, list(by_task.get_group(task))))
+        rows.append(row("all", list(table["record"])))
+        last = len(rows) - 1
+        tables.append(Table(f"{method.label}: {title}", columns, rows, {last}, {last}))
     return tables
 
 
@@ -66,12 +69,17 @@ def show(figure: Figure, short: bool = False) -> str:
             return f"incomplete ({figure.done:,} of {figure.expected:,})"
         partial = "" if figure.partial is None else f" ({figure.partial:.1f} so far)"
         return f"{figure.done:,} of {figure.expected:,} episodes{partial}"
-    text = f"{figure.mean:.2f}" + ("" if figure.std is None else f" ± {figure.std:.2f}")
-    return (
-        text
-        if figure.complete == figure.runs
-        else f"{text} ({figure.complete} of {figure.runs} runs)"
-    )
+    text = show_mean(figure.mean, figure.std)
+    if figure.complete < figure.runs:
+        text += f" ({figure.complete} of {figure.runs} runs)"
+    return text
+
+
+def show_mean(mean: float, std: float | None) -> str:
+    """A mean and its deviation, where there is one."""
+    if std is None:
+        return f"{mean:.2f}"
+    return f"{mean:.2f} ± {std:.2f}"
 
 
 def span(interval: Interval | None) -> str:
@@ -83,9 +91,7 @@ def show_paper(figure: Figure) -> str:
     """What the paper reports for a figure."""
     if figure.paper is None:
         return ""
-    return f"{figure.paper.mean:.2f}" + (
-        "" if figure.paper.std is None else f" ± {figure.paper.std:.2f}"
-    )
+    return show_mean(figure.paper.mean, figure.paper.std)
 
 
 def overview(results: Results) -> Table:
@@ -93,29 +99,23 @@ def overview(results: Results) -> Table:
     suites = results.protocol.suites
     level = f"{100 * results.protocol.confidence:g} %"
     nested = any(len(method.trainings) > 1 for method in results.methods)
-    columns = [
-        "method",
-        *(["trainings"] if nested else []),
-        "runs",
-        "episodes",
-        *suites,
-        "average",
-        level,
-        "paper",
-    ]
+    over = "runs"
+    columns = ["method", "runs", "episodes", *suites, "average", level, "paper"]
+    if nested:
+        over = "trainings, or over the runs of one"
+        columns.insert(1, "trainings")
     rows = []
     for method in results.methods:
         average = method.average
-        episodes = (
-            f"{average.done:,}"
-            if average.done == average.expected
-            else f"{average.done:,} of {average.expected:,}"
-        )
-        cells = [show(method.figures["suite"][suite], short=True) for suite in suites]
-        figures = [show(average, short=True), span(average.interval), show_paper(average)]
-        trainings = [str(len(method.trainings))] if nested else []
-        rows.append([method.label, *trainings, str(average.runs), episodes, *cells, *figures])
-    over = "trainings, or over the runs of one" if nested else "runs"
+        episodes = f"{average.done:,}"
+        if average.done < average.expected:
+            episodes += f" of {average.expected:,}"
+        row = [method.label, str(average.runs), episodes]
+        if nested:
+            row.insert(1, str(len(method.trainings)))
+        row += [show(method.figures["suite"][suite], short=True) for suite in suites]
+        row += [show(average, short=True), span(average.interval), show_paper(average)]
+        rows.append(row)
     return Table(f"Success rate (%), mean ± sample standard deviation over {over}", columns, rows)
 
 
@@ -128,11 +128,9 @@ def detail(method: Method, results: Results) -> Table:
     rules, strong = set(), set()
 
     def add(name: str, figure: Figure, mark: bool = False) -> None:
-        gap = (
-            ""
-            if figure.mean is None or figure.paper is None
-            else f"{figure.mean - figure.paper.mean:+.2f}"
-        )
+        gap = ""
+        if figure.mean is not None and figure.paper is not None:
+            gap = f"{figure.mean - figure.paper.mean:+.2f}"
         if mark:
             strong.add(len(rows))
         rows.append([name, show(figure), span(figure.interval), show_paper(figure), gap])
@@ -155,31 +153,25 @@ def detail(method: Method, results: Results) -> Table:
 
 def runs_table(results: Results) -> Table:
     """Every run: how far it is, how its episodes ended, and its average."""
-    rows = []
+    columns = ["method", "checkpoint", "seed", "episodes"]
+    columns += ["success", "fail", "timeout", "error", "average (%)"]
     named = any(run.key.training for method in results.methods for run in method.runs)
+    if named:
+        columns.insert(1, "training seed")
+    rows = []
     for method in results.methods:
         for run in method.runs:
             outcomes = run.outcomes
-            rate = (
-                f"{100 * outcomes['success'] / run.expected:.2f}" if run.complete else "incomplete"
-            )
-            done = f"{len(run.averaged)} of {run.expected}"
-            counts = [str(outcomes[name]) for name in ("success", "fail", "timeout", "error")]
-            seed = [str(run.key.training.seed) if run.key.training else ""] if named else []
-            rows.append(
-                [
-                    method.label,
-                    *seed,
-                    str(run.key.checkpoint),
-                    str(run.key.model_seed),
-                    done,
-                    *counts,
-                    rate,
-                ]
-            )
-    trained = ["training seed"] if named else []
-    ends = ["episodes", "success", "fail", "timeout", "error", "average (%)"]
-    columns = ["method", *trained, "checkpoint", "seed", *ends]
+            row = [method.label, str(run.key.checkpoint), str(run.key.model_seed)]
+            row.append(f"{len(run.averaged)} of {run.expected}")
+            row += [str(outcomes[name]) for name in ("success", "fail", "timeout", "error")]
+            if run.complete:
+                row.append(f"{100 * outcomes['success'] / run.expected:.2f}")
+            else:
+                row.append("incomplete")
+            if named:
+                row.insert(1, str(run.key.training.seed) if run.key.training else "")
+            rows.append(row)
     return Table("Runs", columns, rows)
 
 
@@ -187,18 +179,25 @@ def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     """Differences of pairs, on their common episodes."""
     rows = []
     for c in comparisons:
-        paired = f"{c.episodes}" if c.episodes == c.expected else f"{c.episodes} of {c.expected}"
+        episodes = f"{c.episodes}"
+        if c.episodes < c.expected:
+            episodes += f" of {c.expected}"
+        significant = "no"
+        if c.significant:
+            significant = "yes"
+        elif not c.testable:
+            significant = "too few episodes"
         rows.append(
             [
                 f"{c.first} − {c.second}",
-                paired,
+                episodes,
                 f"{c.first_rate:.2f}",
                 f"{c.second_rate:.2f}",
                 f"{c.difference:+.2f}",
                 f"[{c.interval.low:+.1f}, {c.interval.high:+.1f}]",
                 c.better_worse,
                 show_p(c.corrected),
-                "yes" if c.significant else "no",
+                significant,
             ]
         )
     columns = [
@@ -226,42 +225,34 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
         order = {seed: i for i, seed in enumerate(PAPER_SEEDS)}
         runs.sort(key=lambda run: (order.get(run.key.model_seed, len(order)), run.key.model_seed))
         several = len(by_training(runs)) > 1
-        names = [
-            f"Training {run.key.training.seed}, " if several and run.key.training else ""
-            for run in runs
-        ]
-        seeds = [f"{name}Seed {run.key.model_seed}" for name, run in zip(names, runs, strict=True)]
-        columns = ["Task", *seeds, "Average"]
-        values: list[list[float | str]] = []
-        for task in results.protocol.averaged:
-            row: list[float | str] = []
-            for run in runs:
+        columns = ["Task"]
+        for run in runs:
+            name = f"Seed {run.key.model_seed}"
+            if several and run.key.training:
+                name = f"Training {run.key.training.seed}, {name}"
+            columns.append(name)
+        columns.append("Average")
+        # Rates of the tasks [tasks, runs], NaN of an incomplete one; NaN of one makes averages NaN.
+        tasks = results.protocol.averaged
+        rates = pd.DataFrame(index=tasks, columns=range(len(runs)), dtype=float)
+        for number, run in enumerate(runs):
+            for task in tasks:
                 outcomes = run.successes(task)
-                done = sum(key.task == task for key in run.records)
-                row.append(
-                    f"{done} of {results.protocol.episodes} episodes"
-                    if outcomes is None
-                    else 100 * sum(outcomes) / len(outcomes)
-                )
-            values.append(row)
-        run_columns = [[row[i] for row in values] for i in range(len(runs))]
-        values.append([_mean(column) for column in run_columns])
-        labels = [*results.protocol.averaged, "**Average**"]
-        rows = [
-            [name, *map(_percent, row), _percent(_mean(row))]
-            for name, row in zip(labels, values, strict=True)
-        ]
+                if outcomes is not None:
+                    rates.loc[task, number] = 100 * sum(outcomes) / len(outcomes)
+        rates.loc["**Average**"] = rates.mean(skipna=False)
+        rates["Average"] = rates.mean(axis=1, skipna=False)
+        rows = []
+        for name, values in rates.iterrows():
+            cells = ["incomplete" if pd.isna(value) else f"{value:.2f}" for value in values]
+            if name in tasks:
+                for number, run in enumerate(runs):
+                    if pd.isna(values[number]):
+                        done = sum(key.task == name for key in run.records)
+                        cells[number] = f"{done} of {results.protocol.episodes} episodes"
+            rows.append([str(name), *cells])
         tables.append(Table(f"{method.label}, checkpoint {checkpoint}", columns, rows))
     return tables
-
-
-def _mean(values: Sequence[float | str]) -> float | str:
-    numbers = [value for value in values if isinstance(value, float)]
-    return sum(numbers) / len(numbers) if len(numbers) == len(values) else "incomplete"
-
-
-def _percent(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.2f}"
 
 
 def to_rich(table: Table) -> "RichTable":
@@ -301,60 +292,51 @@ def to_markdown(table: Table) -> str:
     return f"### {escape_markdown(table.title)}\n\n{body}\n"
 
 
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "_": r"\_",
-    "%": r"\%",
-    "&": r"\&",
-    "#": r"\#",
-    "±": r"$\pm$",
-    "−": "$-$",
-    "<": "$<$",
-    ">": "$>$",
-    "π": r"$\pi$",
-    "$": r"\$",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-}
+_LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "_": r"\_",
+        "%": r"\%",
+        "&": r"\&",
+        "#": r"\#",
+        "±": r"$\pm$",
+        "−": "$-$",
+        "<": "$<$",
+        ">": "$>$",
+        "π": r"$\pi$",
+        "$": r"\$",
+        "{": r"\{",
+        "}": r"\}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+    }
+)
 
 
 def to_latex(table: Table) -> str:
     """A LaTeX table (package booktabs)."""
-
-    def line(cells: Sequence[str], strong: bool = False) -> str:
-        escaped = ("".join(_LATEX.get(letter, letter) for letter in cell) for cell in cells)
-        return (
-            " & ".join(rf"\textbf{{{cell}}}" if strong and cell else cell for cell in escaped)
-            + r" \\"
-        )
-
-    body = []
-    for i, row in enumerate(table.rows):
-        body += [r"\midrule"] * (i in table.rules) + [line(row, i in table.strong)]
-    caption = line([table.title]).removesuffix(r" \\")
-    return "\n".join(
-        [
-            r"\begin{table}",
-            r"\centering",
-            rf"\caption{{{caption}}}",
-            rf"\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}",
-            r"\toprule",
-            line(table.columns),
-            r"\midrule",
-            *body,
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-            "",
-        ]
+    rows = []
+    for number, row in enumerate(table.rows):
+        cells = [cell.translate(_LATEX) for cell in row]
+        if number in table.strong:
+            cells = [rf"\textbf{{{cell}}}" if cell else "" for cell in cells]
+        if number in table.rules:
+            cells[0] = "\\midrule\n" + cells[0]
+        rows.append(cells)
+    frame = pd.DataFrame(rows, columns=[column.translate(_LATEX) for column in table.columns])
+    return frame.style.hide(axis="index").to_latex(
+        column_format="l" + "r" * (len(table.columns) - 1),
+        hrules=True,
+        position_float="centering",
+        caption=table.title.translate(_LATEX),
     )
 
 
 def _no_formula(text: str) -> str:
     text = " ".join(text.split())  # a name with a line break would begin another row
-    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
+    if text.startswith(("=", "+", "-", "@")):
+        return f"'{text}"
+    return text
 
 
 CSV_COLUMNS = (
@@ -378,28 +360,14 @@ def to_csv(results: Results) -> str:
     """Every figure as a row of numbers; names that a spreadsheet would run as formulas get an
     apostrophe first.
     """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(CSV_COLUMNS)
+    rows = []
     for method in results.methods:
         for kind, figures in method.figures.items():
-            for name, f in figures.items():
-                low, high = f.interval or (None, None)
-                reported = f.paper or (None, None)
-                numbers = [
-                    f.mean,
-                    f.std,
-                    low,
-                    high,
-                    f.runs,
-                    f.complete,
-                    f.done,
-                    f.expected,
-                    *reported,
-                ]
-                cells = [
-                    f"{n:.4f}" if isinstance(n, float) else ("" if n is None else str(n))
-                    for n in numbers
-                ]
-                writer.writerow([*map(_no_formula, (method.label, kind, name)), *cells])
-    return out.getvalue()
+            for name, figure in figures.items():
+                names = [_no_formula(text) for text in (method.label, kind, name)]
+                low, high = figure.interval or (None, None)
+                reported = figure.paper or (None, None)
+                counts = (figure.runs, figure.complete, figure.done, figure.expected)
+                rows.append([*names, figure.mean, figure.std, low, high, *counts, *reported])
+    frame = pd.DataFrame(rows, columns=CSV_COLUMNS)
+    return str(frame.to_csv(index=False, float_format="%.4f", lineterminator="\n"))

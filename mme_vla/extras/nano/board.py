@@ -18,25 +18,23 @@ import numpy as np
 
 from mme_vla.errors import require
 from mme_vla.evaluation.results import paper
-from mme_vla.evaluation.results.aggregate import (
-    Figure,
-    Interval,
-    Method,
-    aggregate,
-    percentiles,
-    resampled_means,
-    wilson,
-)
+from mme_vla.evaluation.results.aggregate import Figure, Method, aggregate
 from mme_vla.evaluation.results.compare import (
     Comparison,
     compare,
     compare_all,
     compare_unpaired,
-    holm,
     pair_methods,
 )
 from mme_vla.evaluation.results.paper import PaperMethod
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, Protocol, scopes
+from mme_vla.evaluation.results.statistics import (
+    Interval,
+    holm,
+    percentiles,
+    resampled_means,
+    wilson,
+)
 from mme_vla.extras.nano.rows import CHOICES, Trained, Training
 
 SAMPLES = 2000

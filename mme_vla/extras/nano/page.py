@@ -11,7 +11,7 @@ import numpy as np
 
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Interval, Method, Results, aggregate, wilson
+from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import (
     Comparison,
     common_episodes,
@@ -19,6 +19,7 @@ from mme_vla.evaluation.results.compare import (
     why_unpaired,
 )
 from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.statistics import Interval, wilson
 from mme_vla.evaluation.results.tables import comparison_table, to_markdown
 from mme_vla.extras.nano.evaluating import PLANNER
 from mme_vla.extras.nano.fitting import learning_curve

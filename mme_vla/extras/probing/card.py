@@ -16,6 +16,7 @@ from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.statistics import resampled_means
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.rollout.evaluation import evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -390,17 +391,23 @@ def _mean(values: Outcomes) -> float:
     return float(np.mean(means))
 
 
+def _by_task(values: Outcomes) -> dict[str, np.ndarray]:
+    """The values of each task's scenes, in order."""
+    tasks: dict[str, list[float]] = {}
+    for key, value in values.items():
+        tasks.setdefault(key.task, []).append(value)
+    return {task: np.array(of_task) for task, of_task in tasks.items()}
+
+
 def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
     """Means over tasks of scenes resampled within each task, the same ones for all columns:
     [columns, samples].
     """
-    rng, keys = np.random.default_rng(0), list(columns[0]) if columns else []
-    tasks = dict.fromkeys(key.task for key in keys)
-    means = np.zeros((len(columns), _SAMPLES))
-    for task in tasks:
-        values = np.array([[column[key] for key in keys if key.task == task] for column in columns])
-        means += values[:, rng.integers(0, values.shape[1], (_SAMPLES, values.shape[1]))].mean(-1)
-    return means / max(len(tasks), 1)
+    if not columns:
+        return np.zeros((0, _SAMPLES))
+    tables = [_by_task(column) for column in columns]
+    tasks = {task: [table[task][:, None] for table in tables] for task in tables[0]}
+    return resampled_means(tasks, _SAMPLES, seed=0)
 
 
 def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any] | str:

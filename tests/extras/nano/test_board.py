@@ -17,7 +17,7 @@ from scipy.stats import kendalltau, spearmanr
 from helpers.nano_rows import SCENES, SPLIT, TASKS, records_of, write_records, write_training
 from mme_vla import UserError
 from mme_vla.envs.metadata import episodes
-from mme_vla.evaluation.results.aggregate import percentiles
+from mme_vla.evaluation.results.statistics import percentiles
 from mme_vla.evaluation.store import claim_run, read_folders
 from mme_vla.extras.nano import board_page
 from mme_vla.extras.nano.board import Board, Row, homogeneity, kendall, pooled, smallest_p, spearman

@@ -1,0 +1,264 @@
+"""How sure a figure is: every interval, test and bootstrap of the results.
+
+All of them hold for three episodes as well as for 800. Rates are shares (0 to 1), not percent.
+
+- A rate: the score interval of Wilson (1927).
+- A mean over tasks, or over repeated runs: the same, for an effective number of episodes (the
+  design effect of survey statistics: Korn and Graubard 1998).
+- A paired difference: the score interval of Tango (1998), at least as wide as the exact interval
+  of the sign test (Clopper and Pearson 1934).
+- An unpaired difference: the interval of Agresti and Caffo (2000).
+- A paired test: the exact sign test. Several of them: Holm (1979).
+- Several trainings: a percentile bootstrap (Efron and Tibshirani 1993) over episodes and trainings.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import binomtest, norm
+
+
+class Interval(NamedTuple):
+    """A confidence interval."""
+
+    low: float
+    high: float
+
+    @property
+    def percent(self) -> "Interval":
+        """The interval of a share, in percent."""
+        return Interval(100 * self.low, 100 * self.high)
+
+    def widen(self, other: "Interval") -> "Interval":
+        """The smallest interval that has both in it."""
+        return Interval(min(self.low, other.low), max(self.high, other.high))
+
+
+class Difference(NamedTuple):
+    """An interval of a difference, and the p value of no difference."""
+
+    interval: Interval
+    p: float
+
+
+def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
+    """Mean and sample standard deviation (divisor n − 1), as the released aggregation; one value
+    has none.
+    """
+    array = np.asarray(values, np.float64)
+    if len(array) == 1:
+        return float(array.mean()), None
+    return float(array.mean()), float(array.std(ddof=1))
+
+
+# Rates --------------------------------------------------------------------------------------------
+
+
+def wilson(rate: float, trials: float, confidence: float = 0.95) -> Interval:
+    """Wilson's score interval of a rate.
+
+    `scipy.stats.binomtest` has it for counts; here `trials` may be an effective number.
+    """
+    z = norm.ppf(0.5 + confidence / 2)
+    shrink = 1 + z * z / trials
+    centre = (rate + z * z / (2 * trials)) / shrink
+    half = z / shrink * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
+    return Interval(float(max(0.0, centre - half)), float(min(1.0, centre + half)))
+
+
+def effective_trials(tasks: Sequence[np.ndarray]) -> float:
+    """How many independent episodes a mean over tasks is worth: its p(1−p) over its variance.
+
+    Runs of one episode share its scene and are not independent: a task has the variance that the
+    differences between its episodes show, and at least that of as many independent trials. It is
+    estimated with two episodes more, one solved and one not, since a few equal episodes do not show
+    that there is none. The mean is worth at least its episodes: tasks that differ make it less
+    uncertain, not more.
+
+    tasks: of each, successes [episodes, runs], every run on the same episodes.
+    """
+    p = float(np.mean([outcomes.mean() for outcomes in tasks]))
+    variances = []
+    inverse_episodes = []
+    for outcomes in tasks:
+        n_episodes, n_runs = outcomes.shape
+        rates = np.append(outcomes.mean(1), [0, 1])
+        independent = rates.mean() * (1 - rates.mean()) / n_runs
+        variances.append(max(rates.var(), independent) / n_episodes)
+        inverse_episodes.append(1 / n_episodes)
+    n_tasks = len(tasks)
+    at_least = n_tasks**2 / sum(inverse_episodes)
+    return max(at_least, p * (1 - p) * n_tasks**2 / sum(variances))
+
+
+def mean_interval(tasks: Sequence[np.ndarray], confidence: float = 0.95) -> Interval:
+    """Wilson's interval of a mean over tasks, for other episodes of the same tasks.
+
+    tasks: as `effective_trials` takes them.
+    """
+    mean = float(np.mean([outcomes.mean() for outcomes in tasks]))
+    return wilson(mean, effective_trials(tasks), confidence)
+
+
+# Differences --------------------------------------------------------------------------------------
+
+
+def paired_interval(gaps: Mapping[str, np.ndarray], confidence: float = 0.95) -> Interval:
+    """Interval of a mean over tasks of paired differences.
+
+    The wider of two: Tango's score interval, and the share of unequal pairs times the exact
+    interval of how many of them favour the first side. The second has 0 in it exactly where
+    `sign_test` has p ≥ 1 − confidence, so that interval and test never contradict each other. Of
+    no unequal pair nothing is known but that they are rare, which is what the first one states.
+
+    gaps: of each task, first side minus second of every pair, −1 … 1. Pairs of several runs have
+    fractions, and count as so many pairs of single runs as their smaller spread is worth.
+    """
+    n_pairs = sum(len(values) for values in gaps.values())
+    # A pair of a task with fewer pairs weighs more: the figure is a mean over tasks.
+    scaled = [values * (n_pairs / len(values) / len(gaps)) for values in gaps.values()]
+    weighted = np.concatenate(scaled)
+    gained = weighted[weighted > 0].sum()
+    lost = -weighted[weighted < 0].sum()
+    unequal = np.concatenate(list(gaps.values()))
+    unequal = unequal[unequal != 0]
+    if not len(unequal):
+        return tango(0.0, 0.0, n_pairs, confidence)
+    worth = np.abs(unequal).sum() / (unequal**2).sum()
+    score = tango(gained * worth, lost * worth, n_pairs * worth, confidence)
+    test = binomtest(int((unequal > 0).sum()), len(unequal))
+    low, high = test.proportion_ci(confidence, "exact")
+    share = float(gained + lost) / n_pairs
+    return score.widen(Interval(share * float(2 * low - 1), share * float(2 * high - 1)))
+
+
+def tango(gained: float, lost: float, pairs: float, confidence: float = 0.95) -> Interval:
+    """Score interval of a paired difference (Tango 1998, Statistics in Medicine 17, 891).
+
+    gained, lost: pairs that only the first side, or only the second, solved.
+    """
+    z = norm.ppf(0.5 + confidence / 2)
+    difference = (gained - lost) / pairs
+
+    def excess(delta: float) -> float:
+        """The squared score of a difference of `delta`, minus z², times its variance."""
+        # `only_second`: likeliest share of pairs that only the second side solves.
+        b = -gained - lost + (2 * pairs - gained + lost) * delta
+        c = -lost * delta * (1 - delta)
+        only_second = (math.sqrt(max(b * b - 8 * pairs * c, 0.0)) - b) / (4 * pairs)
+        variance = pairs * (2 * only_second + delta * (1 - delta))
+        return float((gained - lost - pairs * delta) ** 2 - z * z * variance)
+
+    low, high = -1.0, 1.0
+    if excess(-1.0) > 0:
+        low = brentq(excess, -1.0, difference - 1e-9)
+    if excess(1.0) > 0:
+        high = brentq(excess, difference + 1e-9, 1.0)
+    return Interval(float(low), float(high))
+
+
+def unpaired_difference(
+    first: Sequence[np.ndarray], second: Sequence[np.ndarray], confidence: float = 0.95
+) -> Difference:
+    """Interval and p of the difference between two means over the same tasks, of other scenes.
+
+    Each side is counted with two scenes more, one solved and one not (Agresti and Caffo 2000), so
+    that few scenes with equal outcomes are no certainty. p is of the normal approximation that the
+    interval is of.
+
+    first, second: as `effective_trials` takes them.
+    """
+    rates = []
+    variance = 0.0
+    for tasks in (first, second):
+        trials = effective_trials(tasks)
+        solved = trials * float(np.mean([outcomes.mean() for outcomes in tasks]))
+        rate = (solved + 1) / (trials + 2)
+        variance += rate * (1 - rate) / (trials + 2)
+        rates.append(rate)
+    difference = rates[0] - rates[1]
+    deviation = math.sqrt(variance)
+    half = float(norm.ppf(0.5 + confidence / 2)) * deviation
+    p = float(2 * norm.sf(abs(difference) / deviation))
+    return Difference(Interval(max(-1.0, difference - half), min(1.0, difference + half)), p)
+
+
+# Tests --------------------------------------------------------------------------------------------
+
+
+def sign_test(first: int, second: int) -> float:
+    """Exact two-sided p that as many of the differing pairs favour one side; on pairs of runs,
+    McNemar's test.
+    """
+    if first + second == 0:
+        return 1.0
+    return float(binomtest(first, first + second).pvalue)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's correction for several comparisons, in the order given."""
+    values = np.asarray(p_values, np.float64)
+    order = np.argsort(values)
+    factors = np.arange(len(values), 0, -1)
+    corrected = np.empty_like(values)
+    corrected[order] = np.maximum.accumulate(factors * values[order])
+    return [float(p) for p in corrected.clip(max=1.0)]
+
+
+# Bootstrap ----------------------------------------------------------------------------------------
+
+
+def bootstrap(
+    tasks: Mapping[str, Sequence[np.ndarray]],
+    confidence: float = 0.95,
+    samples: int = 10_000,
+    seed: int = 0,
+) -> Interval:
+    """Percentile interval of a mean over tasks, resampling episodes within each task, and trainings
+    for all.
+
+    tasks: see `resampled_means`. The figure of several methods is the sum of theirs.
+    """
+    return percentiles(resampled_means(tasks, samples, seed).sum(0), confidence)
+
+
+def percentiles(values: np.ndarray, confidence: float = 0.95) -> Interval:
+    """The interval between two percentiles of resampled values; NaNs, which are not defined in a
+    sample, left out.
+    """
+    tail = (1 - confidence) / 2
+    low, high = np.nanquantile(values, [tail, 1 - tail])
+    return Interval(float(low), float(high))
+
+
+def resampled_means(
+    tasks: Mapping[str, Sequence[np.ndarray]], samples: int, seed: int
+) -> np.ndarray:
+    """Means over tasks of each method [methods, samples], of episodes sampled within each task, and
+    of trainings.
+
+    tasks: for each task one array of [episodes, trainings] a method, already averaged over the runs
+    of a training: an episode is sampled with all of them, for all methods alike. Of one training
+    none is sampled.
+    """
+    rng = np.random.default_rng(seed)
+    n_trainings = [values.shape[1] for values in next(iter(tasks.values()))]
+    # Trainings have a generator of their own: episodes are the same with one training and several.
+    training_rng = np.random.default_rng([seed, 1])
+    shares = []  # how often each training is sampled: [samples, trainings] a method
+    for n in n_trainings:
+        if n == 1:
+            shares.append(np.ones((samples, 1)))
+        else:
+            shares.append(training_rng.multinomial(n, np.full(n, 1 / n), samples) / n)
+    means = np.zeros((len(n_trainings), samples))
+    for values_of_methods in tasks.values():
+        n_episodes = len(values_of_methods[0])
+        sampled = rng.integers(0, n_episodes, (samples, n_episodes))
+        for method, (values, share) in enumerate(zip(values_of_methods, shares, strict=True)):
+            by_training = [values[:, i][sampled].mean(1) * share[:, i] for i in range(len(share.T))]
+            means[method] += sum(by_training)
+    return means / len(tasks)
