@@ -156,6 +156,13 @@ def compose(
         except COMPOSITION_ERRORS as error:
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
+    for group in ("memory", "integration"):
+        section = cfg.get(group)
+        require(
+            not section or section.get("name"),
+            f"The section `{group}` has no name, only {', '.join(map(str, section or ()))}. Choose"
+            f" one: {group}=<name>; its keys are set beside it, {group}.<key>=<value>.",
+        )
     join_plugins(cfg, config_name, trees, words)
     return cfg
 

@@ -327,7 +327,8 @@ class RequestReader:
         require(isinstance(message, dict), f"A request is a map, got {described(message)}.")
         action = self._robot.action
         space = message.get("action_space", action.answers)
-        if not isinstance(space, str) or space != action.answers:
+        is_text = space is None or isinstance(space, str)
+        if not is_text or space != action.answers:
             raise UserError(
                 f"action_space={described(space)}: this policy returns {action.answers} only."
             )

@@ -285,7 +285,7 @@ def test_hydras_switches_still_work(app: Path, tmp_path: Path) -> None:
     [
         (["--cfg", "job", "--multirun"], 2, "Use one of --multirun and --cfg"),
         (["--config-dir", "nowhere"], 2, "nowhere' does not exist"),
-        (["--help"], 0, "memory=none    none · tokendrop"),
+        (["--help"], 0, "memory=none: none · tokendrop"),
     ],
 )
 def test_a_command_ends_before_it_starts_a_run(

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from mme_vla import build_policy, cli, registry
-from mme_vla.config.composition import library_files
 from mme_vla.config.plugins import import_trusted
 from mme_vla.errors import UserError
 from mme_vla.registry import Command, Extension, Registry
@@ -38,9 +37,8 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         "# @package _global_\ndefaults:\n  - /memory: fading\n  - /integration: modulator\n"
         "name: fading_modul\n"
     )
-    shipped = library_files("memory")["framesamp"].read_text()
     (tmp_path / "configs" / "memory" / "fading.yaml").write_text(
-        shipped.replace("name: framesamp", "name: fading")
+        "name: fading\nbudget: 64\ngrid: 4\n"
     )
     extension = Extension(
         parts={"memory": {"fading": PACKAGE}},

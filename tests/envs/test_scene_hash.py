@@ -105,6 +105,10 @@ def test_an_environment_with_values_is_named_by_those_of_its_reset() -> None:
     assert isinstance(env, EpisodeEnv)
 
 
+# The benchmark ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
 def tasks() -> Iterator[list[Any]]:
     pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
     made: list[Any] = []

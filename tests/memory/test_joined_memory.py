@@ -177,13 +177,10 @@ def test_a_running_episode_acts_as_a_fresh_start_and_a_saved_policy_as_the_first
 
 
 def test_a_list_of_memories_is_understood_everywhere(tmp_path: Path) -> None:
-    assert (
-        compose("train", ["memory=[framesamp,ttt]", "integration=modulator"]).name
-        == "framesamp_ttt_modul"
-    )
-    assert build_policy(
-        "pi05", memory=["tokendrop", "rmt"], integration="expert", device="meta"
-    ).config["name"] == ("tokendrop_rmt_expert")
+    composed = compose("train", ["memory=[framesamp,ttt]", "integration=modulator"])
+    assert composed.memory.members == ["framesamp", "ttt"]
+    several = build_policy("pi05", memory=["tokendrop", "rmt"], integration="expert", device="meta")
+    assert isinstance(several.memory, JoinedMemory)
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "two.yaml").write_text(
         "# @package _global_\ndefaults:\n  - /integration: context\nname: two\n"

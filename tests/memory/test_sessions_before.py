@@ -14,6 +14,7 @@ from helpers.scripted_env import ScriptedEnv, make_moving_env
 from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
+from mme_vla.evaluation.api import policy_of_split
 from mme_vla.evaluation.results.curves import stress_curves
 from mme_vla.evaluation.rollout.evaluation import evaluate
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -57,7 +58,7 @@ def test_nobody_evaluates_such_a_split_without_showing_them(tmp_path: Path) -> N
     with pytest.raises(UserError, match="2 recorded episodes to take from, and there are 1"):
         with_sessions(policy, SPLIT, made_up(1))
     with pytest.raises(UserError, match="split=test shows none"):
-        with_sessions(policy, "test", made_up())
+        policy_of_split(policy, "test", made_up())
     assert with_sessions(policy, "stress:sessions=0", made_up()) is policy
 
 

@@ -21,7 +21,7 @@ class QuietPolicy(MMEPolicy):
 
 def test_the_section_policy_says_which_class_is_built() -> None:
     built = build_policy("pi05", policy={"name": "quiet"})
-    assert type(built) is QuietPolicy and built.config["name"].startswith("quiet")
+    assert type(built) is QuietPolicy
     assert type(build_policy("pi05")) is MMEPolicy
     assert policy_class({}) is policy_class({"policy": {"compute_dtype": "float32"}}) is MMEPolicy
     for name in ("dreaming", 5, None):

@@ -30,6 +30,17 @@ EXTENSION = Extension(
     },
     configs=Path(__file__).parent / "configs",
     weight_formats={
+        "simplememvla": WeightFormat(
+            f"{_METHODS}.simplememvla.weights",
+            "SimpleMemVLA as its authors publish it, or Qwen3.5 (safetensors)",
+            matches="is_simplememvla",
+            adapter="simplememvla_adapter",
+            write="write_simplememvla",
+            stats="read_published_stats",
+            spelling="read_names",
+            check="check_config",
+            configure="configured",
+        ),
         "diffusion_policy": WeightFormat(
             f"{_METHODS}.diffusion_policy.weights",
             "Diffusion Policy as RoboMME's authors train it (.pth)",
@@ -63,17 +74,6 @@ EXTENSION = Extension(
             adapter="memoryvla_adapter",
             write="write_memoryvla",
             native="read_names",
-        ),
-        "simplememvla": WeightFormat(
-            f"{_METHODS}.simplememvla.weights",
-            "SimpleMemVLA as its authors publish it, or Qwen3.5 (safetensors)",
-            matches="is_simplememvla",
-            adapter="simplememvla_adapter",
-            write="write_simplememvla",
-            stats="read_published_stats",
-            spelling="read_names",
-            check="check_config",
-            configure="configured",
         ),
     },
 )

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mme_vla.extras.methods.sam2act.sam2 import BankState
 
 from helpers.probe_fakes import made_up, probed
 from helpers.rollout_fakes import quick_policy
 from mme_vla import build_policy
 from mme_vla.errors import UserError
+from mme_vla.extras.methods.sam2act.sam2 import BankState
 from mme_vla.extras.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.lines import MomentLine

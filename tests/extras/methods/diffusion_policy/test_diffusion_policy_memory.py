@@ -68,7 +68,7 @@ def test_any_memory_joins_the_condition(memory: str) -> None:
             1,
             policy.backbone.condition_width,
         )
-    assert policy.config["name"] == f"diffusion_policy_{memory}_film"
+    assert policy.config["memory"]["name"] == memory
 
 
 def test_what_is_stored_changes_the_reply_and_learns(policy: DiffusionPolicy) -> None:

@@ -59,7 +59,7 @@ def noise(policy: MemoryVlaPolicy) -> dict[str, torch.Tensor]:
 )
 def test_any_memory_stands_where_the_banks_stood(memory: str) -> None:
     policy = recalling(memory)
-    assert policy.config["name"] == f"memoryvla_{memory}"
+    assert policy.config["memory"]["name"] == memory
     assert isinstance(policy.core, RecallingCore) and not any(
         "_bank" in name for name, _ in policy.core.named_modules()
     )

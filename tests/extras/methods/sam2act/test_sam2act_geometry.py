@@ -5,10 +5,10 @@ from its rules.
 import numpy as np
 import pytest
 import torch
-from mme_vla.extras.methods.sam2act.geometry import Cube, shift_and_rotate, unproject
 
 from helpers.sam2act_golden import load, meta, relative_error
 from mme_vla.extras.methods.sam2act import geometry
+from mme_vla.extras.methods.sam2act.geometry import Cube, shift_and_rotate, unproject
 
 TOLERANCE = 1e-5
 

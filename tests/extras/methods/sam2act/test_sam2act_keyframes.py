@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mme_vla.extras.methods.sam2act.geometry import Cube
-from mme_vla.extras.methods.sam2act.processor import Shot, cloud_images, cloud_of
 
 from helpers.h5_files import pose_at, write_file
 from mme_vla.data.convert import ConvertOptions, convert
@@ -17,6 +15,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.errors import UserError
 from mme_vla.extras.methods.sam2act import keyframes
+from mme_vla.extras.methods.sam2act.geometry import Cube
 from mme_vla.extras.methods.sam2act.keyframes import (
     EpisodeKeyframes,
     KeyframeDataset,
@@ -26,6 +25,7 @@ from mme_vla.extras.methods.sam2act.keyframes import (
     motions_of,
     write_keyframes,
 )
+from mme_vla.extras.methods.sam2act.processor import Shot, cloud_images, cloud_of
 
 LENGTHS, VIDEOS = [32, 14], [12, 0]
 

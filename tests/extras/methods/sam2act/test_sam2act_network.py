@@ -6,6 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
+
+from helpers.sam2act_golden import load, meta, relative_error, sample_array, sample_weight
 from mme_vla.extras.methods.sam2act.config import EncoderSizes, SAM2ActSizes
 from mme_vla.extras.methods.sam2act.geometry import (
     VIEWS,
@@ -22,9 +25,6 @@ from mme_vla.extras.methods.sam2act.sam2 import (
     sine_positions,
 )
 from mme_vla.extras.methods.sam2act.weights import RATES, released_names
-from torch import Tensor, nn
-
-from helpers.sam2act_golden import load, meta, relative_error, sample_array, sample_weight
 from mme_vla.weights.tables import read
 
 MODULE, NETWORK, GRADIENT = 1e-4, 5e-4, 2e-3

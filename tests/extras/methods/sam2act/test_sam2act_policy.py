@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mme_vla.extras.methods.sam2act.policy import SAM2ActPolicy
-from mme_vla.extras.methods.sam2act.processor import KeyframeBatch
 
 from helpers.depth_env import readings
 from helpers.h5_files import write_file
@@ -17,6 +15,8 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
 from mme_vla.extras.methods.sam2act.keyframes import KeyframeDataset
+from mme_vla.extras.methods.sam2act.policy import SAM2ActPolicy
+from mme_vla.extras.methods.sam2act.processor import KeyframeBatch
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.finetune import apply_finetuning
 

@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
+
+from helpers.memory_fakes import same
+from mme_vla.errors import UserError
 from mme_vla.extras.methods.sam2act.config import SAM2ActSizes
 from mme_vla.extras.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.extras.methods.sam2act.policy import STAGES, SAM2ActPolicy
@@ -21,10 +25,6 @@ from mme_vla.extras.methods.sam2act.weights import (
     sam2act_adapter,
     write_sam2act,
 )
-from torch import nn
-
-from helpers.memory_fakes import same
-from mme_vla.errors import UserError
 from mme_vla.policy.build import build_policy
 from mme_vla.weights.load import load_weights
 from mme_vla.weights.source import detect_format

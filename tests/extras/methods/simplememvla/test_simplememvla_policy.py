@@ -201,7 +201,7 @@ def test_a_memory_of_the_paper_in_the_videos_place(memory: str, tmp_path: Path) 
     checkpoint = run("simplememvla", tmp_path / "run", *words, short=UNTESTED)
     assert len(losses(tmp_path / "run")) == 2 and np.isfinite(losses(tmp_path / "run")).all()
     policy = Policy.from_pretrained(checkpoint)
-    assert policy.config["name"].startswith(f"simplememvla_{memory}")
+    assert policy.config["memory"]["name"] == memory
     assert isinstance(policy, SimpleMemVlaPolicy) and policy.memory is not None
     views, states = observations(6)
     episode = policy.start_episode("pick up the cube", seed=1)
