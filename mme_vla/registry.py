@@ -156,6 +156,10 @@ class Registry[T]:
                 modules.setdefault(name, module)
         return modules
 
+    def _module_of(self, name: str) -> str | None:
+        """The module that registers a name; extensions are listed only for names the core lacks."""
+        return self._core[name] if name in self._core else self._shipped.get(name)
+
     def register(self, name: str) -> Callable[[Any], Any]:
         """Return a decorator that files a class or function under `name`."""
 
@@ -169,7 +173,7 @@ class Registry[T]:
                 ),
                 f"{self.kind} {name!r} is already registered by {taken!r}; choose another name.",
             )
-            module = self._shipped.get(name)
+            module = self._module_of(name)
             require(
                 taken is not None or module in (None, getattr(entry, "__module__", None)),
                 f"{self.kind} {name!r} ships with the library ({module}); choose another name.",
@@ -183,7 +187,7 @@ class Registry[T]:
         if not isinstance(name, str) or name not in self:
             raise UserError(f"Unknown {self.kind} {brief(name)}. {did_you_mean(brief(name), self)}")
         if name not in self._entries:
-            importlib.import_module(self._shipped[name])
+            importlib.import_module(str(self._module_of(name)))
         return self._entries[name]
 
     def build(self, section: Mapping[str, Any], *args: Any, **fixed: Any) -> Any:
@@ -257,7 +261,7 @@ class Registry[T]:
         )
 
     def __contains__(self, name: object) -> bool:
-        return name in self._entries or name in self._shipped
+        return name in self._entries or name in self._core or name in self._shipped
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted({*self._entries, *self._shipped}))

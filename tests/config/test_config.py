@@ -273,8 +273,8 @@ def test_hydras_switches_still_work(app: Path, tmp_path: Path) -> None:
     mine = write_tree(tmp_path / "mine", {"memory/mine.yaml": "{name: mine, budget: 7}"})
     swept = run(app, "--multirun", "--config-dir", str(mine), "train.lr=1,2", "memory=mine")
     assert [line for line in swept.stdout.splitlines() if line.startswith("ran")] == [
-        "ran mine 7 1 app",
-        "ran mine 7 2 app",
+        "ran small 7 1 app",
+        "ran small 7 2 app",
     ], swept.stderr
     output = run(app, "--cfg", "job", "seed=5")
     assert "seed: 5" in output.stdout

@@ -164,7 +164,7 @@ def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
             if status != "ongoing":
                 break
         scene = env.scene_digest
-        steps = env.steps_counted  # never the official environment
+        steps = env.steps_counted
     finally:
         env.close()
     extra: dict[str, Any] = {"status": status, "demonstrated": motions is not None}
