@@ -190,11 +190,11 @@ def _group_page(word: str, groups: dict[str, str], trees: Sequence[Path]) -> str
 def _body(file: Path) -> str:
     """A file without the comment that it begins with and without Hydra's own sections."""
     lines: list[str] = []
-    is_shown = True
+    is_printed = True
     for line in file.read_text().splitlines():
         if line and not line[0].isspace() and not line.startswith("#"):
-            is_shown = not line.startswith(("defaults:", "hydra:"))
-        if is_shown and (lines or not line.startswith("#")):
+            is_printed = not line.startswith(("defaults:", "hydra:"))
+        if is_printed and (lines or not line.startswith("#")):
             lines.append(line)
     return "\n".join(lines).strip()
 
