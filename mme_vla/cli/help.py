@@ -9,7 +9,7 @@ import difflib
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from typing import Any
 import yaml
 
 from mme_vla.cli import commands, usage
+from mme_vla.config.trees import yaml_files
 from mme_vla.errors import UserError, did_you_mean
 
 
@@ -98,14 +99,6 @@ def defaults(file: Path) -> Defaults:
     )
 
 
-def choices(trees: Iterable[Path], group: str) -> dict[str, Path]:
-    """The files of a group by name, of all trees; a later tree's file stands before an earlier
-    one's.
-    """
-    files = {file.stem: file for tree in trees for file in sorted((tree / group).glob("*.yaml"))}
-    return dict(sorted(files.items()))
-
-
 OPTIONS = """\
   --help [GROUP | GROUP=NAME …]  this text; the files of a group; one of its files
   --cfg job                      print the whole configuration and run nothing
@@ -119,12 +112,12 @@ def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
     Args:
         config_name: the command's file.
         words: what stands beside `--help`: a group, or a group's file (`model=framesamp_modul`).
-        trees: folders of YAML files, the library's first.
+        trees: folders of YAML files in the order of search.
 
     Raises:
         UserError: a word is no group of this command, or no file of its group.
     """
-    files = _with_included(choices(trees, "")[config_name], trees)
+    files = _with_included(yaml_files(trees, "")[config_name], trees)
     groups = _groups(files, trees)
     if words:
         return "\n\n".join(_group_page(word, groups, trees) for word in words)
@@ -140,7 +133,7 @@ def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
         parts.append(f"{title}\n{textwrap.indent(_body(file), '  ')}")
     rows = []
     for group, name in sorted(groups.items()):
-        rows.append(f"  {group}={name}: {' · '.join(choices(trees, group)) or '(none)'}")
+        rows.append(f"  {group}={name}: {' · '.join(yaml_files(trees, group)) or '(none)'}")
     if rows:
         introduction = "Groups: GROUP=NAME takes another file; --help GROUP shows what is in them"
         parts.append("\n".join([introduction, *rows]))
@@ -152,7 +145,7 @@ def _with_included(file: Path, trees: Sequence[Path]) -> list[Path]:
     """A file of the top level, and those that it is built on."""
     files = [file]
     for name in defaults(file).files:
-        part = choices(trees, "").get(name)
+        part = yaml_files(trees, "").get(name)
         if part is not None:
             files += _with_included(part, trees)
     return files
@@ -167,7 +160,7 @@ def _groups(files: Sequence[Path], trees: Sequence[Path]) -> dict[str, str]:
             group = name.strip("/").partition("@")[0]
             if group not in groups:
                 groups[group] = choice
-                file = choices(trees, group).get(choice)
+                file = yaml_files(trees, group).get(choice)
                 if file is not None:
                     pending.append(file)
     return groups
@@ -178,7 +171,7 @@ def _group_page(word: str, groups: dict[str, str], trees: Sequence[Path]) -> str
     group, _, name = word.partition("=")
     if group not in groups:
         raise UserError(f"{group!r} is no group of this command. {did_you_mean(group, groups)}")
-    files = choices(trees, group)
+    files = yaml_files(trees, group)
     if name and name not in files:
         raise UserError(f"Unknown {group} {name!r}. {did_you_mean(name, files)}")
     parts = [f"Group {group}, by default {group}={groups[group]}"]

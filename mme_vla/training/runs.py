@@ -61,8 +61,8 @@ MAY_DIFFER = (
 changes a loss.
 
 The name is a label alone. `data.content`, the fingerprints of the datasets, is compared when they
-are open (`check_content`). A run's statistics stay what they are: `data.narrow_ranges` decides only whether
-it continues with narrow ones.
+are open (`check_content`). A run's statistics stay what they are: `data.narrow_ranges` decides only
+whether it continues with narrow ones.
 """
 
 
