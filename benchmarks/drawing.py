@@ -179,9 +179,8 @@ def main() -> None:
     parser.add_argument("--no-record", action="store_true")
     args = parser.parse_args()
     print(f"{args.task} · {args.steps + 1} steps · {machine()}\n")
-    episode(
-        small_policy("pi05"), "pi05", Job(args.task, "test", 1), 2, "needed"
-    )  # shaders and imports: once a process
+    # shaders and imports: once a process
+    episode(small_policy("pi05"), "pi05", Job(args.task, "test", 1), 2, "needed")
     if not args.no_episodes:
         episodes(args.models, args.task, args.steps)
     if not args.no_record:

@@ -27,9 +27,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(
-    0, str(Path(__file__).resolve().parent.parent / "tests")
-)  # small files as the tests have them
+# small files as the tests have them
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 _CACHE = tempfile.TemporaryDirectory(prefix="fuzz-cache-")
 os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": _CACHE.name, "OMP_NUM_THREADS": "1"}
 

@@ -74,9 +74,8 @@ def chunk(model: str, backbone: str = "pi05") -> dict[str, float]:
     )
     with torch.no_grad(), policy.autocast():
         memory = policy.encode_memory(batch.history)
-    batch = replace(
-        batch, history=None, actions=None
-    )  # an episode's tokens are counted where episodes are
+    # an episode's tokens are counted where episodes are
+    batch = replace(batch, history=None, actions=None)
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
     for _ in range(2):

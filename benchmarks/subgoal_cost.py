@@ -80,9 +80,8 @@ def vision_flops(patches: int, n_images: int) -> int:
     total = patches * n_images
     pixels = torch.empty(total, 3 * 2 * 16 * 16, device="meta")
     angles = torch.empty(total, 64, device="meta")
-    bounds = (
-        torch.arange(n_images + 1) * patches
-    )  # on the CPU: the attention splits by their values
+    # on the CPU: the attention splits by their values
+    bounds = torch.arange(n_images + 1) * patches
 
     def run() -> None:
         hidden = tower.patch_embed(pixels)
@@ -117,9 +116,8 @@ def language_flops(read: int, n_output: int) -> int:
 
         return flops(run)
 
-    return step(read, 0) + max(n_output - 1, 0) * step(
-        1, read
-    )  # the pass over the question gives the first token
+    # the pass over the question gives the first token
+    return step(read, 0) + max(n_output - 1, 0) * step(1, read)
 
 
 class CountingVLM:

@@ -72,9 +72,8 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
     "Did you mean 'tokendrop'? Known: framesamp, tokendrop."
     """
     known = sorted(options)
-    near = get_close_matches(
-        name[:200], known, n=3, cutoff=0.6
-    )  # the time it takes grows with the square
+    # the time it takes grows with the square
+    near = get_close_matches(name[:200], known, n=3, cutoff=0.6)
     hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
     return f"{hint}Known: {', '.join(known) or 'none'}."
 

@@ -219,9 +219,8 @@ class Registry[T]:
             raise self._refused(section, fixed, len(args), str(error)) from None
         try:
             return entry(*args, **fixed, **options)
-        except (
-            TypeError
-        ) as error:  # a constructor that passes `**options` on is asked only when it is called
+        except TypeError as error:
+            # a constructor that passes `**options` on is asked only when it is called
             unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
             if unknown is None or unknown[1] not in options:
                 raise

@@ -65,9 +65,8 @@ class Regression(Backbone, HasLoraTargets, Recomputes):
         return self.vision(images).flatten(2).transpose(1, 2) + self.places
 
     def embed(self, batch: Batch) -> list[Block]:
-        tokens = self.encode_images(batch.images.flatten(0, 1)).unflatten(
-            0, batch.images.shape[:2]
-        )  # b v n d
+        # b v n d
+        tokens = self.encode_images(batch.images.flatten(0, 1)).unflatten(0, batch.images.shape[:2])
         mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
         words = self.words(batch.prompt) + self.order.weight[: batch.prompt.shape[1]]
         return [

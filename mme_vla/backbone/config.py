@@ -72,9 +72,8 @@ class BackboneConfig:
     time_distribution: str = (
         "beta"  # `beta`: 0.001 + 0.999·Beta(1.5, 1), as released; `uniform`: the paper's text
     )
-    head: Mapping[str, Any] = field(
-        default_factory=lambda: {"name": "flow"}, hash=False
-    )  # a key of HEADS, its options
+    # a key of HEADS, its options
+    head: Mapping[str, Any] = field(default_factory=lambda: {"name": "flow"}, hash=False)
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
@@ -82,7 +81,6 @@ class BackboneConfig:
         check_positive(self.action, "backbone.action.")
         check_multiple("backbone.", "num_heads", self.num_heads, "num_kv_heads", self.num_kv_heads)
         check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)  # of a rotation
-        check_multiple(
-            "backbone.", "action.width", self.action.width, "pairs", 2
-        )  # sin and cos of the flow time
+        # sin and cos of the flow time
+        check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)
         check_choice("backbone.time_distribution", self.time_distribution, ("beta", "uniform"))

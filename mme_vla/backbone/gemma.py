@@ -82,9 +82,8 @@ class GatedMLP(nn.Module):
         gate, up = self.gate_up(x).chunk(2, dim=-1)
         if torch.is_grad_enabled():
             return self.down(nn.functional.gelu(gate, approximate="tanh") * up)
-        return self.down(
-            torch.ops.aten.gelu_(gate, approximate="tanh").mul_(up)
-        )  # in place: a chunk's largest tensors
+        # in place: a chunk's largest tensors
+        return self.down(torch.ops.aten.gelu_(gate, approximate="tanh").mul_(up))
 
 
 class ExpertLayer(nn.Module):

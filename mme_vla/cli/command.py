@@ -48,9 +48,8 @@ def cli[T](
     def decorate(main: Callable[[DictConfig], T]) -> Callable[..., T | None]:
         @functools.wraps(main)
         def job(cfg: DictConfig) -> T:
-            with (
-                print_user_errors()
-            ):  # here too: Hydra would print a traceback before it gets further
+            with print_user_errors():
+                # here too: Hydra would print a traceback before it gets further
                 if missing := sorted(OmegaConf.missing_keys(cfg)):
                     words = " ".join(f"{key}=…" for key in missing)
                     raise UserError(f"A value is needed for {', '.join(missing)}: add {words}")

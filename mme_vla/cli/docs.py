@@ -121,9 +121,8 @@ def main() -> None:
     )
     parser.add_argument("--build", action="store_true", help="build only, open no browser")
     arguments = parser.parse_args()
-    logging.getLogger("mkdocs").addHandler(
-        logging.StreamHandler()
-    )  # its warnings, which are errors here
+    # its warnings, which are errors here
+    logging.getLogger("mkdocs").addHandler(logging.StreamHandler())
     page = build_site(arguments.output).resolve()
     print(f"The site is in {page}")
     if not arguments.build and not webbrowser.open(page.as_uri()):

@@ -73,9 +73,8 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     if values["deterministic"]:
         settings = replace(settings, max_batch=1)
         # PyTorch takes kernels whose results repeat; where an operation has none, it warns.
-        os.environ.setdefault(
-            "CUBLAS_WORKSPACE_CONFIG", ":4096:8"
-        )  # read when the GPU is first used
+        # read when the GPU is first used
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         torch.use_deterministic_algorithms(True, warn_only=True)
         torch.backends.cudnn.benchmark = False
     jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
@@ -110,9 +109,8 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     }
     notes["deterministic"] = values["deterministic"]
     notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
-    if (
-        multiprocessing.get_start_method() == "loky"
-    ):  # a job of joblib: a worker of ours cannot look that way up
+    if multiprocessing.get_start_method() == "loky":
+        # a job of joblib: a worker of ours cannot look that way up
         multiprocessing.set_start_method("spawn", force=True)
     try:
         done = evaluate_events(

@@ -93,9 +93,8 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
                 **counts,
                 "failed_seeds": failures,
             }
-            write_json(
-                folder / f"{job.name}.json", done, indent=None
-            )  # last: what it tells of is there
+            # last: what it tells of is there
+            write_json(folder / f"{job.name}.json", done, indent=None)
             return done
         failures[seed] = result.error or FAILED
     draft.unlink(missing_ok=True)
@@ -226,9 +225,8 @@ def run(cfg: "DictConfig") -> None:
     require_simulator()
     with FolderLock(work, "recording"):
         _claim(work, [job.plan for job in jobs])
-        missing = recording_plan.missing(
-            options
-        )  # asked again: another process may have finished it meanwhile
+        # asked again: another process may have finished it meanwhile
+        missing = recording_plan.missing(options)
         if missing:
             previews = None if cfg.previews is None else Path(cfg.previews)
             begun, there = (

@@ -38,9 +38,8 @@ def main(cfg: DictConfig) -> None:
             train_several(cfg, fresh, config["trainings"])
         from torch import distributed
 
-        if (
-            distributed.is_available() and distributed.is_initialized()
-        ):  # all trainings share the group
+        if distributed.is_available() and distributed.is_initialized():
+            # all trainings share the group
             distributed.destroy_process_group()
     except UserError:
         with suppress(OSError):
@@ -130,9 +129,8 @@ def train(
     check_processes(accelerator.num_processes)
     selection: list[Any] = [None]
     with ExitStack() as resources:
-        if (
-            accelerator.is_main_process
-        ):  # the clock is in the folder's name: the first process decides
+        if accelerator.is_main_process:
+            # the clock is in the folder's name: the first process decides
             selection[0], lock = claim_run(folder, named, config["resume"], config)
             resources.push(lock)
         run = broadcast_object_list(selection)[0]

@@ -68,9 +68,8 @@ def fused_kernels(x: "torch.Tensor") -> AbstractContextManager[object]:
 
 def checked_products(how: str) -> str:
     """`how`, once it is one of `FLOAT32_PRODUCTS`."""
-    check_choice(
-        "policy.float32_products", how, FLOAT32_PRODUCTS
-    )  # exact; inputs keep ten bits on a GPU
+    # exact; inputs keep ten bits on a GPU
+    check_choice("policy.float32_products", how, FLOAT32_PRODUCTS)
     return how
 
 

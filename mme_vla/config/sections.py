@@ -160,9 +160,8 @@ def _converted(value: Any, kind: Any, name: str) -> Any:
 
 def _first_that_fits(value: Any, kinds: Sequence[Any], name: str) -> Any:
     for kind in kinds:
-        if is_dataclass(kind) and isinstance(
-            value, Mapping
-        ):  # its own words for what is wrong inside
+        if is_dataclass(kind) and isinstance(value, Mapping):
+            # its own words for what is wrong inside
             return _converted(value, kind, name)
     for kind in kinds:
         if not is_dataclass(kind) or isinstance(value, cast(type, kind)):

@@ -340,9 +340,8 @@ def _check_images(dataset: Description, column: str, table: Any) -> None:
 def _compare_size(dataset: Description, column: str, width: int, height: int) -> None:
     """Warn of pictures of another size than described: all are scaled for the network anyway."""
     shape = dataset.info["features"][column]["shape"]
-    sides = (
-        [[shape[0], shape[1]], [shape[-2], shape[-1]]] if len(shape) == 3 else []
-    )  # colours last, or first
+    # colours last, or first
+    sides = [[shape[0], shape[1]], [shape[-2], shape[-1]]] if len(shape) == 3 else []
     if [height, width] not in sides:
         log.warning(
             "%s: meta/info.json gives %s the shape %s, but its pictures have %d rows and %d"

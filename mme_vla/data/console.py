@@ -59,9 +59,8 @@ def progress(
     )
 
     console = Console(stderr=True, highlight=False, soft_wrap=True)
-    if not (
-        console.is_terminal and console.file.isatty()
-    ):  # FORCE_COLOR makes the first true, in notebooks too
+    if not (console.is_terminal and console.file.isatty()):
+        # FORCE_COLOR makes the first true, in notebooks too
         begun = reported = time.monotonic()
         count = done
         first: tuple[float, int] | None = (

@@ -424,9 +424,8 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
         aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
     for video in merged.glob("videos/**/*.mp4"):
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
-    stats = (
-        merged / "meta" / "stats.json"
-    )  # LeRobot writes its keys in the order of a set, another in each process
+    # LeRobot writes its keys in the order of a set, another in each process
+    stats = merged / "meta" / "stats.json"
     stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
     for i, part in enumerate(parts):
         if (part / _KEYFRAMES).is_file():

@@ -83,9 +83,8 @@ def compute_norm_stats(
             advance(1)
     values = actions.result(extremes).to_dict()
     for name, value in {"q01": 0.0, "q99": 1.0, "min": 0.0, "max": 1.0}.items():
-        for place in (
-            robot.action.choice if name in values else ()
-        ):  # a letter that is seldom chosen has no range
+        for place in robot.action.choice if name in values else ():
+            # a letter that is seldom chosen has no range
             values[name][place] = value
     stats = NormStats(state=states.result(extremes), actions=QuantileStats.from_dict(values))
     return check_ranges(stats, sources, episodes, horizon, action_offset, robot, video, narrow)

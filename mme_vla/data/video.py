@@ -88,9 +88,8 @@ class VideoReader:
                 if frame is None:
                     return
                 time, image = float(frame.pts * stream.time_base), frame
-            while (
-                target - time > tolerance / 2
-            ):  # of a video with more images a second, the next may be nearer
+            while target - time > tolerance / 2:
+                # of a video with more images a second, the next may be nearer
                 ahead = next(frames, None) if ahead is None else ahead
                 if ahead is None:
                     break
@@ -105,16 +104,14 @@ class VideoReader:
     def _container(self, path: Path) -> Any:
         import av
 
-        if (
-            self._process != os.getpid()
-        ):  # open files of a parent process share their position with it
+        if self._process != os.getpid():
+            # open files of a parent process share their position with it
             self._open, self._process = OrderedDict(), os.getpid()
             self._may_hold = None
         if path not in self._open:
             container = av.open(str(path))
-            container.streams.video[
-                0
-            ].codec_context.thread_count = 1  # parallelism is across workers
+            # parallelism is across workers
+            container.streams.video[0].codec_context.thread_count = 1
             self._open[path] = container
             if self._may_hold is None:
                 self._may_hold = files_to_hold(self.max_open)

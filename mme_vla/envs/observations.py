@@ -44,9 +44,8 @@ class RenderRequest:
 
     def cameras(self, frame: int, newest: bool) -> tuple[str, ...]:
         """The cameras that show a frame of this number."""
-        known = dict.fromkeys(
-            (*CAMERAS, *self.frames, *self.now)
-        )  # some environments have more than the benchmark
+        # some environments have more than the benchmark
+        known = dict.fromkeys((*CAMERAS, *self.frames, *self.now))
         return tuple(
             c for c in known if frame in self.frames.get(c, NOTHING) or (newest and c in self.now)
         )
@@ -238,9 +237,8 @@ def _read_texture(camera: "RenderCamera", name: str) -> "Tensor":
     if camera.scene.backend.render_backend == "sapien_cpu":
         import torch
 
-        return torch.from_numpy(
-            camera._render_cameras[0].get_picture(name)
-        )  # ManiSkill's own copy takes 8 ms
+        # ManiSkill's own copy takes 8 ms
+        return torch.from_numpy(camera._render_cameras[0].get_picture(name))
     return camera.get_picture(name)[0][0]
 
 

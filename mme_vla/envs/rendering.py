@@ -227,9 +227,8 @@ def _beyond(camera: "sapien.render.RenderCameraComponent", boxes: np.ndarray) ->
     [n, 2, 3].
     """
     view = camera.global_pose.inv().to_transformation_matrix()
-    corners = np.stack(
-        [boxes[:, ends, range(3)] for ends in product((0, 1), repeat=3)], 1
-    )  # [n, 8, 3]
+    # [n, 8, 3]
+    corners = np.stack([boxes[:, ends, range(3)] for ends in product((0, 1), repeat=3)], 1)
     x, y, z = np.moveaxis(corners @ view[:3, :3].T + view[:3, 3], -1, 0)  # forward, left, up
     right, top = x * np.tan(camera.fovx / 2), x * np.tan(camera.fovy / 2)
     outside = np.stack([y - right, -y - right, z - top, -z - top]) > MARGIN  # [4, n, 8]

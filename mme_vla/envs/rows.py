@@ -73,9 +73,8 @@ def _ood() -> dict[str, list[Row]]:
 def _read_file(path: str, modified: int, known: tuple[str, ...]) -> dict[str, list[Row]]:
     """Rows by task. modified: time of the last change, so that a changed file is read again."""
     try:
-        lines = (
-            Path(path).read_text(encoding="utf-8").split("\n")
-        )  # values may hold other separators
+        # values may hold other separators
+        lines = Path(path).read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read as text: {error}.") from error
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]

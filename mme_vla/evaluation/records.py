@@ -149,9 +149,8 @@ class EpisodeRecord:
     scene: str | None = None
 
     def __post_init__(self) -> None:
-        if (
-            isinstance(self.checkpoint, str) and self.checkpoint.isdecimal()
-        ):  # 60000 and "60000" are one checkpoint
+        if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():
+            # 60000 and "60000" are one checkpoint
             object.__setattr__(self, "checkpoint", int(self.checkpoint))
 
     @property

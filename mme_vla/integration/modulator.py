@@ -119,9 +119,8 @@ class Modulator(Integration):
         positions = (
             None if self.memory_position == "slot" else tokens.shape[1] - 1 - ages_of(memory)
         )
-        mask = additive_mask(
-            memory.mask[:, None], tokens.dtype
-        )  # b 1 1 m: every action sees the same keys
+        # b 1 1 m: every action sees the same keys
+        mask = additive_mask(memory.mask[:, None], tokens.dtype)
         cached = [layer.keys_values(tokens, positions) for layer in self.layers]  # type: ignore[operator]
         return LayerHooks(
             [

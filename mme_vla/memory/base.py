@@ -436,9 +436,8 @@ def position_features(positions: Tensor, dim: int) -> Tensor:
         f"position_dim={dim} must be a multiple of 6 (three axes, sin and cos) from 12 on.",
     )
     ramp = torch.arange(w, device=positions.device, dtype=torch.float32) / (w - 1)
-    frequencies = torch.stack(
-        [TEMPORAL_BASE**-ramp, SPATIAL_BASE**-ramp, SPATIAL_BASE**-ramp]
-    )  # 3 w
+    # 3 w
+    frequencies = torch.stack([TEMPORAL_BASE**-ramp, SPATIAL_BASE**-ramp, SPATIAL_BASE**-ramp])
     angles = positions.float()[..., None] * frequencies
     return torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
 

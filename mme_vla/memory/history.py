@@ -444,9 +444,8 @@ class LazyHistory(OnlineHistory):
         that wait.
         """
         frames, rows = np.unique(indices[:, 0], return_inverse=True)
-        self._row_of(
-            frames, np.asarray(self._stored_frames, np.int64)
-        )  # says which frames are missing
+        # says which frames are missing
+        self._row_of(frames, np.asarray(self._stored_frames, np.int64))
         new = [int(frame) for frame in frames if int(frame) in self._waiting]
         if new:
             tokens = self._encode(np.stack([self._waiting[frame] for frame in new]))

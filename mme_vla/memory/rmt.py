@@ -80,12 +80,10 @@ class RMTLayer(RecurrentLayer):
             cos, sin = rope.cos(), rope.sin()
             of_frame, of_slots = (cos[:patches], sin[:patches]), (cos[patches:], sin[patches:])
             kv = self.kv.weight.float()
-            qkv = torch.cat(
-                [self.q.weight.float(), kv]
-            )  # projected and rotated together: fewer small operations
-            frame_k, frame_v = self._heads(
-                layer_norm(self.pre_norm, x.float()), kv, of_frame
-            )  # b t p kv h
+            # projected and rotated together: fewer small operations
+            qkv = torch.cat([self.q.weight.float(), kv])
+            # b t p kv h
+            frame_k, frame_v = self._heads(layer_norm(self.pre_norm, x.float()), kv, of_frame)
             for t in range(x.shape[1]):
                 qk, v = self._heads(layer_norm(self.pre_norm, slots.float()), qkv, of_slots)
                 q, k = qk.tensor_split([-self.kv_heads], -2)
@@ -147,9 +145,8 @@ def attend_rounded(q: Tensor, k: Tensor, v: Tensor, dtype: torch.dtype) -> Tenso
     weights = (
         ((q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)).softmax(-1).to(dtype)
     )
-    if (
-        q.device.type == "cpu"
-    ):  # sums are float32 either way, and many CPUs only emulate products of bfloat16
+    if q.device.type == "cpu":
+        # sums are float32 either way, and many CPUs only emulate products of bfloat16
         return (weights.float() @ v.float()).to(dtype).float()
     return (weights @ v).float()
 

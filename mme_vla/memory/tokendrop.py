@@ -117,9 +117,8 @@ def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
     """
     changed = scores.values >= THRESHOLD
     beside = max(limit - patches, 0)  # places that the first frame leaves
-    if (
-        np.count_nonzero(changed) > beside > 0
-    ):  # sort no more than can stay: an episode's length costs next to nothing
+    if np.count_nonzero(changed) > beside > 0:
+        # sort no more than can stay: an episode's length costs next to nothing
         flat = scores.values.reshape(-1)
         changed &= scores.values >= np.partition(flat, len(flat) - beside)[len(flat) - beside]
     row, patch = np.nonzero(changed)

@@ -117,9 +117,8 @@ class TTTLayer(RecurrentLayer):
             v = layer_norm(self.v_norm, self._by_head(linear(self.v, x)))
             raw = nn.functional.softplus(linear(self.rate, x) + self.rate_constant)  # b t p h
             rate = raw.clamp(0, self.max_rate).transpose(2, 3)[..., None]  # b t h p 1
-            read = min(
-                steps, max(window - following, 0)
-            )  # only these frames' outputs are still in the window at the end
+            # only these frames' outputs are still in the window at the end
+            read = min(steps, max(window - following, 0))
             first_read = steps - read
             q = layer_norm(self.q_norm, self._by_head(linear(self.q, x[:, first_read:])))
             answers, numbers = [], []
@@ -179,9 +178,8 @@ class TTTLayer(RecurrentLayer):
         """
         output, unit, inverse_rms = self.inner(weight, bias, k)
         error = (output - (v - k)) * (1 + self.inner_norm[:, 0, None].float())
-        delta = (
-            rate * inverse_rms * (error - unit * (error * unit).mean(-1, keepdim=True))
-        )  # b h p w
+        # b h p w
+        delta = rate * inverse_rms * (error - unit * (error * unit).mean(-1, keepdim=True))
         of_weight, of_bias = k.transpose(-1, -2) @ delta, delta.sum(-2)
         norms = torch.stack(
             [

@@ -89,9 +89,8 @@ class Episode:
         spec = past_view_spec(memory)
         self._past = None if spec is None else PastImages(spec)
         self.n_observed_frames = 0
-        self._motion_of_frames: list[
-            Tensor
-        ] = []  # rows [w], one a frame, if the memory reads motion
+        # rows [w], one a frame, if the memory reads motion
+        self._motion_of_frames: list[Tensor] = []
         self._chunk: np.ndarray | None = None
         self.action_prefix: ActionPrefix | None = None
         """See `set_action_prefix`."""

@@ -56,9 +56,8 @@ def composition_digest(config: Mapping[str, Any]) -> str:
         if value is not None and key != "processor.tokenizer"
     }
     robot = embodiment_of(config)
-    if robot != ROBOMME_JOINT.with_horizon(
-        robot.action.horizon
-    ):  # which configurations did not use to name
+    if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):
+        # which configurations did not use to name
         settings |= flat({"embodiment": robot.to_dict()})
     return digest(settings, 12)
 
@@ -252,9 +251,8 @@ def save_policy(
         policy.config["card"] = {**policy.config.get("card", {}), **card}
     save_tensors(policy.state_dict(), folder, dtype=kind)
     settings = save_settings(policy, folder)
-    write_sums(
-        folder, [*settings, *list_weight_files(folder)]
-    )  # without the card, which people edit
+    # without the card, which people edit
+    write_sums(folder, [*settings, *list_weight_files(folder)])
 
 
 def save_settings(policy: "Policy", folder: Path) -> list[str]:

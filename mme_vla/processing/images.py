@@ -301,9 +301,8 @@ def crop_and_rotate(pixels: Tensor, offset: Tensor, angle: Tensor) -> Tensor:
         [torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)], 1
     )
     grid = functional.affine_grid(rows, [batch, 1, size, size], align_corners=False)
-    stacked = pixels.flatten(
-        1, 2
-    )  # the views of a sample move together: as channels they share one grid
+    # the views of a sample move together: as channels they share one grid
+    stacked = pixels.flatten(1, 2)
     warped = functional.grid_sample(
         stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False
     )

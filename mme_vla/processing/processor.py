@@ -127,9 +127,8 @@ def saved_tokenizer(folder: Path, name: Any) -> str | Path:
         return str(name)
     if isinstance(name, str) and name.startswith(HUB):
         if (folder / TOKENIZER_FILE).is_file():
-            Sums(folder).check(
-                TOKENIZER_FILE
-            )  # it may be added later: its fingerprint is in processor.json
+            # it may be added later: its fingerprint is in processor.json
+            Sums(folder).check(TOKENIZER_FILE)
             return inside(folder, TOKENIZER_FILE, "tokenizer")
         raise UserError(
             f"{folder} takes its tokenizer from the network, at {brief(name, 200)}, which is not"

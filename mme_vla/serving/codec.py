@@ -15,9 +15,8 @@ import numpy as np
 from mme_vla.errors import UserError, missing_extra, require
 
 REFUSED_KINDS = "VOc"  # records and raw bytes, Python objects, complex numbers
-MOST_OBJECTS = (
-    2**20
-)  # values of a message, whatever holds them; a frame with all its cameras takes about 130
+# values of a message, whatever holds them; a frame with all its cameras takes about 130
+MOST_OBJECTS = 2**20
 MOST_TEXT = 2**20  # characters of one text
 
 try:

@@ -57,9 +57,8 @@ def build_small(sections: dict[str, Any]) -> MMEPolicy:
         policy = MMEPolicy.from_config(sections)
     open_gates(policy)
     with torch.no_grad():
-        for (
-            parameter
-        ) in policy.integration.parameters():  # near zero, or zero, where it starts as the identity
+        for parameter in policy.integration.parameters():
+            # near zero, or zero, where it starts as the identity
             parameter.add_(
                 0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
             )

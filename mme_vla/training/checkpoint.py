@@ -186,9 +186,8 @@ def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
     parameters = trainable(policy)
     averaged, raw, moments = load_tensors(folder), _read(folder / RAW), _read(folder / OPTIMIZER)
     state = policy.state_dict()
-    low = {
-        name for name, tensor in state.items() if tensor.dtype == torch.bfloat16
-    }  # frozen, and stored in float32
+    # frozen, and stored in float32
+    low = {name for name, tensor in state.items() if tensor.dtype == torch.bfloat16}
     averaged = {
         name: cast(tensor, torch.bfloat16) if name in low else tensor
         for name, tensor in averaged.items()
@@ -257,9 +256,8 @@ def check_disk(folder: Path, policy: Policy, keep: KeepRule, sharded: bool = Fal
     """
     weights = sum(4 * p.numel() for p in policy.parameters())
     trained = sum(4 * p.numel() for p in trainable(policy).values())
-    needed = (weights * (1 + sharded) + 3 * trained) * (
-        keep.last + 1
-    )  # a new one is written before an old one goes
+    # a new one is written before an old one goes
+    needed = (weights * (1 + sharded) + 3 * trained) * (keep.last + 1)
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free
     require(
@@ -276,9 +274,8 @@ def tidy(folder: Path, keep: KeepRule) -> None:
     """
     for path in checkpoints_in(folder)[: -keep.last]:
         if not keep.every or step_of(path) % keep.every:
-            path.rename(
-                folder / f".{path.name}.partial"
-            )  # a reader finds a full checkpoint or none
+            # a reader finds a full checkpoint or none
+            path.rename(folder / f".{path.name}.partial")
     for path in folder.glob(".step_*.partial"):
         shutil.rmtree(path)
 

@@ -161,9 +161,8 @@ def resident_gib() -> float:
     """Most resident memory this process has had, or, where the system does not say so, it or its
     parent before it.
     """
-    with suppress(
-        OSError
-    ):  # on Linux; getrusage begins with what the parent had when it started this process
+    with suppress(OSError):
+        # on Linux; getrusage begins with what the parent had when it started this process
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 2**20

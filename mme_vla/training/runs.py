@@ -101,9 +101,8 @@ def claim_run(
                 raise
             continue
         try:
-            again = open_run(
-                place, resume, config
-            )  # what decided may have changed before the folder was held
+            # what decided may have changed before the folder was held
+            again = open_run(place, resume, config)
             if again.folder == run.folder:
                 return again, lock
             raise UserError(
@@ -215,9 +214,8 @@ def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
         if config.get("learning")
         else {}
     )
-    if list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [
-        3
-    ]:  # now the default
+    if list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]:
+        # now the default
         data["val_episodes"] = None
     return {
         **config,

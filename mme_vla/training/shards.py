@@ -173,9 +173,8 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     files = shard_files(checkpoint)
     rank, world = (0, 1) if alone else (distributed.get_rank(), distributed.get_world_size())
     sums: dict[Path, Sums] = {}
-    if any(
-        name.startswith(f"{SHARDS}/") for name in Sums(checkpoint).table
-    ):  # earlier versions listed none
+    if any(name.startswith(f"{SHARDS}/") for name in Sums(checkpoint).table):
+        # earlier versions listed none
         check_sums(checkpoint, shard_notes(checkpoint))
     for file in files:
         note = file.with_suffix(".sha256")

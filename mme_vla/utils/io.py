@@ -69,9 +69,8 @@ def disk_trouble(error: BaseException) -> str | None:
         if place is None and number is not None and (named := _NAME.search(str(current))):
             place = named[1]
         current = current.__cause__ or current.__context__
-    if number is None or (
-        place is None and number in (errno.EACCES, errno.EPERM)
-    ):  # a port, not a file
+    if number is None or (place is None and number in (errno.EACCES, errno.EPERM)):
+        # a port, not a file
         return None
     reason, advice = _ADVICE[number]
     return (
@@ -134,9 +133,8 @@ def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        message = " ".join(
-            str(error.__cause__ or error).split()
-        )  # some wrap what happened in a sentence without content
+        # some wrap what happened in a sentence without content
+        message = " ".join(str(error.__cause__ or error).split())
         reason = (
             f"{type(error).__name__}: {brief(message, 200, quote=False)}"
             if message
@@ -245,9 +243,8 @@ def user_cache(kind: str) -> Path:
 
 _KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}
 
-TEXT_LIMIT = (
-    64 * 2**20
-)  # bytes; the largest files of text here, tables of subgoals and statistics, stay far below
+# bytes; the largest files of text here, tables of subgoals and statistics, stay far below
+TEXT_LIMIT = 64 * 2**20
 LOG_LIMIT = 2**30  # bytes of a file of lines
 
 
@@ -263,9 +260,8 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
                 status.st_size <= limit,
                 f"{path} has {status.st_size:,} bytes; {what} has at most {limit:,}.",
             )
-            return file.read(
-                status.st_size + 1
-            )  # reading `limit` would allocate it, whatever the size
+            # reading `limit` would allocate it, whatever the size
+            return file.read(status.st_size + 1)
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; expected {what}.") from None
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
@@ -285,9 +281,8 @@ def read_unpacked(path: Path, what: str = "data", limit: int = LOG_LIMIT) -> byt
     return unpack_xz(data, path, what, limit) if path.suffix == ".xz" else data
 
 
-_BLOCK = (
-    2**14
-)  # bytes that a stream's unpacker is given at once: it copies those that it leaves over
+# bytes that a stream's unpacker is given at once: it copies those that it leaves over
+_BLOCK = 2**14
 
 
 def unpack_xz(
@@ -309,14 +304,12 @@ def unpack_xz(
     while not stream.eof or position < len(packed):
         if stream.eof:
             stream = lzma.LZMADecompressor(lzma.FORMAT_XZ)
-        block = packed[
-            position : position + _BLOCK
-        ]  # what lies behind a stream is copied once a stream
+        # what lies behind a stream is copied once a stream
+        block = packed[position : position + _BLOCK]
         require(block, f"{source} is cut off: its last stream has no end. {remedy}")
         with decoding(source, what, remedy):
-            piece = stream.decompress(
-                block, limit + 1 - size
-            )  # one more byte shows that there is more
+            # one more byte shows that there is more
+            piece = stream.decompress(block, limit + 1 - size)
         size += len(piece)
         require(
             size <= limit,
@@ -324,9 +317,8 @@ def unpack_xz(
         )
         pieces.append(piece)
         position += len(block) - len(stream.unused_data)
-        while stream.eof and packed[position : position + 4] == bytes(
-            4
-        ):  # padding between streams, by the format
+        while stream.eof and packed[position : position + 4] == bytes(4):
+            # padding between streams, by the format
             position += 4
     return b"".join(pieces)
 

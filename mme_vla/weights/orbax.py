@@ -192,9 +192,8 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
             "key_metadata": [{"key": key, "key_type": _DICT_KEY} for key in path],
             "value_metadata": {"value_type": "np.ndarray", "skip_deserialize": False},
         }
-    context = (
-        ts.Context()
-    )  # shared, and all writes at once: the store then gathers them into few files
+    # shared, and all writes at once: the store then gathers them into few files
+    context = ts.Context()
     layout = {"compressor": {"id": "zstd", "level": 1}}
     opened = [
         ts.open(

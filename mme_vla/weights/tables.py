@@ -37,9 +37,8 @@ class Piece:
 
     def to_target(self, tensor: Tensor) -> Tensor:
         if self.layer is not None:
-            tensor = tensor[
-                self.layer
-            ].clone()  # a tensor of its own, which keeps no other layer in memory
+            # a tensor of its own, which keeps no other layer in memory
+            tensor = tensor[self.layer].clone()
         return rearrange(tensor, self.pattern, **self.axes) if self.pattern else tensor
 
     def to_source(self, tensor: Tensor) -> Tensor:
@@ -195,9 +194,8 @@ class Adapter:
     ) -> dict[str, Tensor]:
         """Read foreign tensors into our names; `target` gives the shapes they must have."""
         self.check_fit(released, target, source)
-        for (
-            constant
-        ) in self.derived:  # what a checkpoint stores of them is what this configuration gives
+        for constant in self.derived:
+            # what a checkpoint stores of them is what this configuration gives
             if constant.path in released:
                 stored, expected = (
                     x.real.float().cpu() for x in (released[constant.path], constant.make())

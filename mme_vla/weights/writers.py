@@ -199,9 +199,8 @@ def write_openpi(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormSt
     }
     _write_json(folder / "config.json", about)
     tensors = to_openpi(policy, policy.state_dict())
-    del tensors[
-        EMBEDDING
-    ]  # of a tied pair, safetensors' save_model keeps the first name; its load_model wants no more
+    # of a tied pair, safetensors' save_model keeps the first name; its load_model wants no more
+    del tensors[EMBEDDING]
     _write_safetensors(tensors, folder, dtype)
     _write_assets(folder, stats)
 

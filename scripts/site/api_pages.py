@@ -133,9 +133,8 @@ def page() -> str:
         ValueError: a public name is in no group.
     """
     named = {name for names in GROUPS.values() for name in names}
-    public = {
-        name for name in mme_vla.__all__ if name != "__version__" and not name.isupper()
-    }  # registries aside
+    # registries aside
+    public = {name for name in mme_vla.__all__ if name != "__version__" and not name.isupper()}
     if public != named:
         raise ValueError(
             "scripts/site/api_pages.py: GROUPS names other things than mme_vla:"

@@ -38,9 +38,8 @@ def test_the_path_runs_from_actions_to_noise():
     start, velocity = flow.interpolate(actions, noise, torch.zeros(2))
     end, _ = flow.interpolate(actions, noise, torch.ones(2))
     assert torch.allclose(start, actions) and torch.allclose(end, noise)
-    assert torch.allclose(
-        start + velocity, end, atol=1e-5
-    )  # numbers near zero are differences of larger ones
+    # numbers near zero are differences of larger ones
+    assert torch.allclose(start + velocity, end, atol=1e-5)
 
 
 @pytest.mark.parametrize("steps", [1, 7, 10])

@@ -97,9 +97,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         policy = build_policy("fading", config_dir=folder / "configs", backbone=small)
     finally:
         sys.path[:] = before
-        plugins._imported.pop(
-            f"{USER_PACKAGE}.memory", None
-        )  # not asked of other tests' worker processes
+        # not asked of other tests' worker processes
+        plugins._imported.pop(f"{USER_PACKAGE}.memory", None)
     policy.require_processor().stats = unit_stats()
     policy(random_batch(policy, 1, valid=32))[0].backward()
     torch.optim.SGD(policy.parameters(), 1e-3).step()

@@ -50,9 +50,8 @@ def ensure(source: EpisodeSource, memory: LastFrames, root: Path, **options) -> 
 def test_cached_and_online_histories_are_the_same(
     source, tmp_path, keep_every, scored, dtype
 ) -> None:
-    tolerance = (
-        1e-6 if dtype == "float32" else 0
-    )  # in batches of other sizes MKL may add in another order
+    # in batches of other sizes MKL may add in another order
+    tolerance = 1e-6 if dtype == "float32" else 0
     memory = LastFrames(keep_every=keep_every, scored=scored)
     cache = ensure(source, memory, tmp_path, dtype=dtype)
     assert cache.width == WIDTH

@@ -67,9 +67,8 @@ def test_golden_samples_are_reproduced(parity: Path, tmp_path: Path) -> None:
     golden = json.loads((parity / "pipeline_datasets.json").read_text())["policy_dataset"]
     with zipfile.ZipFile(parity / "pipeline_h5.zip") as archive:
         archive.extractall(tmp_path / "h5")
-    convert(
-        list_episodes(find_files([tmp_path / "h5"])), tmp_path / "out"
-    )  # no pixel is compared here
+    # no pixel is compared here
+    convert(list_episodes(find_files([tmp_path / "h5"])), tmp_path / "out")
     source = EpisodeSource(tmp_path / "out")
     horizon = len(golden["samples"][0]["actions"])
     dataset = TrainingDataset([source], Processor(28, Tokenizer.load("sample"), horizon=horizon))

@@ -89,9 +89,8 @@ def test_as_many_files_are_open_as_the_system_allows(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("limit", [64, 65, 100, 512, 2048])
 def test_ranking_no_more_than_can_stay_changes_no_choice(limit: int) -> None:
     rng = np.random.default_rng(limit)
-    values = rng.choice([0.0, THRESHOLD / 2, 0.1, 0.2, 0.3, 0.5], (40, 64)).astype(
-        np.float32
-    )  # many ties
+    # many ties
+    values = rng.choice([0.0, THRESHOLD / 2, 0.1, 0.2, 0.3, 0.5], (40, 64)).astype(np.float32)
     scores = FrameScores(np.arange(7, 320, 8), values)
     rows, patches = np.nonzero(values >= THRESHOLD)
     every = [(FIRST_FRAME_SCORE, 0, patch) for patch in range(64)]

@@ -43,9 +43,8 @@ def test_the_first_episode_has_a_separate_image_wherever_something_changed(share
 def test_the_sample_equals_the_recorded_episodes(
     shared: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        RawEpisode, "_image", lambda *_: None
-    )  # reading them takes its time; see above
+    # reading them takes its time; see above
+    monkeypatch.setattr(RawEpisode, "_image", lambda *_: None)
     source = EpisodeSource("sample")
     folders = {"full": shared / "robomme_h5_full", "thinned": shared / "robomme_h5"}
     for e, (folder, task, number) in enumerate(EPISODES):

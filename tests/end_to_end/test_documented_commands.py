@@ -167,9 +167,8 @@ def test_a_documented_command_runs_as_printed(
 
 @pytest.mark.parametrize(("page", "command"), OTHERS)
 def test_the_words_of_other_documented_commands_are_valid(page: str, command: str) -> None:
-    filled = re.sub(
-        r"<the words[^>]*>|(?<= )(…|\$B)", "", command
-    )  # what means several words, and may be none
+    # what means several words, and may be none
+    filled = re.sub(r"<the words[^>]*>|(?<= )(…|\$B)", "", command)
     words = shlex.split(re.sub(r"<[^>]*>|…", "x", filled), comments=True)
     start = next(
         (i for i, word in enumerate(words) if re.match(r"mme-vla$|mme_vla(\.|$)", word)), None

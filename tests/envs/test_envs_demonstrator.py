@@ -113,9 +113,8 @@ def test_failing_offsets_point_somewhere() -> None:
     offsets = np.array([failing_offset("xy", 0.04, seed) for seed in range(40)])
     assert set(np.unique(np.round(offsets[:, :2] / 0.04))) == {-1, 0, 1}
     assert (np.abs(offsets).sum(1) > 0).all() and (offsets[:, 2] == 0).all()
-    np.testing.assert_allclose(
-        failing_offset("xy", 0.035, 6400), [-0.035, 0, 0]
-    )  # as VideoUnmask's fourth episode
+    # as VideoUnmask's fourth episode
+    np.testing.assert_allclose(failing_offset("xy", 0.035, 6400), [-0.035, 0, 0])
 
 
 def test_the_hand_takes_the_nearer_of_two_equal_sides() -> None:

@@ -20,9 +20,8 @@ from mme_vla.envs.robomme.recording.recorder import Recorder
 from mme_vla.errors import UserError
 from mme_vla.utils.media import GAP, MARGIN, TILE
 
-SHORT = record.Job(
-    "PatternLock", 0, seed=0, difficulty="easy", recovery=None, retries=3
-)  # a single move
+# a single move
+SHORT = record.Job("PatternLock", 0, seed=0, difficulty="easy", recovery=None, retries=3)
 
 
 pytestmark = pytest.mark.usefixtures("renderer")

@@ -43,9 +43,8 @@ def watch(env: RouteStick, tip: Tip) -> None:
 def test_obstacles_are_thin_along_the_row(env):
     obstacles = [thing for thing in env.things if thing.name.startswith("obstacle")]
     shapes = [thing.entity._bodies[0].collision_shapes[0] for thing in obstacles]
-    assert [shape.half_size for shape in shapes] == [
-        pytest.approx([0.03, 0.015, 0.05])
-    ] * 4  # the row is their y
+    # the row is their y
+    assert [shape.half_size for shape in shapes] == [pytest.approx([0.03, 0.015, 0.05])] * 4
 
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])

@@ -27,9 +27,8 @@ FACTS = REPOSITORY.parent / "shared" / "spec" / "goals.json"
 COLOURS = ("red", "blue", "green")
 NUMBERS = ("one", "two", "three", "four", "five")
 ORDINALS = ("first", "second", "third", "fourth", "fifth")
-SCENES = [
-    (task, episode) for task in TASK_NAMES for episode in (0, 2, 3)
-]  # of the test split: every difficulty
+# of the test split: every difficulty
+SCENES = [(task, episode) for task in TASK_NAMES for episode in (0, 2, 3)]
 
 Case = tuple[dict[str, Any], str, dict[str, str]]
 """What a scene has, which variant of the texts that is, and what fills them."""

@@ -72,9 +72,8 @@ def test_a_recording_is_compared_with_the_test_split(
     capsys: pytest.CaptureFixture[str],
     lerobot: bool,
 ) -> None:
-    write_file(
-        tmp_path / "record_dataset_StopCube.h5", [6, 7]
-    )  # whose goals are "do task 0" and "do task 1"
+    # whose goals are "do task 0" and "do task 1"
+    write_file(tmp_path / "record_dataset_StopCube.h5", [6, 7])
     refs = list_episodes(find_files([tmp_path]))
     jobs = [record.Job("StopCube", ref.index, 0, "easy", None, 1) for ref in refs]
     dataset = tmp_path / "data" if lerobot else None

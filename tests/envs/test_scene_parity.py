@@ -189,9 +189,8 @@ def test_replaying_the_execution_succeeds(episode: Episode, space: str) -> None:
         **episode.scene,
         **included,
     )
-    env.task.recording = (
-        space == "joint_angle"
-    )  # drops and waits are judged as when the episode was recorded
+    # drops and waits are judged as when the episode was recorded
+    env.task.recording = space == "joint_angle"
     displayed: list[Shown] = []
     env.on_frame = lambda frame, info, in_video: displayed.append(
         Shown(info["simple_subgoal_online"], in_video, touches(env.task))

@@ -85,9 +85,8 @@ def test_a_scene_built_from_its_values_is_the_same(task: str) -> None:
 def test_twenty_scenes_built_from_their_values_are_the_same(task: str) -> None:
     built = 0
     for episode in range(50):
-        with contextlib.suppress(
-            SceneError
-        ):  # of two published test seeds an object finds no place here
+        with contextlib.suppress(SceneError):
+            # of two published test seeds an object finds no place here
             check_round_trip(task, metadata.episode(task, "test", episode).options)
             built += 1
         if built == 20:

@@ -133,9 +133,8 @@ def test_too_high_or_beside_the_target_is_no_swing(env, hand):
     hand.carry(env.cube, over=env.right, z=0.15)
     assert env.progress.index == 1 and env.swings[0].count == 0
     hand.carry(env.cube, over=env.left, z=LOW)
-    assert (
-        env.progress.index == 1 and env.swings[1].count == 1
-    )  # counted, but not the one that is due
+    # counted, but not the one that is due
+    assert env.progress.index == 1 and env.swings[1].count == 1
     hand.carry(env.cube, over=env.right, z=LOW)
     assert env.progress.index == 2
 

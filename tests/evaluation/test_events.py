@@ -238,9 +238,8 @@ def test_events_act_by_sub_task_and_episode_by_episode(memoryless: MMEPolicy) ->
     envs = InlineEnvs(6)
     made = roll(memoryless, JOBS, envs, event="pause:7@subtask:20+pause:3@subtask:20")
     assert {env.hold_steps for env in envs.made.values()} == {10}
-    assert [entry["step"] for r in made for entry in r.extra["events"]] == [
-        32
-    ] * 12  # the first decision in it
+    # the first decision in it
+    assert [entry["step"] for r in made for entry in r.extra["events"]] == [32] * 12
     alone = roll(
         memoryless, JOBS, InlineEnvs(1), event="pause:7@subtask:20+pause:3@subtask:20", max_batch=1
     )

@@ -306,9 +306,8 @@ def test_the_command_reads_shards_and_saves_every_format(
     )
     printed = capsys.readouterr().out
     assert "75.00" in printed
-    assert (
-        "no significant difference between pi05 and ttt_modul" in printed
-    )  # two methods are compared unasked
+    # two methods are compared unasked
+    assert "no significant difference between pi05 and ttt_modul" in printed
     page = files["html"].read_text()
     assert page.count("<svg") >= 5
     assert "<script" not in page

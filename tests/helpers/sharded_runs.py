@@ -183,9 +183,8 @@ def whole(folder: Path) -> dict[str, Any]:
 
 
 def resume(folder: Path) -> dict[str, Any]:
-    job = trainer(
-        folder / "run", 8, resumed=True, accumulate=2, **SHARDED
-    )  # gradients travel with the last piece
+    # gradients travel with the last piece
+    job = trainer(folder / "run", 8, resumed=True, accumulate=2, **SHARDED)
     assert finish_run(job)
     return validation_losses(job)
 

@@ -79,9 +79,8 @@ def test_a_dropped_frame_shifts_the_distance_the_older_ones_stand_from_the_view_
     dropped = without(history, 2 * OLD, OLD)
     assert (distance(history) != distance(dropped)) == shifts
     if position == "time":
-        assert (
-            distance(history) == FRAMES
-        )  # frame 0 is five frames ago, and the view stands one place further
+        # frame 0 is five frames ago, and the view stands one place further
+        assert distance(history) == FRAMES
 
 
 @pytest.mark.parametrize(("position", "shifts"), [("slot", True), ("time", False)])

@@ -75,9 +75,8 @@ def in_process(policy: MMEPolicy) -> np.ndarray:
 def test_its_benchmark_runs_on_our_environments_and_takes_the_policys_actions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(
-        RoboMMEBenchmark, "_render_env", {}
-    )  # the renderer is this library's affair
+    # the renderer is this library's affair
+    monkeypatch.setattr(RoboMMEBenchmark, "_render_env", {})
     policy = small_policy("tokendrop_expert")
     benchmark = Noted(tasks=[TASK], max_steps=STEPS)
     benchmark.taken = []

@@ -272,9 +272,8 @@ def test_a_full_server_says_so_and_has_capacity_again_later(policy):
 def test_a_client_that_takes_no_answers_is_cut_off_and_delays_nobody(policy):
     with Served(policy, limits=Limits(send_s=2)) as served:
         for listening in served.server._uvicorn.servers[0].sockets:
-            listening.setsockopt(
-                socket.SOL_SOCKET, socket.SO_SNDBUF, 4096
-            )  # so that little has to go unread
+            # so that little has to go unread
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
         slow = socket.create_connection(served.address)
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         slow.sendall(
@@ -329,9 +328,8 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
     with served, ThreadPoolExecutor(2) as pool:
         busy, idle = served.client(), served.client()
         busy.reset()
-        wait_until(
-            lambda: served.busy == 0
-        )  # the answer to the reset comes before the server rests
+        # the answer to the reset comes before the server rests
+        wait_until(lambda: served.busy == 0)
         front = np.zeros((40, 64, 64, 3), np.uint8)
         with served.reading():
             pending = pool.submit(

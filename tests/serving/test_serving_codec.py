@@ -267,9 +267,8 @@ def test_a_message_of_nothing_but_empty_maps_is_refused_before_they_are_made():
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 2**20
-    with pytest.raises(
-        UserError, match="more than 1000 values"
-    ):  # many small lists count as one large
+    with pytest.raises(UserError, match="more than 1000 values"):
+        # many small lists count as one large
         check_size(b"\xdc\x00\x40" + (b"\xdc\x00\x40" + b"\x80" * 64) * 64, 1000)
 
 

@@ -35,9 +35,8 @@ def test_weights_for_acting_are_rounded_where_they_may_be(
         not any(p.requires_grad for p in rounded.parameters())
         and rounded.compute_dtype == torch.bfloat16
     )
-    monkeypatch.setattr(
-        MMEPolicy, "to", lambda self, device: self
-    )  # there need be no GPU to see what would go there
+    # there need be no GPU to see what would go there
+    monkeypatch.setattr(MMEPolicy, "to", lambda self, device: self)
     there = MMEPolicy.from_pretrained(tmp_path, dtype="auto", device="cuda")
     assert {p.dtype for p in there.parameters()} == {torch.bfloat16}
     monkeypatch.setattr(MMEPolicy, "acts_in_bfloat16", DiffusionPolicy.acts_in_bfloat16)

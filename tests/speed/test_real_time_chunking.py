@@ -71,9 +71,8 @@ def test_the_next_chunk_honours_what_was_committed(policy: MMEPolicy, before: np
     episode.set_action_prefix(before, delay=4)
     bound = policy.act(episode)
     apart = [np.abs(chunk[:10] - before).mean(1) for chunk in (free, bound)]
-    assert (apart[1][:4] < 0.15 * apart[0][:4]).all(), (
-        apart
-    )  # these are executed before the chunk is there
+    # these are executed before the chunk is there
+    assert (apart[1][:4] < 0.15 * apart[0][:4]).all(), apart
     assert apart[1][4:7].mean() < 0.6 * apart[0][4:7].mean(), apart  # these fade
     assert episode.action_prefix is None
     np.testing.assert_array_equal(policy.act(episode_of(policy)), free)

@@ -127,9 +127,8 @@ def test_damage_is_an_error_of_the_library_whatever_the_checksum_says(
         add_sums(checkpoint)
         file.write_bytes(content)
         add_sums(checkpoint)
-    assert (
-        refused > 80
-    )  # a flipped bit of a weight that has a checksum of its own is another weight
+    # a flipped bit of a weight that has a checksum of its own is another weight
+    assert refused > 80
 
 
 @pytest.mark.parametrize("name", ["shard", "checksum", "folder"])

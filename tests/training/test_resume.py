@@ -76,9 +76,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     killed.kill()
     assert commands.finish(killed).returncode == -signal.SIGKILL
     printed = io.StringIO()
-    with redirect_stdout(
-        printed
-    ):  # in this process, which has imported everything: the same numbers, sooner
+    with redirect_stdout(printed):
+        # in this process, which has imported everything: the same numbers, sooner
         main(compose("train", [*SMALL, f"data.cache.root={base}", f"output={base / 'whole'}"]))
     return base, printed.getvalue()
 
@@ -121,9 +120,8 @@ def test_a_run_with_narrow_statistics_goes_on_when_told_to_and_stays_the_same_tr
     shutil.rmtree(second)
     stats = NormStats.load(first / STATS_FILE)
     stats.actions.q01[0], stats.actions.q99[0] = -1e-6, 1e-6
-    stats.save(
-        first / STATS_FILE
-    )  # as a version of the library might have left it that did not look
+    # as a version of the library might have left it that did not look
+    stats.save(first / STATS_FILE)
     write_sums(first, [STATS_FILE], keep=True)
     with pytest.raises(UserError, match=r"data\.narrow_ranges=warn"):
         main(compose("train", [*small, f"resume={folder}"]))

@@ -118,9 +118,8 @@ def test_a_video_has_its_name_only_when_it_is_complete(tmp_path: Path) -> None:
 
 def test_equal_frames_make_equal_bytes_and_odd_sides_survive(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (4, 33, 45, 3), dtype=np.uint8)
-    ballast = [
-        np.ones(size, np.uint8) for size in range(1000, 200_000, 5000)
-    ]  # the encoder's memory is not always clean
+    # the encoder's memory is not always clean
+    ballast = [np.ones(size, np.uint8) for size in range(1000, 200_000, 5000)]
     assert len({video_bytes(noise) for _ in range(40) if ballast.pop() is not None}) == 1
     assert len(video_bytes(noise, crf=10)) > len(video_bytes(noise, crf=30))
     (tmp_path / "odd.mp4").write_bytes(video_bytes(noise))

@@ -75,9 +75,8 @@ def test_lerobots_pipelines_and_policy_give_our_actions(
     assert fetched == ["google/paligemma-3b-pt-224"]
     assert config.n_action_steps == 1  # LeRobot's loop cannot anchor later ones
 
-    size = (
-        policy.backbone.image_size
-    )  # at another one the two libraries resize a little differently
+    # at another one the two libraries resize a little differently
+    size = policy.backbone.image_size
     frames, state = moving_frames(2, size), np.linspace(-0.4, 0.4, 8, dtype=np.float32)
     episode = policy.start_episode(GOAL, seed=4)
     episode.observe({"front": frames[:1], "wrist": frames[1:]}, state[None])

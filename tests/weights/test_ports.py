@@ -131,18 +131,16 @@ def test_full_size_names_and_shapes_are_those_of_both_ports(shared: Path) -> Non
 def test_lerobots_policy_loads_our_export_and_replies_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pi05 = small_policy(
-        "pi05", backbone={"num_heads": 8}
-    )  # a number that LeRobot's attention has written in
+    # a number that LeRobot's attention has written in
+    pi05 = small_policy("pi05", backbone={"num_heads": 8})
     lerobot_module = reduce_sizes(monkeypatch, pi05.backbone.config)
     pi05.save_pretrained(tmp_path / "ours")
     convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
     config = lerobot_module.PreTrainedConfig.from_pretrained(tmp_path / "lerobot")
     config.device = "cpu"
     loaded = lerobot_module.PI05Policy.from_pretrained(tmp_path / "lerobot", config=config).eval()
-    assert (
-        "All keys loaded successfully" in capsys.readouterr().out
-    )  # it only prints what went wrong
+    # it only prints what went wrong
+    assert "All keys loaded successfully" in capsys.readouterr().out
 
     batch = random_batch(pi05)
     batch.image_mask[0, 1] = False

@@ -474,14 +474,12 @@ def _figure(
     if not complete:
         partial = 100 * sum(record.success for record in done) / len(done) if done else None
         return Figure(None, None, None, **counts, partial=partial, paper=reported)
-    matrices = [
-        np.array([run[i] for run in complete], np.float64).T for i in range(len(tasks))
-    ]  # episodes × runs
+    # episodes × runs
+    matrices = [np.array([run[i] for run in complete], np.float64).T for i in range(len(tasks))]
     place = {id(run): number for number, run in enumerate(full)}
     rows = [[place[id(run)] for run in members] for members in by_training(full)]
-    trainings = [
-        np.stack([matrix[:, row].mean(1) for row in rows], 1) for matrix in matrices
-    ]  # episodes × trainings
+    # episodes × trainings
+    trainings = [np.stack([matrix[:, row].mean(1) for row in rows], 1) for matrix in matrices]
     units = trainings if len(rows) > 1 else matrices
     mean, std = mean_std(
         [float(np.mean([unit[:, r].mean() for unit in units])) for r in range(units[0].shape[1])]
@@ -491,9 +489,8 @@ def _figure(
     else:
         episodes = {task: [matrix] for task, matrix in zip(tasks, trainings, strict=True)}
         interval = bootstrap(episodes, protocol.confidence, protocol.samples, protocol.seed)
-        if (
-            interval.low == interval.high
-        ):  # all episodes of a task alike, as with no success at all: nothing to draw
+        if interval.low == interval.high:
+            # all episodes of a task alike, as with no success at all: nothing to draw
             trials = sum(map(len, trainings))
             interval = wilson(
                 float(np.mean([values.mean() for values in trainings])), trials, protocol.confidence

@@ -284,9 +284,8 @@ def legend(canvas: "Canvas", axes: "Axes", columns: int) -> None:
     """A legend above the panel, clear of its content, in so many columns at most."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        order = sorted(
-            range(len(labels)), key=lambda i: labels[i].endswith("paper")
-        )  # last, in the bars
+        # last, in the bars
+        order = sorted(range(len(labels)), key=lambda i: labels[i].endswith("paper"))
         canvas.legend(
             [handles[i] for i in order],
             [labels[i] for i in order],

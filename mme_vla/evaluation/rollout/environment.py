@@ -307,9 +307,8 @@ class _Frames:
 
     def __init__(self, robot: Embodiment) -> None:
         self._cameras, self._width = robot.camera_names, robot.state.width
-        beside = (
-            CAMERAS if robot.action.space else ()
-        )  # the benchmark's videos show both of its cameras
+        # the benchmark's videos show both of its cameras
+        beside = CAMERAS if robot.action.space else ()
         self._images: dict[str, list[np.ndarray | None]] = {
             name: [] for name in (*self._cameras, *beside)
         }

@@ -366,9 +366,8 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         tokens = self.condition_on_prompt(
             self._view_tokens(batch, views), batch.prompt, batch.prompt_mask
         )
-        located = (
-            self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]
-        )  # b v n d
+        # b v n d
+        located = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]
         encoded = located + self.see(located)
         image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
         return [

@@ -183,9 +183,8 @@ class Board:
             next(iter(scenes.values()))[0],
             next(iter(rows.values()))[0].action_space,
         )
-        self._once = replace(
-            self.protocol, samples=1
-        )  # where intervals are of `draws`, and no others are read
+        # where intervals are of `draws`, and no others are read
+        self._once = replace(self.protocol, samples=1)
         made = [_row(name, trainings, self._once) for name, trainings in rows.items()]
         self.rows = sorted(made, key=lambda row: -self.success(row))
 
@@ -200,9 +199,8 @@ class Board:
 
     def success(self, row: Row, tasks: Sequence[str] = ()) -> float:
         """A row's success over tasks, by default all, in percent."""
-        return round(
-            float(row.mean(tasks or self.protocol.tasks).mean()), 9
-        )  # equal counts, equal figures
+        # equal counts, equal figures
+        return round(float(row.mean(tasks or self.protocol.tasks).mean()), 9)
 
     def noise(self, tasks: Sequence[str] = ()) -> float | None:
         """Standard deviation of success between trainings of one row, over all rows; None where
@@ -495,9 +493,8 @@ class Board:
 
 
 def _row(name: str, trainings: Sequence[Training], protocol: Protocol) -> Row:
-    data = trainings[
-        0
-    ].facts.data  # of all: in a row other data are another recording, not another method
+    # of all: in a row other data are another recording, not another method
+    data = trainings[0].facts.data
     records = [
         replace(record, training=record.training and replace(record.training, data=data))
         for training in trainings
@@ -529,9 +526,8 @@ def smallest_p(sizes: Sequence[int]) -> float:
     """The smallest p that memories of so many trainings can have: 1 / the number of ways to deal
     out the trainings.
     """
-    alike = [
-        factorial(count) for count in Counter(sizes).values()
-    ]  # memories of as many trainings may change places
+    # memories of as many trainings may change places
+    alike = [factorial(count) for count in Counter(sizes).values()]
     return prod(map(factorial, sizes)) * prod(alike) / factorial(sum(sizes))
 
 

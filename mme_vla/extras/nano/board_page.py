@@ -64,9 +64,8 @@ def ranking(board: Board, brief: bool = False) -> Table:
 
 def success(board: Board, row: Row) -> str:
     """A row's success over all tasks ± the deviation between its trainings, in percent."""
-    return show(
-        replace(row.average, mean=board.success(row))
-    )  # rounded, so that equal rows read alike
+    # rounded, so that equal rows read alike
+    return show(replace(row.average, mean=board.success(row)))
 
 
 def tasks(board: Board) -> Table:
@@ -86,9 +85,8 @@ def trainings(board: Board) -> Table:
     for row in board.rows:
         seeds = [runs[0].key.training.seed for runs in row.method.trainings if runs[0].key.training]
         if len(seeds) > 1:
-            solved = [
-                sum(row.outcomes(task).sum(0) for task in scope) for scope in scopes
-            ]  # each [trainings]
+            # each [trainings]
+            solved = [sum(row.outcomes(task).sum(0) for task in scope) for scope in scopes]
             for seed, *counts in zip(seeds, *solved, strict=True):
                 rows.append([row.name, str(seed), *(f"{count:g}" for count in counts)])
     columns = ["row", "training seed", "all", *board.protocol.suites, *board.protocol.tasks]

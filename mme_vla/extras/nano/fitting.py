@@ -318,9 +318,8 @@ def content_of(files: tuple[Path, ...], choice: tuple[int, ...]) -> tuple[str, .
         letters = targets[:, list(choice)].argmax(1).tolist() if choice else None
         facts = {"decisions": len(targets), "letters": letters}
         facts |= {name: getattr(made, name) for name in ("task", "seed", "difficulty", "goal")}
-        facts |= (
-            {"carried_out": True} if made.carried_out else {}
-        )  # others keep the digest they had without it
+        # others keep the digest they had without it
+        facts |= {"carried_out": True} if made.carried_out else {}
         digests.append(digest(facts, 64))
     return tuple(digests)
 

@@ -140,9 +140,8 @@ class Reflection:
         actions, half = batch.actions.clone(), (high - low) / 2
         points = actions[..., self.columns]
         reflected = (reflect_points((points + 1) * half + low, signs, exchange) - low) / half - 1
-        moved = changes.any(0).view(
-            -1, *[1] * (points.ndim - 1)
-        )  # the others stay equal to the last bit
+        # the others stay equal to the last bit
+        moved = changes.any(0).view(-1, *[1] * (points.ndim - 1))
         actions[..., self.columns] = torch.where(moved, reflected, points).to(actions.dtype)
         history = batch.history
         if history is not None:
@@ -270,9 +269,8 @@ class Decisions(Dataset[int]):
         return self._noisy(batch, rows) if self.noise or self.token_noise else batch
 
     def _noisy(self, batch: Batch, rows: Sequence[int]) -> Batch:
-        generator = torch.Generator().manual_seed(
-            seed_of("rows", *map(int, rows))
-        )  # of numbers alone, so the same everywhere
+        # of numbers alone, so the same everywhere
+        generator = torch.Generator().manual_seed(seed_of("rows", *map(int, rows)))
 
         def perturbed(values: Tensor, size: float | Tensor) -> Tensor:
             return (values + size * torch.randn(values.shape, generator=generator)).to(values.dtype)
@@ -280,9 +278,8 @@ class Decisions(Dataset[int]):
         assert batch.state is not None and batch.view_tokens is not None
         fixed = {"views": VIEW_NOISE * self.noise, "past": self.noise}
         size = {name: fixed[name] + self.token_noise * std for name, std in self._token_std.items()}
-        joints = perturbed(
-            batch.state[:, :-1], JOINT_NOISE * self.noise
-        )  # the last number is the gripper's
+        # the last number is the gripper's
+        joints = perturbed(batch.state[:, :-1], JOINT_NOISE * self.noise)
         state = torch.cat([joints, batch.state[:, -1:]], 1)
         batch = replace(batch, state=state, view_tokens=perturbed(batch.view_tokens, size["views"]))
         if batch.history is None:
@@ -453,9 +450,8 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
     history = CachedHistory(
         memory.storage, stored, frames, demonstration.length, scores, demonstration.exec_start
     )
-    if uses_proprio(
-        policy.memory
-    ):  # an action is a motion of many frames here, so the states alone tell what was done
+    if uses_proprio(policy.memory):
+        # an action is a motion of many frames here, so the states alone tell what was done
         length = demonstration.length
         nothing = np.zeros((length, policy.embodiment.action.width), np.float32)
         states, unknown = demonstration.states[:length], np.zeros(length, bool)

@@ -42,15 +42,13 @@ class Pointer(nn.Module):
         self.visible = nn.Parameter(torch.ones(()))
         # `recall` and `counts`: names in the shipped checkpoint.
         self.recall = nn.Linear(action_width, goals * WAVES**2)
-        self.counts = nn.Linear(
-            action_width, goals + 1
-        )  # weights of the queries' maps, and of none
+        # weights of the queries' maps, and of none
+        self.counts = nn.Linear(action_width, goals + 1)
         self.sharpness = nn.Parameter(torch.tensor(FRESH_SHARPNESS))
         self.point = nn.Linear(2, 2)
         with torch.no_grad():
-            self.point.weight.copy_(
-                torch.tensor([[0.0, 1.0], [1.0, 0.0]])
-            )  # a point is row and column
+            # a point is row and column
+            self.point.weight.copy_(torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
             self.point.bias.zero_()
 
     def forward(

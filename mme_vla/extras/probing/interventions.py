@@ -332,9 +332,8 @@ _ORDINALS = (
     "tenth",
 )
 _NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
-_COUNT = re.compile(
-    rf"<[^>]*>|\b(?:{'|'.join((*_ORDINALS, *_NUMBERS))}|\d+)\b"
-)  # points are read, and left alone
+# points are read, and left alone
+_COUNT = re.compile(rf"<[^>]*>|\b(?:{'|'.join((*_ORDINALS, *_NUMBERS))}|\d+)\b")
 
 
 @INTERVENTIONS.register("subgoal_swap")

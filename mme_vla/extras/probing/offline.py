@@ -159,9 +159,8 @@ class _Moments:
             for probed in arms:
                 result += self._probe(probed, episode, step)
             episode.inner.subgoal = episode.subgoal
-            self._policy.act(
-                [episode.inner], self._settings.flow_steps
-            )  # banks are written where chunks are chosen
+            # banks are written where chunks are chosen
+            self._policy.act([episode.inner], self._settings.flow_steps)
         return result
 
     def _probe(self, probed: ProbedPolicy, episode: ProbedEpisode, step: int) -> list[Line]:

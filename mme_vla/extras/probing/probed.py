@@ -197,9 +197,8 @@ class ProbedPolicy(FedPolicy):
             weigh = (
                 None if sampled is None else partial(self._weigh, episode, snapshot, place, sampled)
             )
-            edited.append(
-                self.arm.edit(store, self.moment(episode, weigh))
-            )  # the same chance for each store
+            # the same chance for each store
+            edited.append(self.arm.edit(store, self.moment(episode, weigh)))
         return snapshot, edited
 
     def moment(self, episode: ProbedEpisode, weigh: Any = None) -> Moment:

@@ -102,9 +102,8 @@ def run_probe(
     if plan.recordings:
         has_boundaries = all(recording.tells_subtasks for recording in plan.recordings)
         names = {recording.name for recording in plan.lend}
-        n_donors = len(names) - any(
-            recording.name in names for recording in plan.recordings
-        )  # never the probed one
+        # never the probed one
+        n_donors = len(names) - any(recording.name in names for recording in plan.recordings)
         arms, notes = choose_arms(plan.arms, policy, channel, n_donors, boundaries=has_boundaries)
         _on_recordings(policy, arms, plan, folder / OFFLINE, facts, show_progress)
     if plan.jobs:

@@ -93,9 +93,8 @@ class LSTMLayer(RecurrentLayer):
     def __init__(self, hidden: int, layers: int, budget: int, longest: int) -> None:
         super().__init__()
         self.hidden, self.budget = hidden, budget
-        self.norm = nn.LayerNorm(
-            hidden
-        )  # a fresh encoder's outputs are small: the gates would hardly move
+        # a fresh encoder's outputs are small: the gates would hardly move
+        self.norm = nn.LayerNorm(hidden)
         inputs = [nn.Linear(hidden, 4 * hidden) for _ in range(layers)]
         self.inputs = nn.ModuleList(inputs)
         self.recurrent = nn.ModuleList(

@@ -290,9 +290,8 @@ class MemoryBank(Retrieval):
         longest = max(lengths)
         if not longest:
             return tokens
-        entries = torch.stack([_padded(state.entries, longest) for state in states]).to(
-            tokens
-        )  # b t n d
+        # b t n d
+        entries = torch.stack([_padded(state.entries, longest) for state in states]).to(tokens)
         times = torch.stack([_padded(state.times, longest) for state in states]).to(tokens.device)
         valid = (
             torch.arange(longest, device=tokens.device)
@@ -343,9 +342,8 @@ class MemoryBank(Retrieval):
 
         places = torch.arange(self.length, device=times.device)[None]
         indices = places[:, : times.shape[1]].expand(len(times), -1)  # b k: which of the moments
-        alike = similarity(
-            indices[:, :-1], indices[:, 1:]
-        )  # of neighbours; merging changes two of them
+        # of neighbours; merging changes two of them
+        alike = similarity(indices[:, :-1], indices[:, 1:])
         for step in range(self.length, times.shape[1]):
             indices = torch.cat([indices, torch.full_like(indices[:, :1], step)], 1)
             # Where the first place is empty it goes; else the oldest does, or two neighbours become

@@ -97,9 +97,8 @@ class Moment(FrameMemory):
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2
-        x = by_frame(
-            self.encoder(history.features, history.positions, history.mask), patches
-        )  # b t p d
+        # b t p d
+        x = by_frame(self.encoder(history.features, history.positions, history.mask), patches)
         valid = by_frame(history.mask, patches)[..., 0]  # b t
         rows, frames = valid.shape
         questions = self.questions.to(x.dtype).repeat(rows * frames, 1, 1)

@@ -122,9 +122,8 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
             tokens = history.features.new_zeros(*history.mask.shape, self.width)
             return MemoryTokens(tokens, history.mask, ages=history.ages)
         weight, ages = self.states.weight, history.ages
-        tokens = self.states(
-            history.features[..., : self.state_dim].to(weight)
-        )  # an episode's states are on the CPU
+        # an episode's states are on the CPU
+        tokens = self.states(history.features[..., : self.state_dim].to(weight))
         return MemoryTokens(
             tokens,
             history.mask.to(weight.device),

@@ -92,9 +92,8 @@ def test_trainings_lie_between_scenes_and_rows(board: Board, tmp_path: Path) -> 
 def test_intervals_have_the_noise_of_a_rows_number_of_trainings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    half = dict.fromkeys(
-        TASKS[:2], 3
-    )  # every scene of two tasks, none of the others: nothing changes with the scenes
+    # every scene of two tasks, none of the others: nothing changes with the scenes
+    half = dict.fromkeys(TASKS[:2], 3)
     for row, seed in (("one", 0), ("four", 0), ("four", 1), ("four", 2), ("four", 3)):
         write_training(tmp_path, row, seed, half)
     write_training(

@@ -12,9 +12,8 @@ from mme_vla.testing.small import BEYOND
 pytestmark = pytest.mark.slow
 
 GUESSING = 0.75
-LEARNING = [
-    model for model in BEYOND if not model.startswith("anchors")
-]  # no square in the first frame and the last
+# no square in the first frame and the last
+LEARNING = [model for model in BEYOND if not model.startswith("anchors")]
 TOWER = {"depth": 1, "image_size": 16, "patch_size": 4, "width": 16, "mlp_dim": 16, "num_heads": 1}
 
 

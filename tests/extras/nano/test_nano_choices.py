@@ -19,9 +19,8 @@ def test_a_demonstration_for_a_robot_that_chooses_is_its_choices_and_says_the_op
     letters = "".join("abcdefgh"[row] for row in made.motions.targets[:, :8].argmax(1))
     assert letters == "abbbbcd"
     across = made.motions.targets[1:5, 9]
-    assert (
-        across[0] == across[2] < across[1] == across[3]
-    )  # right of the robot is left in the image
+    # right of the robot is left in the image
+    assert across[0] == across[2] < across[1] == across[3]
     assert made.boundaries is not None and len(made.boundaries) == len(letters) + 1, (
         "after the last one it is over"
     )

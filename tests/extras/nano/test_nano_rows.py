@@ -67,9 +67,8 @@ def test_decisions_hold_what_an_episode_would_store(memory: str) -> None:
     assert batch.history is not None
     for name in ("features", "positions", "mask"):
         here, there = getattr(history, name).float(), getattr(batch.history, name)[0].float()
-        there = there[
-            -len(here) :
-        ]  # later decisions read more frames, so that this one is padded on the left
+        # later decisions read more frames, so that this one is padded on the left
+        there = there[-len(here) :]
         # Resized from noise by Pillow and by PyTorch, encoded in other batches, and kept as
         # bfloat16.
         assert torch.allclose(here, there, atol=0.05)

@@ -121,9 +121,8 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
             runs.run(resolved(compose("nano", [*words, changed])))
     killed = tmp_path / "run" / "training" / "framesamp_modul@2" / "0"
     (killed / "trained.json").unlink()
-    shutil.rmtree(
-        killed / "checkpoints"
-    )  # as before the first one: there are only lines of progress
+    # as before the first one: there are only lines of progress
+    shutil.rmtree(killed / "checkpoints")
     runs.run(resolved(compose("nano", words)))
     assert read_json(killed / "trained.json", "a training's end")["steps"] == 2
 

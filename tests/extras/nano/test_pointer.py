@@ -57,9 +57,8 @@ def test_reflected_tokens_are_those_of_objects_at_reflected_points(
         *((kind, column, row) for (kind, _, _), (row, column) in zip(objects, points, strict=True))
     )
     reflected = reflect(image_of(*objects), *how)
-    sums = slice(
-        len(CLASSES), None
-    )  # presence is the largest of a token's cells, and tokens keep their order
+    # presence is the largest of a token's cells, and tokens keep their order
+    sums = slice(len(CLASSES), None)
     assert torch.allclose(reflected.sum(1)[:, sums], expected.sum(1)[:, sums], atol=1e-4)
     if signs == (1.0, 1.0) and not exchange:
         assert torch.equal(reflected, image_of(*objects))
@@ -127,9 +126,8 @@ def test_the_loss_of_a_mixture_is_its_negative_log_likelihood() -> None:
     output = torch.cat([torch.zeros(3), logits, points.flatten()])[None, None]
     loss = head.loss(lambda x, time: output, actions, head.training_noise(1, torch.Generator()))
     mixture = MixtureSameFamily(Categorical(logits=logits), Independent(Normal(points, SPREAD), 1))
-    peak = (
-        Normal(0.0, SPREAD).log_prob(torch.tensor(0.0)) * 2
-    )  # the constant that the loss leaves out
+    # the constant that the loss leaves out
+    peak = Normal(0.0, SPREAD).log_prob(torch.tensor(0.0)) * 2
     assert loss.item() == pytest.approx(
         -WEIGHT * (mixture.log_prob(actions[0, 0, 1:]) - peak).item(), rel=1e-5
     )

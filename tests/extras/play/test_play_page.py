@@ -252,9 +252,8 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
         browser.wait("document.querySelectorAll('.option:not(:disabled)').length === 3")
         assert browser.text("#goal") == "press the blocks in the order of the video"
         assert browser.text("#do").startswith("Do it")
-        browser.wait(
-            "document.querySelector('#badge').innerText === 'Present'"
-        )  # the video has played to its end
+        # the video has played to its end
+        browser.wait("document.querySelector('#badge').innerText === 'Present'")
 
         # Scrub back into the video, and see that a point is only taken in the present image.
         browser.press("ArrowLeft", shift=True)

@@ -95,9 +95,8 @@ def test_watching_changes_no_action_and_leaves_no_hook() -> None:
 def test_modulation_statistics_are_those_of_what_was_predicted() -> None:
     policy = small_policy("tokendrop_modul")
     with torch.no_grad():
-        for (
-            layer
-        ) in policy.integration.layers:  # a constant answer: scale 2 and −1 in turns, bias 0.5
+        for layer in policy.integration.layers:
+            # a constant answer: scale 2 and −1 in turns, bias 0.5
             layer.modulation.weight.zero_()
             half = len(layer.modulation.bias) // 2
             layer.modulation.bias[:half] = torch.tensor([2.0, -1.0]).repeat(half // 2)

@@ -102,9 +102,8 @@ def test_every_memory_answers_otherwise_when_its_entries_are_others(kind: str) -
     )
     for word in words:
         changed = chunks(policy, word)[1]
-        if not (
-            kind == "by change" and word == "shuffle"
-        ):  # where all that changed is of one frame, nothing moves
+        if not (kind == "by change" and word == "shuffle"):
+            # where all that changed is of one frame, nothing moves
             assert any(
                 np.abs(a - b).max() > 1e-6 for a, b in zip(baseline, changed, strict=True)
             ), word

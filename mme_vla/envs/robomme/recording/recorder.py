@@ -134,9 +134,8 @@ class Recorder:
         task.reset()
         self._observer.start()
         self._planned = Grounding(retry=False)
-        self._online = Grounding(
-            retry=False
-        )  # unlike a running environment's, a file's text is made once
+        # unlike a running environment's, a file's text is made once
+        self._online = Grounding(retry=False)
         self._action_angles = AngleTrack()
         self._roll_shift: float | None = None
         self._waypoint: np.ndarray | None = None
@@ -158,9 +157,8 @@ class Recorder:
         if self._result.steps >= limit:
             raise TooLongError(f"not done after {limit} control steps")
         self._action = np.asarray(action, np.float64)
-        self._displayed = (
-            self._task.progress.displayed
-        )  # the text is set before the evaluation moves the pointer
+        # the text is set before the evaluation moves the pointer
+        self._displayed = self._task.progress.displayed
         self._task.step(np.asarray(action, np.float32))
         self._result.steps += 1
 
@@ -216,9 +214,8 @@ class Recorder:
         pose = self._demonstrator.arm.forward(action[:ARM_JOINTS])
         gripper = -1.0 if task.stick else float(action[ARM_JOINTS])
         angles = self._action_angles.follow(pose.q)
-        if (
-            self._roll_shift is None
-        ):  # a gripper begins straight down, which the official files have at +pi
+        if self._roll_shift is None:
+            # a gripper begins straight down, which the official files have at +pi
             self._roll_shift = 2 * np.pi if abs(angles[0] + np.pi) < AT_REST else 0.0
         angles[0] += self._roll_shift
         pixel = (

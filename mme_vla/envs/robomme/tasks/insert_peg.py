@@ -43,9 +43,8 @@ DISPLAY_STEPS = 20  # how long the box shows an insertion
 HOLD_STEPS = 100
 OPEN_FROM_BOX, OPEN_FROM_PEG = 0.18, 0.13
 """Free distance that the hand needs around a peg: to the box, to other pegs; metres."""
-SIDEWAYS = (
-    -0.4
-)  # cosine between the way from a near box and the way a peg may be pulled: a little past sideways
+# cosine between the way from a near box and the way a peg may be pulled: a little past sideways
+SIDEWAYS = -0.4
 WORKSPACE = (0.4, 0.72)  # nearest and farthest from the robot's base that a peg is moved to, metres
 FLUNG = 0.05  # from its place in one step, metres
 MARK = (0.015, 0.055)  # radius and half length of the disc on the box

@@ -56,9 +56,8 @@ class DiffusionSizes:
                 n for n in (value if isinstance(value, tuple) else [value]) if isinstance(n, int)
             ]
             if value == () or not all(1 <= n <= LARGEST for n in numbers):
-                where = (
-                    "processor" if f.name == "window" else "backbone"
-                )  # which the backbone follows
+                # which the backbone follows
+                where = "processor" if f.name == "window" else "backbone"
                 raise UserError(
                     f"{where}.{f.name}={brief(value)} must be made of whole numbers from 1 to"
                     f" {LARGEST}."

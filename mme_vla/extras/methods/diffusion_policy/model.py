@@ -265,9 +265,8 @@ class ConditionalUnet1d(nn.Module):
     def forward(self, chunk: Tensor, step: Tensor, condition: Tensor) -> Tensor:
         condition = torch.cat([self.diffusion_step_encoder(step), condition], dim=-1)
         x, skips = chunk.mT, []
-        down: Any = (
-            self.down_modules
-        )  # lists of modules, whose own modules type checkers do not see
+        # lists of modules, whose own modules type checkers do not see
+        down: Any = self.down_modules
         up: Any = self.up_modules
         for first, second, half in down:
             skips.append(second(first(x, condition), condition))

@@ -78,9 +78,8 @@ class MemoryVlaEpisode(Episode):
             self.pending = None
         moments = []
         for i in range(len(demo)):
-            if (
-                self._due is not None and demo[i]
-            ):  # a later frame of the video shows that it was not the last one
+            if self._due is not None and demo[i]:
+                # a later frame of the video shows that it was not the last one
                 moments.append(self._due)
             if self._due is not None and (demo[i] or not self._video_over):
                 self._due = None

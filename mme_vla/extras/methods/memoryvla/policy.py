@@ -227,9 +227,8 @@ class MemoryVlaPolicy(NetworkPolicy):
             read, perceptual = self.core.through(
                 cognition, features, batch.times[batch.valid], groups, memory
             )
-            losses = self.core.noise_error(
-                batch.actions[batch.valid], read, perceptual, sampled
-            )  # r·m h
+            # r·m h
+            losses = self.core.noise_error(batch.actions[batch.valid], read, perceptual, sampled)
         counted = None
         if batch.action_mask is not None:
             of_moments = batch.action_mask[batch.valid]

@@ -92,9 +92,8 @@ class SAM2ActSizes:
 
     def __post_init__(self) -> None:
         check_multiple("backbone.", "width", self.width, "backbone.heads", self.heads)
-        check_multiple(
-            "backbone.", "depth", self.depth, "pairs", 2
-        )  # half of the layers see one view alone
+        # half of the layers see one view alone
+        check_multiple("backbone.", "depth", self.depth, "pairs", 2)
         check_multiple("backbone.", "memory", self.memory, "quarters", 4)
         check_multiple(
             "backbone.", "sam + backbone.pictures + backbone.state", self.token, "quarters", 4

@@ -249,17 +249,15 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
         selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
         self.total_frames, self.sampled = 0, sampled
         self._items: list[tuple[int, int, EpisodeKeyframes, list[Link]]] = []
-        shares: list[
-            float
-        ] = []  # how often an item is sampled within its task, relative to the task's others
+        # how often an item is sampled within its task, relative to the task's others
+        shares: list[float] = []
         tasks: list[str] = []
         counted: Counter[str] = Counter()
         longest = 0
         for number, (source, part) in enumerate(zip(sources, selected, strict=True)):
             for episode in map(int, part):
-                source.goal(
-                    episode
-                )  # a sample has one: an episode of several is refused here, not while training
+                # a sample has one: an episode of several is refused here, not while training
+                source.goal(episode)
                 self.total_frames += int(source.lengths[episode])
                 keyframes = EpisodeKeyframes(KeyframeFile.file_of(source.root, episode))
                 chains = [chain for chain in keyframes.chains if len(chain) >= length]

@@ -172,9 +172,8 @@ class MultiViewTransformer(nn.Module):
         )
         self.language = Normed(nn.Linear(sizes.language, sizes.token), sizes.token)
         self.sam = nn.Conv2d(sizes.encoder.neck, sizes.sam, 1)
-        self.unused_sam = nn.Conv2d(
-            sizes.encoder.neck, sizes.sam, 1
-        )  # in every released checkpoint; nothing reads it
+        # in every released checkpoint; nothing reads it
+        self.unused_sam = nn.Conv2d(sizes.encoder.neck, sizes.sam, 1)
         self.wide = nn.Linear(sizes.token, sizes.width)
         self.narrow = nn.Linear(sizes.width, sizes.token)
         self.layers = nn.ModuleList(Layer(sizes.width, sizes.heads) for _ in range(sizes.depth))

@@ -171,9 +171,8 @@ def sine_positions(side: int, width: int, device: torch.device | None = None) ->
     line = torch.arange(1, side + 1, device=device).float() / (side + 1e-6) * (2 * math.pi)
     rates = 10_000 ** (-2 * (torch.arange(half, device=device) // 2).float() / half)
     angles = line[:, None] * rates
-    codes = (
-        torch.stack([angles[:, 0::2].sin(), angles[:, 1::2].cos()], -1).flatten(1).T
-    )  # half side
+    # half side
+    codes = torch.stack([angles[:, 0::2].sin(), angles[:, 1::2].cos()], -1).flatten(1).T
     rows, columns = codes[:, :, None].expand(-1, -1, side), codes[:, None].expand(-1, side, -1)
     return torch.cat([rows, columns])
 

@@ -146,9 +146,8 @@ class VideoLanguageModel(nn.Module):
         vision = self.model.visual.config
         rows = pixel_rows(pairs, vision.patch_size, vision.spatial_merge_size)
         height, width = (side // vision.patch_size for side in pairs.shape[-2:])
-        grid = torch.tensor(
-            [[len(pairs), height, width]]
-        )  # on the CPU: transformers reads it as numbers
+        # on the CPU: transformers reads it as numbers
+        grid = torch.tensor([[len(pairs), height, width]])
         tokens = self.model.visual(
             rows.to(self.embedding.weight.dtype), grid_thw=grid
         ).pooler_output
@@ -222,9 +221,8 @@ class VideoLanguageModel(nn.Module):
         last = self.hidden(embedded, positions, cache, mask)[:, -1]
         place = positions[:, :, -1].amax(1)
         responses: list[list[int]] = [[] for _ in range(len(embedded))]
-        tails: list[list[int]] = [
-            [] for _ in responses
-        ]  # what follows the words: the end and the line break
+        # what follows the words: the end and the line break
+        tails: list[list[int]] = [[] for _ in responses]
         hidden: list[Tensor] = []
         tokens: list[Tensor] = []
         while any(len(tail) < 2 for tail in tails):

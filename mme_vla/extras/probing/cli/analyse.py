@@ -141,9 +141,8 @@ def recurrence(args: argparse.Namespace) -> None:
 
     policy, source, name = _subject(args)
     numbers = range(len(source)) if args.episodes is None else args.episodes
-    with _rerun(
-        args
-    ) as log:  # before the replays: a file that cannot be written is an error at once
+    with _rerun(args) as log:
+        # before the replays: a file that cannot be written is an error at once
         episode_curves = [
             recurrence_curves(policy, source, episode, args.stride) for episode in numbers
         ]

@@ -159,9 +159,8 @@ def test_what_lies_between_in_every_golden_model(golden: Any) -> None:
             handle.remove()
         for name, actual in captured.items():
             expected = arrays[f"out/{name}"]
-            if name == "text_feature" and len(actual) < len(
-                expected
-            ):  # they repeat it for every step of the window
+            if name == "text_feature" and len(actual) < len(expected):
+                # they repeat it for every step of the window
                 actual = actual.repeat_interleave(len(expected) // len(actual), 0)
             close(actual, expected.reshape(actual.shape) if name == "text_feature" else expected)
 
@@ -238,9 +237,8 @@ def test_a_conditioning_unit_with_and_without_a_shortcut(folder: Path) -> None:
         out, channels, kernel = weights["blocks.0.block.0.weight"].shape
         condition, x = arrays.get(f"{kind}/cond", arrays["film/cond"]), arrays[f"{kind}/x"]
         errors = []
-        for groups in (
-            g for g in range(1, out + 1) if out % g == 0
-        ):  # the case does not say how many
+        for groups in (g for g in range(1, out + 1) if out % g == 0):
+            # the case does not say how many
             unit = ConditionedUnit(channels, out, condition.shape[1], kernel, groups)
             unit.load_state_dict(weights)
             errors.append(float((unit(x, condition) - arrays[f"{kind}/y"]).abs().max().detach()))
@@ -343,9 +341,8 @@ def test_updates_with_their_optimizer_schedule_and_averages(folder: Path, golden
         loss, _ = policy(batch_of(arrays, policy), draws, corner)
         loss.backward()
         norm = clip_gradients([p.grad for p in parameters.values() if p.grad is not None], 1.0)
-        assert loss.item() == pytest.approx(
-            update["loss"], rel=5e-4
-        )  # after updates by such gradients
+        # after updates by such gradients
+        assert loss.item() == pytest.approx(update["loss"], rel=5e-4)
         assert float(norm) == pytest.approx(update["grad_norm"], rel=GRADIENTS)
         optimizer.step()
         optimizer.zero_grad()

@@ -87,9 +87,8 @@ def test_the_loss_depends_on_what_is_remembered_and_teaches_the_memory(
     still = [
         n for n, p in policy.named_parameters() if component(n) == "memory" and not p.grad.any()
     ]  # type: ignore[union-attr]
-    assert all(name.endswith("key.bias") for name in still), (
-        still
-    )  # a bias of all keys alike changes no weight
+    # a bias of all keys alike changes no weight
+    assert all(name.endswith("key.bias") for name in still), still
     policy.zero_grad()
     with pytest.raises(ValueError, match="has a memory"):
         policy(replace(batch, history=None))
@@ -159,9 +158,8 @@ def test_moments_of_a_group_do_not_read_each_other(policy: MemoryVlaPolicy) -> N
 
 
 def test_each_frame_of_a_group_has_the_history_of_its_step(tmp_path: Path) -> None:
-    policy = recalling(
-        "actions", processor={"group_size": 3}
-    )  # it keeps next to no frames: a cache at once
+    # it keeps next to no frames: a cache at once
+    policy = recalling("actions", processor={"group_size": 3})
     data = OmegaConf.to_container(
         compose("train", [f"data.cache.root={tmp_path}"]).data, resolve=True
     )

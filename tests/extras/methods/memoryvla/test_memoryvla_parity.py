@@ -105,9 +105,8 @@ def compare_banks(golden: dict[str, Tensor], kind: str, states: list[BankState])
     stored = golden[f"{kind}/bank_times"]
     for i, state in enumerate(states):
         assert len(state) == int(golden[f"{kind}/count"][i])
-        if (
-            int(stored[i].min()) >= -1
-        ):  # −2: the original keeps no time there, and its record no merges
+        if int(stored[i].min()) >= -1:
+            # −2: the original keeps no time there, and its record no merges
             assert state.merged == int(golden[f"{kind}/merged_at"][i])
             assert state.times.tolist() == stored[i][: len(state)].tolist()
         if f"{kind}/bank_feats" in golden:

@@ -104,9 +104,8 @@ def test_images_are_changed_by_their_draws_alone_whatever_stands_beside_them() -
         policy(batch.rows(slice(i, i + 1)), {k: v[i : i + 1] for k, v in draws_[0].items()})
         for i in range(2)
     ]
-    apart = (
-        sum(loss for loss, _ in halves) / 2
-    )  # pixels are rounded, so that a last bit may become a level
+    # pixels are rounded, so that a last bit may become a level
+    apart = sum(loss for loss, _ in halves) / 2
     assert abs(apart - first) < abs(other - first) / 20
     assert policy.eval().augmentation_params(2, torch.Generator()) == {}
 

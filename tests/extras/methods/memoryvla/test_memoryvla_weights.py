@@ -23,9 +23,8 @@ def test_a_checkpoint_is_saved_by_components_and_read_again(tmp_path: Path) -> N
     model = torch.load(file, weights_only=True)["model"]
     assert model["per_compr"]["reduce.weight"].ndim == 4
     assert "retrieval_blocks.0.q_proj.weight" in model["cog_mem_bank"]
-    model["action_model"]["net.history_embedder.linear.weight"] = torch.zeros(
-        2, 2
-    )  # as CogACT's hold
+    # as CogACT's hold
+    model["action_model"]["net.history_embedder.linear.weight"] = torch.zeros(2, 2)
     torch.save({"model": model}, file)
     assert detect_format(file) == "memoryvla"
     load_weights(other, file)
@@ -38,9 +37,8 @@ def of_vlm(policy: Policy) -> dict[str, torch.Tensor]:
 
 def test_openvla_is_a_start_that_has_nothing_of_banks_and_head(tmp_path: Path) -> None:
     """Small files in the layout of `openvla/openvla-7b`, and in that of its Prismatic original."""
-    openvla = build_policy(
-        "openvla_oft", seed=1, backbone={"vision": {"image_size": 56}}
-    )  # as large as memoryvla_tiny
+    # as large as memoryvla_tiny
+    openvla = build_policy("openvla_oft", seed=1, backbone={"vision": {"image_size": 56}})
     source_names = openvla_adapter(openvla).export(openvla.state_dict())
     base = {
         name.removeprefix(VLA): tensor.contiguous()

@@ -109,9 +109,8 @@ def test_the_renderer_follows_its_rules_to_the_pixel() -> None:
 
 
 def test_what_is_behind_a_camera_stands_before_everything() -> None:
-    points = torch.tensor(
-        [[0.0, 0.0, 0.5], [0.0, 0.0, 1.5]]
-    )  # the second is above the eye of the view from the top
+    # the second is above the eye of the view from the top
+    points = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 1.5]])
     images, depth = geometry.z_buffer(points, torch.tensor([[1.0], [2.0]]), 4)
     assert images[0, 2, 2].item() == 2.0
     assert depth[0, 2, 2].item() == 0.0

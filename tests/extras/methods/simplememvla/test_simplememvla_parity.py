@@ -212,9 +212,8 @@ def test_head(policy: SimpleMemVlaPolicy) -> None:
     assert error(head(actions, times, condition, None), golden["without_state"]) < TOLERANCE
     assert error(head(actions, times, without_tokens, state), golden["without_tokens"]) < TOLERANCE
     assert error(head(short, times, condition, state), golden["shorter"]) < TOLERANCE
-    assert (
-        error(head(actions, times, odd, state), golden["odd_positions"]) < TOLERANCE
-    )  # unscaled sections: 5e-4
+    # unscaled sections: 5e-4
+    assert error(head(actions, times, odd, state), golden["odd_positions"]) < TOLERANCE
     assert error(head.time_embed(golden["time/in"]), golden["time/out"]) < TOLERANCE
     for steps in (1, 4, 10):
         chunk = head.sample(golden["sample/noise"], condition, state, steps)
@@ -290,9 +289,8 @@ def test_hidden_states_velocity_and_losses(policy: SimpleMemVlaPolicy) -> None:
     )
     assert error(velocity, golden["head/velocity"]) < TOLERANCE
     words, right = words_loss(policy.backbone, hidden, batch.ids, batch.spans)
-    assert (
-        right == 1
-    )  # the case is trained on these answers: the loss is near the precision of a probability of 1
+    # the case is trained on these answers: the loss is near the precision of a probability of 1
+    assert right == 1
     assert words.item() == pytest.approx(golden["vl_loss"].item(), rel=TOLERANCE, abs=1e-6)
     loss, metrics = policy(batch, {"noise": golden["noise"], "time": golden["times"]})
     assert error(metrics["action"], golden["action_loss"]) < TOLERANCE

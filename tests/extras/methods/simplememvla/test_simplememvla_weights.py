@@ -59,9 +59,8 @@ def test_a_published_folder_is_written_and_read_again(published: Path, tmp_path:
         and stats.state.mean.tolist() == policy.require_processor().stats.state.mean.tolist()
     )  # type: ignore[union-attr]
     del tensors[LM_HEAD]
-    save_file(
-        tensors, tmp_path / "model.safetensors"
-    )  # also without the tied head, and without a description
+    # also without the tied head, and without a description
+    save_file(tensors, tmp_path / "model.safetensors")
     load_weights(tiny(3), tmp_path)
 
 
