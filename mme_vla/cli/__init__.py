@@ -102,11 +102,6 @@ def commands() -> dict[str, Command]:
     return all_commands
 
 
-def usage(name: str) -> str:
-    """How a command is typed."""
-    return commands()[name].usage or f"mme-vla {name}"
-
-
 _WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}  # Options that only print
 
 

@@ -16,15 +16,18 @@ from typing import Any
 
 import yaml
 
-from mme_vla.cli import commands, usage
+from mme_vla.cli import commands
 from mme_vla.config.trees import yaml_files
 from mme_vla.errors import UserError, did_you_mean
 
 
 def configured_commands() -> dict[str, str]:
     """File of the tree's top level → how the command that it configures is typed."""
-    usages = {command.config: usage(name) for name, command in commands().items() if command.config}
-    return usages | {"policy": "build_policy(…)"}
+    usages = {"policy": "build_policy(…)"}
+    for name, command in commands().items():
+        if command.config:
+            usages[command.config] = command.usage or f"mme-vla {name}"
+    return usages
 
 
 _KEY = re.compile(

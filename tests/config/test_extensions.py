@@ -9,7 +9,7 @@ import pytest
 from mme_vla import build_policy, cli, registry
 from mme_vla.config.plugins import import_trusted
 from mme_vla.errors import UserError
-from mme_vla.registry import Command, Extension, Registry
+from mme_vla.registry import Extension, Registry
 
 SOURCE = """
 from mme_vla.memory.framesamp import FrameSamp
@@ -24,7 +24,18 @@ class Fading(FrameSamp):
 def main():
     print("faded")
 """
-PACKAGE = "package_of_a_fading_memory"
+EXTENSION = """
+from pathlib import Path
+
+from mme_vla.registry import Command, Extension
+
+EXTENSION = Extension(
+    parts={"memory": {"fading": "package_of_a_fading_memory"}},
+    commands={"fade": Command("package_of_a_fading_memory", "fade")},
+    configs=Path(__file__).parent / "configs",
+)
+"""
+PACKAGE, NAMES = "package_of_a_fading_memory", "names_of_a_fading_memory"
 
 
 @pytest.fixture
@@ -40,16 +51,17 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (tmp_path / "configs" / "memory" / "fading.yaml").write_text(
         "name: fading\nbudget: 64\ngrid: 4\n"
     )
-    extension = Extension(
-        parts={"memory": {"fading": PACKAGE}},
-        commands={"fade": Command(PACKAGE, "fade")},
-        configs=tmp_path / "configs",
-    )
+    (tmp_path / f"{NAMES}.py").write_text(EXTENSION)
+    metadata = tmp_path / f"{NAMES}-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {NAMES}\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(f"[mme_vla.plugins]\nfading = {NAMES}:EXTENSION\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(registry, "installed_extensions", lambda: (extension,))
-    monkeypatch.setattr("mme_vla.config.plugins.installed_extensions", lambda: (extension,))
+    registry.installed_extensions.cache_clear()
     yield tmp_path
-    sys.modules.pop(PACKAGE, None)
+    registry.installed_extensions.cache_clear()
+    for name in (PACKAGE, NAMES):
+        sys.modules.pop(name, None)
     registry.MEMORIES._entries.pop("fading", None)
 
 
