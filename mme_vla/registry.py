@@ -85,7 +85,7 @@ class Extension:
 
 @cache
 def extras() -> tuple[Extension, ...]:
-    """The extensions in `mme_vla.extras`, found by listing its packages."""
+    """List the packages of `mme_vla.extras` and return their extensions."""
     package = importlib.import_module("mme_vla.extras")
     names = sorted(module.name for module in pkgutil.iter_modules(package.__path__))
     modules = [importlib.import_module(f"{package.__name__}.{name}.extension") for name in names]
@@ -99,11 +99,11 @@ def installed_extensions() -> tuple[Extension, ...]:
     Raises:
         UserError: a package's entry point cannot be imported, or is no `Extension`.
     """
-    found = []
+    listed: list[Extension] = []
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
         try:
             extension = entry.load()
-        except Exception as error:  # whatever a package of somebody else raises
+        except Exception as error:  # any error of a third-party package
             raise UserError(
                 f"The installed plugin {entry.name!r} ({entry.value}) cannot be imported:"
                 f" {type(error).__name__}: {error}. Mend or uninstall it."
@@ -113,12 +113,12 @@ def installed_extensions() -> tuple[Extension, ...]:
             f"The installed plugin {entry.name!r} ({entry.value}) is no"
             " mme_vla.registry.Extension.",
         )
-        found.append(extension)
-    return tuple(found)
+        listed.append(extension)
+    return tuple(listed)
 
 
 def extensions() -> tuple[Extension, ...]:
-    """All that add to the library: its extras, then installed packages."""
+    """All extensions: those of the library's extras, then those of installed packages."""
     return extras() + installed_extensions()
 
 

@@ -34,6 +34,14 @@ SAMPLING = [
     ("model.py", "sample"), ("backbone/pi05.py", "sample"),
 ]  # fmt: skip
 ALONE = "README.md"
+QUESTIONS = (
+    "How does FrameSamp + Modulator work, image to loss?",
+    "Change the selection rule of TokenDrop",
+    "Another flow head (noise schedule, time distribution, sampler)",
+    "Where is an action chunk sampled?",
+    "Backbone, memory and integration alone in your own training loop",
+)
+"""(a) to (e), as docs/extend/layout.md has them."""
 
 
 def path_of(module: str) -> Path | None:
@@ -109,28 +117,29 @@ def example() -> tuple[int, int]:
     )
 
 
-def row(question: str, files: list[Path], note: str = "") -> str:
-    lines = sum(len(file.read_text().splitlines()) for file in files)
-    names = ", ".join(f"`{file.relative_to(PACKAGE)}`" for file in files)
-    return f"| {question} | {note}{len(files)} files, {lines:,} lines | {names} |"
+def count(files: list[Path]) -> str:
+    """How many files."""
+    return "1 file" if len(files) == 1 else f"{len(files)} files"
+
+
+def answers() -> list[tuple[str, list[Path]]]:
+    """What (a) to (e) take, and the files."""
+    lines, modules = example()
+    sampled = sampling()
+    read = [closure(MODEL), *(check([PACKAGE / n for n in names]) for names in (SELECTION, HEAD))]
+    return [
+        *((count(files), files) for files in read),
+        (f"{len(SAMPLING)} calls, {count(sampled)}", sampled),
+        (f"{lines} lines, {modules} modules imported", [ROOT / ALONE]),
+    ]
 
 
 def main() -> None:
     """Print the table."""
-    lines, modules = example()
     print("| question | to read | files |\n|---|---|---|")
-    print(row("(a) FrameSamp + Modulator, image to loss", closure(MODEL)))
-    print(
-        row(
-            "(b) another selection rule of TokenDrop", check([PACKAGE / name for name in SELECTION])
-        )
-    )
-    print(row("(c) another flow head", check([PACKAGE / name for name in HEAD])))
-    print(row("(d) where a chunk is sampled", sampling(), f"{len(SAMPLING)} calls, "))
-    print(
-        f"| (e) the model in your own loop | {lines} lines, {modules} modules imported |"
-        f" `{ALONE}` |"
-    )
+    for question, (take, files) in zip(QUESTIONS, answers(), strict=True):
+        names = ", ".join(f"`{file.relative_to(ROOT)}`" for file in files)
+        print(f"| {question} | {take} | {names} |")
 
 
 if __name__ == "__main__":

@@ -95,16 +95,11 @@ COMMANDS = {
 
 def commands() -> dict[str, Command]:
     """All commands: the core's, its extras', and those of installed packages."""
-    found = dict(COMMANDS)
+    all_commands = dict(COMMANDS)
     for extension in extensions():
         for name, command in extension.commands.items():
-            found.setdefault(name, command)
-    return found
-
-
-def usage(name: str) -> str:
-    """How a command is typed."""
-    return commands()[name].usage or f"mme-vla {name}"
+            all_commands.setdefault(name, command)
+    return all_commands
 
 
 _WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}  # Options that only print

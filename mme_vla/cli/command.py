@@ -23,15 +23,14 @@ from mme_vla.config.composition import (
     VERSION_BASE,
     command_trees,
     compose,
-    config_dir,
     import_plugins,
     join_plugins,
-    library_trees,
     local_hydra,
     parse,
 )
 from mme_vla.config.naming import join_memories, several_memories
 from mme_vla.config.override_errors import paths
+from mme_vla.config.trees import config_dir, library_trees
 from mme_vla.errors import UserError, printable
 
 
@@ -122,8 +121,10 @@ def _check_command_line(config_name: str, tree: Path) -> None:
         )
     extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     if args.help:
-        trees = library_trees() if tree == config_dir() else (tree.resolve(),)
-        print(help_page(args.config_name or config_name, args.overrides, [*trees, *extra]))
+        trees = [tree.resolve(), *extra]
+        if tree == config_dir():
+            trees += library_trees()[1:]
+        print(help_page(args.config_name or config_name, args.overrides, trees))
         raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed

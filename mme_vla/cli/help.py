@@ -9,21 +9,25 @@ import difflib
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from mme_vla.cli import commands, usage
+from mme_vla.cli import commands
+from mme_vla.config.trees import yaml_files
 from mme_vla.errors import UserError, did_you_mean
 
 
 def configured_commands() -> dict[str, str]:
     """File of the tree's top level → how the command that it configures is typed."""
-    usages = {command.config: usage(name) for name, command in commands().items() if command.config}
-    return usages | {"policy": "build_policy(…)"}
+    usages = {"policy": "build_policy(…)"}
+    for name, command in commands().items():
+        if command.config:
+            usages[command.config] = command.usage or f"mme-vla {name}"
+    return usages
 
 
 _KEY = re.compile(
@@ -98,14 +102,6 @@ def defaults(file: Path) -> Defaults:
     )
 
 
-def choices(trees: Iterable[Path], group: str) -> dict[str, Path]:
-    """The files of a group by name, of all trees; a later tree's file stands before an earlier
-    one's.
-    """
-    files = {file.stem: file for tree in trees for file in sorted((tree / group).glob("*.yaml"))}
-    return dict(sorted(files.items()))
-
-
 OPTIONS = """\
   --help [GROUP | GROUP=NAME …]  this text; the files of a group; one of its files
   --cfg job                      print the whole configuration and run nothing
@@ -119,12 +115,12 @@ def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
     Args:
         config_name: the command's file.
         words: what stands beside `--help`: a group, or a group's file (`model=framesamp_modul`).
-        trees: folders of YAML files, the library's first.
+        trees: folders of YAML files in the order of search.
 
     Raises:
         UserError: a word is no group of this command, or no file of its group.
     """
-    files = _with_included(choices(trees, "")[config_name], trees)
+    files = _with_included(yaml_files(trees, "")[config_name], trees)
     groups = _groups(files, trees)
     if words:
         return "\n\n".join(_group_page(word, groups, trees) for word in words)
@@ -140,7 +136,7 @@ def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
         parts.append(f"{title}\n{textwrap.indent(_body(file), '  ')}")
     rows = []
     for group, name in sorted(groups.items()):
-        rows.append(f"  {group}={name}: {' · '.join(choices(trees, group)) or '(none)'}")
+        rows.append(f"  {group}={name}: {' · '.join(yaml_files(trees, group)) or '(none)'}")
     if rows:
         introduction = "Groups: GROUP=NAME takes another file; --help GROUP shows what is in them"
         parts.append("\n".join([introduction, *rows]))
@@ -152,7 +148,7 @@ def _with_included(file: Path, trees: Sequence[Path]) -> list[Path]:
     """A file of the top level, and those that it is built on."""
     files = [file]
     for name in defaults(file).files:
-        part = choices(trees, "").get(name)
+        part = yaml_files(trees, "").get(name)
         if part is not None:
             files += _with_included(part, trees)
     return files
@@ -167,7 +163,7 @@ def _groups(files: Sequence[Path], trees: Sequence[Path]) -> dict[str, str]:
             group = name.strip("/").partition("@")[0]
             if group not in groups:
                 groups[group] = choice
-                file = choices(trees, group).get(choice)
+                file = yaml_files(trees, group).get(choice)
                 if file is not None:
                     pending.append(file)
     return groups
@@ -178,7 +174,7 @@ def _group_page(word: str, groups: dict[str, str], trees: Sequence[Path]) -> str
     group, _, name = word.partition("=")
     if group not in groups:
         raise UserError(f"{group!r} is no group of this command. {did_you_mean(group, groups)}")
-    files = choices(trees, group)
+    files = yaml_files(trees, group)
     if name and name not in files:
         raise UserError(f"Unknown {group} {name!r}. {did_you_mean(name, files)}")
     parts = [f"Group {group}, by default {group}={groups[group]}"]
@@ -190,11 +186,11 @@ def _group_page(word: str, groups: dict[str, str], trees: Sequence[Path]) -> str
 def _body(file: Path) -> str:
     """A file without the comment that it begins with and without Hydra's own sections."""
     lines: list[str] = []
-    is_shown = True
+    is_printed = True
     for line in file.read_text().splitlines():
         if line and not line[0].isspace() and not line.startswith("#"):
-            is_shown = not line.startswith(("defaults:", "hydra:"))
-        if is_shown and (lines or not line.startswith("#")):
+            is_printed = not line.startswith(("defaults:", "hydra:"))
+        if is_printed and (lines or not line.startswith("#")):
             lines.append(line)
     return "\n".join(lines).strip()
 

@@ -29,8 +29,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from mme_vla.config import plugins
 from mme_vla.config.naming import join_memories, several_memories
 from mme_vla.config.override_errors import COMPOSITION_ERRORS, ConfigTree
+from mme_vla.config.trees import config_dir, library_trees
 from mme_vla.errors import UserError, require
-from mme_vla.registry import extensions
 
 VERSION_BASE = "1.3"
 
@@ -48,29 +48,6 @@ def _load_installed_plugins() -> None:
 _load_installed_plugins()
 
 
-def config_dir() -> Path:
-    """Return the folder of the YAML tree: inside the package when a wheel is installed, else the
-    repository's.
-    """
-    package = Path(__file__).resolve().parents[1]
-    shipped = package / "configs"
-    return shipped if shipped.is_dir() else package.parent / "configs"
-
-
-def library_trees() -> tuple[Path, ...]:
-    """Folders of YAML files of the library: its core's, then those of its extras and of installed
-    packages.
-    """
-    folders = [extension.configs for extension in extensions()]
-    return (config_dir(), *(folder for folder in folders if folder is not None))
-
-
-def library_files(group: str) -> dict[str, Path]:
-    """Name → YAML file of a group (of the top level where it is empty), in all `library_trees`."""
-    files = [file for tree in library_trees() for file in (tree / group).glob("*.yaml")]
-    return {file.stem: file for file in sorted(files, key=lambda file: file.stem)}
-
-
 class ExtensionTrees(SearchPathPlugin):
     """Hydra searches the folders of extensions after the library's own."""
 
@@ -78,14 +55,11 @@ class ExtensionTrees(SearchPathPlugin):
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Append the folders, where the library's own tree is what is composed."""
-        main = [path for path in search_path.get_path() if path.provider == "main"]
-        own = f"file://{config_dir().resolve()}"
-        if not any(
-            str(path.path).rstrip("/") in (own, str(config_dir().resolve())) for path in main
-        ):
-            return
-        for folder in library_trees()[1:]:
-            search_path.append(self.PROVIDER, f"file://{folder.resolve()}")
+        core = str(config_dir().resolve())
+        paths = [path.path for path in search_path.get_path() if path.provider == "main"]
+        if any(str(path).removeprefix("file://") == core for path in paths):
+            for folder in library_trees()[1:]:
+                search_path.append(self.PROVIDER, f"file://{folder.resolve()}")
 
 
 Plugins.instance().register(ExtensionTrees)

@@ -288,15 +288,15 @@ def _compare_identity(
         expected["training"] = content["training"]
     for record in records[:1]:  # a run has one policy and one robot
         expected |= {"composition": record.composition, "action_space": record.action_space}
-    found: dict[str, set[str]] = {field: set() for field in expected}
+    values_of: dict[str, set[str]] = {field: set() for field in expected}
     for record in records:
         training = record.training and asdict(record.training)
         env = record.extra.get("env", expected["env"])  # not every record names its own
         values = {**vars(record), "training": training, "env": env}
         for field in expected:
-            found[field].add(str(values[field]))
+            values_of[field].add(str(values[field]))
     for field, value in expected.items():
-        for here in sorted(found[field]):
+        for here in sorted(values_of[field]):
             result.compare(f"records.{field}", str(value), here)
 
 
@@ -309,8 +309,8 @@ def _compare_steps(
     from mme_vla.evaluation.rollout.events import read_events
 
     try:
-        held = sum(placed.event.hold for placed in read_events(settings.get("event")))
-        limit = int(settings["max_steps"]) + _MARGIN + held
+        hold_steps = sum(placed.event.hold for placed in read_events(settings.get("event")))
+        limit = int(settings["max_steps"]) + _MARGIN + hold_steps
     except (KeyError, TypeError, ValueError) as error:  # UserError is a ValueError
         result.not_compared.append(f"steps: the settings name no limit of them ({error}).")
         return
@@ -328,7 +328,7 @@ def _compare_scenes(
     build: bool,
 ) -> None:
     """Seeds and difficulties of the episodes, and the scenes' digests, for which they are built."""
-    skipped = result.not_compared
+    not_compared = result.not_compared
     try:
         require(records, "there is no record.")
         env = environment(str(settings.get("env")))
@@ -339,19 +339,21 @@ def _compare_scenes(
             then, here = f"{record.seed}, {record.difficulty}", f"{spec.seed}, {spec.difficulty}"
             result.compare(name, then, here)
             if record.scene is None:
-                skipped.append("scenes: records do not name them, as those of earlier versions.")
+                not_compared.append(
+                    "scenes: records do not name them, as those of earlier versions."
+                )
             elif record.scene == NO_VALUES:
-                skipped.append("scenes: the environment gave no values of some.")
+                not_compared.append("scenes: the environment gave no values of some.")
             elif not build:
-                skipped.append("scenes: they were not built here, as was asked.")
+                not_compared.append("scenes: they were not built here, as was asked.")
             elif record.scene == NOT_BUILT:
-                skipped.append("scenes: some episodes ended before theirs was built.")
+                not_compared.append("scenes: some episodes ended before theirs was built.")
             elif (built := env.scene_digest(spec)) == NO_VALUES:
-                skipped.append("scenes: the environment gives no values of some here.")
+                not_compared.append("scenes: the environment gives no values of some here.")
             else:
                 result.compare(name, record.scene, built)
     except UserError as error:  # of a plugin that is not loaded, or without the simulator
-        skipped.append(f"scenes: {error}")
+        not_compared.append(f"scenes: {error}")
 
 
 # The conditions -----------------------------------------------------------------------------------

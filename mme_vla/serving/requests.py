@@ -1,4 +1,4 @@
-"""Requests: what clients send, checked whole before anything is done.
+"""Requests: what clients send, checked completely before anything is done.
 
 There are two message schemas, told apart by their keys. The MME-VLA schema (openpi's, with memory)
 sends past frames and the current observation apart: `add_buffer`, then an `observation/…` message.
@@ -63,7 +63,7 @@ class Infer:
     states: [t, s] float32.
     stored: whether the frames go into memory; False where they came by `AddBuffer`, and t is 1.
     first: whether the message begins an episode; None in the MME-VLA schema, which does not say.
-    subgoals: by kind, those given.
+    subgoals: by kind; kinds that the message lacks are left out.
     options: what can be chosen, for a policy that chooses; empty where the options stay as they
         were.
     """
@@ -140,8 +140,8 @@ def _numbers(value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
         raise ValueError(expected) from None
     if array.dtype.kind not in "fiu" or array.ndim != len(shape):
         raise ValueError(expected)
-    for size, wanted in zip(array.shape, shape, strict=True):
-        if wanted is not None and size != wanted:
+    for size, expected_size in zip(array.shape, shape, strict=True):
+        if expected_size is not None and size != expected_size:
             raise ValueError(expected)
     return _finite(array)
 
@@ -202,7 +202,7 @@ def _flag(value: Any) -> Any:
     return _truth(value)
 
 
-def _whole(value: Any) -> Any:
+def _integer(value: Any) -> Any:
     return int(value) if isinstance(value, np.integer) else value
 
 
@@ -233,7 +233,7 @@ class Flags(BaseModel):
 class BufferMessage(BaseModel):
     """`{"add_buffer": True, …}` of the MME-VLA schema. Its reader adds `images` and `state`."""
 
-    exec_start_idx: Annotated[StrictInt, BeforeValidator(_whole), Field(ge=0)] = 0
+    exec_start_idx: Annotated[StrictInt, BeforeValidator(_integer), Field(ge=0)] = 0
 
 
 class InferMessage(BaseModel):
@@ -245,8 +245,8 @@ class InferMessage(BaseModel):
 
     @property
     def subgoals(self) -> dict[str, str]:
-        given = {kind: getattr(self, kind) for kind in SUBGOALS}
-        return {kind: text for kind, text in given.items() if text is not None}
+        texts = {kind: getattr(self, kind) for kind in SUBGOALS}
+        return {kind: text for kind, text in texts.items() if text is not None}
 
 
 class ObservationMessage(InferMessage):

@@ -1,6 +1,6 @@
 """`PolicyServer`: one asyncio process, one port, websocket and HTTP, many clients, one policy.
 
-uvicorn speaks HTTP and websocket, limits sizes, and pings. `PolicyServer.websocket` and
+uvicorn implements HTTP and websocket, limits sizes, and pings. `PolicyServer.websocket` and
 `PolicyServer.infer` take a client's requests, `Session` does what they ask, and `Engine` computes.
 `Places` limits how many clients there are.
 """
@@ -55,7 +55,7 @@ the key to its next request, and for the closing handshake of a websocket.
 """
 KEEP_ALIVE_S = 75  # seconds from a reply to the end of the next request's headers
 MIN_BYTES_S = 2**16  # bytes a second of a body, beside limits.receive_s
-MAX_STRANGERS = 64  # connections that are between two requests
+MAX_IDLE_CONNECTIONS = 64  # connections that are between two requests
 SMALL = 2**16  # bytes decoded on the event loop; larger messages are decoded in a thread
 BUSY = "The server is full (limits.connections), and every client waits for a reply.\n"
 FULL = "The server is full and this client was silent longest; begin the episode again."
@@ -349,16 +349,16 @@ class PolicyServer:
                     coming = asyncio.ensure_future(socket.receive())
                     continue
                 place.work()
-                # Reading goes on while the policy computes, so that a client that leaves is
+                # Reading continues while the policy computes, so that a client that leaves is
                 # noticed.
                 coming = asyncio.ensure_future(socket.receive())
-                answering = asyncio.ensure_future(self._answer(session, event, place))
+                computing = asyncio.ensure_future(self._reply(session, event, place))
                 del event  # hundreds of megabytes that need not wait for the next request
-                await asyncio.wait([answering, coming], return_when=asyncio.FIRST_COMPLETED)
-                if not answering.done() and coming.result()["type"] == "websocket.disconnect":
-                    answering.cancel()
+                await asyncio.wait([computing, coming], return_when=asyncio.FIRST_COMPLETED)
+                if not computing.done() and coming.result()["type"] == "websocket.disconnect":
+                    computing.cancel()
                     raise WebSocketDisconnect(coming.result()["code"])
-                reply = await answering  # another request may have come; it waits for its turn
+                reply = await computing  # another request may have come; it waits for its turn
                 await self._send(socket, reply)
                 if isinstance(reply, str):
                     return await _close(socket, 1011, reply)
@@ -378,7 +378,7 @@ class PolicyServer:
             self.places.leave(place)
         return None
 
-    async def _answer(
+    async def _reply(
         self, session: Session, event: dict[str, Any], place: "Place"
     ) -> dict[str, Any] | str:
         """The reply to a message, or the reason why there is none; then the connection closes."""
@@ -437,12 +437,12 @@ class Place:
 
 
 class Places:
-    """Who is served, and who has to go.
+    """The clients that hold a place, and which connection is closed next.
 
-    When all places are taken, the client that the server has waited for longest makes room for a
+    When all places are taken, the client that the server has waited for longest is closed for a
     new one: a body that arrives slowly before a websocket, which holds an episode. Connections
     between two requests hold no place. They end after a time, and the oldest of more than
-    `MAX_STRANGERS` at once, so that clients without the key keep out nobody.
+    `MAX_IDLE_CONNECTIONS` at once, so that clients without the key cannot lock out the others.
     """
 
     def __init__(self, limits: Limits, stats: ServerStats) -> None:
@@ -512,7 +512,7 @@ class Places:
         pending = [(end, address) for address, end in self._deadlines.items() if end is not None]
         pending.sort(reverse=True)
         for number, (end, address) in enumerate(pending):
-            if end < now or number >= MAX_STRANGERS:
+            if end < now or number >= MAX_IDLE_CONNECTIONS:
                 transports[address].abort()
 
 

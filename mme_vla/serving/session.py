@@ -105,8 +105,8 @@ class Session:
             NoEpisodeError: the episode that the client means is not here.
             UserError: frames have to be sent before.
         """
-        policy, seen = self._engine.policy, self.episode.n_observed_frames
-        if request.first is False and seen == 0:
+        policy, n_observed = self._engine.policy, self.episode.n_observed_frames
+        if request.first is False and n_observed == 0:
             raise NoEpisodeError(
                 "is_first_step is false but this episode has no frame here: its first request must"
                 " come first. Was the server restarted, or the connection lost? Reset and begin the"
@@ -115,13 +115,13 @@ class Session:
         if request.stored:
             return
         require(
-            seen > 0 or policy.memory is None,
+            n_observed > 0 or policy.memory is None,
             "This policy remembers past frames: send them with add_buffer, the current one"
             " included.",
         )
         reads_actions = policy.require_processor().prompt_spec.past_actions > 0
         require(
-            not reads_actions or self._n_frames_at_action != seen,
+            not reads_actions or self._n_frames_at_action != n_observed,
             "This policy reads which actions were executed, one a frame: send the frames since"
             " the last chunk with add_buffer before the observation.",
         )

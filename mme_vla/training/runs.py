@@ -60,10 +60,9 @@ MAY_DIFFER = (
 """Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that
 changes a loss.
 
-The name too: it follows from the sections that are compared, and runs of earlier versions may be
-called otherwise. `data.content`, the fingerprints of the datasets, is compared when they are open
-(`check_content`). A run's statistics stay what they are: `data.narrow_ranges` decides only whether
-it goes on with narrow ones.
+The name is a label alone. `data.content`, the fingerprints of the datasets, is compared when they
+are open (`check_content`). A run's statistics stay what they are: `data.narrow_ranges` decides only
+whether it continues with narrow ones.
 """
 
 

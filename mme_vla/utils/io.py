@@ -31,7 +31,10 @@ _AGAIN = "and repeat the same command: what was finished is kept."
 _PERMIT = (
     "Change the permissions of it or its folder, or choose another, and repeat the same command."
 )
+_MOVE = "Choose another place, or move that file away yourself, and repeat."
 _ADVICE = {
+    errno.EEXIST: ("a file is where a folder has to be", _MOVE),
+    errno.ENOTDIR: ("a part of its path is a file", _MOVE),
     errno.ENOSPC: ("there is no room left for it", f"Free some room {_AGAIN}"),
     errno.EDQUOT: ("your share of the disk is used up", f"Free some room {_AGAIN}"),
     errno.EFBIG: (

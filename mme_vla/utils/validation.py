@@ -48,7 +48,7 @@ def validated[T](kind: type[T], value: object, what: str, where: str = "") -> T:
         checked: T = _adapter(kind).validate_python(value)  # type: ignore[arg-type]
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        raise UserError(_sentence(first, kind, value, what, where)) from None
+        raise UserError(_sentence(first, kind, what, where)) from None
     return checked
 
 
@@ -57,13 +57,13 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def _sentence(error: ErrorDetails, kind: Any, whole: object, what: str, where: str) -> str:
+def _sentence(error: ErrorDetails, kind: Any, what: str, where: str) -> str:
     """Say what is wrong with one value."""
     key = _key(where, error["loc"]) or what
-    found, rule = error["input"], error["type"]
+    value, rule = error["input"], error["type"]
     if rule == "missing":
         meaning = _descriptions(kind).get(str(error["loc"][-1]), "")
-        present = listed(found) if isinstance(found, Mapping) and found else "none"
+        present = listed(value) if isinstance(value, Mapping) and value else "none"
         lacking = f"{key} ({meaning})" if meaning else key
         return f"{what} lacks {lacking}; it has {present}."
     if rule in ("extra_forbidden", "unexpected_keyword_argument"):
@@ -72,15 +72,15 @@ def _sentence(error: ErrorDetails, kind: Any, whole: object, what: str, where: s
         return f"Unknown key {key}. {near}"
     if rule == "value_error":
         text = str(error["ctx"]["error"])
-        return f"{key} {text}" if text.endswith(".") else f"{key} {text}, got {described(found)}."
-    if rule == "literal_error" and isinstance(found, str):
+        return f"{key} {text}" if text.endswith(".") else f"{key} {text}, got {described(value)}."
+    if rule == "literal_error" and isinstance(value, str):
         choices = re.findall(r"'([^']*)'", error["ctx"]["expected"])
-        return f"{key}={brief(found)}. {did_you_mean(found[:200], choices)}"
+        return f"{key}={brief(value)}. {did_you_mean(value[:200], choices)}"
     if rule in _TYPES:
-        return f"{key}={described(found)} must be {_TYPES[rule]}."
+        return f"{key}={described(value)} must be {_TYPES[rule]}."
     # pydantic's own sentences: "Input should be greater than 0".
     _, _, expected = error["msg"].partition(" should ")
-    return f"{key}={described(found)} must {expected or error['msg']}."
+    return f"{key}={described(value)} must {expected or error['msg']}."
 
 
 def _key(where: str, location: tuple[int | str, ...]) -> str:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from mme_vla.cli.help import heading, keys
-from mme_vla.config.composition import library_files, library_trees
+from mme_vla.config.trees import library_files, library_trees
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 INTRODUCTION = """# Configuration

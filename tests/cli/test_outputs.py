@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from mme_vla.cli import docs, gallery, results, train_tokenizer
+from mme_vla.cli.errors import print_user_errors
 from mme_vla.errors import UserError
 from mme_vla.extras.nano.cli import board
 from mme_vla.extras.nano.fitting import _remove_drafts
@@ -192,3 +193,18 @@ def test_a_training_that_begins_anew_removes_drafts_alone(tmp_path: Path) -> Non
     (drafts / "weights_of_mine").rmdir()
     _remove_drafts(tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("output", "reason"),
+    [("file.txt", "a file is where a folder has to be"), ("file.txt/run", "a part of its path")],
+)
+def test_an_output_in_the_place_of_a_file_is_named(
+    output: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file.txt").write_text("mine")
+    with pytest.raises(SystemExit), print_user_errors():
+        (tmp_path / output).mkdir(parents=True, exist_ok=True)  # as Hydra makes a run's folder
+    error = capsys.readouterr().err
+    assert f"{output} cannot be written or opened: {reason}" in error and "Choose another" in error
+    assert (tmp_path / "file.txt").read_text() == "mine"

@@ -13,12 +13,8 @@ from omegaconf import OmegaConf
 
 from helpers import commands
 from mme_vla.cli.command import check_overrides, cli, options_first
-from mme_vla.config.composition import (
-    compose,
-    import_plugins,
-    library_files,
-    library_trees,
-)
+from mme_vla.config.composition import compose, import_plugins
+from mme_vla.config.trees import library_files, library_trees
 from mme_vla.errors import UserError
 
 TREE = {

@@ -11,8 +11,9 @@ import pytest
 
 from helpers import REPOSITORY
 from mme_vla import cli
-from mme_vla.cli.help import choices, configured_commands, defaults, help_page, keys
-from mme_vla.config.composition import compose, library_files, library_trees
+from mme_vla.cli.help import configured_commands, defaults, help_page, keys
+from mme_vla.config.composition import compose
+from mme_vla.config.trees import library_files, library_trees
 from mme_vla.errors import UserError
 
 COMMANDS = configured_commands()
@@ -29,7 +30,7 @@ def test_help_tells_what_a_command_does_with_examples_and_every_key(name: str) -
         assert key.comment in text, key
     for group, option in defaults(file).groups.items():
         assert f"  {group.strip('/')}={option}: " in text
-        assert all(choice in text for choice in choices(library_trees(), group.strip("/")))
+        assert all(choice in text for choice in library_files(group.strip("/")))
 
 
 def test_help_names_the_files_of_a_group_and_custom_ones_too(tmp_path: Path) -> None:

@@ -9,22 +9,33 @@ import pytest
 from mme_vla import build_policy, cli, registry
 from mme_vla.config.plugins import import_trusted
 from mme_vla.errors import UserError
-from mme_vla.registry import Command, Extension, Registry
+from mme_vla.registry import Extension, Registry
 
 SOURCE = """
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.registry import register
 
 
-@register("memory", "fading")
-class Fading(FrameSamp):
+@register("memory", "paling")
+class Paling(FrameSamp):
     pass
 
 
 def main():
-    print("faded")
+    print("paled")
 """
-PACKAGE = "package_of_a_fading_memory"
+EXTENSION = """
+from pathlib import Path
+
+from mme_vla.registry import Command, Extension
+
+EXTENSION = Extension(
+    parts={"memory": {"paling": "package_of_a_paling_memory"}},
+    commands={"pale": Command("package_of_a_paling_memory", "pale")},
+    configs=Path(__file__).parent / "configs",
+)
+"""
+PACKAGE, NAMES = "package_of_a_paling_memory", "names_of_a_paling_memory"
 
 
 @pytest.fixture
@@ -33,42 +44,43 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (tmp_path / f"{PACKAGE}.py").write_text(SOURCE)
     (tmp_path / "configs" / "model").mkdir(parents=True)
     (tmp_path / "configs" / "memory").mkdir()
-    (tmp_path / "configs" / "model" / "fading_modul.yaml").write_text(
-        "# @package _global_\ndefaults:\n  - /memory: fading\n  - /integration: modulator\n"
-        "name: fading_modul\n"
+    (tmp_path / "configs" / "model" / "paling_modul.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - /memory: paling\n  - /integration: modulator\n"
+        "name: paling_modul\n"
     )
-    (tmp_path / "configs" / "memory" / "fading.yaml").write_text(
-        "name: fading\nbudget: 64\ngrid: 4\n"
+    (tmp_path / "configs" / "memory" / "paling.yaml").write_text(
+        "name: paling\nbudget: 64\ngrid: 4\n"
     )
-    extension = Extension(
-        parts={"memory": {"fading": PACKAGE}},
-        commands={"fade": Command(PACKAGE, "fade")},
-        configs=tmp_path / "configs",
-    )
+    (tmp_path / f"{NAMES}.py").write_text(EXTENSION)
+    metadata = tmp_path / f"{NAMES}-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {NAMES}\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(f"[mme_vla.plugins]\npaling = {NAMES}:EXTENSION\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(registry, "installed_extensions", lambda: (extension,))
-    monkeypatch.setattr("mme_vla.config.plugins.installed_extensions", lambda: (extension,))
+    registry.installed_extensions.cache_clear()
     yield tmp_path
-    sys.modules.pop(PACKAGE, None)
-    registry.MEMORIES._entries.pop("fading", None)
+    registry.installed_extensions.cache_clear()
+    for name in (PACKAGE, NAMES):
+        sys.modules.pop(name, None)
+    registry.MEMORIES._entries.pop("paling", None)
 
 
 def test_an_installed_package_adds_a_memory_and_its_files(package: Path) -> None:
-    assert "fading" in registry.MEMORIES and PACKAGE not in sys.modules
-    policy = build_policy("fading_modul", backbone="tiny", device="meta")
-    assert type(policy.memory).__name__ == "Fading" and PACKAGE in sys.modules
+    assert "paling" in registry.MEMORIES and PACKAGE not in sys.modules
+    policy = build_policy("paling_modul", backbone="tiny", device="meta")
+    assert type(policy.memory).__name__ == "Paling" and PACKAGE in sys.modules
 
 
 def test_an_installed_package_adds_a_command(
     package: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["mme-vla fade"])
-    cli.run("fade")
-    assert capsys.readouterr().out == "faded\n"
+    monkeypatch.setattr(sys, "argv", ["mme-vla pale"])
+    cli.run("pale")
+    assert capsys.readouterr().out == "paled\n"
 
 
 def test_a_checkpoint_that_names_a_part_of_a_package_needs_trust(package: Path) -> None:
-    config = {"name": "fading_modul", "memory": {"name": "fading"}}
+    config = {"name": "paling_modul", "memory": {"name": "paling"}}
     with pytest.raises(UserError, match=f"needs the plugin {PACKAGE}.*--trust-plugins"):
         import_trusted(config, "a checkpoint", trust=False)
     assert PACKAGE not in sys.modules

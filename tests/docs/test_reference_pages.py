@@ -14,7 +14,7 @@ import pytest
 
 from mme_vla.cli import commands
 from mme_vla.cli import help as cli_help
-from mme_vla.config.composition import library_files
+from mme_vla.config.trees import library_files
 from mme_vla.registry import Command
 
 

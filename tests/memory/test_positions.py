@@ -9,7 +9,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from mme_vla.config.composition import config_dir
+from mme_vla.config.trees import config_dir
 from mme_vla.errors import UserError
 from mme_vla.memory.base import FeatureEncoder, Memory, stack_history
 from mme_vla.memory.transforms import RepeatFrame, TransformedHistory, map_frames

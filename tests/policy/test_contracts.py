@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mme_vla.backbone.layers import PI05_VISIBILITY
 from mme_vla.backbone.pi05 import Pi05Backbone
-from mme_vla.config.composition import config_dir
+from mme_vla.config.trees import config_dir
 from mme_vla.integration.context import Context
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import History

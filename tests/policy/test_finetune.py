@@ -8,7 +8,8 @@ import torch
 
 from mme_vla import MMEPolicy, UserError
 from mme_vla.cli.weights import convert
-from mme_vla.config.composition import compose, library_files
+from mme_vla.config.composition import compose
+from mme_vla.config.trees import library_files
 from mme_vla.policy.finetune import apply_finetuning, merge_adapters, warn_of_frozen_random_weights
 from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 from mme_vla.weights import load_weights

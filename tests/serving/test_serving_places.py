@@ -82,11 +82,11 @@ def idle(served: Served, count: int, request: bytes) -> list[socket.socket]:
 def test_unauthenticated_clients_take_no_place_from_those_who_have_the_key(policy, request_):
     with Served(policy, api_key="right", limits=Limits(connections=2)) as served:
         known = served.client(api_key="right")
-        sockets = idle(served, server.MAX_STRANGERS + 20, request_)
+        sockets = idle(served, server.MAX_IDLE_CONNECTIONS + 20, request_)
         with served.client(api_key="right") as client:
             assert client.reset() and known.reset()
             assert ask(served, "GET", "/healthz")[0] == 200
-        wait_until(lambda: len(open_connections(served)) <= server.MAX_STRANGERS + 3)
+        wait_until(lambda: len(open_connections(served)) <= server.MAX_IDLE_CONNECTIONS + 3)
         for raw in sockets:
             raw.close()
 

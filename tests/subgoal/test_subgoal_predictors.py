@@ -239,7 +239,7 @@ def test_every_key_of_the_yaml_files_is_an_option_and_every_option_a_key():
 
     from omegaconf import OmegaConf
 
-    from mme_vla.config.composition import config_dir
+    from mme_vla.config.trees import config_dir
     from mme_vla.subgoal.models.api import PROVIDERS
     from mme_vla.subgoal.qwenvl import VLMPredictor
 

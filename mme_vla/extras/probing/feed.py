@@ -147,13 +147,13 @@ class FedEpisode(Episode):
 
         views, places = {}, {}
         for name, view in frames.items():
-            shown = np.arange(length)  # frames that there are images of
+            with_images = np.arange(length)
             if rendered is not None and name in rendered:
-                shown = np.asarray(rendered[name])
-            places[name] = np.flatnonzero(np.isin(order, shown))
+                with_images = np.asarray(rendered[name])
+            places[name] = np.flatnonzero(np.isin(order, with_images))
             views[name] = view
             if (repeats != 1).any():
-                views[name] = view[np.searchsorted(shown, order[places[name]])]
+                views[name] = view[np.searchsorted(with_images, order[places[name]])]
         if rendered is None:
             self.inner.observe(views, states[order], demo[order], actions)
         else:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.extras.methods.sam2act.keyframes import EpisodeKeyframes, file_of
+from mme_vla.extras.methods.sam2act.keyframes import EpisodeKeyframes, KeyframeFile
 from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
 
@@ -85,7 +85,7 @@ class Recording:
         """
         robot = self.source.robot
         if robot.readings:
-            keyframes = EpisodeKeyframes(file_of(self.source.root, self.episode))
+            keyframes = EpisodeKeyframes(KeyframeFile.file_of(self.source.root, self.episode))
             here = keyframes.frames[(keyframes.frames >= start) & (keyframes.frames < stop)]
             stored_views = keyframes.views(here, robot)
             return stored_views, dict.fromkeys(stored_views, here - start)

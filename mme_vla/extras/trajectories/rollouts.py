@@ -303,19 +303,20 @@ class _Collector(Rollout):
     def choose(self, batch: Sequence[RunningEpisode]) -> np.ndarray:
         """The chunks of the policy, or of the oracle where it acts; every decision is kept."""
         policy, episodes = self.policy, [running.episode for running in batch]
-        seen: list[Batch] = []
+        observations: list[Batch] = []
         paths: list[SamplePath] = []
 
         def predict(observation: Batch, noise: Mapping[str, Tensor]) -> Tensor:
-            seen.append(_with_memory(policy, observation, batch))
+            observations.append(_with_memory(policy, observation, batch))
             if "increments" in noise and "log_probs" in self.keep:
                 deviation = policy.backbone.head.deviation  # type: ignore[union-attr]
-                paths.append(sample_path(policy, seen[0], deviation, **noise))  # type: ignore[arg-type]
+                paths.append(sample_path(policy, observations[0], deviation, **noise))  # type: ignore[arg-type]
                 return paths[0].chunk
             return policy.predict_chunk(observation, episodes, noise, self.settings.flow_steps)
 
         selection = choose_actions(policy, episodes, predict=predict)
-        rows, path = seen[0], paths[0] if paths else None
+        rows = observations[0]
+        path = paths[0] if paths else None
         execute = self.settings.execute or policy.embodiment.action.execute
         log_probs = None
         if path is not None:

@@ -47,26 +47,6 @@ _ARRAYS = (
 )
 
 
-@SIDE_FILES.register("keyframes")
-class KeyframeFile:
-    """The keyframes of recordings, kept by `mme-vla convert keyframes=true`."""
-
-    @staticmethod
-    def file_of(root: Path, episode: int) -> Path:
-        """Where the keyframes of an episode of the dataset at `root` are."""
-        return file_of(root, episode)
-
-    @staticmethod
-    def write(episode: RawEpisode, path: Path) -> None:
-        """Keep the keyframes of a recorded episode."""
-        write_keyframes(episode, path)
-
-
-def file_of(root: Path, episode: int) -> Path:
-    """Where the keyframes of an episode of the dataset at `root` are."""
-    return root / FOLDER / f"episode_{episode:06d}.npz"
-
-
 def motions_of(episode: RawEpisode) -> Motions:
     """The planned motions of a whole episode: those of the video, then those of the execution."""
     rows = episode.pose_actions("waypoint_actions")
@@ -78,32 +58,42 @@ def motions_of(episode: RawEpisode) -> Motions:
     )
 
 
-def write_keyframes(episode: RawEpisode, path: Path, side: int = SIDE) -> int:
-    """Keep the keyframes of a recorded episode; returns how many frames those are."""
-    motions = motions_of(episode)
-    frames = np.union1d(np.arange(0, episode.length, ENTRY_EVERY), motions.decisions)
-    arrays: dict[str, list[np.ndarray]] = {
-        name: [] for name in ("colours", "depth", "intrinsic", "extrinsic")
-    }
-    for frame in frames:
-        shots = [Shot(**episode.shot(int(frame), camera)).shrunk(side) for camera in CAMERAS]
-        for name, values in arrays.items():
-            values.append(np.stack([getattr(shot, name) for shot in shots]))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with write_atomically(path) as draft, draft.open("wb") as file:
-        np.savez_compressed(
-            file,
-            frames=frames,
-            colours=np.stack(arrays["colours"]),
-            depth=np.stack(arrays["depth"]),
-            intrinsic=arrays["intrinsic"][0],
-            extrinsic=np.stack(arrays["extrinsic"]),
-            open=np.array([episode.commanded_open(int(frame)) for frame in frames]),
-            decisions=motions.decisions,
-            targets=motions.targets,
-            length=np.int64(episode.length),
-        )
-    return len(frames)
+@SIDE_FILES.register("keyframes")
+class KeyframeFile:
+    """The keyframes of a recording, kept by `mme-vla convert keyframes=true`."""
+
+    @staticmethod
+    def file_of(root: Path, episode: int) -> Path:
+        """Where the keyframes of an episode of the dataset at `root` are."""
+        return root / FOLDER / f"episode_{episode:06d}.npz"
+
+    @staticmethod
+    def write(episode: RawEpisode, path: Path, side: int = SIDE) -> int:
+        """Keep the keyframes of a recorded episode; returns how many frames those are."""
+        motions = motions_of(episode)
+        frames = np.union1d(np.arange(0, episode.length, ENTRY_EVERY), motions.decisions)
+        arrays: dict[str, list[np.ndarray]] = {
+            name: [] for name in ("colours", "depth", "intrinsic", "extrinsic")
+        }
+        for frame in frames:
+            shots = [Shot(**episode.shot(int(frame), camera)).shrunk(side) for camera in CAMERAS]
+            for name, values in arrays.items():
+                values.append(np.stack([getattr(shot, name) for shot in shots]))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with write_atomically(path) as draft, draft.open("wb") as file:
+            np.savez_compressed(
+                file,
+                frames=frames,
+                colours=np.stack(arrays["colours"]),
+                depth=np.stack(arrays["depth"]),
+                intrinsic=arrays["intrinsic"][0],
+                extrinsic=np.stack(arrays["extrinsic"]),
+                open=np.array([episode.commanded_open(int(frame)) for frame in frames]),
+                decisions=motions.decisions,
+                targets=motions.targets,
+                length=np.int64(episode.length),
+            )
+        return len(frames)
 
 
 @dataclass(frozen=True)
@@ -269,7 +259,7 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
                 # a sample has one: an episode of several is refused here, not while training
                 source.goal(episode)
                 self.total_frames += int(source.lengths[episode])
-                keyframes = EpisodeKeyframes(file_of(source.root, episode))
+                keyframes = EpisodeKeyframes(KeyframeFile.file_of(source.root, episode))
                 chains = [chain for chain in keyframes.chains if len(chain) >= length]
                 longest = max(longest, *map(len, keyframes.chains))
                 runs = [[link] for chain in chains for link in chain] if length == 1 else chains

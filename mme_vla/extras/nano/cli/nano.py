@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
-from mme_vla.config.composition import command_trees, library_files, resolved
+from mme_vla.config.composition import command_trees, resolved
+from mme_vla.config.trees import library_files
 from mme_vla.errors import brief, require
 
 ALL_TASKS = "nano16"

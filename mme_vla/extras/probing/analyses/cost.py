@@ -16,7 +16,8 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from mme_vla.config.composition import compose, library_files
+from mme_vla.config.composition import compose
+from mme_vla.config.trees import library_files
 from mme_vla.errors import UserError
 from mme_vla.evaluation.results.paper import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory

@@ -19,11 +19,10 @@ from mme_vla.extras.methods.sam2act.geometry import Cube
 from mme_vla.extras.methods.sam2act.keyframes import (
     EpisodeKeyframes,
     KeyframeDataset,
+    KeyframeFile,
     KeyframeSample,
     Link,
-    file_of,
     motions_of,
-    write_keyframes,
 )
 from mme_vla.extras.methods.sam2act.processor import Shot, cloud_images, cloud_of
 
@@ -58,7 +57,7 @@ def test_the_motions_of_video_and_execution_follow_each_other(folder: Path) -> N
 
 
 def test_every_chain_leads_from_its_entry_to_the_last_motion(folder: Path) -> None:
-    stored = EpisodeKeyframes(file_of(folder / "out", 0))
+    stored = EpisodeKeyframes(KeyframeFile.file_of(folder / "out", 0))
     decisions = stored.motions.decisions.tolist()
     assert [chain[0].frame for chain in stored.chains] == list(range(0, LENGTHS[0], 10))
     for chain in stored.chains:
@@ -72,7 +71,7 @@ def test_every_chain_leads_from_its_entry_to_the_last_motion(folder: Path) -> No
 
 def test_what_is_stored_is_what_was_recorded(folder: Path) -> None:
     ref = list_episodes(find_files([folder]))[0]
-    stored = EpisodeKeyframes(file_of(folder / "out", 0))
+    stored = EpisodeKeyframes(KeyframeFile.file_of(folder / "out", 0))
     with open_episode(ref) as episode:
         for frame, shots in zip([0, 12], stored.shots([0, 12]), strict=True):
             for shot, camera in zip(shots, ("front", "wrist"), strict=True):
@@ -94,7 +93,7 @@ def test_recordings_without_depth_are_refused_by_name(tmp_path: Path) -> None:
         open_episode(refs[0]) as episode,
         pytest.raises(UserError, match=r"front_depth.*record it with depth"),
     ):
-        write_keyframes(episode, tmp_path / "kept.npz")
+        KeyframeFile.write(episode, tmp_path / "kept.npz")
 
 
 def test_a_conversion_without_keyframes_is_another_plan_and_has_none(
@@ -102,11 +101,11 @@ def test_a_conversion_without_keyframes_is_another_plan_and_has_none(
 ) -> None:
     refs = list_episodes(find_files([folder]))
     convert(refs, tmp_path / "out", ConvertOptions(images="png"))
-    assert not file_of(tmp_path / "out", 0).exists()
+    assert not KeyframeFile.file_of(tmp_path / "out", 0).exists()
     with pytest.raises(UserError, match="is not the result of this conversion"):
         convert(refs, tmp_path / "out", ConvertOptions(images="png", keyframes=True))
     with pytest.raises(UserError, match="keyframes=true"):
-        EpisodeKeyframes(file_of(tmp_path / "out", 0))
+        EpisodeKeyframes(KeyframeFile.file_of(tmp_path / "out", 0))
 
 
 def source_of(folder: Path) -> EpisodeSource:
@@ -119,7 +118,7 @@ def test_transitions_are_one_for_every_keyframe_of_every_chain(folder: Path) -> 
     chains = [
         chain
         for e in range(len(LENGTHS))
-        for chain in EpisodeKeyframes(file_of(source.root, e)).chains
+        for chain in EpisodeKeyframes(KeyframeFile.file_of(source.root, e)).chains
     ]
     assert len(data) == sum(map(len, chains))
     assert data.total_frames == sum(LENGTHS)
@@ -220,7 +219,7 @@ def test_the_memorys_stage_draws_task_episode_and_chain_again_where_it_is_too_sh
 
 
 def test_depth_becomes_a_table_at_its_height(folder: Path) -> None:
-    shots = EpisodeKeyframes(file_of(folder / "out", 0)).shots([0])[0]
+    shots = EpisodeKeyframes(KeyframeFile.file_of(folder / "out", 0)).shots([0])[0]
     points, colours = cloud_of(shots, 128)
     assert points.shape == colours.shape == (2 * 128**2, 3)
     assert np.allclose(points[:, 2], 0.2, atol=1e-6)

@@ -1,0 +1,40 @@
+"""The folders of YAML files: the library's own, those of extras and of installed packages."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from mme_vla.registry import extensions
+
+
+def config_dir() -> Path:
+    """Return the folder of the YAML tree: inside the package when a wheel is installed, else the
+    repository's.
+    """
+    package = Path(__file__).resolve().parents[1]
+    shipped = package / "configs"
+    return shipped if shipped.is_dir() else package.parent / "configs"
+
+
+def library_trees() -> tuple[Path, ...]:
+    """Return the folders in the order of search: the core's, those of extras, then those of
+    installed packages.
+    """
+    folders = [extension.configs for extension in extensions()]
+    return (config_dir(), *(folder for folder in folders if folder is not None))
+
+
+def yaml_files(trees: Iterable[Path], group: str) -> dict[str, Path]:
+    """Name → file of a group (of the top level where it is empty), sorted by name.
+
+    trees: in the order of search. Of files with one name the first counts, as in Hydra.
+    """
+    files: dict[str, Path] = {}
+    for tree in trees:
+        for file in (tree / group).glob("*.yaml"):
+            files.setdefault(file.stem, file)
+    return dict(sorted(files.items()))
+
+
+def library_files(group: str) -> dict[str, Path]:
+    """Name → file of a group in all `library_trees`."""
+    return yaml_files(library_trees(), group)
