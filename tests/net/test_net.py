@@ -1,0 +1,165 @@
+"""What an earlier version recorded is still read, computed and answered: `tests/net/record.py`
+wrote `tests/data/net`.
+
+Everything goes through `mme_vla`, `mme_vla.testing` and the commands, so that modules may move.
+"""
+
+import json
+import lzma
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mme_vla
+from helpers import REPOSITORY
+from mme_vla.config.trees import library_files
+from net import models, replies, runs, times
+from net.archives import unpack
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+NET = REPOSITORY / "tests" / "data" / "net"
+TOLERANCE = 1e-5
+
+
+def read(name: str) -> Any:
+    """A recorded JSON file."""
+    data = (NET / name).read_bytes()
+    return json.loads(lzma.decompress(data) if name.endswith(".xz") else data)
+
+
+MODELS, REPLIES, RUNS, TIMES = (read(f"{name}.json{end}") for name, end in (
+    ("models", ".xz"), ("replies", ""), ("runs", ".xz"), ("times", ""),
+))  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The saved policies, by the names of their models."""
+    return unpack(NET / "models.tar.xz", tmp_path_factory.mktemp("models"))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_saved_policy_gives_the_same_loss_and_actions(
+    model: str, checkpoints: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(checkpoints / model, tmp_path / model)
+    models.restore(folder)
+    found = models.figures(mme_vla.Policy.from_pretrained(folder))
+    (folder / "model.safetensors").unlink()  # as large as 45 MB
+    if MODELS[model]["loss"] is not None:  # else a run records it, below
+        assert found["loss"] == pytest.approx(MODELS[model]["loss"], rel=TOLERANCE)
+    np.testing.assert_allclose(
+        found["actions"], MODELS[model]["actions"], rtol=TOLERANCE, atol=TOLERANCE
+    )
+
+
+def test_every_model_has_a_saved_policy() -> None:
+    assert set(library_files("model")) >= set(MODELS), "a model is gone"
+
+
+# Replies
+
+
+@pytest.fixture(scope="session")
+def mistaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the files that the mistakes name."""
+    return replies.prepare(tmp_path_factory.mktemp("mistakes") / "here", NET / "models.tar.xz")
+
+
+@pytest.mark.parametrize(
+    "line", [pytest.param(line, marks=slow if REPLIES[line]["slow"] else ()) for line in REPLIES]
+)
+def test_reply_to_a_mistake_says_no_less(line: str, mistaken: Path) -> None:
+    if line.startswith("harness"):
+        pytest.importorskip("vla_eval", reason="needs the extra harness")
+    found = replies.reply(line, mistaken)
+    shown = replies.difference(REPLIES[line]["text"], found["text"])
+    assert found["code"] == REPLIES[line]["code"], shown
+    assert not replies.missing(REPLIES[line], found["text"]), shown
+
+
+# Datasets, runs and what was measured
+
+
+@pytest.fixture
+def at_runs(tmp_path: Path, checkpoints: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the recorded runs, as the current folder."""
+    unpack(NET / "runs.tar.xz", tmp_path)
+    shutil.copytree(checkpoints / runs.POLICY, tmp_path / "policy")
+    models.restore(tmp_path / "policy")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def assert_close(found: Any, expected: Any, place: str = "") -> None:
+    """Equal structures, floats to the tolerance."""
+    if isinstance(expected, dict):
+        assert set(found) >= set(expected), place
+        for key in expected:
+            assert_close(found[key], expected[key], f"{place}.{key}")
+    elif isinstance(expected, list):
+        assert len(found) == len(expected), place
+        for number, (here, then) in enumerate(zip(found, expected, strict=True)):
+            assert_close(here, then, f"{place}[{number}]")
+    elif isinstance(expected, float):
+        assert found == pytest.approx(expected, rel=TOLERANCE, abs=TOLERANCE), place
+    else:
+        assert found == expected, place
+
+
+@pytest.mark.parametrize("run", runs.RUNS)
+def test_policy_of_a_run_acts_as_before(run: str, at_runs: Path) -> None:
+    found = models.figures(mme_vla.Policy.from_pretrained(Path("training", run)))
+    assert_close(found["actions"], RUNS["actions"][run])
+
+
+def test_dataset_has_the_same_frames_goals_and_statistics(at_runs: Path) -> None:
+    assert_close(runs.dataset(), RUNS["dataset"])
+
+
+def test_cache_is_complete(at_runs: Path) -> None:
+    assert runs.cached()
+
+
+@pytest.mark.parametrize("run", runs.RUNS)
+def test_run_resumes_with_the_same_losses(run: str, at_runs: Path) -> None:
+    assert_close(runs.resume(run), RUNS["resumed"][run])
+
+
+@pytest.mark.parametrize("model", RUNS["first_loss"])
+def test_saved_policy_has_the_same_loss_on_the_dataset(
+    model: str, at_runs: Path, checkpoints: Path
+) -> None:
+    shutil.copytree(checkpoints / model, "saved")
+    models.restore(Path("saved"))
+    assert_close(runs.first_loss(model, Path("saved")), RUNS["first_loss"][model])
+
+
+def test_results_have_the_same_figures(at_runs: Path) -> None:
+    assert_close(runs.result_rows(), RUNS["results"])
+
+
+def test_receipt_is_verified(at_runs: Path) -> None:
+    assert not runs.verified()
+
+
+def test_probe_has_the_same_table(at_runs: Path) -> None:
+    assert runs.probed() == RUNS["probe"]
+
+
+def test_report_card_is_the_same(at_runs: Path) -> None:
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    assert_close(runs.card(), RUNS["card"])
+
+
+def test_board_ranks_the_rows_as_before(at_runs: Path) -> None:
+    assert runs.board() == RUNS["board"]
+
+
+@pytest.mark.parametrize("name", times.COMMANDS)
+def test_no_more_modules_are_imported(name: str) -> None:
+    found = times.measure(times.COMMANDS[name])
+    assert found["modules"] <= 1.1 * TIMES[name]["modules"], "an import became heavier"
