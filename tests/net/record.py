@@ -32,7 +32,6 @@ import os
 import signal
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +39,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 REPOSITORY = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(REPOSITORY), str(REPOSITORY / "tests")]
 NET = REPOSITORY / "tests" / "data" / "net"
-LONGEST, SLOW = 120, 1.5
-"""Seconds that a mistake may take to be answered, and CPU seconds from which on a test of it is
-marked `slow`.
-"""
+LONGEST = 120
+"""Seconds that a mistake may take to be answered."""
 
 
 def write(name: str, content: Any) -> None:
@@ -78,7 +75,6 @@ def record_replies(scratch: Path) -> None:
     signal.signal(signal.SIGALRM, too_long)
     for line in replies.mistakes():
         signal.alarm(LONGEST)
-        before = time.process_time()
         try:
             found[line] = replies.reply(line, folder)
         except Exception as error:  # a defect is no reply to keep
@@ -86,7 +82,6 @@ def record_replies(scratch: Path) -> None:
             continue
         finally:
             signal.alarm(0)
-        found[line]["slow"] = time.process_time() - before > SLOW
         if not found[line]["code"]:
             print(f"{line}: was accepted", flush=True)
     write("replies.json", found)

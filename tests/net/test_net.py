@@ -69,9 +69,7 @@ def mistaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return replies.prepare(tmp_path_factory.mktemp("mistakes") / "here", NET / "models.tar.xz")
 
 
-@pytest.mark.parametrize(
-    "line", [pytest.param(line, marks=slow if REPLIES[line]["slow"] else ()) for line in REPLIES]
-)
+@pytest.mark.parametrize("line", REPLIES)
 def test_reply_to_a_mistake_says_no_less(line: str, mistaken: Path) -> None:
     if line.startswith("harness"):
         pytest.importorskip("vla_eval", reason="needs the extra harness")
