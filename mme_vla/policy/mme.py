@@ -33,7 +33,7 @@ from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
-from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes, Sharded
+from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes
 from mme_vla.speed.graphs import CapturedSampling
 from mme_vla.speed.sharding import ShardGroup, backbone_groups
 from mme_vla.types import Batch, MemoryTokens, Noise, map_noise, named_noise, send, stack_noise
@@ -92,9 +92,15 @@ class MMEPolicy(NetworkPolicy):
         self._modules = model._modules
         self.horizon = backbone.horizon
         self.action_dim = backbone.action_dim
+        sizes = {
+            "image_size": backbone.image_size,
+            "action_dim": backbone.action_dim,
+            "embodiment.action.horizon": backbone.horizon,
+        }
+        self.info = replace(self.info, processor_sizes=sizes)
         if isinstance(backbone, HasFlowHead):
-            self.sample_steps = backbone.head.steps
-            self.supports_rtc = backbone.head.supports_rtc
+            head = backbone.head
+            self.info = replace(self.info, sample_steps=head.steps, supports_rtc=head.supports_rtc)
         if isinstance(backbone, HasAttentionBackends):
             backbone.set_attention_backend(attention)
         elif check_backend(attention) != "auto":
@@ -243,7 +249,7 @@ class MMEPolicy(NetworkPolicy):
             memory = self.model.memory_tokens(batch)
         with self.autocast():
             injection = self.model.inject(self.model.prepare_images(batch), memory)
-            return self.backbone.velocity(injection, x_t, time)  # type: ignore[operator]
+            return self.backbone.predictor(batch, injection)(x_t, time)
 
     def recompute(self, mode: Recompute) -> None:
         if not isinstance(self.backbone, Recomputes):
@@ -267,11 +273,7 @@ class MMEPolicy(NetworkPolicy):
         """The backbone's groups. Memory and integration are in none: they are small, and compute in
         float32.
         """
-        return (
-            self.backbone.shard_groups()
-            if isinstance(self.backbone, Sharded)
-            else backbone_groups(self.backbone)
-        )
+        return backbone_groups(self.backbone)
 
     def _sample_augmentation(self, count: int, generator: torch.Generator) -> Tensor:
         """Random numbers of the augmentation of `count` training samples, [count, …] on the CPU."""
@@ -313,7 +315,7 @@ class MMEPolicy(NetworkPolicy):
             return self.model.sample(batch, values, steps, memory)
         if memory is None:
             memory = self.model.memory_tokens(batch)
-        return self._sampler(batch, values, steps or self.sample_steps, memory)
+        return self._sampler(batch, values, steps or self.info.sample_steps, memory)
 
     def compile_sampling(self, layers: bool = False) -> bool:
         """Speed up sampling with fixed weights; chunks are equal up to the rounding of other
@@ -331,12 +333,12 @@ class MMEPolicy(NetworkPolicy):
         """
         if not isinstance(self.backbone, CapturableSampling):
             return False
-        self.backbone.compile_sampling()
+        stamp = self.backbone.compile_sampling()
         if layers:
             self.backbone.compile(dynamic=False)
         if self.device.type != "cuda":
             return True
-        self._sampler = CapturedSampling(self.model.sample, self.backbone.sampling_stamp)
+        self._sampler = CapturedSampling(self.model.sample, stamp)
         if self.processor is None:
             return True
         full = self.full_batch(self.device)
@@ -445,15 +447,6 @@ class MMEPolicy(NetworkPolicy):
     def warm_up_vision(self) -> None:
         size = self.backbone.image_size
         self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
-
-    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        processor: Any = self.require_processor()
-        backbone = self.backbone
-        return {
-            "image_size": (processor.image_size, backbone.image_size),
-            "action_dim": (processor.action_dim, backbone.action_dim),
-            "horizon": (processor.embodiment.action.horizon, backbone.horizon),
-        }
 
     @property
     def finetune_spec(self) -> FineTuneSpec:

@@ -5,6 +5,7 @@ import json
 import re
 import tempfile
 from collections.abc import Mapping
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -397,7 +398,8 @@ def check_processor(policy: "Policy", source: str) -> None:
         f" configuration of {brief(robot.name)}, or they describe it differently. The files are"
         " from two checkpoints, or one was changed.",
     )
-    for name, (actual, expected) in policy.processor_sizes().items():
+    for name, expected in policy.info.processor_sizes.items():
+        actual = attrgetter(name)(processor)
         require(
             actual == expected,
             f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The"

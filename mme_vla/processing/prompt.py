@@ -96,7 +96,7 @@ class Subgoal(PromptFormat):
     def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text, or the plain pieces if there is no subgoal."""
         if inputs.subgoal is None:
-            _warn_once(
+            warn_once(
                 "The prompt format 'subgoal' got no subgoal: such steps use the plain prompt, as"
                 " released."
             )
@@ -152,36 +152,6 @@ class PastActions(PromptFormat):
             )
         levels = " ".join(map(str, discretize(inputs.past_actions.reshape(-1))))
         return [(f"Task: {_one_line(inputs.goal)}; Past actions: {levels};\nAction: ", True)]
-
-
-@PROMPTS.register("openvla")
-class OpenVla(PromptFormat):
-    """The question that OpenVLA was trained on, the goal in lower case."""
-
-    def pieces(self, inputs: PromptInput) -> list[Piece]:
-        return [(f"In: What action should the robot take to {self.language(inputs)}?\nOut:", True)]
-
-    def language(self, inputs: PromptInput) -> str:
-        """What the robot is asked to do."""
-        return inputs.goal.strip().lower()
-
-
-@PROMPTS.register("openvla_subgoal")
-class OpenVlaSubgoal(OpenVla):
-    """The same question with the subgoal behind the goal; the plain one where there is none."""
-
-    reads_subgoal = True
-
-    def language(self, inputs: PromptInput) -> str:
-        """The goal without its full stop, and the subgoal."""
-        if inputs.subgoal is None:
-            _warn_once(
-                "The prompt format 'openvla_subgoal' got no subgoal: such steps use the plain"
-                " prompt."
-            )
-            return super().language(inputs)
-        goal = inputs.goal.strip().removesuffix(".")
-        return f"{goal}; current subgoal: {inputs.subgoal.strip()}".lower()
 
 
 def discretize(values: np.ndarray) -> list[int]:
@@ -255,7 +225,7 @@ def encode_prompt(
         for token in tokenizer.encode(text, bos=bos)
     ]
     if len(tokens) > max_length:
-        _warn_once(
+        warn_once(
             f"A prompt has more tokens than prompt_length={max_length} and loses its end; raise"
             f" prompt_length. The first one, {len(tokens)} tokens long: {brief(inputs.goal, 200)}.",
             key=("truncated", max_length),
@@ -272,7 +242,7 @@ def shorten(text: str, tokenizer: Tokenizer, length: int | None) -> str:
     tokens = tokenizer.encode(text, bos=False)
     if length is None or len(tokens) <= length:
         return text
-    _warn_once(
+    warn_once(
         f"A subgoal has more tokens than subgoal_length={length} and loses its end. The first one:"
         f" {brief(text, 200)}.",
         key=("shortened", length),
@@ -284,7 +254,8 @@ def _one_line(text: str) -> str:
     return text.strip().replace("_", " ").replace("\n", " ")
 
 
-def _warn_once(message: str, key: object = None) -> None:
+def warn_once(message: str, key: object = None) -> None:
+    """Warn the first time that this process has this key, by default the message."""
     if (key or message) not in _warned:
         _warned.add(key or message)
         warnings.warn(message, stacklevel=3)

@@ -66,7 +66,8 @@ def port_adapter(policy: MMEPolicy) -> Adapter:
         table |= {
             f"memory.states.{part}": [Piece(f"{HISTORY}.{part}")] for part in ("weight", "bias")
         }
-    return Adapter(table, names.torch_unread(pi05_of(policy)), names.TIED)
+    unread = names.torch_unread(pi05_of(policy))
+    return Adapter(table, unread, names.TIED, of_memory=rf"^{HISTORY}\.")
 
 
 def is_port(tensor_names: list[str]) -> bool:

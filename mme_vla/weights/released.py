@@ -28,10 +28,16 @@ from mme_vla.weights.tables import (
     prefixed,
 )
 
+OF_MEMORY = r"(^|/)mem_|_mem(/|$)"
+"""Leaves that a memory of the released code adds to π0.5."""
+
 
 def released_adapter(policy: MMEPolicy) -> Adapter:
     return Adapter(
-        released_table(policy), released_unread(policy), derived=released_derived(policy)
+        released_table(policy),
+        released_unread(policy),
+        derived=released_derived(policy),
+        of_memory=OF_MEMORY,
     )
 
 
@@ -53,7 +59,7 @@ def partial_adapter(policy: Any) -> Adapter:
         for name, pieces in table.items()
         if name in state or policy.finetune_spec.component_of(name) != "memory"
     }
-    return Adapter(known, unread, derived=derived)
+    return Adapter(known, unread, derived=derived, of_memory=OF_MEMORY)
 
 
 def members_of(memory: Memory | None) -> list[tuple[str, Memory]]:

@@ -152,10 +152,14 @@ class Adapter:
 
     table: our name → the foreign tensors it is made of.
     unread: foreign tensors, or layers of them, that no action reads: dropped when read, zeros when
-    written. tied: foreign name → the foreign name it repeats: optional when read, written as a
-    copy. derived: foreign constants that follow from the configuration: dropped when read,
-    recomputed when written. fresh: our names that a checkpoint to start from may lack, beside the
-    memory's: heads that are trained anew.
+        written.
+    tied: foreign name → the foreign name it repeats: optional when read, written as a copy.
+    derived: foreign constants that follow from the configuration: dropped when read, recomputed
+        when written.
+    fresh: our names that a checkpoint to start from may lack, beside the memory's: heads that are
+        trained anew.
+    of_memory: pattern of the foreign names of a memory's tensors. A start from a checkpoint leaves
+        them behind where the policy has no place for them.
     """
 
     table: NameTable
@@ -163,6 +167,7 @@ class Adapter:
     tied: Mapping[str, str] = field(default_factory=dict)
     derived: list[Derived] = field(default_factory=list)
     fresh: frozenset[str] = frozenset()
+    of_memory: str | None = None
 
     def needed(self) -> set[str]:
         """Foreign names without which the policy cannot be filled."""
