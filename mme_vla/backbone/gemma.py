@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Hook, bind_hook
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.base import BackboneConfig, ExpertConfig, Hook, bind_hook
 from mme_vla.backbone.layers import (
     AdaRMSNorm,
     AttentionMask,

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.config.devices import fused_kernels
 from mme_vla.errors import check_choice, require
+from mme_vla.speed import fused_kernels
 
 Visibility = Mapping[str, frozenset[str] | set[str]]
 """For each block of queries: the blocks whose keys it may attend to."""

@@ -10,11 +10,12 @@ from torch.nn import functional
 
 from mme_vla.backbone.base import (
     Backbone,
+    BackboneConfig,
+    ExpertConfig,
     FineTuneSpec,
     HasExtraExperts,
     Injection,
 )
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.flow import HasFlowHead, Predict, build_head, time_embedding
 from mme_vla.backbone.gemma import Conditioning, JointTransformer
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, check_backend, float32_linear

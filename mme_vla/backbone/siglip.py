@@ -6,10 +6,10 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.config import VisionConfig
+from mme_vla.backbone.base import VisionConfig
 from mme_vla.backbone.layers import compute_dtype
-from mme_vla.config.devices import fused_kernels
 from mme_vla.errors import UserError, require
+from mme_vla.speed import fused_kernels
 
 
 class VisionTower(nn.Module):

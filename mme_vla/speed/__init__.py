@@ -1,9 +1,10 @@
 """Optional speed of a backbone: compiled attention, CUDA graphs, recomputation, real-time chunking.
 
-Each is a class to inherit from beside `Backbone`. Callers test for it with `isinstance`.
+Each capability is a class to inherit from beside `Backbone`. Callers test for it with `isinstance`.
 """
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
 
@@ -46,6 +47,21 @@ def run_layer(layer: Callable[..., Any], *inputs: Any, how: Recompute) -> Any:
     if not how or not torch.is_grad_enabled():
         return layer(*inputs)
     return checkpoint(layer, *inputs, **checkpoint_options(how))
+
+
+def fused_kernels(x: torch.Tensor) -> AbstractContextManager[object]:
+    """The context of an attention with a mask: on a GPU, every kernel but cuDNN's.
+
+    cuDNN's, which PyTorch prefers on H100, gives NaN gradients for masks at some lengths
+    (pytorch#196678).
+    """
+    if not x.is_cuda:
+        return nullcontext()
+    from torch.nn.attention import SDPBackend, sdpa_kernel
+
+    return sdpa_kernel(
+        [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
+    )
 
 
 class HasAttentionBackends:
