@@ -101,15 +101,8 @@ class Subgoal(PromptFormat):
                 " released."
             )
             return GoalPrompt().pieces(inputs)
-        return [
-            (
-                (
-                    f"Task: {_one_line(inputs.goal)};\nCurrent Subgoal:"
-                    f" {_one_line(inputs.subgoal)};\nAction: "
-                ),
-                True,
-            )
-        ]
+        goal, subgoal = _one_line(inputs.goal), _one_line(inputs.subgoal)
+        return [(f"Task: {goal};\nCurrent Subgoal: {subgoal};\nAction: ", True)]
 
 
 @PROMPTS.register("subgoal_sentence")
@@ -122,15 +115,8 @@ class SubgoalSentence(Subgoal):
         """Return one text, or the plain pieces if there is no subgoal."""
         if inputs.subgoal is None:
             return super().pieces(inputs)
-        return [
-            (
-                (
-                    f"Task: {_one_line(inputs.goal)}\nCurrent Subgoal:"
-                    f" {_one_line(inputs.subgoal)}.\nAction: "
-                ),
-                True,
-            )
-        ]
+        goal, subgoal = _one_line(inputs.goal), _one_line(inputs.subgoal)
+        return [(f"Task: {goal}\nCurrent Subgoal: {subgoal}.\nAction: ", True)]
 
 
 @PROMPTS.register("past_actions")
@@ -170,7 +156,9 @@ def goal_case(robot: Embodiment) -> str:
     A robot of one's own: as in training. The benchmark's: as they are given, as in the released
     code.
     """
-    return "lower" if robot.action.space is None else "given"
+    if robot.action.space is None:
+        return "lower"
+    return "given"
 
 
 def spelled(text: str, case: str) -> str:
@@ -185,10 +173,10 @@ def checked_goal(text: object) -> str:
         UserError: it is no text, holds half a character, or nothing but spaces.
     """
     goal = checked_text(text, "the goal")
-    require(
-        goal.strip(),
-        f"The goal is {goal!r}: a policy is told what to do in words. Give the task as a text.",
-    )
+    if not goal.strip():
+        raise UserError(
+            f"The goal is {goal!r}: a policy is told what to do in words. Give the task as a text."
+        )
     return goal
 
 
@@ -196,11 +184,11 @@ def checked_text(text: object, what: str) -> str:
     """`text`, if a tokenizer can take it."""
     if not isinstance(text, str):
         raise UserError(f"{what} must be a text, got {brief(text)}.")
-    require(
-        is_text(text),
-        f"{what} holds half a character (a lone surrogate), which cannot be written:"
-        f" {brief(text)}.",
-    )
+    if not is_text(text):
+        raise UserError(
+            f"{what} holds half a character (a lone surrogate), which cannot be written:"
+            f" {brief(text)}."
+        )
     return text
 
 
@@ -219,11 +207,9 @@ def encode_prompt(
         ids [l] int64, padded on the right with 0; mask [l] bool, False on the padding.
     """
     checked_text(inputs.goal, "the goal")
-    tokens = [
-        token
-        for text, bos in prompt_format.pieces(inputs)
-        for token in tokenizer.encode(text, bos=bos)
-    ]
+    tokens: list[int] = []
+    for text, bos in prompt_format.pieces(inputs):
+        tokens += tokenizer.encode(text, bos=bos)
     if len(tokens) > max_length:
         warn_once(
             f"A prompt has more tokens than prompt_length={max_length} and loses its end; raise"
@@ -272,11 +258,9 @@ class SubgoalText:
 
     kind: `simple_subgoal` or `grounded_subgoal`.
     online_probability: how often the label is the one the simulator reports at test time, which
-    switches a little
-        earlier than the planner's.
+        switches a little earlier than the planner's.
     point_noise: pixels; a text with exactly one point `at <y, x>` gets Gaussian noise on both
-    numbers, cut off here
-        and rounded. 0 adds none. The result may leave the image, as released.
+        numbers, cut off here and rounded. 0 adds none. The result may leave the image, as released.
     """
 
     kind: str
@@ -298,7 +282,9 @@ class SubgoalText:
     @classmethod
     def from_config(cls, config: Mapping[str, Any] | None) -> Self | None:
         """Build from the section `subgoal_text`, or return None where there is none."""
-        return None if config is None else read_section(cls, config, "subgoal_text")
+        if config is None:
+            return None
+        return read_section(cls, config, "subgoal_text")
 
     @property
     def columns(self) -> tuple[str, str]:
@@ -308,8 +294,11 @@ class SubgoalText:
     def __call__(self, texts: Mapping[str, str], rng: np.random.Generator) -> str:
         """Choose among a step's `texts`, by column name, and perturb the point."""
         planner, online = self.columns
-        text = texts[online if rng.random() < self.online_probability else planner]
-        return perturb_point(text, self.point_noise, rng) if self.point_noise else text
+        is_online = rng.random() < self.online_probability
+        text = texts[online] if is_online else texts[planner]
+        if self.point_noise:
+            text = perturb_point(text, self.point_noise, rng)
+        return text
 
 
 def perturb_point(text: str, limit: int, rng: np.random.Generator) -> str:
@@ -321,7 +310,8 @@ def perturb_point(text: str, limit: int, rng: np.random.Generator) -> str:
     shift = np.clip(rng.normal(0, limit * STD_PER_LIMIT, 2), -limit, limit).round().astype(int)
 
     def shifted(match: re.Match[str]) -> str:
-        y, x = (int(match[i + 1]) + int(shift[i]) for i in range(2))
+        y = int(match[1]) + int(shift[0])
+        x = int(match[2]) + int(shift[1])
         return f"at <{y}, {x}>"
 
     return POINT.sub(shifted, text)
