@@ -144,11 +144,11 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
 
     repository = place[1]
     within = place[2].strip("/")
-    patterns = [within, f"{within}/*"] if within else None
+    options: dict[str, Any] = {"revision": revision, "token": token}
+    if within:
+        options["allow_patterns"] = [within, f"{within}/*"]
     try:
-        root = Path(
-            snapshot_download(repository, revision=revision, token=token, allow_patterns=patterns)
-        )
+        root = Path(snapshot_download(repository, **options))
     except (
         HfHubHTTPError,
         LocalEntryNotFoundError,
