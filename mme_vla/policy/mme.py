@@ -155,26 +155,31 @@ class MMEPolicy(NetworkPolicy):
         """
         backbone_cls, sizes = read_backbone(config["backbone"])
         embodiment_of(config)  # raises an error before anything is built
+
+        # The integration, which decides on the backbone's extra experts.
         section = config.get("integration")
-        if section and (
-            unsupported := extension_points(INTEGRATIONS[section.get("name")])
-            - backbone_cls.supports
-        ):
-            raise UserError(
-                f"The backbone {config['backbone']['name']!r} has no place for"
-                f" {listed(sorted(unsupported))} of the integration {section['name']!r}; it hosts"
-                f" {listed(sorted(backbone_cls.supports))}. Choose another integration or backbone."
-            )
-        integration: Integration = (
-            INTEGRATIONS.build(section, sizes) if section else Integration(sizes)
-        )
+        integration = Integration(sizes)
+        if section:
+            required = extension_points(INTEGRATIONS[section.get("name")])
+            unsupported = required - backbone_cls.supports
+            if unsupported:
+                raise UserError(
+                    f"The backbone {config['backbone']['name']!r} has no place for"
+                    f" {listed(sorted(unsupported))} of the integration {section['name']!r}; it"
+                    f" hosts {listed(sorted(backbone_cls.supports))}. Choose another integration or"
+                    " backbone."
+                )
+            integration = INTEGRATIONS.build(section, sizes)
         experts = integration.extra_experts()
+
+        # The backbone, whose weights are not initialised if a checkpoint is loaded next.
         with nullcontext() if fresh_backbone else shapes_only():
             backbone = backbone_cls(sizes, experts)
         if not fresh_backbone:
             backbone.to_empty(device=torch.get_default_device())
             if isinstance(backbone, HasExtraExperts):
                 backbone.init_experts(list(experts))
+
         memory: MemoryModule | None = None
         if config.get("memory"):
             memory = build_memory(
@@ -343,10 +348,9 @@ class MMEPolicy(NetworkPolicy):
             return True
         full = self.full_batch(self.device)
         for length in range(16, self._prompt_length() + 16, 16):
-            cut = replace(
-                full, prompt=full.prompt[:, :length], prompt_mask=full.prompt_mask[:, :length]
-            )
-            self.sample_actions(cut)
+            prompt = full.prompt[:, :length]
+            prompt_mask = full.prompt_mask[:, :length]
+            self.sample_actions(replace(full, prompt=prompt, prompt_mask=prompt_mask))
         return True
 
     # Episodes
@@ -384,16 +388,13 @@ class MMEPolicy(NetworkPolicy):
         if self.memory is None:
             return None
         with self.autocast():
-            histories = [
-                PromptConditionedHistory(
-                    e.required_history(),
-                    partial(self._condition_one, batch.prompt[i], batch.prompt_mask[i]),
-                )
-                for i, e in enumerate(episodes)
-            ]
-            for episode, history in zip(episodes, histories, strict=True):
+            histories = []
+            for i, episode in enumerate(episodes):
+                condition = partial(self._condition_one, batch.prompt[i], batch.prompt_mask[i])
+                history = PromptConditionedHistory(episode.required_history(), condition)
                 episode.read = history
-            return self.memory.encode(histories, [e.stream for e in episodes])
+                histories.append(history)
+            return self.memory.encode(histories, [episode.stream for episode in episodes])
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
@@ -426,19 +427,17 @@ class MMEPolicy(NetworkPolicy):
         size = self.backbone.image_size
         views = len(self.embodiment.cameras)
         length = self._prompt_length()
-        history = None
-        if self.memory is not None:
-            history = full_history(self.memory, self.backbone.vision_width, device)
-        past_view_spec = None if self.memory is None else self.memory.past_view_spec
-        return Batch(
+        batch = Batch(
             images=torch.zeros(1, views, 3, size, size, dtype=torch.uint8, device=device),
             image_mask=torch.ones(1, views, dtype=torch.bool, device=device),
             prompt=torch.full((1, length), 5, device=device),
             prompt_mask=torch.ones(1, length, dtype=torch.bool, device=device),
-            history=history,
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            past=full_past(past_view_spec, views, size, device),
         )
+        if self.memory is not None:
+            batch.history = full_history(self.memory, self.backbone.vision_width, device)
+            batch.past = full_past(self.memory.past_view_spec, views, size, device)
+        return batch
 
     def _prompt_length(self) -> int:
         words = int(self.config["processor"]["prompt_length"])
@@ -454,11 +453,13 @@ class MMEPolicy(NetworkPolicy):
         component `memory`.
         """
         spec = self.backbone.finetune_spec
-        components = {
-            name: rf"backbone\.(?:{pattern})" for name, pattern in spec.components.items()
-        }
-        experts = f"|{components['memory']}" if "memory" in components else ""
-        components["memory"] = rf"memory\.|integration\.{experts}"
+        components = {}
+        for name, pattern in spec.components.items():
+            components[name] = rf"backbone\.(?:{pattern})"
+        of_memory = r"memory\.|integration\."
+        if "memory" in components:
+            of_memory += f"|{components['memory']}"
+        components["memory"] = of_memory
         return replace(spec, components=components)
 
 
