@@ -82,7 +82,7 @@ class Pi05Backbone(
         self.vision = VisionTower(config.vision, config.vlm.width)
         initialise(self.vision)
         self.embedding = nn.Embedding(config.vocab_size, config.vlm.width)
-        self.embedding.shard_alone = True  # see `mme_vla.speed.sharding.backbone_groups`
+        self.embedding.shard_alone = True  # type: ignore[assignment]  # see `backbone_groups`
         experts = {**(extra_experts or {}), "vlm": config.vlm, "action": config.action}
         self.transformer = JointTransformer(config, experts)
         self.keep_times = False

@@ -299,16 +299,16 @@ class Policy(nn.Module):
         Raises:
             UserError: no checkpoint at `source`, or files that do not fit together.
         """
-        where, trust = {"revision": revision, "token": token}, trust_plugins
         return load_policy(
             cls,
             source,
             device=device,
             dtype=dtype,
-            trust_plugins=trust,
+            revision=revision,
+            token=token,
+            trust_plugins=trust_plugins,
             tokenizer=tokenizer,
             options=policy,
-            **where,
         )
 
     def save_pretrained(
@@ -343,8 +343,16 @@ class Policy(nn.Module):
             revision: the branch to commit to. message: of the commit. dtype, card: as for
                 `save_pretrained`.
         """
-        options = {"private": private, "token": token, "revision": revision, "message": message}
-        return push_to_hub(self, repo_id, dtype=dtype, card=card, **options)
+        return push_to_hub(
+            self,
+            repo_id,
+            dtype=dtype,
+            card=card,
+            private=private,
+            token=token,
+            revision=revision,
+            message=message,
+        )
 
 
 @dataclass(frozen=True)
@@ -389,8 +397,11 @@ def choose_actions(
         policy.train(was_training)
     absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
     space = policy.embodiment.action
-    decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
-    actions = torch.stack(decided).numpy()[:, processor.samples.window - 1 :]
-    for episode, chosen in zip(episodes, actions, strict=True):
-        episode.acted(chosen)
+    decided = []
+    for episode, rows in zip(episodes, absolute, strict=True):
+        decided.append(space.decide(rows, episode.options))
+    n_past = processor.samples.window - 1
+    actions = torch.stack(decided).numpy()[:, n_past:]
+    for episode, executed in zip(episodes, actions, strict=True):
+        episode.acted(executed)
     return SelectedActions(batch, chunk, actions)

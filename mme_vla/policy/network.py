@@ -160,9 +160,8 @@ class NetworkPolicy(Policy, Recomputes):
         for start in range(0, len(frames), batch_size):
             images = processor.memory_images(frames[start : start + batch_size], device=device)
             with self.autocast():
-                encoded.append(
-                    source.pooled_tokens(images, storage.grid, storage.pooling).to(empty)
-                )
+                tokens = source.pooled_tokens(images, storage.grid, storage.pooling)
+                encoded.append(tokens.to(empty))
         return torch.cat(encoded)
 
     def vision_fingerprint(self) -> str:
