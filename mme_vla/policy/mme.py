@@ -250,6 +250,7 @@ class MMEPolicy(NetworkPolicy):
         """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times
         [b], in one pass.
         """
+        assert isinstance(self.backbone, HasFlowHead)
         if memory is None:
             memory = self.model.memory_tokens(batch)
         with self.autocast():

@@ -205,17 +205,17 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
     # One context, and all writes at once: the store then gathers them into few files.
     context = ts.Context()
     stores = {}
-    for path, array in arrays.items():
+    for key, array in arrays.items():
         compressor = {"id": "zstd", "level": 1}
         spec = {
             "driver": "zarr",
-            "kvstore": _store(params, path, True),
+            "kvstore": _store(params, key, True),
             "metadata": {"compressor": compressor, "chunks": array.shape},
         }
-        stores[path] = ts.open(
+        stores[key] = ts.open(
             spec, create=True, dtype=array.dtype, shape=array.shape, context=context
         )
-    writes = [store.result().write(arrays[path]) for path, store in stores.items()]
+    writes = [store.result().write(arrays[key]) for key, store in stores.items()]
     for write in writes:
         write.result()
     about = {"tree_metadata": leaves, "use_ocdbt": True, "use_zarr3": False}

@@ -227,7 +227,7 @@ class SAM2ActPolicy(NetworkPolicy):
         return cls(SAM2ActNetwork(sizes), processor, config, **policy_options(cls, config))
 
     @property
-    def info(self) -> PolicyInfo:  # type: ignore[override]
+    def info(self) -> PolicyInfo:
         """Rollouts end after the waypoints of an episode, which the processor's clock counts to."""
         if self.processor is None:
             return self._info
