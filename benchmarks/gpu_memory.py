@@ -52,7 +52,9 @@ def batch_of(policy: MMEPolicy, size: int) -> Batch:
     if full.history is not None:
         full = replace(
             full,
-            history=replace(full.history, features=full.history.features.to(policy.history_dtype)),
+            history=replace(
+                full.history, features=full.history.features.to(policy.info.history_dtype)
+            ),
         )
     return full.rows(torch.zeros(size, dtype=torch.int64, device=DEVICE))
 

@@ -112,8 +112,8 @@ class MMEModel(nn.Module):
             metrics["loss"] = total.detach()
             if len(losses) > 1:
                 metrics |= {f"losses/{name}": value.detach() for name, value in losses.items()}
-            reported = {} if memory is None else memory.metrics
-            metrics |= {f"memory/{name}": value for name, value in reported.items()}
+            if memory is not None:
+                metrics |= {f"memory/{name}": value for name, value in memory.metrics.items()}
         return total
 
     def forward(
@@ -189,15 +189,15 @@ class MMEModel(nn.Module):
         Args:
             batch: images uint8. augmentation: random numbers [b, …] of the image augmentation.
         """
+        images = self.transform_images(batch.images, augmentation)
         past = batch.past
-        if past is not None:
-            count = past.images.shape[1]
-            repeated = None if augmentation is None else augmentation.repeat_interleave(count, 0)
-            images = self.transform_images(past.images.flatten(0, 1), repeated).unflatten(
-                0, past.images.shape[:2]
-            )
-            past = replace(past, images=images)
-        return replace(batch, images=self.transform_images(batch.images, augmentation), past=past)
+        if past is None:
+            return replace(batch, images=images)
+        if augmentation is not None:
+            augmentation = augmentation.repeat_interleave(past.images.shape[1], 0)
+        frames = self.transform_images(past.images.flatten(0, 1), augmentation)
+        past = replace(past, images=frames.unflatten(0, past.images.shape[:2]))
+        return replace(batch, images=images, past=past)
 
     def inject(self, batch: Batch, memory: MemoryTokens | None) -> Injection:
         """The observation's blocks with memory added. The batch's images are prepared."""
@@ -232,15 +232,17 @@ class MMEModel(nn.Module):
 
 def check_uncounted(block: Block, backbone: Backbone) -> None:
     """Make sure that a block for a backbone which numbers tokens itself brings no positions."""
-    if block.positions is not None:
-        count = block.positions.shape[-1] if block.positions.ndim > 2 else 1
-        numbers = "1 number" if count == 1 else f"{count} numbers"
-        raise UserError(
-            f"The block {block.name!r} has positions of {numbers} a token,"
-            f" and {type(backbone).__name__} counts tokens in causal order. Allowed here is"
-            " Block.positions=None. A backbone whose `supports` has 'positions', such as"
-            " backbone=pi05, takes others."
-        )
+    if block.positions is None:
+        return
+    numbers = "1 number"
+    if block.positions.ndim > 2 and block.positions.shape[-1] > 1:
+        numbers = f"{block.positions.shape[-1]} numbers"
+    raise UserError(
+        f"The block {block.name!r} has positions of {numbers} a token,"
+        f" and {type(backbone).__name__} counts tokens in causal order. Allowed here is"
+        " Block.positions=None. A backbone whose `supports` has 'positions', such as"
+        " backbone=pi05, takes others."
+    )
 
 
 def check_auxiliary(name: str, values: Tensor, samples: int) -> None:
@@ -260,14 +262,19 @@ def masked_mean(losses: Tensor, counted: Tensor | None, weight: Tensor | None = 
         counted: [b, h] bool; None counts all (`data.mask_padding`). weight: of each sample, [b]
             (`data.weights`).
     """
+    if counted is None and weight is None:
+        return losses.mean()
     if counted is None:
-        return losses.mean() if weight is None else weighted_mean(losses.mean(1), weight)
-    weights = counted.to(losses.dtype)
-    return weighted_mean((losses * weights).sum(1) / weights.sum(1).clamp(min=1), weight)
+        return weighted_mean(losses.mean(1), weight)
+    counts = counted.to(losses.dtype)
+    sample_means = (losses * counts).sum(1) / counts.sum(1).clamp(min=1)
+    return weighted_mean(sample_means, weight)
 
 
 def weighted_mean(losses: Tensor, weight: Tensor | None) -> Tensor:
     """The mean over a batch of each sample's loss [b] times its weight [b]; None
     weighs all with 1.
     """
-    return losses.mean() if weight is None else (losses * weight).mean()
+    if weight is None:
+        return losses.mean()
+    return (losses * weight).mean()

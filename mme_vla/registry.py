@@ -42,11 +42,21 @@ class Command:
 class WeightFormat:
     """A checkpoint format of one method: the functions that read and write it.
 
-    module: where the functions are, imported when first used. text: what the format is. matches:
-    whether tensor names are its. adapter: its name table for a policy. write: a policy as its
-    files. native: tensors under the one spelling of the name table, for files of `torch.save`.
-    stats: reads its statistics. spelling: as native, for safetensors. check: compares its
-    config.json with a policy. configure: a composed configuration as its config.json says.
+    module: where the functions are, imported when first used.
+    text: what the format is.
+    matches: whether tensor names are its.
+    adapter: its name table for a policy.
+    write: a policy as its files.
+    model: the name of the model it holds; the format's own name by default.
+    native: for files of `torch.save`: tensors under the one spelling of the name table. Called with
+        the tensors and the file's name.
+    spelling: as `native`, for safetensors. Called with the tensors and their folder.
+    stats: reads its statistics.
+    check: compares its config.json with a policy.
+    configure: a composed configuration as its config.json says.
+    named_base: for runs that hold adapters apart from what they were trained on: the name of that
+        base, or None where a folder holds no such adapters.
+    merge: for the same runs: the tensors of the base with the adapters in a folder merged in.
     """
 
     module: str
@@ -54,11 +64,14 @@ class WeightFormat:
     matches: str
     adapter: str
     write: str
+    model: str | None = None
     native: str | None = None
-    stats: str | None = None
     spelling: str | None = None
+    stats: str | None = None
     check: str | None = None
     configure: str | None = None
+    named_base: str | None = None
+    merge: str | None = None
 
     def function(self, role: str) -> Callable[..., Any]:
         """The function that has this role, imported now."""
@@ -325,8 +338,6 @@ PROMPTS: Registry[Any] = Registry(
             "subgoal",
             "subgoal_sentence",
             "past_actions",
-            "openvla",
-            "openvla_subgoal",
         ),
         "mme_vla.processing.prompt",
     ),

@@ -19,11 +19,9 @@ def send(x: Tensor, device: torch.device) -> Tensor:
     """A tensor on a device; from the CPU to a GPU through page-locked memory, without waiting for
     the copy.
     """
-    return (
-        x.pin_memory().to(device, non_blocking=True)
-        if device.type == "cuda" and not x.is_cuda
-        else x.to(device)
-    )
+    if device.type == "cuda" and not x.is_cuda:
+        return x.pin_memory().to(device, non_blocking=True)
+    return x.to(device)
 
 
 Noise = dict[str, Tensor]
@@ -34,16 +32,20 @@ cannot change them.
 
 def named_noise(noise: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> Noise:
     """Noise by name; a bare tensor is a flow's `noise`."""
-    named = {"noise": noise} if isinstance(noise, Tensor) else dict(noise or {})
-    return named | {name: value for name, value in more.items() if value is not None}
+    if isinstance(noise, Tensor):
+        noise = {"noise": noise}
+    named = dict(noise or {})
+    for name, value in more.items():
+        if value is not None:
+            named[name] = value
+    return named
 
 
 def stack_noise(rows: Sequence[Mapping[str, Tensor]], device: torch.device | None = None) -> Noise:
     """Noise of single samples (`sampling_noise`) as that of a batch."""
-    return {
-        name: torch.stack([row[name] for row in rows]).to(device)
-        for name in (rows[0] if rows else {})
-    }
+    if not rows:
+        return {}
+    return {name: torch.stack([row[name] for row in rows]).to(device) for name in rows[0]}
 
 
 def map_noise(noise: Mapping[str, Tensor], change: Callable[[Tensor], Tensor]) -> Noise:
@@ -118,10 +120,11 @@ class FrameBatch:
         cls, images: np.ndarray, index: np.ndarray | None = None, length: int | None = None
     ) -> Self:
         """A batch; by default every frame has an image."""
-        length = len(images) if length is None else length
-        return cls(
-            images, np.arange(length) if index is None else np.asarray(index, np.int64), length
-        )
+        if length is None:
+            length = len(images)
+        if index is None:
+            index = np.arange(length)
+        return cls(images, np.asarray(index, np.int64), length)
 
     def select(self, frames: np.ndarray) -> np.ndarray:
         """Images of frames that have one."""
@@ -130,7 +133,9 @@ class FrameBatch:
     def image(self, frame: int) -> np.ndarray | None:
         """The image of a frame, if it has one."""
         row = int(np.searchsorted(self.index, frame))
-        return self.images[row] if row < len(self.index) and int(self.index[row]) == frame else None
+        if row == len(self.index) or int(self.index[row]) != frame:
+            return None
+        return self.images[row]
 
 
 @dataclass
@@ -139,13 +144,11 @@ class HistoryTokens(TensorStruct):
 
     features: [b, n, d_vision]; pooled vision tokens.
     positions: [b, n, 3]; (frame, row, column) of each token: the frame counted from the episode's
-    first,
-        video included, the rest patch centres in sixteenths of a view's side.
+        first, video included, the rest patch centres in sixteenths of a view's side.
     mask: [b, n] bool; False on padding.
     step: [b] int64; the current frame, counted like the others. None where it is not needed.
     labels: in training, the labels of each token's frame that the memory reads (`ReadsLabels`),
-    each [b, n] or
-        [b, n, k] float32, 0 on padding. Empty in episodes.
+        each [b, n] or [b, n, k] float32, 0 on padding. Empty in episodes.
     """
 
     features: Tensor
@@ -168,13 +171,13 @@ class HistoryTokens(TensorStruct):
 class MemoryTokens(TensorStruct):
     """What every neural memory hands over: at most `budget` valid tokens.
 
-    tokens: [b, budget, d]; mask: [b, budget] bool. Where the mask is False the token's value is
-    undefined. metrics: scalars a memory reports of how it came to these tokens, detached.
+    tokens: [b, budget, d].
+    mask: [b, budget] bool. Where it is False the token's value is undefined.
+    metrics: scalars that a memory reports of how it came to these tokens, detached.
     ages: [b, budget] float32; frames between the frame of a token and the current one. None where
-    tokens belong to
-        no frame, or the selection has no number of the current frame.
+        tokens belong to no frame, or the selection has no number of the current frame.
     losses: auxiliary losses by name, each [b], with gradients. Only training reads them
-    (`train.losses`).
+        (`train.losses`).
     """
 
     tokens: Tensor
@@ -189,9 +192,9 @@ class Overlap(TensorStruct):
     """Actions of the chunk before that are still to be executed; the sampling of a new chunk is
     pulled towards them.
 
-    actions: [b, h, a]; normalised as the network predicts. weight: [b, h, a] in [0, 1]: how
-    strongly the chunk is
-        pulled towards each number; 0 where the chunk before has none.
+    actions: [b, h, a]; normalised as the network predicts.
+    weight: [b, h, a] in [0, 1]: how strongly the chunk is pulled towards each number; 0 where the
+        chunk before has none.
     """
 
     actions: Tensor
@@ -202,10 +205,10 @@ class Overlap(TensorStruct):
 class PastViews(TensorStruct):
     """Views of past frames, for a vision tower that reads them along with the current ones.
 
-    images: [b, k, v, 3, s, s] uint8, oldest first, the current frame not among them; float in [−1,
-    1] once they are as
-        the tower takes them. mask: [b, k] bool; False on frames before the episode's first.
-    every: each so-many-th layer of the tower looks through time, and at least its last.
+    images: [b, k, v, 3, s, s] uint8, oldest first, the current frame not among them; float in
+        [−1, 1] once they are as the tower takes them.
+    mask: [b, k] bool; False on frames before the episode's first.
+    every: each so-many-th layer of the tower attends through time, and at least its last.
     """
 
     images: Tensor
@@ -215,11 +218,13 @@ class PastViews(TensorStruct):
 
 @dataclass
 class Batch(TensorStruct):
-    """What the network reads, and for training what it should answer.
+    """What the network reads, and for training what it should return.
 
     images: [b, v, 3, s, s] uint8; the views at the vision tower's resolution, in the embodiment's
-    order. image_mask: [b, v] bool; False hides a view.
-    prompt: [b, l] int64 token ids; prompt_mask: [b, l] bool.
+        order.
+    image_mask: [b, v] bool; False hides a view.
+    prompt: [b, l] int64 token ids.
+    prompt_mask: [b, l] bool.
     history: the memory's selection, None for a policy without memory.
     actions: [b, h, a]; normalised, padded chunk. None when sampling.
     action_mask: [b, h] bool; steps that count in the loss. None counts all.
@@ -229,8 +234,9 @@ class Batch(TensorStruct):
     overlap: what a sampled chunk is to agree with; None where it is free.
     past: past views that a memory gives along with the current ones; None for all others.
     options: [b, letters] bool; the letters offered to a policy that chooses among options. None
-    means all. weight: [b] float32; multiplies each sample's loss (`data.weights`). None counts all
-    alike. labels: in training, labels of the current frame (`ReadsLabels` of a backbone).
+        means all.
+    weight: [b] float32; multiplies each sample's loss (`data.weights`). None counts all alike.
+    labels: in training, labels of the current frame (`ReadsLabels` of a backbone).
     """
 
     images: Tensor
@@ -257,7 +263,7 @@ class Batch(TensorStruct):
         Done where batches are made, on the CPU: the network itself never reads content.
         """
         longest = int(self.prompt_mask.sum(1).max())
-        length = min(-(-longest // multiple) * multiple, self.prompt.shape[1])
+        length = -(-longest // multiple) * multiple  # rounded up; slicing ends at the prompt's own
         return replace(
             self, prompt=self.prompt[:, :length], prompt_mask=self.prompt_mask[:, :length]
         )
@@ -266,11 +272,9 @@ class Batch(TensorStruct):
 class ReadsLabels:
     """Capability of a memory or a backbone: it learns from labels of the dataset.
 
-    reads_labels: columns of numbers in the dataset, `subtask_boundary` (1 where a sub-task begins,
-    else 0), or
-        `subtask_index` (how many sub-tasks have begun).
-        A memory has them by frame in `HistoryTokens.labels`, a backbone of the current frame in
-        `Batch.labels`.
+    reads_labels: columns of numbers in the dataset: `subtask_boundary` (1 where a sub-task begins,
+        else 0) or `subtask_index` (how many sub-tasks have begun). A memory has them by frame in
+        `HistoryTokens.labels`, a backbone of the current frame in `Batch.labels`.
     """
 
     reads_labels: Sequence[str] = ()
@@ -278,5 +282,8 @@ class ReadsLabels:
 
 def labels_read(*parts: object) -> tuple[str, ...]:
     """Names of the labels that some parts of a policy read, each once."""
-    names = (name for part in parts if isinstance(part, ReadsLabels) for name in part.reads_labels)
+    names: list[str] = []
+    for part in parts:
+        if isinstance(part, ReadsLabels):
+            names += part.reads_labels
     return tuple(dict.fromkeys(names))

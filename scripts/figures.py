@@ -26,7 +26,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig, VisionConfig
+from mme_vla.backbone.base import BackboneConfig, ExpertConfig, VisionConfig
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.extras.probing.run import probed_folder
 from mme_vla.integration.base import Integration

@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 from helpers import REPOSITORY
+from mme_vla.registry import extras
 
 PACKAGE = REPOSITORY / "mme_vla"
 
@@ -116,6 +117,29 @@ def test_the_core_names_no_extra() -> None:
     for module, file in modules().items():
         if level_of(module) in CORE:
             assert "mme_vla.extras." not in file.read_text().replace("{name}", ""), file
+
+
+NAMED_BY_EXTRAS = ("backbone", "policy", "processor", "prompt")
+"""Kinds of parts whose names the core must not hold; names of others are words that it uses too."""
+EVERYDAY = {"subtask"}
+
+
+def test_the_core_holds_no_name_that_an_extra_registers() -> None:
+    """No case for a method, its prompt or its checkpoint format stands in the core."""
+    names: set[str] = set()
+    for extension in extras():
+        names |= set(extension.weight_formats) | set(extension.checkpoints)
+        for kind in NAMED_BY_EXTRAS:
+            names |= set(extension.parts.get(kind, {}))
+    assert {"openvla", "simplememvla", "openvla_subgoal", "nano"} <= names
+    for module, file in modules().items():
+        if level_of(module) in CORE:
+            constants = {
+                node.value
+                for node in ast.walk(ast.parse(file.read_text()))
+                if isinstance(node, ast.Constant) and isinstance(node.value, str)
+            }
+            assert constants & names <= EVERYDAY, file
 
 
 def test_an_extension_imports_nothing_but_the_registry() -> None:

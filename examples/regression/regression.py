@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mme_vla import Backbone, Batch, register
-from mme_vla.backbone.base import FineTuneSpec, Injection
-from mme_vla.backbone.config import BackboneConfig
+from mme_vla.backbone.base import BackboneConfig, FineTuneSpec, Injection
 from mme_vla.backbone.layers import Block, Span, additive_mask, attend, attention_mask
 from mme_vla.speed import Recomputes
 

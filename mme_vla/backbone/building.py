@@ -45,9 +45,8 @@ def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
     from mme_vla.config.sections import read_section
 
     kind: type[Backbone] = BACKBONES[str(section.get("name"))]
-    return kind, read_section(
-        kind.Config, {key: value for key, value in section.items() if key != "name"}, "backbone"
-    )
+    sizes = {key: value for key, value in section.items() if key != "name"}
+    return kind, read_section(kind.Config, sizes, "backbone")
 
 
 def shape_of(section: Mapping[str, Any]) -> Backbone:

@@ -56,15 +56,14 @@ class ChoiceHead(FlowHead):
             " head.choice=${embodiment.action.choice}.",
         )
         require(temperature >= 0, f"backbone.head.temperature={temperature} must not be negative.")
-        self.choice, self.temperature = list(choice), temperature
+        self.choice = list(choice)
+        self.temperature = temperature
         self.numbers = [place for place in range(action_dim) if place not in self.choice]
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """`noise` [n, h, a] of zeros and `time` [n] of ones: the loss has no noise."""
-        return {
-            "noise": torch.zeros(count, self.horizon, self.action_dim),
-            "time": torch.ones(count),
-        }
+        noise = torch.zeros(count, self.horizon, self.action_dim)
+        return {"noise": noise, "time": torch.ones(count)}
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
         """`noise` [h, a] on the CPU: standard Gumbel for letters, standard normal for the other
@@ -83,23 +82,22 @@ class ChoiceHead(FlowHead):
         """
         output = predict(noise["noise"], noise["time"]).float()
         letters = actions[..., self.choice].argmax(-1)
-        loss = nn.functional.cross_entropy(
-            output[..., self.choice].movedim(-1, 1), letters, reduction="none"
-        )
+        logits = output[..., self.choice].movedim(-1, 1)
+        loss = nn.functional.cross_entropy(logits, letters, reduction="none")
         if not self.numbers:
             return loss
         numbers = actions[..., self.numbers].float()
         if output.shape[-1] == self.action_dim:
             return loss + (output[..., self.numbers] - numbers).square().mean(-1)
-        logits, points = self._mixture(output)
+        components, points = self._mixture(output)
         distance = (points - numbers[..., None, :]).square().sum(-1)
-        return loss - WEIGHT * (logits.log_softmax(-1) - distance / (2 * SPREAD**2)).logsumexp(-1)
+        log_density = (components.log_softmax(-1) - distance / (2 * SPREAD**2)).logsumexp(-1)
+        return loss - WEIGHT * log_density
 
     def _mixture(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Logits [b, h, m] and points [b, h, m, 2]."""
-        logits, points = output[..., self.action_dim :].tensor_split(
-            [(output.shape[-1] - self.action_dim) // 3], -1
-        )
+        count = (output.shape[-1] - self.action_dim) // 3
+        logits, points = output[..., self.action_dim :].tensor_split([count], -1)
         return logits, points.unflatten(-1, (-1, 2))
 
     def _means(self, output: Tensor) -> Tensor:
@@ -152,16 +150,16 @@ class ChoiceHead(FlowHead):
             "backbone.head.temperature=0 has no log-probability: set a positive temperature.",
         )
         output = self._means(predict(torch.zeros_like(chunk), 0).float())
-        logits, scores = output[..., self.choice] / self.temperature, chunk[..., self.choice]
+        logits = output[..., self.choice] / self.temperature
+        scores = chunk[..., self.choice]
         if options is not None:
-            logits, scores = (
-                x.masked_fill(~options[:, None], -torch.inf) for x in (logits, scores)
-            )
-        log_prob = logits.log_softmax(-1).gather(-1, scores.argmax(-1, keepdim=True))[..., 0]
+            refused = ~options[:, None]
+            logits = logits.masked_fill(refused, -torch.inf)
+            scores = scores.masked_fill(refused, -torch.inf)
+        letters = scores.argmax(-1, keepdim=True)
+        log_prob = logits.log_softmax(-1).gather(-1, letters)[..., 0]
         if self.deviation and self.numbers:
             error = (chunk - output)[..., self.numbers]
-            density = normal_log_density(error.flatten(0, 1), self.deviation).unflatten(
-                0, error.shape[:2]
-            )
-            log_prob = log_prob + density
+            density = normal_log_density(error.flatten(0, 1), self.deviation)
+            log_prob = log_prob + density.unflatten(0, error.shape[:2])
         return log_prob

@@ -26,11 +26,10 @@ def through_time(layers: Sequence[Any], x: Tensor, visible: Tensor, every: int) 
     n, t = x.shape[:2]
     temporal = {i for i in range(len(layers)) if (i + 1) % every == 0} or {len(layers) - 1}
     times = encode_time(t, x.shape[-1], x.device).to(x.dtype)[:, None]
-    before = (
-        torch.ones(t, t, dtype=torch.bool, device=x.device).tril() & visible[:, None]
-    ) | torch.eye(
-        t, dtype=torch.bool, device=x.device
-    )  # padding attends to itself, so that no row is empty
+    earlier = torch.ones(t, t, dtype=torch.bool, device=x.device).tril()
+    itself = torch.eye(t, dtype=torch.bool, device=x.device)
+    # Padding attends to itself, so that no row is empty.
+    before = (earlier & visible[:, None]) | itself
     for i, layer in enumerate(layers):
         if i in temporal:
             x = x + space_time(layer.attn, layer.norm1(x + times), before)
@@ -49,17 +48,20 @@ def space_time(attention: Any, x: Tensor, before: Tensor) -> Tensor:
         attention: timm's `Attention`. before: [n, t, t] bool, which frames a frame attends to.
     """
     n, t, p = x.shape[:3]
-    q, k, v = (
-        attention.qkv(x).unflatten(-1, (3, attention.num_heads, -1)).permute(3, 0, 4, 1, 2, 5)
-    )  # n h t p c
-    of_patch = [part.permute(0, 3, 1, 2, 4).flatten(0, 1) for part in (q, k, v)]  # n·p h t c
+    qkv = attention.qkv(x).unflatten(-1, (3, attention.num_heads, -1))
+    q, k, v = qkv.permute(3, 0, 4, 1, 2, 5)  # each n h t p c
+
+    # Over time: each patch reads the values of the same patch in earlier frames.
+    time_q, time_k, time_v = (
+        part.permute(0, 3, 1, 2, 4).flatten(0, 1) for part in (q, k, v)
+    )  # n·p h t c
     mask = before.repeat_interleave(p, 0)[:, None]
-    mixed = functional.scaled_dot_product_attention(
-        of_patch[0], of_patch[1], of_patch[2], attn_mask=mask
-    )
+    mixed = functional.scaled_dot_product_attention(time_q, time_k, time_v, attn_mask=mask)
     mixed = mixed.unflatten(0, (n, p)).permute(0, 3, 2, 1, 4)  # n t h p c
-    q, k = (part.transpose(1, 2).flatten(0, 1) for part in (q, k))
-    output = functional.scaled_dot_product_attention(q, k, mixed.flatten(0, 1))
+
+    # Over space, in each frame.
+    space_q, space_k = (part.transpose(1, 2).flatten(0, 1) for part in (q, k))  # n·t h p c
+    output = functional.scaled_dot_product_attention(space_q, space_k, mixed.flatten(0, 1))
     return attention.proj(output.transpose(1, 2).flatten(2).unflatten(0, (n, t)))
 
 
@@ -68,8 +70,7 @@ def encode_time(count: int, width: int, device: torch.device) -> Tensor:
     the last frame.
     """
     ages = torch.arange(1 - count, 1, device=device, dtype=torch.float32)
-    rates = torch.exp(
-        torch.arange(0, width, 2, device=device, dtype=torch.float32) * (-math.log(PERIOD) / width)
-    )
+    pairs = torch.arange(0, width, 2, device=device, dtype=torch.float32)
+    rates = torch.exp(pairs * (-math.log(PERIOD) / width))
     angles = ages[:, None] * rates
     return torch.stack([angles.sin(), angles.cos() - 1], -1).flatten(1)

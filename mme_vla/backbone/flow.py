@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Injection
-from mme_vla.errors import check_sizes, require
+from mme_vla.errors import UserError, check_sizes, require
 from mme_vla.registry import HEADS
 from mme_vla.types import Batch, Noise, Overlap
 
@@ -58,7 +58,8 @@ def euler_times(steps: int, device: torch.device) -> Tensor:
     """The times 1, 1 − 1/steps, … of Euler steps [steps], added up in float32 as released."""
     # Computed on the device: a copy from the CPU would wait for the GPU, and could not be in a CUDA
     # graph.
-    times, time = [], torch.ones((), device=device)
+    times = []
+    time = torch.ones((), device=device)
     for _ in range(steps):
         times.append(time)
         time = time - 1.0 / steps
@@ -70,9 +71,8 @@ def normal_log_density(x: Tensor, deviation: float) -> Tensor:
     deviation.
     """
     x = x.flatten(1)
-    return -0.5 * (x / deviation).square().sum(1) - x.shape[1] * (
-        math.log(deviation) + 0.5 * math.log(2 * math.pi)
-    )
+    normaliser = math.log(deviation) + 0.5 * math.log(2 * math.pi)
+    return -0.5 * (x / deviation).square().sum(1) - x.shape[1] * normaliser
 
 
 Predict = Callable[[Tensor, Tensor], Tensor]
@@ -121,10 +121,8 @@ class FlowHead:
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """`noise` [n, h, a] and flow times `time` [n], on the CPU."""
         noise = torch.randn(count, self.horizon, self.action_dim, generator=generator)
-        return {
-            "noise": noise,
-            "time": sample_time(count, self.time_distribution, noise.device, generator),
-        }
+        time = sample_time(count, self.time_distribution, noise.device, generator)
+        return {"noise": noise, "time": time}
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a], on the CPU; with `deviation` also `increments` [steps, h,
@@ -153,14 +151,16 @@ class FlowHead:
         Raises:
             UserError: noise of Gaussian steps, and another number of steps or real-time chunking.
         """
-        if "increments" in noise:
-            made = noise["increments"].shape[1]
-            require(
-                made == steps,
-                f"flow_steps={steps}: backbone.head.deviation has noise for {made}; set"
-                " backbone.head.steps.",
+        if "increments" not in noise:
+            return noise["noise"]
+        count = noise["increments"].shape[1]
+        if count != steps:
+            raise UserError(
+                f"flow_steps={steps}: backbone.head.deviation has noise for {count}; set"
+                " backbone.head.steps."
             )
-            require(overlap is None, "backbone.head.deviation must be 0 for real-time chunking.")
+        if overlap is not None:
+            raise UserError("backbone.head.deviation must be 0 for real-time chunking.")
         return noise["noise"]
 
     def velocity(self, predict: PredictAt, times: Tensor, noise: Mapping[str, Tensor]) -> PredictAt:
@@ -188,8 +188,10 @@ class FlowHead:
         velocity = self.velocity(predict, times, {"noise": noise})
         states = [noise]
         for index, increment in enumerate(increments.unbind(1)):
-            mean = states[-1] - velocity(states[-1], index).to(noise.dtype) / steps
-            states.append(mean + deviation * increment if deviation else mean)
+            state = states[-1] - velocity(states[-1], index).to(noise.dtype) / steps
+            if deviation:
+                state = state + deviation * increment
+            states.append(state)
         return torch.stack(states, 1)
 
     def path_log_prob(self, predict: PredictAt, path: Tensor, deviation: float) -> Tensor:

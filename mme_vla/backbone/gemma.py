@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Hook, bind_hook
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.base import BackboneConfig, ExpertConfig, Hook, bind_hook
 from mme_vla.backbone.layers import (
     AdaRMSNorm,
     AttentionMask,
@@ -88,7 +87,7 @@ class GatedMLP(nn.Module):
 class ExpertLayer(nn.Module):
     """One expert's weights in one layer.
 
-    In the last layer only the answering expert is read further: of the others that layer needs keys
+    In the last layer only the action expert is read further: of the others that layer needs keys
     and values alone (`keys_only`), and has no other weights.
     """
 
@@ -100,19 +99,15 @@ class ExpertLayer(nn.Module):
         keys_only: bool,
     ):
         super().__init__()
-        self.heads, self.kv_heads, self.head_dim = (
-            config.num_heads,
-            config.num_kv_heads,
-            config.head_dim,
-        )
+        self.heads = config.num_heads
+        self.kv_heads = config.num_kv_heads
+        self.head_dim = config.head_dim
         self.keys_only = keys_only
 
         def norm() -> nn.Module:
-            return (
-                AdaRMSNorm(expert.width, condition_width)
-                if condition_width
-                else RMSNorm(expert.width)
-            )
+            if condition_width:
+                return AdaRMSNorm(expert.width, condition_width)
+            return RMSNorm(expert.width)
 
         self.attention_norm = norm()
         kv_width = 2 * self.kv_heads * self.head_dim
@@ -172,17 +167,13 @@ class JointBlock(nn.Module):
     ) -> None:
         super().__init__()
         self.action_expert = action_expert
-        self.experts = nn.ModuleDict(
-            {
-                name: ExpertLayer(
-                    config,
-                    expert,
-                    expert.width if name == action_expert else None,
-                    last and name != action_expert,
-                )
-                for name, expert in experts.items()
-            }
-        )
+        self.experts = nn.ModuleDict()
+        for name, expert in experts.items():
+            if name == action_expert:  # its norms are conditioned on the flow time
+                layer = ExpertLayer(config, expert, expert.width, keys_only=False)
+            else:
+                layer = ExpertLayer(config, expert, None, keys_only=last)
+            self.experts[name] = layer
 
     def forward(
         self,
@@ -198,14 +189,15 @@ class JointBlock(nn.Module):
         Args:
             segments: this pass's tokens in sequence order. rope: their rotation.
             mask: additive [b, 1, n, past + n], or what another backend of attention reads.
-            condition: what the answering expert's norms are conditioned on: the time embedding [b,
-                c] or a modulation.
+            condition: what the action expert's norms are conditioned on: the time embedding [b, c]
+                or a modulation.
             hook: see `Hook`, layer already bound.
             past: keys and values [b, past, K, h] of earlier passes, rotated; or these with space
                 for this pass's own.
 
         Returns:
-            The updated segments (of those that asked), and this pass's keys (rotated) and values.
+            The updated segments (of those that have queries), and this pass's keys (rotated) and
+            values.
         """
         of_attention: Tensor | Modulation | None
         of_mlp: Tensor | Modulation | None
@@ -301,13 +293,13 @@ class Conditioning:
         """Return the modulations of one time, which has `rows`: one for the whole batch, or one a
         sample.
         """
+        at_time = slice(index * rows, (index + 1) * rows)
 
         def pick(m: Modulation) -> Modulation:
-            return Modulation(*(x[index * rows : (index + 1) * rows] for x in m))
+            return Modulation(m.scale[at_time], m.shift[at_time], m.gate[at_time])
 
-        return Conditioning(
-            [LayerModulation(pick(a), pick(m)) for a, m in self.layers], pick(self.final)
-        )
+        layers = [LayerModulation(pick(m.attention), pick(m.mlp)) for m in self.layers]
+        return Conditioning(layers, pick(self.final))
 
 
 class JointTransformer(nn.Module):
@@ -320,7 +312,9 @@ class JointTransformer(nn.Module):
         action_expert: str = "action",
     ) -> None:
         super().__init__()
-        self.head_dim, self.action_expert, self.experts = config.head_dim, action_expert, experts
+        self.head_dim = config.head_dim
+        self.action_expert = action_expert
+        self.experts = experts
         self.gradient_checkpointing: Recompute = False
         self.attention = "auto"
         self.layers = nn.ModuleList(
@@ -340,10 +334,11 @@ class JointTransformer(nn.Module):
 
     def modulating(self) -> list[AdaRMSNorm]:
         """The norms that a condition modulates: two of every layer, and the final one."""
-        experts: list[Any] = [block.experts[self.action_expert] for block in self.layers]  # type: ignore[index]
-        return [norm for expert in experts for norm in (expert.attention_norm, expert.mlp_norm)] + [
-            self.final_norm
-        ]
+        norms = []
+        for block in self.layers:
+            expert: Any = block.experts[self.action_expert]  # type: ignore[index]
+            norms += [expert.attention_norm, expert.mlp_norm]
+        return [*norms, self.final_norm]
 
     @property
     def _compiled(self) -> bool:
@@ -356,19 +351,19 @@ class JointTransformer(nn.Module):
         visibility table.
         """
         spans = [Span(block.name, len(block)) for block in blocks]
-        asking = torch.cat([block.mask for block in blocks], 1)
-        before = past.mask if past else None
-        positions = apply_custom_positions(token_positions(asking, before), blocks)
-        all_spans, valid = spans, asking
+        query_mask = torch.cat([block.mask for block in blocks], 1)
+        past_mask = None if past is None else past.mask
+        positions = apply_custom_positions(token_positions(query_mask, past_mask), blocks)
+        all_spans = spans
+        valid = query_mask
         if past is not None:
             all_spans = past.spans + spans
-            valid = torch.cat([past.mask, asking], 1)
+            valid = torch.cat([past.mask, query_mask], 1)
         mask_layout = MaskLayout.of(spans, all_spans, valid, table)
         dtype = compute_dtype(blocks[0].tokens)
         mask = build_mask(mask_layout, dtype, self.attention, self._compiled)
-        return Layout(
-            all_spans, valid, mask, rotation(positions, self.head_dim), mask_layout, dtype
-        )
+        rope = rotation(positions, self.head_dim)
+        return Layout(all_spans, valid, mask, rope, mask_layout, dtype)
 
     def forward(
         self,
@@ -383,37 +378,41 @@ class JointTransformer(nn.Module):
 
         Args:
             blocks: in sequence order. layout: of these blocks after this past.
-            condition: time condition [b, c] of the answering expert, or its modulations; unread
+            condition: time condition [b, c] of the action expert, or its modulations; unread
                 without that expert.
             hook: the per-layer hook. past: an earlier pass's cache.
             keep: whether to return a cache of `past` and this pass.
 
         Returns:
-            The answering block's output [b, n, d] (None if it is not among `blocks`) and the cache
-            (None unless kept).
+            The output [b, n, d] of the action expert's last block (None if it is not among
+            `blocks`) and the cache (None unless kept).
         """
         segments = _segments(blocks, layout.dtype, self._compiled)
         cached: list[KeyValue] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
-            args = (
+            past_kv = None if past is None else past.layers[i]
+            segments, (k, v) = run_layer(
+                block,
                 segments,
                 layout.rope,
                 layout.mask,
                 of_layer,
                 bind_hook(hook, i),
-                past.layers[i] if past else None,
+                past_kv,
+                how=self.gradient_checkpointing,
             )
-            segments, kv = run_layer(block, *args, how=self.gradient_checkpointing)
             if keep:
                 # Copies where they are views: a view would keep all queries of its layer alive.
-                k, v = _after(past.layers[i] if past else None, *kv)
+                k, v = _after(past_kv, k, v)
                 cached.append((k.contiguous(), v.contiguous()))
         output = None
         if segments:
             final = condition.final if isinstance(condition, Conditioning) else condition
             output, _ = self.final_norm(segments[-1].tokens, final)
-        return output, KVCache(cached, layout.spans, layout.valid) if keep else None
+        if not keep:
+            return output, None
+        return output, KVCache(cached, layout.spans, layout.valid)
 
 
 def _after(past: KeyValue | StaticKV | None, k: Tensor, v: Tensor) -> KeyValue:

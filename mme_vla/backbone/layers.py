@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.config.devices import fused_kernels
-from mme_vla.errors import check_choice, require
+from mme_vla.errors import UserError, check_choice
+from mme_vla.speed import fused_kernels
 
 Visibility = Mapping[str, frozenset[str] | set[str]]
 """For each block of queries: the blocks whose keys it may attend to."""
@@ -35,11 +35,9 @@ def autocast(device: torch.device, dtype: torch.dtype) -> torch.autocast:
 def compute_dtype(x: Tensor) -> torch.dtype:
     """The dtype matmuls run in where `x` lives: autocast's when it is on, else the tensor's own."""
     kind = x.device.type
-    return (
-        torch.get_autocast_dtype(kind)
-        if kind != "meta" and torch.is_autocast_enabled(kind)
-        else x.dtype
-    )
+    if kind != "meta" and torch.is_autocast_enabled(kind):
+        return torch.get_autocast_dtype(kind)
+    return x.dtype
 
 
 def float32_linear(layer: nn.Linear, x: Tensor) -> Tensor:
@@ -72,9 +70,11 @@ def rotation(positions: Tensor, head_dim: int) -> Rotation:
     """
     pairs = torch.arange(head_dim // 2, device=positions.device)
     exponent = pairs.float() * (2 / head_dim)
-    several = positions.ndim == 3
-    places = positions[..., pairs % positions.shape[-1]] if several else positions[..., None]
-    angles = (places[:, :, None].float() / BASE**exponent).repeat(1, 1, 1, 2)
+    if positions.ndim == 3:
+        coordinates = positions[..., pairs % positions.shape[-1]]
+    else:
+        coordinates = positions[..., None]
+    angles = (coordinates[:, :, None].float() / BASE**exponent).repeat(1, 1, 1, 2)
     return Rotation(angles.cos(), angles.sin())
 
 
@@ -173,10 +173,10 @@ class Span(NamedTuple):
 
 def visible_blocks(name: str, table: Visibility) -> frozenset[str] | set[str]:
     """The blocks that a block of this name attends to."""
-    require(
-        name in table,
-        f"Block {name!r} has no row in the visibility table; it has rows {sorted(table)}.",
-    )
+    if name not in table:
+        raise UserError(
+            f"Block {name!r} has no row in the visibility table; it has rows {sorted(table)}."
+        )
     return table[name]
 
 
@@ -211,7 +211,9 @@ def token_positions(mask: Tensor, past_mask: Tensor | None = None) -> Tensor:
     first).
     """
     positions = mask.long().cumsum(1) - 1
-    return positions if past_mask is None else positions + past_mask.long().sum(1, keepdim=True)
+    if past_mask is None:
+        return positions
+    return positions + past_mask.long().sum(1, keepdim=True)
 
 
 def apply_custom_positions(numbered: Tensor, blocks: Sequence[Block]) -> Tensor:
@@ -271,28 +273,32 @@ class MaskLayout(NamedTuple):
                 runs.append((query.length, sees))
         parts = valid.split([key.length for key in keys], 1)
         hidden = [torch.zeros_like(part) for part in parts]
-        rows = [
-            valid
-            if all(sees)
-            else torch.cat([p if s else h for p, h, s in zip(parts, hidden, sees, strict=True)], 1)
-            for _, sees in runs
-        ]
+        rows = []
+        for _, sees in runs:
+            if all(sees):
+                rows.append(valid)
+                continue
+            row = list(hidden)
+            for i, is_visible in enumerate(sees):
+                if is_visible:
+                    row[i] = parts[i]
+            rows.append(torch.cat(row, 1))
         return cls(tuple(length for length, _ in runs), torch.stack(rows, 1))
 
     def part(self, rows: Sequence[slice]) -> "MaskLayout":
         """The layout of some of the queries, ranges of their indices in order."""
         lengths, runs, start = [], [], 0
         for run, length in enumerate(self.lengths):
-            count = sum(max(min(at.stop, start + length) - max(at.start, start), 0) for at in rows)
+            count = 0
+            for at in rows:
+                count += max(min(at.stop, start + length) - max(at.start, start), 0)
             if count:
                 lengths.append(count)
                 runs.append(run)
             start += length
-        visible = (
-            self.visible
-            if len(runs) == len(self.lengths)
-            else torch.stack([self.visible[:, run] for run in runs], 1)
-        )
+        visible = self.visible
+        if len(runs) < len(self.lengths):
+            visible = torch.stack([visible[:, run] for run in runs], 1)
         return MaskLayout(tuple(lengths), visible)
 
     def expand(self, rows: Tensor) -> Tensor:
@@ -348,9 +354,9 @@ def additive_mask(mask: Tensor, dtype: torch.dtype) -> Tensor:
 
 def layout_mask(layout: MaskLayout, dtype: torch.dtype) -> Tensor:
     """The additive mask [b, 1, n, k] of a layout."""
-    return layout.expand(_padded(layout.visible, dtype))[..., : layout.visible.shape[-1]].unsqueeze(
-        1
-    )
+    keys = layout.visible.shape[-1]
+    mask = layout.expand(_padded(layout.visible, dtype))
+    return mask[..., :keys].unsqueeze(1)
 
 
 def _padded(visible: Tensor, dtype: torch.dtype) -> Tensor:
@@ -375,14 +381,15 @@ def build_mask(
     code; else `sdpa`.
     """
     if backend == "auto":
-        backend = (
-            "flex" if compiled and layout.visible.is_cuda and torch.is_grad_enabled() else "sdpa"
-        )
+        is_training = layout.visible.is_cuda and torch.is_grad_enabled()
+        backend = "flex" if compiled and is_training else "sdpa"
     if backend == "sdpa":
         return layout_mask(layout, dtype)
     from mme_vla.speed.sparse_attention import FlexMask, PackedMask
 
-    return FlexMask.of(layout) if backend == "flex" else PackedMask.of(layout)
+    if backend == "flex":
+        return FlexMask.of(layout)
+    return PackedMask.of(layout)
 
 
 def select_rows(mask: AttentionMask, rows: Sequence[slice], dtype: torch.dtype) -> Tensor:
@@ -410,15 +417,12 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: AttentionMask) -> Tensor:
         return mask.attend(q, k, v)
     groups = q.shape[2] // k.shape[2]
     q, k, v = (x.transpose(1, 2) for x in (q, k, v))
-    if groups > 1:
-        # One shared key head broadcasts without a copy; several are repeated.
-        k, v = (
-            (x.expand(-1, groups, -1, -1) if x.shape[1] == 1 else x.repeat_interleave(groups, 1))
-            for x in (k, v)
-        )
+    if groups > 1 and k.shape[1] == 1:  # one shared key head broadcasts without a copy
+        k = k.expand(-1, groups, -1, -1)
+        v = v.expand(-1, groups, -1, -1)
+    elif groups > 1:
+        k = k.repeat_interleave(groups, 1)
+        v = v.repeat_interleave(groups, 1)
     with fused_kernels(q):
-        return (
-            functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-            .transpose(1, 2)
-            .flatten(2)
-        )
+        output = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    return output.transpose(1, 2).flatten(2)

@@ -1,8 +1,8 @@
 """π0.5: embed images and prompt, the flow-matching loss, and the sampler, in this order."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -10,21 +10,19 @@ from torch.nn import functional
 
 from mme_vla.backbone.base import (
     Backbone,
+    BackboneConfig,
+    ExpertConfig,
     FineTuneSpec,
     HasExtraExperts,
     Injection,
 )
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.flow import HasFlowHead, Predict, build_head, time_embedding
 from mme_vla.backbone.gemma import Conditioning, JointTransformer
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, check_backend, float32_linear
 from mme_vla.backbone.siglip import VisionTower
 from mme_vla.registry import BACKBONES
-from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes, Sharded
+from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes
 from mme_vla.types import Batch, Noise, PastViews
-
-if TYPE_CHECKING:
-    from mme_vla.speed.sharding import ShardGroup
 
 
 @BACKBONES.register("pi05")
@@ -34,7 +32,6 @@ class Pi05Backbone(
     HasExtraExperts,
     HasAttentionBackends,
     Recomputes,
-    Sharded,
     CapturableSampling,
 ):
     """Vision tower, VLM expert and action expert under joint attention; chunks by flow matching.
@@ -85,6 +82,7 @@ class Pi05Backbone(
         self.vision = VisionTower(config.vision, config.vlm.width)
         initialise(self.vision)
         self.embedding = nn.Embedding(config.vocab_size, config.vlm.width)
+        self.embedding.shard_alone = True  # type: ignore[assignment]  # see `backbone_groups`
         experts = {**(extra_experts or {}), "vlm": config.vlm, "action": config.action}
         self.transformer = JointTransformer(config, experts)
         self.keep_times = False
@@ -166,7 +164,7 @@ class Pi05Backbone(
     def loss(self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor]) -> Tensor:
         """The flow-matching loss [b, h]."""
         assert batch.actions is not None
-        return self.head.loss(partial(self.velocity, injection), batch.actions, noise)
+        return self.head.loss(self.predictor(batch, injection), batch.actions, noise)
 
     def predictor(self, batch: Batch, injection: Injection) -> Predict:
         return partial(self.velocity, injection)
@@ -290,27 +288,22 @@ class Pi05Backbone(
         """Recompute layers in the backward pass (activation checkpointing)."""
         self.transformer.gradient_checkpointing = mode
 
-    def shard_groups(self) -> "Sequence[ShardGroup]":
-        """Tower, token embedding, and every layer of all experts."""
-        from mme_vla.speed.sharding import ShardGroup, backbone_groups
-
-        return [*backbone_groups(self), ShardGroup(self.embedding, full=True)]
-
-    def compile_sampling(self) -> None:
+    def compile_sampling(self) -> Callable[[], object]:
         """Keep the time modulations between chunks."""
         self.keep_times = True
+        return self.sampling_stamp
 
     def sampling_stamp(self) -> tuple[object, ...]:
         """Place and version of the weights that time modulations are computed from, and the
         precision.
         """
         layers = self.transformer.modulating()
-        weights = [
-            p for module in (self.time_in, self.time_out, *layers) for p in module.parameters()
-        ]
-        return torch.is_autocast_enabled(weights[0].device.type), *(
-            (p.data_ptr(), p._version) for p in weights
-        )
+        device = self.time_in.weight.device
+        stamp: list[object] = [torch.is_autocast_enabled(device.type)]
+        for module in (self.time_in, self.time_out, *layers):
+            for parameter in module.parameters():
+                stamp.append((parameter.data_ptr(), parameter._version))
+        return tuple(stamp)
 
 
 def initialise(module: nn.Module) -> None:

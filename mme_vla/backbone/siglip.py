@@ -6,10 +6,10 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.config import VisionConfig
+from mme_vla.backbone.base import VisionConfig
 from mme_vla.backbone.layers import compute_dtype
-from mme_vla.config.devices import fused_kernels
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError
+from mme_vla.speed import fused_kernels
 
 
 class VisionTower(nn.Module):
@@ -84,10 +84,11 @@ def pool_grid(tokens: Tensor, grid: int, pooling: str = "mean") -> Tensor:
         pooling: `mean` as released, or `max` (paper, section 4.2).
     """
     side = int(tokens.shape[-2] ** 0.5)
-    require(
-        side % grid == 0,
-        f"A {side}×{side} token grid cannot be pooled to {grid}×{grid}: {grid} must divide {side}.",
-    )
+    if side % grid:
+        raise UserError(
+            f"A {side}×{side} token grid cannot be pooled to {grid}×{grid}: {grid} must divide"
+            f" {side}."
+        )
     window = side // grid
     cells = tokens.unflatten(-2, (grid, window, grid, window))
     if pooling == "mean":

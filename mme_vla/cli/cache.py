@@ -36,7 +36,7 @@ def main(cfg: DictConfig) -> None:
     if memory is None:
         raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
     tower = policy.vision_fingerprint()
-    dtype = str(policy.history_dtype).removeprefix("torch.")
+    dtype = str(policy.info.history_dtype).removeprefix("torch.")
     root = Path(cfg.data.cache.root) if cfg.data.cache.root else default_cache_root()
     for source in open_sources(cfg.data.sources, policy.embodiment):
         expected = fingerprint(source, memory.storage, tower, dtype)

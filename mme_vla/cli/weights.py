@@ -140,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--asset", help="which dataset's statistics, where the source has several")
     parser.add_argument("--revision", help="branch, tag or commit of a hub repository")
     parser.add_argument(
-        "--base", help="what a run of OpenVLA-OFT was trained on, where it holds its adapters alone"
+        "--base", help="what a run was trained on, where it holds its adapters alone"
     )
     parser.add_argument(
         "--dry-run",

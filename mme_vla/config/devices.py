@@ -1,4 +1,4 @@
-"""The device that a command line names, how it multiplies, and which kernels attend.
+"""The device that a command line names, and how it multiplies.
 
 What stays in float32 is computed as it is anywhere (`ieee`), unless `policy.float32_products=tf32`
 lets a GPU's tensor cores round what goes into the products of recurrent memories. Nothing else is
@@ -7,7 +7,7 @@ touched: no switch of PyTorch's is left other than it was.
 
 import os
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from mme_vla.errors import UserError, check_choice
@@ -49,21 +49,6 @@ def process_device(name: str) -> "torch.device":
     if device.type != "cuda" or device.index is not None:
         return device
     return torch.device("cuda", rank % torch.cuda.device_count())
-
-
-def fused_kernels(x: "torch.Tensor") -> AbstractContextManager[object]:
-    """The context of an attention with a mask: on a GPU, every kernel but cuDNN's.
-
-    cuDNN's, which PyTorch prefers on H100, gives NaN gradients for masks at some lengths
-    (pytorch#196678).
-    """
-    if not x.is_cuda:
-        return nullcontext()
-    from torch.nn.attention import SDPBackend, sdpa_kernel
-
-    return sdpa_kernel(
-        [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
-    )
 
 
 def checked_products(how: str) -> str:

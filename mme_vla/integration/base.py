@@ -5,8 +5,7 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Hook, Injection
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.base import BackboneConfig, ExpertConfig, Hook, Injection
 from mme_vla.backbone.layers import PI05_VISIBILITY, Block, Visibility
 from mme_vla.errors import check_choice
 from mme_vla.types import MemoryTokens

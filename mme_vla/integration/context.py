@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig, check_positive
+from mme_vla.backbone.base import BackboneConfig, ExpertConfig, check_positive
 from mme_vla.backbone.layers import Block, Visibility
 from mme_vla.errors import require
 from mme_vla.integration.base import (

@@ -7,8 +7,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Hook, LayerHooks
-from mme_vla.backbone.config import BackboneConfig
+from mme_vla.backbone.base import BackboneConfig, Hook, LayerHooks
 from mme_vla.backbone.layers import (
     EPS,
     RMSNorm,

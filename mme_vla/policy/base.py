@@ -1,7 +1,7 @@
 """`Policy`: the interface that training, evaluation, serving and weights use."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -20,6 +20,29 @@ from mme_vla.types import Noise, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
+
+
+@dataclass(frozen=True)
+class PolicyInfo:
+    """Facts about a policy that rollouts, caches and checkpoints read.
+
+    sample_steps: default steps of its sampler.
+    supports_rtc: whether it can sample chunks that continue an action prefix (real-time chunking).
+    max_actions: actions after which its rollouts end, beside their limit of frames.
+    n_distractor_episodes: unrelated episodes that it is shown before each of its own, as a stress
+        split requires.
+    history_dtype: of stored vision tokens (`Policy.encode_frames`).
+    processor_sizes: sizes of the network that its processor must have too, by the name of the
+        processor's attribute, such as `image_size` or `embodiment.action.horizon`. A checkpoint in
+        which they differ is damaged.
+    """
+
+    sample_steps: int = 1
+    supports_rtc: bool = False
+    max_actions: int | None = None
+    n_distractor_episodes: int = 0
+    history_dtype: torch.dtype = torch.bfloat16
+    processor_sizes: Mapping[str, object] = field(default_factory=dict)
 
 
 class Policy(nn.Module):
@@ -43,24 +66,11 @@ class Policy(nn.Module):
     """Steps of a chunk. The first `processor.samples.window - 1` lie in the past and are not
     executed.
     """
-    action_dim: int
-    """Width of a chunk inside the network; the embodiment's own actions are its first columns."""
-    history_dtype: torch.dtype = torch.bfloat16
-    """Of stored vision tokens (`encode_frames`)."""
+    info: PolicyInfo = PolicyInfo()
     loss_weights: Mapping[str, float] | None = None
     """Weights of auxiliary losses by name, which training sets from `train.losses`. None for a
     policy that has no such losses, and weighs no samples (`Batch.weight`).
     """
-    sample_steps: int = 1
-    """Default steps of its sampler."""
-    supports_rtc: bool = False
-    """Whether it can sample chunks that continue an action prefix (real-time chunking)."""
-    max_actions: int | None = None
-    """Actions after which its rollouts end, beside their limit of frames."""
-    keyframes: int = 1
-    """Keyframes of a training sample, of policies that train on them."""
-    n_distractor_episodes: int = 0
-    """Unrelated episodes that it is shown before each of its own, as a stress split requires."""
 
     @property
     def device(self) -> torch.device:
@@ -88,12 +98,6 @@ class Policy(nn.Module):
                 " build it with build_policy() or load it with from_pretrained()."
             )
         return self.processor
-
-    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        """Size → its value in the processor and in the network; a checkpoint in which they differ
-        is damaged.
-        """
-        return {}
 
     # Stored vision tokens of past frames
 
@@ -209,7 +213,7 @@ class Policy(nn.Module):
         if not episodes:
             n_past = self.require_processor().samples.window - 1
             return np.zeros((0, self.horizon - n_past, self.embodiment.action.width), np.float32)
-        if not self.supports_rtc and any(e.action_prefix is not None for e in episodes):
+        if not self.info.supports_rtc and any(e.action_prefix is not None for e in episodes):
             name = self.config.get("name", type(self).__name__)
             raise UserError(
                 f"{name} does not support real-time chunking, which needs a flow policy such as"
@@ -295,16 +299,16 @@ class Policy(nn.Module):
         Raises:
             UserError: no checkpoint at `source`, or files that do not fit together.
         """
-        where, trust = {"revision": revision, "token": token}, trust_plugins
         return load_policy(
             cls,
             source,
             device=device,
             dtype=dtype,
-            trust_plugins=trust,
+            revision=revision,
+            token=token,
+            trust_plugins=trust_plugins,
             tokenizer=tokenizer,
             options=policy,
-            **where,
         )
 
     def save_pretrained(
@@ -339,8 +343,16 @@ class Policy(nn.Module):
             revision: the branch to commit to. message: of the commit. dtype, card: as for
                 `save_pretrained`.
         """
-        options = {"private": private, "token": token, "revision": revision, "message": message}
-        return push_to_hub(self, repo_id, dtype=dtype, card=card, **options)
+        return push_to_hub(
+            self,
+            repo_id,
+            dtype=dtype,
+            card=card,
+            private=private,
+            token=token,
+            revision=revision,
+            message=message,
+        )
 
 
 @dataclass(frozen=True)
@@ -385,8 +397,11 @@ def choose_actions(
         policy.train(was_training)
     absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
     space = policy.embodiment.action
-    decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
-    actions = torch.stack(decided).numpy()[:, processor.samples.window - 1 :]
-    for episode, chosen in zip(episodes, actions, strict=True):
-        episode.acted(chosen)
+    decided = []
+    for episode, rows in zip(episodes, absolute, strict=True):
+        decided.append(space.decide(rows, episode.options))
+    n_past = processor.samples.window - 1
+    actions = torch.stack(decided).numpy()[:, n_past:]
+    for episode, executed in zip(episodes, actions, strict=True):
+        episode.acted(executed)
     return SelectedActions(batch, chunk, actions)

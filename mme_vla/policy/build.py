@@ -41,35 +41,37 @@ def check_grid(memory: MemoryModule, views: int) -> None:
     """Raise an error unless views of views×views tokens can be pooled to the grid that the memory
     stores.
     """
-    if views % memory.storage.grid:
-        sides = ", ".join(str(side) for side in range(1, views + 1) if views % side == 0)
-        raise UserError(
-            f"memory.grid={memory.storage.grid}: the backbone's {views}×{views} tokens a view pool"
-            f" to {sides} a side."
-        )
+    if views % memory.storage.grid == 0:
+        return
+    sides = [str(side) for side in range(1, views + 1) if views % side == 0]
+    raise UserError(
+        f"memory.grid={memory.storage.grid}: the backbone's {views}×{views} tokens a view pool to"
+        f" {', '.join(sides)} a side."
+    )
 
 
 def check_integrated(
     config: Mapping[str, Any], integration: Integration, memory: Memory | None, supports: Set[str]
 ) -> None:
     """Make sure that memory, integration and backbone fit together."""
-    has_tokens = memory is not None and memory.budget > 0
-    if has_tokens != (integration.memory_width > 0):
-        if memory is not None and not has_tokens:
-            raise UserError(
-                f"The memory {config['memory']['name']!r} produces no tokens with these settings."
-                " Set integration=none or memory.states=true."
-            )
-        mismatch = (
-            "an integration without a memory"
-            if memory is None
-            else "a memory without an integration"
-        )
-        raise UserError(
-            f"This configuration names {mismatch}; name both, or neither for the memoryless policy."
-        )
+    takes_tokens = integration.memory_width > 0
     if memory is None:
+        if takes_tokens:
+            raise UserError(
+                "This configuration names an integration without a memory; name both, or neither"
+                " for the memoryless policy."
+            )
         return
+    if takes_tokens and memory.budget == 0:
+        raise UserError(
+            f"The memory {config['memory']['name']!r} produces no tokens with these settings."
+            " Set integration=none or memory.states=true."
+        )
+    if not takes_tokens and memory.budget > 0:
+        raise UserError(
+            "This configuration names a memory without an integration; name both, or neither for"
+            " the memoryless policy."
+        )
     check_past(config, memory, supports)
     check_positions(config, integration, memory, supports)
 
@@ -144,10 +146,10 @@ def build_policy(
 
 def policy_words(name: str, overrides: Mapping[str, Any]) -> list[str]:
     """Write what `build_policy` takes as Hydra overrides."""
-    return [
-        f"model={name}",
-        *(word for key, value in overrides.items() for word in words(key, value)),
-    ]
+    overridden = [f"model={name}"]
+    for key, value in overrides.items():
+        overridden += words(key, value)
+    return overridden
 
 
 def build_from_config(
@@ -169,11 +171,14 @@ def build_from_config(
     assert isinstance(container, dict)
     sections = {key: container[key] for key in SECTIONS if key in container}
     check_token_budget(sections)
+    if seed is None:
+        seed = container.get("seed", 42)
+    is_on_meta = torch.device(device).type == "meta"
     # On meta the tokenizer is not needed.
-    bare = torch.device(device).type == "meta"
-    processor = None if bare else build_processor(sections)
-    with torch.random.fork_rng(devices=[]), shapes_only() if bare else torch.device(device):
-        torch.manual_seed(container.get("seed", 42) if seed is None else seed)
+    processor = None if is_on_meta else build_processor(sections)
+    place = shapes_only() if is_on_meta else torch.device(device)
+    with torch.random.fork_rng(devices=[]), place:
+        torch.manual_seed(seed)
         policy: Policy = policy_class(sections).from_config(
             sections, processor, fresh_backbone=fresh_backbone
         )

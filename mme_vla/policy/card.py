@@ -23,7 +23,8 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
     Raises:
         UserError: `recipe` or `results` is no mapping.
     """
-    name, known = str(config.get("name", "policy")), config.get("card") or {}
+    name = str(config.get("name", "policy"))
+    known = config.get("card") or {}
     for key in ("recipe", "results"):
         value = known.get(key) or {}
         require(
@@ -32,13 +33,13 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
             " 54.0}.",
         )
     backbone = config.get("backbone") or {}
+    network = backbone.get("name", "pi05")
+    if "depth" in backbone:
+        network += f", {backbone['depth']} layers"
     rows = {
         "memory": _part(config.get("memory")),
         "integration": _part(config.get("integration")),
-        "backbone": (
-            backbone.get("name", "pi05")
-            + (f", {backbone['depth']} layers" if "depth" in backbone else "")
-        ),
+        "backbone": network,
         "robot": str((config.get("embodiment") or {}).get("name", "robomme_joint")),
         "action chunk": (
             f"{backbone.get('horizon', '?')} steps of {backbone.get('action_dim', '?')} numbers"
@@ -47,76 +48,65 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
     }
     if config.get("adapters"):
         rows["adapters"] = f"LoRA, rank {config['adapters'].get('rank')}, not merged"
-    return "\n".join(
-        [
-            "---",
-            front_matter(name, known),
-            "---",
-            "",
-            f"# {name}",
-            "",
-            f"A policy of the MME-VLA library (`{type(policy).__name__}`)"
-            + (" with a memory of the episode." if config.get("memory") else " without memory."),
-            "",
-            *_table(rows),
-            "",
-            "## Use",
-            "",
-            "```python",
-            *example(config),
-            "```",
-            "",
-            "## Data",
-            "",
-            str(known.get("data") or "Not recorded."),
-            "",
-            "## Recipe",
-            "",
-            *(_table(known["recipe"]) if known.get("recipe") else ["Not recorded."]),
-            "",
-            "## Results",
-            "",
-            *(_table(known["results"]) if known.get("results") else ["Not recorded."]),
-            "",
-        ]
-    )
+    memory = "with a memory of the episode" if config.get("memory") else "without memory"
+    return f"""---
+{front_matter(name, known)}
+---
+
+# {name}
+
+A policy of the MME-VLA library (`{type(policy).__name__}`) {memory}.
+
+{_table(rows)}
+
+## Use
+
+```python
+{example(config)}
+```
+
+## Data
+
+{known.get("data") or "Not recorded."}
+
+## Recipe
+
+{_table(known.get("recipe"))}
+
+## Results
+
+{_table(known.get("results"))}
+"""
 
 
-def example(config: Mapping[str, Any]) -> list[str]:
-    """Lines of Python from the weights to an action, with grey frames for the user's own."""
+def example(config: Mapping[str, Any]) -> str:
+    """Python from the weights to an action, with grey frames for the user's own."""
     robot = embodiment_of(config)
-    frames = {camera.name: "frame" for camera in robot.cameras}
-    lines = ["frame = np.full((1, 256, 256, 3), 127, np.uint8)  # yours, of each camera"]
-    if robot.readings:
-        lines += [
-            "depth = np.full((1, 256, 256, 1), 500, np.int16)  # in millimetres",
-            (
-                "pose = np.eye(3, 4, dtype=np.float32)[None]  # from the world to the camera, in"
-                " OpenCV's axes"
-            ),
-        ]
-        frames |= {name: "depth" if name.endswith("_depth") else "pose" for name in robot.readings}
-    options: list[str] = []
-    if robot.action.choice:
-        options = [
-            'episode.options = [Option("a", "press the button")]  # those of the environment'
-        ]
-    return [
-        "import numpy as np",
-        "from mme_vla import Policy",
-        *(["from mme_vla.embodiment.action_space import Option"] if options else []),
-        "",
+    imports = ["import numpy as np", "from mme_vla import Policy"]
+    lines = [
         'policy = Policy.from_pretrained("<this repository or folder>")',
         'episode = policy.start_episode("the goal in words", seed=7)',
-        *options,
-        *lines,
-        f"frames = {{{', '.join(f'"{name}": {value}' for name, value in frames.items())}}}",
-        (
-            f"episode.observe(frames, np.zeros((1, {robot.state.width}), np.float32))  # and the"
-            " robot's state"
-        ),
-        "chunk = policy.act(episode)  # the next actions",
     ]
+    if robot.action.choice:
+        imports.append("from mme_vla.embodiment.action_space import Option")
+        lines.append(
+            'episode.options = [Option("a", "press the button")]  # those of the environment'
+        )
+    lines.append("frame = np.full((1, 256, 256, 3), 127, np.uint8)  # yours, of each camera")
+    frames = [f'"{camera.name}": frame' for camera in robot.cameras]
+    if robot.readings:
+        lines.append("depth = np.full((1, 256, 256, 1), 500, np.int16)  # in millimetres")
+        lines.append(
+            "pose = np.eye(3, 4, dtype=np.float32)[None]  # from the world to the camera, in"
+            " OpenCV's axes"
+        )
+    for name in robot.readings:
+        frames.append(f'"{name}": depth' if name.endswith("_depth") else f'"{name}": pose')
+    state = f"np.zeros((1, {robot.state.width}), np.float32)"
+    lines.append(f"frames = {{{', '.join(frames)}}}")
+    lines.append(f"episode.observe(frames, {state})  # and the robot's state")
+    lines.append("chunk = policy.act(episode)  # the next actions")
+    return "\n".join([*imports, "", *lines])
 
 
 def front_matter(name: str, known: Mapping[str, Any]) -> str:
@@ -127,21 +117,17 @@ def front_matter(name: str, known: Mapping[str, Any]) -> str:
     """
     from huggingface_hub import EvalResult, ModelCardData
 
-    numbers = {
-        str(key): float(value)
-        for key, value in (known.get("results") or {}).items()
-        if isinstance(value, int | float) and not isinstance(value, bool)
-    }
-    results = [
-        EvalResult(
-            task_type="robotics",
-            dataset_type="robomme",
-            dataset_name="RoboMME",
-            metric_type=key,
-            metric_value=value,
-        )
-        for key, value in numbers.items()
-    ]
+    results = []
+    for key, value in (known.get("results") or {}).items():
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            result = EvalResult(
+                task_type="robotics",
+                dataset_type="robomme",
+                dataset_name="RoboMME",
+                metric_type=str(key),
+                metric_value=float(value),
+            )
+            results.append(result)
     data = ModelCardData(
         library_name="mme-vla",
         pipeline_tag="robotics",
@@ -161,12 +147,16 @@ def _part(section: Mapping[str, Any] | None) -> str:
     options = ", ".join(
         f"{key} {value}" for key, value in section.items() if key != "name" and value is not None
     )
-    return f"{section['name']} ({options})" if options else str(section["name"])
+    if not options:
+        return str(section["name"])
+    return f"{section['name']} ({options})"
 
 
-def _table(rows: Mapping[str, Any]) -> list[str]:
-    return ["| | |", "|---|---|", *(f"| {key} | {_cell(value)} |" for key, value in rows.items())]
-
-
-def _cell(value: Any) -> str:
-    return str(value).replace("|", "\\|").replace("\n", " ")
+def _table(rows: Mapping[str, Any] | None) -> str:
+    if not rows:
+        return "Not recorded."
+    lines = ["| | |", "|---|---|"]
+    for key, value in rows.items():
+        cell = str(value).replace("|", "\\|").replace("\n", " ")
+        lines.append(f"| {key} | {cell} |")
+    return "\n".join(lines)

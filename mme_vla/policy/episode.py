@@ -69,22 +69,26 @@ class Episode:
         """The current language subgoal, for policies whose prompt has one; set it before `act`."""
         self.options: tuple[Option, ...] = ()
         """The options of policies that choose among some; set them before `act`."""
-        memory = policy.memory
-        self.history = None if memory is None else start_history(memory, policy.encode_frames)
-        if self.history is not None and memory is not None and memory.uses_proprio:
-            self.history.motion = lambda frames: torch.stack(
-                [self._motion_of_frames[int(frame)] for frame in frames]
-            )
-            self.history.state_width = policy.embodiment.state.width
-        self.stream = None if memory is None else memory.start_stream()
+        self.history: OnlineHistory | None = None
+        self.stream: Any = None
         """State of a streaming memory between two `act`s."""
         self.read: History | None = None
         """The history as the last `act` read it, conditioned on the prompt."""
-        spec = None if memory is None else memory.past_view_spec
-        self._past = None if spec is None else PastImages(spec)
-        self.n_observed_frames = 0
+        self._past: PastImages | None = None
         self._motion_of_frames: list[Tensor] = []
         """Rows [w], one a frame, if the memory reads motion."""
+        memory = policy.memory
+        if memory is not None:
+            self.history = start_history(memory, policy.encode_frames)
+            self.stream = memory.start_stream()
+            if memory.uses_proprio:
+                self.history.motion = lambda frames: torch.stack(
+                    [self._motion_of_frames[int(frame)] for frame in frames]
+                )
+                self.history.state_width = policy.embodiment.state.width
+            if memory.past_view_spec is not None:
+                self._past = PastImages(memory.past_view_spec)
+        self.n_observed_frames = 0
         self._chunk: np.ndarray | None = None
         self.action_prefix: ActionPrefix | None = None
         """See `set_action_prefix`."""
@@ -122,9 +126,12 @@ class Episode:
         demo = np.asarray(is_demo, bool)
         count = len(states) if states.ndim else 0
         width = self._robot.state.width
-        shown = {name: count if rendered is None else len(rendered[name]) for name in images}
-        even = all(len(view) == shown[name] for name, view in images.items())
-        if states.shape != (count, width) or not even or demo.shape not in ((), (count,)):
+        is_even = True
+        for name, view in images.items():
+            n_rendered = count if rendered is None else len(rendered[name])
+            if len(view) != n_rendered:
+                is_even = False
+        if states.shape != (count, width) or not is_even or demo.shape not in ((), (count,)):
             counts = ", ".join(f"{len(view)} {name}" for name, view in images.items())
             raise UserError(
                 f"observe() needs as many {width}-number states and is_demo flags as images of"
@@ -141,12 +148,11 @@ class Episode:
         # Execution frames within the window; the current frame in any case.
         samples = processor.samples
         first = max(count - samples.window, 0) if samples.consecutive else count - 1
-        recent = range(first, count)
-        new_frames = [
-            (self._prepared_images(views, i), torch.from_numpy(states[i].copy()))
-            for i in recent
-            if i == count - 1 or not demo[i]
-        ]
+        new_frames = []
+        for i in range(first, count):
+            if i == count - 1 or not demo[i]:
+                images_of_frame = self._prepared_images(views, i)
+                new_frames.append((images_of_frame, torch.from_numpy(states[i].copy())))
         if not self._video_over and not demo[-1]:
             self._recent = []  # frames of the video are not in a window of the execution
         self._take(views[self._robot.memory_camera], demo, executed, states)
@@ -180,22 +186,19 @@ class Episode:
         camera = self._robot.memory_camera
         frames = self._checked_view({camera: frames}, camera)
         demo = np.asarray(is_demo, bool)
-        require(
-            demo.shape in ((), (len(frames),)),
-            f"is_demo must be one flag or {len(frames)}; got {demo.shape}.",
-        )
+        if demo.shape not in ((), (len(frames),)):
+            raise UserError(f"is_demo must be one flag or {len(frames)}; got {demo.shape}.")
         if states is not None and np.shape(states) != (len(frames), self._robot.state.width):
             raise UserError(
                 f"states must be [{len(frames)}, {self._robot.state.width}]; got"
                 f" {list(np.shape(states))}."
             )
-        if len(frames):
-            proprio = None if states is None else finite_array(states, "states")
-            self._take(
-                FrameBatch.of(frames),
-                *self._checked_course(len(frames), demo, actions),
-                states=proprio,
-            )
+        if not len(frames):
+            return
+        if states is not None:
+            states = finite_array(states, "states")
+        demo, executed = self._checked_course(len(frames), demo, actions)
+        self._take(FrameBatch.of(frames), demo, executed, states)
 
     def set_view(self, views: Mapping[str, np.ndarray], state: np.ndarray) -> None:
         """Set the current view and state, adding nothing to memory.
@@ -211,20 +214,20 @@ class Episode:
         state = finite_array(state, "the state")
         width = self._robot.state.width
         names = self._robot.camera_names
-        require(
-            state.shape == (width,),
-            f"set_view() needs a state of {width} finite numbers, got shape {state.shape}.",
-        )
-        if lacking := [name for name in names if name not in views]:
+        if state.shape != (width,):
             raise UserError(
-                f"set_view() needs an image of {', '.join(lacking)} too; got"
+                f"set_view() needs a state of {width} finite numbers, got shape {state.shape}."
+            )
+        missing = [name for name in names if name not in views]
+        if missing:
+            raise UserError(
+                f"set_view() needs an image of {', '.join(missing)} too; got"
                 f" {', '.join(views) or 'none'}."
             )
         processor = self._policy.require_processor()
         check_reach(state, self._state_stats(), "the state")
-        self._set_window(
-            [(processor.images([views[name] for name in names]), torch.from_numpy(state.copy()))]
-        )
+        images = processor.images([views[name] for name in names])
+        self._set_window([(images, torch.from_numpy(state.copy()))])
 
     def gather_selection(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
@@ -365,11 +368,11 @@ class Episode:
         return np.zeros((0, self._robot.action.width), np.float32)
 
     def _require_single_view(self) -> None:
-        require(
-            self._past is None,
-            "This policy's vision tower reads past images of every camera: use `Episode.observe`,"
-            " not past frames of one camera and the current view apart.",
-        )
+        if self._past is not None:
+            raise UserError(
+                "This policy's vision tower reads past images of every camera: use"
+                " `Episode.observe`, not past frames of one camera and the current view apart."
+            )
 
     def _checked_course(
         self, count: int, demo: np.ndarray, actions: np.ndarray | None
@@ -378,11 +381,12 @@ class Episode:
         them.
         """
         demo = np.broadcast_to(demo, (count,))
-        require(
-            not (demo.any() and (self._video_over or (np.diff(demo.astype(int)) > 0).any())),
-            "A conditioning-video frame came after the first execution frame; the video goes"
-            " first.",
-        )
+        begins_again = (np.diff(demo.astype(int)) > 0).any()
+        if demo.any() and (self._video_over or begins_again):
+            raise UserError(
+                "A conditioning-video frame came after the first execution frame; the video goes"
+                " first."
+            )
         return demo, self._executed_now(int((~demo).sum()), actions)
 
     def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
@@ -395,15 +399,16 @@ class Episode:
                 return self._no_actions
             return self._chunk[:count]
         values = finite_array(actions, "actions")
-        if space.frames is None and values.ndim:
-            count = len(values)
-        executed = values[max(len(values) - count, 0) :] if values.ndim else values
-        require(
-            executed.shape == (count, space.width),
-            f"actions must be [{count}, {space.width}], one for each execution frame; got"
-            f" {executed.shape}.",
-        )
-        return executed
+        if values.ndim:
+            if space.frames is None:
+                count = len(values)
+            values = values[max(len(values) - count, 0) :]
+        if values.shape != (count, space.width):
+            raise UserError(
+                f"actions must be [{count}, {space.width}], one for each execution frame; got"
+                f" {values.shape}."
+            )
+        return values
 
     def _take(
         self,
@@ -424,8 +429,10 @@ class Episode:
         longest = self._policy.require_processor().prompt_spec.past_actions
         past = np.concatenate([self._executed, executed])
         self._executed = past[max(len(past) - longest, 0) :]
-        self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
-        self._video_over = self._video_over or not bool(demo[-1])
+        if self._chunk is not None:
+            self._chunk = self._chunk[int((~demo).sum()) :]
+        if not demo[-1]:
+            self._video_over = True
         self.n_observed_frames += len(demo)
 
     def _motion(
@@ -443,7 +450,8 @@ class Episode:
         known = np.zeros(len(demo), bool)
         if self._robot.action.frames is not None:
             rows = np.flatnonzero(~demo)[: len(executed)]
-            actions[rows], known[rows] = executed[: len(rows)], True
+            actions[rows] = executed[: len(rows)]
+            known[rows] = True
         return list(motion_rows(self._policy.require_processor(), states, actions, known))
 
     def _prepared_images(self, views: Mapping[str, FrameBatch], frame: int) -> Tensor | None:
@@ -466,22 +474,22 @@ class Episode:
         return images
 
     def _require_observation(self) -> None:
-        require(
-            self._recent,
-            "No frame was observed yet: call observe() with the current frame before act().",
-        )
+        if not self._recent:
+            raise UserError(
+                "No frame was observed yet: call observe() with the current frame before act()."
+            )
 
     def _checked_view(self, frames: Mapping[str, np.ndarray], view: str) -> np.ndarray:
-        require(
-            view in frames,
-            f"This policy needs images of the camera {view!r}; got {sorted(frames)}.",
-        )
+        if view not in frames:
+            raise UserError(
+                f"This policy needs images of the camera {view!r}; got {sorted(frames)}."
+            )
         array = np.asarray(frames[view])
-        require(
-            array.ndim == 4 and array.shape[-1] == 3 and array.dtype == np.uint8,
-            f"Camera {view!r} must be uint8 [t, height, width, 3]; got {array.dtype}"
-            f" {array.shape}.",
-        )
+        if array.ndim != 4 or array.shape[-1] != 3 or array.dtype != np.uint8:
+            raise UserError(
+                f"Camera {view!r} must be uint8 [t, height, width, 3]; got {array.dtype}"
+                f" {array.shape}."
+            )
         return array
 
 

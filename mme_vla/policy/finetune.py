@@ -72,6 +72,7 @@ def apply_finetuning(
         add_adapters(
             policy, rank=rank, alpha=alpha, dropout=dropout, init=init, targets=targets, seed=seed
         )
+    counts = dict.fromkeys(spec.components, 0)
     for name, parameter in policy.named_parameters():
         part = spec.component_of(name)
         if mode == "full":
@@ -79,22 +80,21 @@ def apply_finetuning(
         elif mode == "expert_only":
             learns = part in ("action", "memory")
         else:
-            learns = (
-                ".lora_" in name
-                or any(name.startswith(f"{module}.") for module in in_full)
-                or part in train
-            )
-        fixed = spec.frozen is not None and re.match(spec.frozen, name) is not None
-        parameter.requires_grad_(learns and not fixed and not (part == "vision" and freeze_vision))
+            is_named = any(name.startswith(f"{module}.") for module in in_full)
+            learns = ".lora_" in name or is_named or part in train
+        if part == "vision" and freeze_vision:
+            learns = False
+        if spec.frozen is not None and re.match(spec.frozen, name):
+            learns = False
+        parameter.requires_grad_(learns)
+        if learns:
+            counts[part] += parameter.numel()
     cast_frozen(policy, frozen_dtype)
-    counts = dict.fromkeys(spec.components, 0)
-    for name, parameter in policy.named_parameters():
-        counts[spec.component_of(name)] += parameter.numel() if parameter.requires_grad else 0
-    require(
-        any(counts.values()),
-        f"finetune.mode={mode} with freeze_vision={freeze_vision} leaves no parameter of this"
-        f" policy to train; choose another of {', '.join(MODES)}.",
-    )
+    if not any(counts.values()):
+        raise UserError(
+            f"finetune.mode={mode} with freeze_vision={freeze_vision} leaves no parameter of this"
+            f" policy to train; choose another of {', '.join(MODES)}."
+        )
     return counts
 
 
@@ -106,9 +106,9 @@ def warn_of_frozen_random_weights(mode: str) -> None:
     """
     if mode == "full":
         return
-    effect = (
-        "its adapters get no gradient behind gates that are zero, and" if mode == "lora" else "it"
-    )
+    effect = "it"
+    if mode == "lora":
+        effect = "its adapters get no gradient behind gates that are zero, and"
     warnings.warn(
         f"finetune={mode} without init_from: weights that stay as they are are random, so {effect}"
         " can learn next to nothing. Name weights to start from (init_from=…), or train everything"
@@ -119,31 +119,24 @@ def warn_of_frozen_random_weights(mode: str) -> None:
 
 def copy_tower(source: "Policy", policy: "Policy") -> None:
     """Give a policy the vision tower of another of the same composition."""
-    of_vision = {
-        name: value for name, value in source.named_parameters() if _is_vision(source, name)
-    }
+    component_of = source.finetune_spec.component_of
+    targets = dict(policy.named_parameters())
     with torch.no_grad():
-        for name, value in policy.named_parameters():
-            if name in of_vision:
-                value.copy_(of_vision[name])
-
-
-def _is_vision(policy: "Policy", name: str) -> bool:
-    return policy.finetune_spec.component_of(name) == "vision"
+        for name, value in source.named_parameters():
+            if component_of(name) == "vision" and name in targets:
+                targets[name].copy_(value)
 
 
 def check_frozen_dtype(policy: "Policy", name: str | None) -> None:
     """Make sure that a policy can compute with frozen weights of this dtype (None: as they are)."""
     if name is None:
         return
-    require(
-        not (
-            dtype_of(name, "finetune.frozen_dtype") != torch.float32
-            and policy.compute_dtype == torch.float32
-        ),
-        f"finetune.frozen_dtype={name} rounds weights that policy.compute_dtype=float32 would not:"
-        " set policy.compute_dtype=bfloat16 too, or leave frozen_dtype at null.",
-    )
+    rounds = dtype_of(name, "finetune.frozen_dtype") != torch.float32
+    if rounds and policy.compute_dtype == torch.float32:
+        raise UserError(
+            f"finetune.frozen_dtype={name} rounds weights that policy.compute_dtype=float32 would"
+            " not: set policy.compute_dtype=bfloat16 too, or leave frozen_dtype at null."
+        )
 
 
 def cast_frozen(policy: "Policy", name: str | None) -> None:
@@ -234,10 +227,8 @@ def merge_state(
         scale = adapters["alpha"] / adapters["rank"]
         for name, down in tensors.items():
             if f".lora_A.{ADAPTER}." in name:
-                up, target = (
-                    tensors[name.replace(".lora_A.", ".lora_B.")],
-                    name.replace(f".lora_A.{ADAPTER}.", "."),
-                )
+                up = tensors[name.replace(".lora_A.", ".lora_B.")]
+                target = name.replace(f".lora_A.{ADAPTER}.", ".")
                 weight = merged[target]
                 # A convolution's A is [r, in, k, k] and its B [out, r, 1, 1]: the product of their
                 # rows and columns.
@@ -266,14 +257,13 @@ def _targets(policy: "Policy", targets: Sequence[str]) -> list[str]:
                 "finetune.targets: no linear layer of the policy's other parts ends in"
                 f" {target!r}. " + _near(target, layers)
             )
-        past = spec.lora_exclude
-        unreachable = [name for name in matching if past is not None and re.search(past, name)]
-        if unreachable:
-            raise UserError(
-                f"finetune.targets: {target!r} means {unreachable[0]}, whose weight is used in"
-                " float32 past any adapter: it would never act. Train it in full (finetune.train),"
-                " or leave it."
-            )
+        for name in matching:
+            if spec.lora_exclude is not None and re.search(spec.lora_exclude, name):
+                raise UserError(
+                    f"finetune.targets: {target!r} means {name}, whose weight is used in float32"
+                    " past any adapter: it would never act. Train it in full (finetune.train), or"
+                    " leave it."
+                )
         selected += matching
     if not selected:
         raise UserError(
@@ -285,19 +275,19 @@ def _targets(policy: "Policy", targets: Sequence[str]) -> list[str]:
 
 def _named(policy: "Policy", train: Sequence[str]) -> list[str]:
     """Full names of the modules that `train` means; parts are left to the caller."""
-    modules, components = (
-        [name for name, _ in policy.named_modules() if name],
-        policy.finetune_spec.components,
-    )
+    modules = [name for name, _ in policy.named_modules() if name]
+    components = policy.finetune_spec.components
     selected: list[str] = []
     for entry in train:
+        if entry in components:
+            continue
         matching = [name for name in modules if f".{name}".endswith(f".{entry}")]
-        if not matching and entry not in components:
+        if not matching:
             raise UserError(
                 f"finetune.train: {entry!r} is no part and no module."
                 f" {_near(entry, [*components, *modules])}"
             )
-        selected += [] if entry in components else matching
+        selected += matching
     return selected
 
 

@@ -33,7 +33,7 @@ from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
-from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes, Sharded
+from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes
 from mme_vla.speed.graphs import CapturedSampling
 from mme_vla.speed.sharding import ShardGroup, backbone_groups
 from mme_vla.types import Batch, MemoryTokens, Noise, map_noise, named_noise, send, stack_noise
@@ -92,9 +92,15 @@ class MMEPolicy(NetworkPolicy):
         self._modules = model._modules
         self.horizon = backbone.horizon
         self.action_dim = backbone.action_dim
+        sizes = {
+            "image_size": backbone.image_size,
+            "action_dim": backbone.action_dim,
+            "embodiment.action.horizon": backbone.horizon,
+        }
+        self.info = replace(self.info, processor_sizes=sizes)
         if isinstance(backbone, HasFlowHead):
-            self.sample_steps = backbone.head.steps
-            self.supports_rtc = backbone.head.supports_rtc
+            head = backbone.head
+            self.info = replace(self.info, sample_steps=head.steps, supports_rtc=head.supports_rtc)
         if isinstance(backbone, HasAttentionBackends):
             backbone.set_attention_backend(attention)
         elif check_backend(attention) != "auto":
@@ -149,26 +155,31 @@ class MMEPolicy(NetworkPolicy):
         """
         backbone_cls, sizes = read_backbone(config["backbone"])
         embodiment_of(config)  # raises an error before anything is built
+
+        # The integration, which decides on the backbone's extra experts.
         section = config.get("integration")
-        if section and (
-            unsupported := extension_points(INTEGRATIONS[section.get("name")])
-            - backbone_cls.supports
-        ):
-            raise UserError(
-                f"The backbone {config['backbone']['name']!r} has no place for"
-                f" {listed(sorted(unsupported))} of the integration {section['name']!r}; it hosts"
-                f" {listed(sorted(backbone_cls.supports))}. Choose another integration or backbone."
-            )
-        integration: Integration = (
-            INTEGRATIONS.build(section, sizes) if section else Integration(sizes)
-        )
+        integration = Integration(sizes)
+        if section:
+            required = extension_points(INTEGRATIONS[section.get("name")])
+            unsupported = required - backbone_cls.supports
+            if unsupported:
+                raise UserError(
+                    f"The backbone {config['backbone']['name']!r} has no place for"
+                    f" {listed(sorted(unsupported))} of the integration {section['name']!r}; it"
+                    f" hosts {listed(sorted(backbone_cls.supports))}. Choose another integration or"
+                    " backbone."
+                )
+            integration = INTEGRATIONS.build(section, sizes)
         experts = integration.extra_experts()
+
+        # The backbone, whose weights are not initialised if a checkpoint is loaded next.
         with nullcontext() if fresh_backbone else shapes_only():
             backbone = backbone_cls(sizes, experts)
         if not fresh_backbone:
             backbone.to_empty(device=torch.get_default_device())
             if isinstance(backbone, HasExtraExperts):
                 backbone.init_experts(list(experts))
+
         memory: MemoryModule | None = None
         if config.get("memory"):
             memory = build_memory(
@@ -239,11 +250,12 @@ class MMEPolicy(NetworkPolicy):
         """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times
         [b], in one pass.
         """
+        assert isinstance(self.backbone, HasFlowHead)
         if memory is None:
             memory = self.model.memory_tokens(batch)
         with self.autocast():
             injection = self.model.inject(self.model.prepare_images(batch), memory)
-            return self.backbone.velocity(injection, x_t, time)  # type: ignore[operator]
+            return self.backbone.predictor(batch, injection)(x_t, time)
 
     def recompute(self, mode: Recompute) -> None:
         if not isinstance(self.backbone, Recomputes):
@@ -267,11 +279,7 @@ class MMEPolicy(NetworkPolicy):
         """The backbone's groups. Memory and integration are in none: they are small, and compute in
         float32.
         """
-        return (
-            self.backbone.shard_groups()
-            if isinstance(self.backbone, Sharded)
-            else backbone_groups(self.backbone)
-        )
+        return backbone_groups(self.backbone)
 
     def _sample_augmentation(self, count: int, generator: torch.Generator) -> Tensor:
         """Random numbers of the augmentation of `count` training samples, [count, …] on the CPU."""
@@ -313,7 +321,7 @@ class MMEPolicy(NetworkPolicy):
             return self.model.sample(batch, values, steps, memory)
         if memory is None:
             memory = self.model.memory_tokens(batch)
-        return self._sampler(batch, values, steps or self.sample_steps, memory)
+        return self._sampler(batch, values, steps or self.info.sample_steps, memory)
 
     def compile_sampling(self, layers: bool = False) -> bool:
         """Speed up sampling with fixed weights; chunks are equal up to the rounding of other
@@ -331,20 +339,19 @@ class MMEPolicy(NetworkPolicy):
         """
         if not isinstance(self.backbone, CapturableSampling):
             return False
-        self.backbone.compile_sampling()
+        stamp = self.backbone.compile_sampling()
         if layers:
             self.backbone.compile(dynamic=False)
         if self.device.type != "cuda":
             return True
-        self._sampler = CapturedSampling(self.model.sample, self.backbone.sampling_stamp)
+        self._sampler = CapturedSampling(self.model.sample, stamp)
         if self.processor is None:
             return True
         full = self.full_batch(self.device)
         for length in range(16, self._prompt_length() + 16, 16):
-            cut = replace(
-                full, prompt=full.prompt[:, :length], prompt_mask=full.prompt_mask[:, :length]
-            )
-            self.sample_actions(cut)
+            prompt = full.prompt[:, :length]
+            prompt_mask = full.prompt_mask[:, :length]
+            self.sample_actions(replace(full, prompt=prompt, prompt_mask=prompt_mask))
         return True
 
     # Episodes
@@ -382,16 +389,13 @@ class MMEPolicy(NetworkPolicy):
         if self.memory is None:
             return None
         with self.autocast():
-            histories = [
-                PromptConditionedHistory(
-                    e.required_history(),
-                    partial(self._condition_one, batch.prompt[i], batch.prompt_mask[i]),
-                )
-                for i, e in enumerate(episodes)
-            ]
-            for episode, history in zip(episodes, histories, strict=True):
+            histories = []
+            for i, episode in enumerate(episodes):
+                condition = partial(self._condition_one, batch.prompt[i], batch.prompt_mask[i])
+                history = PromptConditionedHistory(episode.required_history(), condition)
                 episode.read = history
-            return self.memory.encode(histories, [e.stream for e in episodes])
+                histories.append(history)
+            return self.memory.encode(histories, [episode.stream for episode in episodes])
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
@@ -424,19 +428,17 @@ class MMEPolicy(NetworkPolicy):
         size = self.backbone.image_size
         views = len(self.embodiment.cameras)
         length = self._prompt_length()
-        history = None
-        if self.memory is not None:
-            history = full_history(self.memory, self.backbone.vision_width, device)
-        past_view_spec = None if self.memory is None else self.memory.past_view_spec
-        return Batch(
+        batch = Batch(
             images=torch.zeros(1, views, 3, size, size, dtype=torch.uint8, device=device),
             image_mask=torch.ones(1, views, dtype=torch.bool, device=device),
             prompt=torch.full((1, length), 5, device=device),
             prompt_mask=torch.ones(1, length, dtype=torch.bool, device=device),
-            history=history,
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            past=full_past(past_view_spec, views, size, device),
         )
+        if self.memory is not None:
+            batch.history = full_history(self.memory, self.backbone.vision_width, device)
+            batch.past = full_past(self.memory.past_view_spec, views, size, device)
+        return batch
 
     def _prompt_length(self) -> int:
         words = int(self.config["processor"]["prompt_length"])
@@ -446,26 +448,19 @@ class MMEPolicy(NetworkPolicy):
         size = self.backbone.image_size
         self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 
-    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        processor: Any = self.require_processor()
-        backbone = self.backbone
-        return {
-            "image_size": (processor.image_size, backbone.image_size),
-            "action_dim": (processor.action_dim, backbone.action_dim),
-            "horizon": (processor.embodiment.action.horizon, backbone.horizon),
-        }
-
     @property
     def finetune_spec(self) -> FineTuneSpec:
         """The backbone's components in its order; memory, integration and its experts are the
         component `memory`.
         """
         spec = self.backbone.finetune_spec
-        components = {
-            name: rf"backbone\.(?:{pattern})" for name, pattern in spec.components.items()
-        }
-        experts = f"|{components['memory']}" if "memory" in components else ""
-        components["memory"] = rf"memory\.|integration\.{experts}"
+        components = {}
+        for name, pattern in spec.components.items():
+            components[name] = rf"backbone\.(?:{pattern})"
+        of_memory = r"memory\.|integration\."
+        if "memory" in components:
+            of_memory += f"|{components['memory']}"
+        components["memory"] = of_memory
         return replace(spec, components=components)
 
 

@@ -12,11 +12,12 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.layers import autocast
 from mme_vla.errors import UserError
-from mme_vla.policy.base import Policy
+from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.processing.base import HasMemoryImages
-from mme_vla.speed import Recomputes, Sharded
+from mme_vla.speed import Recomputes
+from mme_vla.speed.sharding import ShardGroup, stacked_layers
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 if TYPE_CHECKING:
@@ -45,12 +46,15 @@ class MemoryTower(NamedTuple):
     settings: Sequence[str] = ()
 
 
-class NetworkPolicy(Policy, Recomputes, Sharded):
+class NetworkPolicy(Policy, Recomputes):
     """A policy of one network.
 
-    A subclass sets its modules and `memory`, and implements `memory_tower` if it has a memory,
-    `processor_sizes`, and what `Policy` requires.
+    A subclass sets its modules, `memory` and the fields of `info` that have other values, and
+    implements `memory_tower` if it has a memory, and what `Policy` requires.
     """
+
+    action_dim: int
+    """Width of a chunk inside the network. The embodiment's own actions are its first columns."""
 
     acts_in_bfloat16: ClassVar[bool] = False
     """Whether `dtype="auto"` rounds its weights to bfloat16 on a GPU."""
@@ -79,7 +83,7 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
         self.config = dict(config or {})
         self.augment = augment
         self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
-        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
+        self.info = PolicyInfo(history_dtype=dtype_of(history_dtype, "policy.history_dtype"))
 
     def autocast(self) -> torch.autocast:
         """The context all network code runs in."""
@@ -125,6 +129,12 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
 
     # Cost
 
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """Modules whose weights sharded processes gather one by one. All other weights are gathered
+        for a whole pass, in float32.
+        """
+        return [ShardGroup(layer) for layer in stacked_layers(self)]
+
     def full_batch(self, device: torch.device | str = "cpu") -> Any:
         """A batch of one at its fullest: every view, the longest prompt, a full memory, actions to
         learn from.
@@ -144,15 +154,14 @@ class NetworkPolicy(Policy, Recomputes, Sharded):
         processor = self.require_processor()
         assert isinstance(processor, HasMemoryImages)
         empty = torch.zeros(
-            0, storage.grid**2, source.width, dtype=self.history_dtype, device=device
+            0, storage.grid**2, source.width, dtype=self.info.history_dtype, device=device
         )
         encoded = [empty]
         for start in range(0, len(frames), batch_size):
             images = processor.memory_images(frames[start : start + batch_size], device=device)
             with self.autocast():
-                encoded.append(
-                    source.pooled_tokens(images, storage.grid, storage.pooling).to(empty)
-                )
+                tokens = source.pooled_tokens(images, storage.grid, storage.pooling)
+                encoded.append(tokens.to(empty))
         return torch.cat(encoded)
 
     def vision_fingerprint(self) -> str:

@@ -16,11 +16,10 @@ _STEP = re.compile(r"step_(\d+)")
 
 def checkpoints_in(folder: Path) -> list[Path]:
     """The finished checkpoints in a `checkpoints` folder, oldest step first."""
-    folders = [
-        path
-        for path in folder.glob("step_*")
-        if _STEP.fullmatch(path.name) and (path / STATE).is_file()
-    ]
+    folders = []
+    for path in folder.glob("step_*"):
+        if _STEP.fullmatch(path.name) and (path / STATE).is_file():
+            folders.append(path)
     return sorted(folders, key=step_of)
 
 
@@ -47,8 +46,10 @@ def trainings_in(folder: Path) -> list[Path]:
     """The run folders of the trainings of one recipe in `folder` that wrote a checkpoint, in their
     order.
     """
-    runs = [path for path in folder.glob("training_*") if _TRAINING.fullmatch(path.name)]
-    runs = [path for path in runs if checkpoints_in(path / CHECKPOINTS)]
+    runs = []
+    for path in folder.glob("training_*"):
+        if _TRAINING.fullmatch(path.name) and checkpoints_in(path / CHECKPOINTS):
+            runs.append(path)
     return sorted(runs, key=lambda path: int(path.name.removeprefix("training_")))
 
 
@@ -56,10 +57,12 @@ def newest_write(run: Path) -> int:
     """When a run, or one of its trainings, wrote a checkpoint last, in nanoseconds; 0 without a
     checkpoint.
     """
-    stored = [checkpoints_in(one / CHECKPOINTS) for one in (run, *trainings_in(run))]
-    return max(
-        (checkpoints[-1].stat().st_mtime_ns for checkpoints in stored if checkpoints), default=0
-    )
+    newest = 0
+    for folder in (run, *trainings_in(run)):
+        checkpoints = checkpoints_in(folder / CHECKPOINTS)
+        if checkpoints:
+            newest = max(newest, checkpoints[-1].stat().st_mtime_ns)
+    return newest
 
 
 LATEST = "latest"
@@ -70,9 +73,10 @@ is called so.
 
 def shipped_checkpoints() -> dict[str, Path]:
     """The checkpoints that extras and installed packages bring along: name → folder."""
-    return {
-        name: path for extension in extensions() for name, path in extension.checkpoints.items()
-    }
+    by_name: dict[str, Path] = {}
+    for extension in extensions():
+        by_name.update(extension.checkpoints)
+    return by_name
 
 
 def find_run(path: Path) -> Path:
@@ -83,8 +87,9 @@ def find_run(path: Path) -> Path:
     """
     if path.exists():
         return path
-    if str(path) in shipped_checkpoints():
-        return shipped_checkpoints()[str(path)]
+    shipped = shipped_checkpoints().get(str(path))
+    if shipped is not None:
+        return shipped
     if path.name != LATEST:
         return path
     runs = [run for run in path.parent.glob("*") if newest_write(run)]
@@ -106,7 +111,8 @@ def resolve_checkpoint(path: Path) -> Path:
     newest = newest_checkpoint(path)
     if newest != path or (path / "config.json").is_file():
         return newest
-    if trainings := trainings_in(path):
+    trainings = trainings_in(path)
+    if trainings:
         raise UserError(
             f"{path} holds {len(trainings)} trainings of one recipe: name one of them, such as"
             f" {trainings[0]}. mme-vla evaluate and results take all of them."
@@ -132,11 +138,11 @@ def _is_released(path: Path) -> bool:
     """Whether `path` is laid out as a run of the released code, a step of one, its arrays, or the
     zip of a step.
     """
-    steps = [path, *(step for step in path.glob("*") if step.stem.isdigit())]
-    return any(
-        step.suffix == ".zip" or step.name == "params" or (step / "params").is_dir()
-        for step in steps
-    )
+    steps = [step for step in path.glob("*") if step.stem.isdigit()]
+    for step in [path, *steps]:
+        if step.suffix == ".zip" or step.name == "params" or (step / "params").is_dir():
+            return True
+    return False
 
 
 def newest_checkpoint(path: Path) -> Path:
@@ -153,4 +159,6 @@ def locate_checkpoint(source: str | Path) -> str:
     but on the hub.
     """
     path = find_run(Path(source).expanduser())
-    return str(resolve_checkpoint(path)) if path.exists() else str(source)
+    if not path.exists():
+        return str(source)
+    return str(resolve_checkpoint(path))

@@ -5,6 +5,7 @@ import json
 import re
 import tempfile
 from collections.abc import Mapping
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,14 +47,10 @@ def composition_digest(config: Mapping[str, Any]) -> str:
             set, so that a later option with an empty default changes no digest. The robot counts
             where it is not RoboMME's Panda in joint space.
     """
-    settings = flat({key: config.get(key) for key in (*DECISIVE, "backbone")}) | of_policy(
-        config.get("policy") or {}
-    )
-    settings = {
-        key: value
-        for key, value in settings.items()
-        if value is not None and key != "processor.tokenizer"
-    }
+    settings = flat({key: config.get(key) for key in (*DECISIVE, "backbone")})
+    settings |= of_policy(config.get("policy") or {})
+    settings.pop("processor.tokenizer", None)
+    settings = {key: value for key, value in settings.items() if value is not None}
     robot = embodiment_of(config)
     if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):
         # which configurations did not use to name
@@ -145,19 +142,13 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
 
-    repository, within = place[1], place[2].strip("/")
+    repository = place[1]
+    within = place[2].strip("/")
+    options: dict[str, Any] = {"revision": revision, "token": token}
+    if within:
+        options["allow_patterns"] = [within, f"{within}/*"]
     try:
-        if not within:
-            return Path(snapshot_download(repository, revision=revision, token=token))
-        patterns = [within, f"{within}/*"]
-        root = Path(
-            snapshot_download(repository, revision=revision, token=token, allow_patterns=patterns)
-        )
-        require(
-            (root / within).exists(),
-            f"The hub repository {repository} has nothing called {within!r}.",
-        )
-        return root / within
+        root = Path(snapshot_download(repository, **options))
     except (
         HfHubHTTPError,
         LocalEntryNotFoundError,
@@ -166,13 +157,15 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
         OSError,
     ) as error:
         at = "" if revision is None else f" at revision {revision!r}"
-        reason = str(error).strip().splitlines()
+        reason = str(error).strip() or "no answer"
         raise UserError(
             f"{source} is not a path on this machine, and the hub repository of that name{at} could"
-            f" not be fetched ({type(error).__name__}: {reason[0] if reason else 'no answer'})."
-            " Check the name, the network, and for a private or gated repository your token (hf"
-            " auth login)."
+            f" not be fetched ({type(error).__name__}: {reason.splitlines()[0]}). Check the name,"
+            " the network, and for a private or gated repository your token (hf auth login)."
         ) from error
+    if not (root / within).exists():
+        raise UserError(f"The hub repository {repository} has nothing called {within!r}.")
+    return root / within
 
 
 def push_folder(
@@ -260,7 +253,9 @@ def save_settings(policy: "Policy", folder: Path) -> list[str]:
     """
     (folder / CONFIG).write_text(json.dumps(policy.config, indent=2, ensure_ascii=False) + "\n")
     (folder / CARD_FILE).write_text(model_card(policy, policy.config))
-    return [CONFIG, *(policy.processor.save(folder) if policy.processor is not None else [])]
+    if policy.processor is None:
+        return [CONFIG]
+    return [CONFIG, *policy.processor.save(folder)]
 
 
 def push_to_hub(
@@ -296,14 +291,14 @@ def load_policy[P: "Policy"](
     """
     from mme_vla.processing.base import load_processor
 
-    target_dtype, folder = (
-        None if dtype == "auto" else dtype_of(dtype),
-        local_folder(source, revision, token),
-    )
+    requested_dtype = None if dtype == "auto" else dtype_of(dtype)
+    folder = local_folder(source, revision, token)
     require(
         (folder / CONFIG).is_file(),
         f"No policy at {source}: it lacks {CONFIG}, which save_pretrained() writes.",
     )
+
+    # The configuration, which may be untrusted.
     config = read_config(folder)
     if isinstance(config.get(TRAINING), dict):
         config[TRAINING] = {**config[TRAINING], "weights": weights_digest(folder)}
@@ -317,11 +312,19 @@ def load_policy[P: "Policy"](
         check_known(f"section in {folder / CONFIG}:", key, KNOWN_SECTIONS)
     import_trusted(config, str(source), trust_plugins)
     policy_type = policy_class_for(requested, config, str(source))
-    on_gpu = torch.device(device).type == "cuda"
-    rounds = getattr(policy_type, "acts_in_bfloat16", False)  # a network that is made for it
-    kind = target_dtype or (torch.bfloat16 if on_gpu and rounds else torch.float32)
-    settings = {"compute_dtype": "bfloat16"} if kind == torch.bfloat16 else {}
-    policy = build_saved(policy_type, config, str(folder / CONFIG), {**settings, **(options or {})})
+
+    # Precision: `auto` rounds on a GPU, if the policy is made for it.
+    kind = requested_dtype or torch.float32
+    is_on_gpu = torch.device(device).type == "cuda"
+    if requested_dtype is None and is_on_gpu and getattr(policy_type, "acts_in_bfloat16", False):
+        kind = torch.bfloat16
+    settings: dict[str, Any] = {}
+    if kind == torch.bfloat16:
+        settings["compute_dtype"] = "bfloat16"
+    settings |= options or {}
+
+    # The policy on meta, then its tensors.
+    policy = build_saved(policy_type, config, str(folder / CONFIG), settings)
     assign_tensors(policy, load_tensors(folder), str(source), kind)
     recompute_buffers(policy)
     policy.processor = load_processor(folder, tokenizer)
@@ -369,14 +372,14 @@ def recompute_buffers(policy: "Policy") -> None:
     time.
     """
     for module in policy.modules():
-        if callable(reset := getattr(module, "reset_buffers", None)):
+        reset = getattr(module, "reset_buffers", None)
+        if callable(reset):
             reset()
-    unsaved = [
-        (path, name)
-        for path, module in policy.named_modules()
-        for name, value in [*module.named_buffers(recurse=False), *vars(module).items()]
-        if isinstance(value, Tensor) and value.is_meta
-    ]
+    unsaved = []
+    for path, module in policy.named_modules():
+        for name, value in [*module.named_buffers(recurse=False), *vars(module).items()]:
+            if isinstance(value, Tensor) and value.is_meta:
+                unsaved.append((path, name))
     if not unsaved:
         return
     fresh = any(path.startswith("backbone") for path, _ in unsaved)
@@ -391,13 +394,14 @@ def check_processor(policy: "Policy", source: str) -> None:
     """Make sure that a policy and its processor have the same robot and sizes."""
     processor = policy.require_processor()
     robot = embodiment_of(policy.config)
-    require(
-        not (policy.config.get("embodiment") is not None and robot != processor.embodiment),
-        f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the"
-        f" configuration of {brief(robot.name)}, or they describe it differently. The files are"
-        " from two checkpoints, or one was changed.",
-    )
-    for name, (actual, expected) in policy.processor_sizes().items():
+    if policy.config.get("embodiment") is not None and robot != processor.embodiment:
+        raise UserError(
+            f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the"
+            f" configuration of {brief(robot.name)}, or they describe it differently. The files are"
+            " from two checkpoints, or one was changed."
+        )
+    for name, expected in policy.info.processor_sizes.items():
+        actual = attrgetter(name)(processor)
         require(
             actual == expected,
             f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The"

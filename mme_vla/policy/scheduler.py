@@ -77,7 +77,10 @@ class Scheduler[R: Reading, A, L]:
             yield from self._piece(long)
             if time.perf_counter() > until:
                 break
-        if not (self.reading or self.acting) and (work := next(iter(self.later), None)) is not None:
+        if self.reading or self.acting:
+            return
+        work = next(iter(self.later), None)
+        if work is not None:
             del self.later[work]
             yield Prepare(work)
 

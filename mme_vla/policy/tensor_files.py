@@ -85,14 +85,17 @@ def require_one_set(folder: Path) -> list[str]:
         UserError: the index is none, or there is a single file of weights beside it that it does
             not name.
     """
-    table = read_json(checked_file(folder, INDEX), "an index of safetensors files").get(
-        "weight_map"
-    )
-    names = set(table.values()) if isinstance(table, dict) else set()
-    texts = names and all(isinstance(name, str) for name in names)
-    require(
-        texts, f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`."
-    )
+    index = read_json(checked_file(folder, INDEX), "an index of safetensors files")
+    table = index.get("weight_map")
+    if (
+        not isinstance(table, dict)
+        or not table
+        or not all(isinstance(name, str) for name in table.values())
+    ):
+        raise UserError(
+            f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`."
+        )
+    names = set(table.values())
     require(
         WEIGHTS in names or not (folder / WEIGHTS).is_file(),
         f"{folder} holds both {WEIGHTS} and {INDEX}, which names other files: it is not clear which"
@@ -107,7 +110,9 @@ def list_weight_files(folder: Path) -> list[str]:
     there is one, first.
     """
     files = [file.relative_to(folder).as_posix() for file in weight_files(folder)]
-    return [INDEX, *files] if (folder / INDEX).is_file() else files
+    if (folder / INDEX).is_file():
+        files.insert(0, INDEX)
+    return files
 
 
 _TRANSFORMERS = (
@@ -133,13 +138,14 @@ def check_transformers_folder(source: str | Path) -> None:
             weights.
     """
     folder = Path(source)
-    if folder.is_dir():
-        if (folder / INDEX).is_file():
-            require_one_set(folder)
-        check_sums(
-            folder,
-            sorted({file.name for pattern in _TRANSFORMERS for file in folder.glob(pattern)}),
-        )
+    if not folder.is_dir():
+        return
+    if (folder / INDEX).is_file():
+        require_one_set(folder)
+    names = set()
+    for pattern in _TRANSFORMERS:
+        names |= {file.name for file in folder.glob(pattern)}
+    check_sums(folder, sorted(names))
 
 
 def read_safetensors(file: Path) -> dict[str, Tensor]:
@@ -184,7 +190,9 @@ def cast(tensor: Tensor, dtype: torch.dtype | None) -> Tensor:
     """Bring a floating-point tensor to `dtype` (None: leave it); whole numbers and complex ones
     stay as they are.
     """
-    return tensor if dtype is None or not tensor.is_floating_point() else tensor.to(dtype)
+    if dtype is None or not tensor.is_floating_point():
+        return tensor
+    return tensor.to(dtype)
 
 
 def dtype_of(name: str, what: str = "dtype") -> torch.dtype:
@@ -201,34 +209,29 @@ def check_fit(
 ) -> None:
     missing = sorted(set(expected) - set(tensors) - set(optional))
     unexpected = sorted(set(tensors) - set(expected))
-    misshapen = [
-        f"{name}: {tuple(tensors[name].shape)} instead of {tuple(expected[name])}"
-        for name in sorted(set(expected) & set(tensors))
-        if tuple(tensors[name].shape) != tuple(expected[name])
-    ]
-    problems = [
-        f"{len(names):,} {what}:\n  {listed(names, 5)}"
-        for what, names in (
-            ("missing", missing),
-            ("unexpected", unexpected),
-            ("misshapen", misshapen),
-        )
-        if names
-    ]
-    require(
-        not problems, f"The weights in {source} do not fit this policy.\n" + "\n".join(problems)
-    )
+    misshapen = []
+    for name in sorted(set(expected) & set(tensors)):
+        shape = tuple(tensors[name].shape)
+        if shape != tuple(expected[name]):
+            misshapen.append(f"{name}: {shape} instead of {tuple(expected[name])}")
+    groups = {"missing": missing, "unexpected": unexpected, "misshapen": misshapen}
+    problems = []
+    for what, names in groups.items():
+        if names:
+            problems.append(f"{len(names):,} {what}:\n  {listed(names, 5)}")
+    if problems:
+        raise UserError("\n".join([f"The weights in {source} do not fit this policy.", *problems]))
 
 
 def check_values(tensors: Mapping[str, Tensor], source: str) -> None:
     """Make sure that tensors hold numbers a network can compute with."""
     broken = [name for name, tensor in tensors.items() if not _finite(tensor)]
-    require(
-        not broken,
-        f"{source} holds NaN or infinities in {len(broken):,} tensors: {listed(sorted(broken), 5)}."
-        " Its actions would mean nothing: the training diverged or the file is damaged; take an"
-        " earlier checkpoint.",
-    )
+    if broken:
+        raise UserError(
+            f"{source} holds NaN or infinities in {len(broken):,} tensors:"
+            f" {listed(sorted(broken), 5)}. Its actions would mean nothing: the training diverged"
+            " or the file is damaged; take an earlier checkpoint."
+        )
 
 
 def assign_tensors(
@@ -244,9 +247,8 @@ def assign_tensors(
     check_kinds(tensors, state, source)
     check_values(tensors, source)
     trainable = {name: p.requires_grad for name, p in module.named_parameters()}
-    module.load_state_dict(
-        {name: cast(t, dtype) for name, t in tensors.items()}, strict=True, assign=True
-    )
+    in_dtype = {name: cast(tensor, dtype) for name, tensor in tensors.items()}
+    module.load_state_dict(in_dtype, strict=True, assign=True)
     for name, parameter in module.named_parameters():
         parameter.requires_grad_(trainable[name])
 
@@ -267,16 +269,16 @@ def check_kinds(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], s
     """Make sure that tensors are of the kind of number (real, whole, complex) that those of the
     same name are.
     """
-    wrong = [
-        f"{name}: {str(tensor.dtype).removeprefix('torch.')} instead of "
-        f"{str(expected[name].dtype).removeprefix('torch.')}"
-        for name, tensor in tensors.items()
-        if name in expected and _kind(tensor) != _kind(expected[name])
-    ]
-    require(
-        not wrong,
-        f"The weights in {source} are of another kind of number: {listed(sorted(wrong), 5)}.",
-    )
+    wrong = []
+    for name, tensor in sorted(tensors.items()):
+        if name in expected and _kind(tensor) != _kind(expected[name]):
+            stored = str(tensor.dtype).removeprefix("torch.")
+            needed = str(expected[name].dtype).removeprefix("torch.")
+            wrong.append(f"{name}: {stored} instead of {needed}")
+    if wrong:
+        raise UserError(
+            f"The weights in {source} are of another kind of number: {listed(wrong, 5)}."
+        )
 
 
 def replace_folder(built: Path, target: Path) -> None:

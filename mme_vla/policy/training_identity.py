@@ -62,22 +62,24 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
     Args:
         config: the plain configuration of a training. content: fingerprints of its datasets.
     """
+    policy = config.get("policy") or {}
     data = config.get("data") or {}
-    settings = {key: config.get(key) for key in _RECIPE} | {
-        "policy": {key: (config.get("policy") or {}).get(key) for key in _POLICY},
-        "data": {key: data.get(key) for key in _DATA},
-    }
-    start = settings["init_from"]
-    settings["init_from"] = None if start in (None, NONE) else _start(str(start))
-    recipe = {
-        key: value
-        for key, value in flat(settings).items()
-        if value not in (None, [], {})
-        and not any(f"{key}.".startswith(f"{free}.") for free in _NO_EFFECT)
-    }
+    settings = {key: config.get(key) for key in _RECIPE}
+    settings["policy"] = {key: policy.get(key) for key in _POLICY}
+    settings["data"] = {key: data.get(key) for key in _DATA}
+    if settings["init_from"] == NONE:
+        settings["init_from"] = None
+    if settings["init_from"] is not None:
+        settings["init_from"] = _start(str(settings["init_from"]))
+    no_effect = tuple(f"{key}." for key in _NO_EFFECT)
+    recipe = {}
+    for key, value in flat(settings).items():
+        if value not in (None, [], {}) and not f"{key}.".startswith(no_effect):
+            recipe[key] = value
     split = {
         "content": list(content),
-        **{key: data.get(key) for key in ("val_fraction", "val_episodes")},
+        "val_fraction": data.get("val_fraction"),
+        "val_episodes": data.get("val_episodes"),
     }
     identity = TrainingIdentity(int(config["seed"]), digest(recipe, 12), digest(split, 12))
     return {key: value for key, value in asdict(identity).items() if value is not None}
@@ -88,7 +90,9 @@ def identity_of(config: Mapping[str, Any]) -> TrainingIdentity | None:
     earlier version.
     """
     section = config.get(KEY)
-    return None if section is None else read_section(TrainingIdentity, section, KEY)
+    if section is None:
+        return None
+    return read_section(TrainingIdentity, section, KEY)
 
 
 def weights_digest(folder: Path) -> str | None:
@@ -99,7 +103,9 @@ def weights_digest(folder: Path) -> str | None:
     if not table:
         return None
     sums = [table[name] for name in sorted(list_weight_files(folder)) if name in table]
-    return digest({"weights": sums}, 12) if sums else None
+    if not sums:
+        return None
+    return digest({"weights": sums}, 12)
 
 
 def _start(source: str) -> str:

@@ -17,7 +17,7 @@ from mme_vla.memory.base import stack_history
 from mme_vla.processing.images import stack_past
 from mme_vla.processing.normalise import NormStats, normalize
 from mme_vla.registry import PROCESSORS
-from mme_vla.types import Batch, Labels
+from mme_vla.types import Batch
 from mme_vla.utils import checked_file, read_json
 
 CONFIG_FILE = "processor.json"
@@ -265,10 +265,9 @@ def motion_rows(
     done = torch.from_numpy(np.asarray(actions, np.float32))
     is_known = torch.from_numpy(np.asarray(known, np.float32))[:, None]
     relative = processor.embodiment.action.to_relative(done[:, None], proprio)[:, 0]
-    return torch.cat(
-        [normalize(proprio, stats.state), normalize(relative, stats.actions) * is_known, is_known],
-        1,
-    )
+    state = normalize(proprio, stats.state)
+    action = normalize(relative, stats.actions) * is_known
+    return torch.cat([state, action, is_known], 1)
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
@@ -304,21 +303,19 @@ def collate(items: Sequence[dict[str, Any]]) -> Batch:
         image_mask=torch.ones(images.shape[:2], dtype=torch.bool),
         prompt=stack("prompt"),
         prompt_mask=stack("prompt_mask"),
-        history=stack_history([item["history"] for item in items])
-        if "history" in items[0]
-        else None,
         actions=stack("actions"),
-        action_mask=stack("action_mask") if "action_mask" in items[0] else None,
         state=stack("state"),
         past=stack_past([item.get("past") for item in items]),
-        weight=stack("weight") if "weight" in items[0] else None,
-        labels=Labels(
-            {
-                name: torch.stack([item["labels"][name] for item in items])
-                for name in items[0].get("labels", ())
-            }
-        ),
     )
+    # What the dataset adds, all items or none.
+    if "history" in items[0]:
+        batch.history = stack_history([item["history"] for item in items])
+    if "action_mask" in items[0]:
+        batch.action_mask = stack("action_mask")
+    if "weight" in items[0]:
+        batch.weight = stack("weight")
+    for name in items[0].get("labels", ()):
+        batch.labels[name] = torch.stack([item["labels"][name] for item in items])
     return batch.without_prompt_padding()
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError
 from mme_vla.memory.base import PastViewSpec
 from mme_vla.types import FrameBatch, PastViews
 
@@ -31,10 +31,11 @@ def resize_with_pad_uint8(frames: np.ndarray, size: tuple[int, int] | int) -> np
     """
     from PIL import Image
 
-    require(
-        frames.dtype == np.uint8 and frames.ndim >= 3 and frames.shape[-1] == 3,
-        f"Expected uint8 images [..., height, width, 3], got {frames.dtype} {list(frames.shape)}.",
-    )
+    if frames.dtype != np.uint8 or frames.ndim < 3 or frames.shape[-1] != 3:
+        raise UserError(
+            f"Expected uint8 images [..., height, width, 3], got {frames.dtype}"
+            f" {list(frames.shape)}."
+        )
     height, width = _pair(size)
     if frames.shape[-3:-1] == (height, width):
         return frames
@@ -59,19 +60,16 @@ def resize_with_pad(images: Tensor, size: tuple[int, int] | int) -> Tensor:
     Returns:
         [n, 3, h, w] float32 in [-1, 1], on the device of `images`.
     """
-    require(
-        images.ndim == 4 and images.shape[-1] == 3,
-        f"Expected images [n, height, width, 3], got {list(images.shape)}.",
-    )
-    require(
-        not (images.dtype != torch.uint8 and not images.is_floating_point()),
-        f"Expected images as uint8, or as float in [-1, 1]; got {images.dtype}.",
-    )
+    if images.ndim != 4 or images.shape[-1] != 3:
+        raise UserError(f"Expected images [n, height, width, 3], got {list(images.shape)}.")
+    source = images.movedim(-1, 1)
+    if images.dtype == torch.uint8:
+        source = to_unit_range(source)
+    elif images.is_floating_point():
+        source = source.float()
+    else:
+        raise UserError(f"Expected images as uint8, or as float in [-1, 1]; got {images.dtype}.")
     height, width = _pair(size)
-    channels_first = images.movedim(-1, 1)
-    source = (
-        to_unit_range(channels_first) if images.dtype == torch.uint8 else channels_first.float()
-    )
     if source.shape[-2:] == (height, width):
         return source.contiguous()
     inner_h, inner_w, top, left = _fit(source.shape[-2], source.shape[-1], height, width)
@@ -94,28 +92,29 @@ def as_uint8_frames(image: np.ndarray | Tensor) -> np.ndarray:
     Accepts uint8, or float in [0, 1] (mapped by truncating 255·x, as released), with the channels
     last or first.
     """
-    array = image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
-    require(
-        array.ndim in (3, 4),
-        f"Expected an image [H, W, 3] or a stack [n, H, W, 3], got shape {list(array.shape)}.",
-    )
+    if isinstance(image, Tensor):
+        image = image.detach().cpu().numpy()
+    array = np.asarray(image)
+    if array.ndim not in (3, 4):
+        raise UserError(
+            f"Expected an image [H, W, 3] or a stack [n, H, W, 3], got shape {list(array.shape)}."
+        )
     if array.shape[-1] != 3 and array.shape[-3] == 3:
         array = np.moveaxis(array, -3, -1)
-    require(
-        array.shape[-1] == 3,
-        f"Expected RGB images (three channels first or last), got shape {list(array.shape)}.",
-    )
-    if np.issubdtype(array.dtype, np.floating):
-        low, high = (array.min(), array.max()) if array.size else (0, 0)
-        require(
-            low >= 0 and high <= 1,
-            f"Float images must lie in [0, 1], got values from {low:g} to {high:g}: divide by 255.",
+    if array.shape[-1] != 3:
+        raise UserError(
+            f"Expected RGB images (three channels first or last), got shape {list(array.shape)}."
         )
+    if np.issubdtype(array.dtype, np.floating):
+        # `not …` refuses NaN as well.
+        if array.size and not (array.min() >= 0 and array.max() <= 1):
+            raise UserError(
+                f"Float images must lie in [0, 1], got values from {array.min():g} to"
+                f" {array.max():g}: divide by 255."
+            )
         return (255 * array).astype(np.uint8)
-    require(
-        array.dtype == np.uint8,
-        f"Expected images as uint8, or as float in [0, 1]; got {array.dtype}.",
-    )
+    if array.dtype != np.uint8:
+        raise UserError(f"Expected images as uint8, or as float in [0, 1]; got {array.dtype}.")
     return array
 
 
@@ -152,13 +151,10 @@ class PastImages:
         self._count += next(iter(views.values())).length
         oldest = self._count - 1 - self.spec.span
         for frame in range(max(oldest, first), self._count):
-            images = [
-                image.copy()
-                for view in views.values()
-                if (image := view.image(frame - first)) is not None
-            ]
-            if len(images) == len(views):
-                self._frames[frame] = images
+            images = [view.image(frame - first) for view in views.values()]
+            rendered = [image.copy() for image in images if image is not None]
+            if len(rendered) == len(views):
+                self._frames[frame] = rendered
         self._frames = {frame: images for frame, images in self._frames.items() if frame >= oldest}
 
     def at(self, step: int, prepare: Prepare) -> PastViews:
@@ -188,14 +184,16 @@ def past_views(
         read: frames [n], ascending, at least one → images [n, H, W, 3] of every camera.
     """
     requested = spec.at(step)
-    there = requested >= 0
-    # Without a past frame, the current one gives the size of the images.
-    frames = requested[there] if there.any() else np.array([step])
-    prepared = prepare(read(frames))
-    images = prepared.new_zeros(len(requested), *prepared.shape[1:])
-    if there.any():
-        images[torch.from_numpy(there)] = prepared
-    return PastViews(images, torch.from_numpy(there), spec.every)
+    exists = requested >= 0
+    mask = torch.from_numpy(exists)
+    if exists.any():
+        prepared = prepare(read(requested[exists]))
+        images = prepared.new_zeros(len(requested), *prepared.shape[1:])
+        images[mask] = prepared
+    else:  # the current frame gives the size of the images
+        prepared = prepare(read(np.array([step])))
+        images = prepared.new_zeros(len(requested), *prepared.shape[1:])
+    return PastViews(images, mask, spec.every)
 
 
 def stack_past(items: Sequence[PastViews | None]) -> PastViews | None:
@@ -216,10 +214,10 @@ def full_past(
     """Past views of a batch of one, all there and without content."""
     if spec is None:
         return None
-    images = torch.zeros(1, spec.frames - 1, views, 3, size, size, dtype=torch.uint8, device=device)
-    return PastViews(
-        images, torch.ones(images.shape[:2], dtype=torch.bool, device=device), spec.every
-    )
+    count = spec.frames - 1
+    images = torch.zeros(1, count, views, 3, size, size, dtype=torch.uint8, device=device)
+    mask = torch.ones(1, count, dtype=torch.bool, device=device)
+    return PastViews(images, mask, spec.every)
 
 
 CROP = 0.95  # side of the crop, rounded down to whole pixels: 212 of 224
@@ -253,21 +251,18 @@ def augment_views(images: Tensor, augmentations: Sequence[str], draws: Tensor) -
     Returns:
         [b, v, 3, s, s] float32 in [-1, 1].
     """
-    require(
-        images.ndim == 5 and images.shape[2] == 3 and images.shape[-1] == images.shape[-2],
-        f"Expected square images [b, v, 3, s, s], got {list(images.shape)}.",
-    )
+    if images.ndim != 5 or images.shape[2] != 3 or images.shape[-1] != images.shape[-2]:
+        raise UserError(f"Expected square images [b, v, 3, s, s], got {list(images.shape)}.")
     if images.shape[1] != len(augmentations):
         raise UserError(
             f"Got {images.shape[1]} views but {len(augmentations)} cameras are described."
         )
     symmetric = draws[:, :6] * 2 - 1
-    offset, angle = symmetric[:, :2], symmetric[:, 2] * ROTATION
-    brightness, contrast, hue = (
-        symmetric[:, 3] * BRIGHTNESS,
-        symmetric[:, 4] * CONTRAST,
-        symmetric[:, 5] * HUE,
-    )
+    offset = symmetric[:, :2]
+    angle = symmetric[:, 2] * ROTATION
+    brightness = symmetric[:, 3] * BRIGHTNESS
+    contrast = symmetric[:, 4] * CONTRAST
+    hue = symmetric[:, 5] * HUE
     jittered = (draws[:, 6] < JITTER_PROBABILITY)[:, None, None, None]
 
     pixels = (images.float() + 1) / 2  # in [0, 1] the zero fill of the resampling is black
@@ -297,9 +292,9 @@ def crop_and_rotate(pixels: Tensor, offset: Tensor, angle: Tensor) -> Tensor:
     scale = int(CROP * size) / size
     cos, sin = scale * angle.cos(), scale * angle.sin()
     shift = (1 - scale) * offset
-    rows = torch.stack(
-        [torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)], 1
-    )
+    first_row = torch.stack([cos, -sin, shift[:, 0]], 1)
+    second_row = torch.stack([sin, cos, shift[:, 1]], 1)
+    rows = torch.stack([first_row, second_row], 1)
     grid = functional.affine_grid(rows, [batch, 1, size, size], align_corners=False)
     # the views of a sample move together: as channels they share one grid
     stacked = pixels.flatten(1, 2)
@@ -328,9 +323,8 @@ def jitter_colours(pixels: Tensor, brightness: Tensor, contrast: Tensor, hue: Te
     k = torch.tan((contrast + 1) * (math.pi / 4))
     knee = k / (2 * (1 + k))
     middle = k * (value - 0.5) + 0.5
-    value = torch.where(
-        value < knee, value / k, torch.where(value > 1 - knee, (value - 1) / k + 1, middle)
-    )
+    bright = torch.where(value > 1 - knee, (value - 1) / k + 1, middle)
+    value = torch.where(value < knee, value / k, bright)
     return hsv_to_rgb(h + hue, s, value)
 
 

@@ -74,19 +74,21 @@ class QuantileStats:
                     f" {brief(data[field.name])}."
                 )
             arrays[field.name] = array
-        if len({len(array) for array in arrays.values()}) > 1:
-            raise UserError(
-                f"{name}: the lists have different lengths"
-                f" { {k: len(v) for k, v in arrays.items()} }."
-            )
+        lengths = {key: len(array) for key, array in arrays.items()}
+        if len(set(lengths.values())) > 1:
+            raise UserError(f"{name}: the lists have different lengths {lengths}.")
         for low, high in (("q01", "q99"), ("min", "max")):
-            if high in arrays and low in arrays:
-                ordered = (arrays[low] <= arrays[high]).all()
-                require(
-                    ordered,
-                    f"{name}: {high} lies below {low} in a dimension; the statistics are damaged.",
+            if high in arrays and low in arrays and (arrays[low] > arrays[high]).any():
+                raise UserError(
+                    f"{name}: {high} lies below {low} in a dimension; the statistics are damaged."
                 )
         return cls(**arrays)
+
+
+_LAYOUT = (
+    'Normalisation statistics must look like {"norm_stats": {"state": {…}, "actions": {…}}}; got'
+    " the keys"
+)
 
 
 @dataclass(frozen=True)
@@ -108,17 +110,19 @@ class NormStats:
         Args:
             ranges: number of an action → the lowest and the highest value, which become −1 and 1.
         """
-        sides = []
-        for width, given in ((state_width, {}), (action_width, ranges or {})):
-            low, high = -np.ones(width), np.ones(width)
-            for place, ends in given.items():
-                low[place], high[place] = ends
-            sides.append(
-                QuantileStats(
-                    (low + high) / 2, (high - low) / 2, low, high, low.copy(), high.copy()
-                )
+
+        def between(low: np.ndarray, high: np.ndarray) -> QuantileStats:
+            return QuantileStats(
+                mean=(low + high) / 2, std=(high - low) / 2, q01=low, q99=high, min=low, max=high
             )
-        return cls(*sides)
+
+        state = between(-np.ones(state_width), np.ones(state_width))
+        low = -np.ones(action_width)
+        high = np.ones(action_width)
+        for number, (lowest, highest) in (ranges or {}).items():
+            low[number] = lowest
+            high[number] = highest
+        return cls(state, between(low, high))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the layout of openpi's `norm_stats.json`."""
@@ -128,16 +132,13 @@ class NormStats:
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """Read the layout of openpi's `norm_stats.json`."""
         inner = data.get("norm_stats")
-        if not isinstance(inner, dict) or not all(
-            isinstance(inner.get(key), dict) for key in ("state", "actions")
-        ):
-            raise UserError(
-                'Normalisation statistics must look like {"norm_stats": {"state": {…},'
-                ' "actions": {…}}}; got the keys'
-                f" {listed(sorted(inner if isinstance(inner, dict) else data))}."
-            )
+        if not isinstance(inner, dict):
+            raise UserError(f"{_LAYOUT} {listed(sorted(data))}.")
+        state, actions = inner.get("state"), inner.get("actions")
+        if not isinstance(state, dict) or not isinstance(actions, dict):
+            raise UserError(f"{_LAYOUT} {listed(sorted(inner))}.")
         return cls(
-            **{key: QuantileStats.from_dict(inner[key], key) for key in ("state", "actions")}
+            QuantileStats.from_dict(state, "state"), QuantileStats.from_dict(actions, "actions")
         )
 
     def save(self, path: Path | str) -> None:
@@ -176,11 +177,12 @@ def unnormalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tenso
 
 
 def _range(x: Tensor, stats: QuantileStats, by: str) -> tuple[Tensor, Tensor]:
-    require(x.is_floating_point(), f"Only floating-point values can be normalised, got {x.dtype}.")
-    require(
-        x.shape[-1] >= len(stats),
-        f"Statistics of {len(stats)} dimensions do not fit values of shape {list(x.shape)}.",
-    )
+    if not x.is_floating_point():
+        raise UserError(f"Only floating-point values can be normalised, got {x.dtype}.")
+    if x.shape[-1] < len(stats):
+        raise UserError(
+            f"Statistics of {len(stats)} dimensions do not fit values of shape {list(x.shape)}."
+        )
     low, high = stats.bounds(by)
     return x.new_tensor(low), x.new_tensor(high - low + EPSILON)
 
@@ -205,8 +207,10 @@ class ExactStats:
         require(count >= 2, f"Statistics need at least two rows, got {count}.")
         rows = np.concatenate(self._rows)
         q01, q99 = np.quantile(rows, [0.01, 0.99], axis=0)
-        ends = (rows.min(0), rows.max(0)) if extremes else ()
-        return QuantileStats(rows.mean(0), rows.std(0), q01, q99, *ends)
+        stats = QuantileStats(rows.mean(0), rows.std(0), q01, q99)
+        if extremes:
+            return replace(stats, min=rows.min(0), max=rows.max(0))
+        return stats
 
 
 FEWEST_BINS = 50
@@ -236,10 +240,8 @@ class _Magnitudes:
         """Count values [n]."""
         distances = values - self._centre
         mantissas, powers = np.frexp(np.abs(distances))
-        parts = ((2 * mantissas - 1) * self.PARTS).astype(np.int64)
-        bins = (np.clip(powers, self.LEAST, self.MOST - 1) - self.LEAST) * self.PARTS + np.maximum(
-            parts, 0
-        )
+        parts = np.maximum(((2 * mantissas - 1) * self.PARTS).astype(np.int64), 0)
+        bins = (np.clip(powers, self.LEAST, self.MOST - 1) - self.LEAST) * self.PARTS + parts
         np.add.at(self._above, bins[distances > 0], 1)
         np.add.at(self._below, bins[distances < 0], 1)
         self._at_centre += int((distances == 0).sum())
@@ -251,7 +253,8 @@ class _Magnitudes:
         """
         below = np.concatenate([self._below[::-1], [self._at_centre], self._above]).cumsum()
         rank = q * (self._count - 1)
-        low, high = (self._value(below, int(side)) for side in (np.floor(rank), np.ceil(rank)))
+        low = self._value(below, int(np.floor(rank)))
+        high = self._value(below, int(np.ceil(rank)))
         return low + (high - low) * (rank - np.floor(rank))
 
     def _value(self, below: np.ndarray, rank: int) -> float:
@@ -316,7 +319,8 @@ class RunningStats:
                 f"Rows of {rows.shape[1]} numbers cannot join statistics of {len(self._mean)}."
             )
         elif (low < self._low).any() or (high > self._high).any():
-            self._low, self._high = np.minimum(low, self._low), np.maximum(high, self._high)
+            self._low = np.minimum(low, self._low)
+            self._high = np.maximum(high, self._high)
             self._rebin()
         self._count += len(rows)
         weight = len(rows) / self._count
@@ -333,14 +337,16 @@ class RunningStats:
         """
         require(self._count >= 2, f"Statistics need at least two rows, got {self._count}.")
         std = np.sqrt(np.maximum(self._square - self._mean**2, 0))
-        ends = (self._low.copy(), self._high.copy()) if extremes else ()
         low, high = self._quantile(0.01), self._quantile(0.99)
         widths = (self._high - self._low) / self._bins
         for d, magnitudes in enumerate(self._magnitudes):
             fine_low, fine_high = magnitudes.quantile(0.01), magnitudes.quantile(0.99)
             if 0 < fine_high - fine_low < FEWEST_BINS * widths[d]:
                 low[d], high[d] = fine_low, fine_high
-        return QuantileStats(self._mean.copy(), std, low, high, *ends)
+        stats = QuantileStats(self._mean.copy(), std, low, high)
+        if extremes:
+            return replace(stats, min=self._low.copy(), max=self._high.copy())
+        return stats
 
     def _rebin(self) -> None:
         edges = np.linspace(self._low, self._high, self._bins + 1, axis=1)

@@ -49,10 +49,8 @@ from mme_vla.types import Batch
 from mme_vla.utils import Sums, checked_file, inside
 
 TOKENIZER_FILE = "tokenizer.model"
-OLD_VIEWS = [
-    "base_0_rgb",
-    "left_wrist_0_rgb",
-]  # what processors named before robots could be chosen: front and wrist
+OLD_VIEWS = ["base_0_rgb", "left_wrist_0_rgb"]
+"""What processors named before robots could be chosen: front and wrist."""
 
 
 def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) -> dict[str, Any]:
@@ -74,22 +72,26 @@ def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) ->
             f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.",
         )
     PROMPTS[str(settings.get("prompt", "plain"))]  # checks the name before any file is read
-    fingerprint, stats = settings.pop("tokenizer_fingerprint", None), settings.pop("stats", None)
-    if (views := settings.pop("views", OLD_VIEWS)) != OLD_VIEWS:
+    views = settings.pop("views", OLD_VIEWS)
+    if views != OLD_VIEWS:
         raise UserError(
             f"processor.views={brief(views)}: cameras are named in the section 'embodiment' now."
         )
-    if (robot := settings.pop("embodiment", None)) is not None:
+    robot = settings.pop("embodiment", None)
+    if robot is not None:
         settings["embodiment"] = Embodiment.from_dict(robot)
-    tokenizer = Tokenizer.load(settings.pop("tokenizer"))
-    require(
-        not (fingerprint is not None and tokenizer.fingerprint != fingerprint),
-        f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but"
-        f" {brief(fingerprint)} was used in training: its ids would mean other words. Give the file"
-        " that was used.",
-    )
-    stats = None if stats is None else NormStats.load(stats)
-    return {**settings, "tokenizer": tokenizer, "stats": stats}
+    fingerprint = settings.pop("tokenizer_fingerprint", None)
+    tokenizer = Tokenizer.load(settings["tokenizer"])
+    if fingerprint is not None and tokenizer.fingerprint != fingerprint:
+        raise UserError(
+            f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but"
+            f" {brief(fingerprint)} was used in training: its ids would mean other words. Give the"
+            " file that was used."
+        )
+    settings["tokenizer"] = tokenizer
+    if settings.get("stats") is not None:
+        settings["stats"] = NormStats.load(settings["stats"])
+    return settings
 
 
 def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]:
@@ -100,9 +102,9 @@ def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]
         tokenizer: in place of the one it names.
     """
     config = read_settings(folder)
-    named, stats = config.get("tokenizer", ""), config.get("stats")
     if tokenizer is None:
-        tokenizer = saved_tokenizer(folder, named)
+        tokenizer = saved_tokenizer(folder, config.get("tokenizer", ""))
+    stats = config.get("stats")
     if stats is not None:
         stats = saved_file(folder, stats, "statistics")
     return {**config, "tokenizer": tokenizer, "stats": stats}
@@ -173,15 +175,13 @@ class Processor(PolicyProcessor):
         goal_case: str = "given",
     ) -> None:
         check_choice("processor.goal_case", goal_case, GOAL_CASES)
-        sizes = {
-            "image_size": image_size,
-            "prompt_length": prompt_length,
-            "action_dim": action_dim,
-            **({} if horizon is None else {"horizon": horizon}),
-            **({} if subgoal_length is None else {"subgoal_length": subgoal_length}),
-        }
-        for name, value in sizes.items():
-            check_integer(f"processor.{name}", value)
+        check_integer("processor.image_size", image_size)
+        check_integer("processor.prompt_length", prompt_length)
+        check_integer("processor.action_dim", action_dim)
+        if horizon is not None:
+            check_integer("processor.horizon", horizon)
+        if subgoal_length is not None:
+            check_integer("processor.subgoal_length", subgoal_length)
         require(isinstance(prompt, str), f"processor.prompt must be a name, got {brief(prompt)}.")
         self.prompt_format = PROMPTS[prompt]()
         self.prompt_name = prompt
@@ -204,23 +204,23 @@ class Processor(PolicyProcessor):
         settings["goal_case"] = settings.get("goal_case") or goal_case(robot)
         processor = cls.from_config({**settings, **sizes, "embodiment": robot.to_dict()})
         vocab_size = sections["backbone"].get("vocab_size")
-        require(
-            not (vocab_size is not None and processor.tokenizer.vocab_size > vocab_size),
-            f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size}"
-            f" entries but backbone.vocab_size={vocab_size}: choose the processor that goes with"
-            " the backbone.",
-        )
+        tokenizer = processor.tokenizer
+        if vocab_size is not None and tokenizer.vocab_size > vocab_size:
+            raise UserError(
+                f"The tokenizer {tokenizer.spec!r} has {tokenizer.vocab_size} entries but"
+                f" backbone.vocab_size={vocab_size}: choose the processor that goes with the"
+                " backbone."
+            )
         return processor
 
     @property
     def prompt_spec(self) -> PromptSpec:
-        kind, tokenizer = self.prompt_format, self.tokenizer
         return PromptSpec(
-            tokenizer.spec,
+            self.tokenizer.spec,
             self.prompt_name,
-            kind.reads_subgoal,
-            kind.past_actions,
-            tokenizer.fingerprint,
+            self.prompt_format.reads_subgoal,
+            self.prompt_format.past_actions,
+            self.tokenizer.fingerprint,
         )
 
     @property
@@ -239,19 +239,16 @@ class Processor(PolicyProcessor):
             [v, 3, s, s] uint8, or [n, v, 3, s, s].
         """
         names = self.embodiment.camera_names
-        require(
-            len(views) == len(names),
-            f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.",
-        )
+        if len(views) != len(names):
+            raise UserError(f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
         resized = [resize_with_pad_uint8(as_uint8_frames(view), self.image_size) for view in views]
         if len({view.shape for view in resized}) > 1:
             raise UserError(
                 "All views need as many images, got shapes"
                 f" {[list(view.shape) for view in resized]}."
             )
-        return torch.from_numpy(
-            np.ascontiguousarray(np.moveaxis(np.stack(resized, axis=-4), -1, -3))
-        )
+        channels_first = np.moveaxis(np.stack(resized, axis=-4), -1, -3)
+        return torch.from_numpy(np.ascontiguousarray(channels_first))
 
     def memory_images(
         self, frames: np.ndarray | Tensor, device: torch.device | str | None = None
@@ -259,13 +256,13 @@ class Processor(PolicyProcessor):
         """Resize memory frames [n, H, W, 3] uint8 to [n, 3, s, s] float32 in [-1, 1], on `device`
         if one is given.
         """
-        # A copy where the array is read-only (memory-mapped), which PyTorch cannot share safely.
-        array = (
-            frames
-            if isinstance(frames, Tensor)
-            else torch.from_numpy(np.require(frames, requirements=["C", "W"]))
-        )
-        return resize_with_pad(array.to(device) if device is not None else array, self.image_size)
+        if not isinstance(frames, Tensor):
+            # A copy where the array is read-only (memory-mapped), which PyTorch cannot share
+            # safely.
+            frames = torch.from_numpy(np.require(frames, requirements=["C", "W"]))
+        if device is not None:
+            frames = frames.to(device)
+        return resize_with_pad(frames, self.image_size)
 
     def prompt(
         self,
@@ -286,15 +283,15 @@ class Processor(PolicyProcessor):
         Returns:
             ids [l] int64 and mask [l] bool.
         """
-        normalised, past = None, None
+        normalised = None
         if state is not None and self.prompt_format.reads_state:
             normalised = normalize(_float(state), self.require_stats().state).numpy()
+        past = None
         count = self.prompt_format.past_actions
         if count and state is not None and past_actions is not None:
-            recent = self.embodiment.action.to_relative(
-                _float(past_actions)[-count:], _float(state)
-            )
-            past = normalize(recent, self.require_stats().actions).numpy()
+            recent = _float(past_actions)[-count:]
+            relative = self.embodiment.action.to_relative(recent, _float(state))
+            past = normalize(relative, self.require_stats().actions).numpy()
         goal = spelled(checked_text(goal, "the goal"), self.goal_case)
         if subgoal is not None and self.prompt_format.reads_subgoal:
             subgoal = spelled(checked_text(subgoal, "the subgoal"), self.goal_case)
@@ -314,13 +311,14 @@ class Processor(PolicyProcessor):
             padded with zeros.
         """
         stats = self.require_stats()
-        chunk, state = _float(chunk), _float(state)
-        horizon = self.embodiment.action.horizon
-        require(
-            chunk.shape == (horizon, len(stats.actions)) and state.shape == (len(stats.state),),
-            f"Expected actions [{horizon}, {len(stats.actions)}] and a state [{len(stats.state)}], "
-            f"got {list(chunk.shape)} and {list(state.shape)}.",
-        )
+        chunk = _float(chunk)
+        state = _float(state)
+        expected = (self.embodiment.action.horizon, len(stats.actions))
+        if chunk.shape != expected or state.shape != (len(stats.state),):
+            raise UserError(
+                f"Expected actions {list(expected)} and a state [{len(stats.state)}], got"
+                f" {list(chunk.shape)} and {list(state.shape)}."
+            )
         relative = self.embodiment.action.to_relative(chunk, state)
         return pad_width(normalize(relative, stats.actions), self.action_dim)
 
@@ -358,10 +356,12 @@ class Processor(PolicyProcessor):
         return collate(items)
 
     def to_config(self) -> dict[str, Any]:
-        on_hub = self.tokenizer.spec.startswith(HUB)
-        return {
+        tokenizer = TOKENIZER_FILE
+        if self.tokenizer.spec.startswith(HUB):
+            tokenizer = self.tokenizer.spec
+        config = {
             "image_size": self.image_size,
-            "tokenizer": self.tokenizer.spec if on_hub else TOKENIZER_FILE,
+            "tokenizer": tokenizer,
             "tokenizer_fingerprint": self.tokenizer.fingerprint,
             "prompt": self.prompt_name,
             "prompt_length": self.prompt_length,
@@ -369,9 +369,10 @@ class Processor(PolicyProcessor):
             "action_dim": self.action_dim,
             "embodiment": self.embodiment.to_dict(),
             "stats": None if self.stats is None else STATS_FILE,
-            # Absent in files of earlier versions, which left goals as they were given.
-            **({"goal_case": self.goal_case} if self.goal_case != "given" else {}),
         }
+        if self.goal_case != "given":  # absent in files of earlier versions, which left goals
+            config["goal_case"] = self.goal_case
+        return config
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:

@@ -96,20 +96,13 @@ class Subgoal(PromptFormat):
     def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text, or the plain pieces if there is no subgoal."""
         if inputs.subgoal is None:
-            _warn_once(
+            warn_once(
                 "The prompt format 'subgoal' got no subgoal: such steps use the plain prompt, as"
                 " released."
             )
             return GoalPrompt().pieces(inputs)
-        return [
-            (
-                (
-                    f"Task: {_one_line(inputs.goal)};\nCurrent Subgoal:"
-                    f" {_one_line(inputs.subgoal)};\nAction: "
-                ),
-                True,
-            )
-        ]
+        goal, subgoal = _one_line(inputs.goal), _one_line(inputs.subgoal)
+        return [(f"Task: {goal};\nCurrent Subgoal: {subgoal};\nAction: ", True)]
 
 
 @PROMPTS.register("subgoal_sentence")
@@ -122,15 +115,8 @@ class SubgoalSentence(Subgoal):
         """Return one text, or the plain pieces if there is no subgoal."""
         if inputs.subgoal is None:
             return super().pieces(inputs)
-        return [
-            (
-                (
-                    f"Task: {_one_line(inputs.goal)}\nCurrent Subgoal:"
-                    f" {_one_line(inputs.subgoal)}.\nAction: "
-                ),
-                True,
-            )
-        ]
+        goal, subgoal = _one_line(inputs.goal), _one_line(inputs.subgoal)
+        return [(f"Task: {goal}\nCurrent Subgoal: {subgoal}.\nAction: ", True)]
 
 
 @PROMPTS.register("past_actions")
@@ -154,36 +140,6 @@ class PastActions(PromptFormat):
         return [(f"Task: {_one_line(inputs.goal)}; Past actions: {levels};\nAction: ", True)]
 
 
-@PROMPTS.register("openvla")
-class OpenVla(PromptFormat):
-    """The question that OpenVLA was trained on, the goal in lower case."""
-
-    def pieces(self, inputs: PromptInput) -> list[Piece]:
-        return [(f"In: What action should the robot take to {self.language(inputs)}?\nOut:", True)]
-
-    def language(self, inputs: PromptInput) -> str:
-        """What the robot is asked to do."""
-        return inputs.goal.strip().lower()
-
-
-@PROMPTS.register("openvla_subgoal")
-class OpenVlaSubgoal(OpenVla):
-    """The same question with the subgoal behind the goal; the plain one where there is none."""
-
-    reads_subgoal = True
-
-    def language(self, inputs: PromptInput) -> str:
-        """The goal without its full stop, and the subgoal."""
-        if inputs.subgoal is None:
-            _warn_once(
-                "The prompt format 'openvla_subgoal' got no subgoal: such steps use the plain"
-                " prompt."
-            )
-            return super().language(inputs)
-        goal = inputs.goal.strip().removesuffix(".")
-        return f"{goal}; current subgoal: {inputs.subgoal.strip()}".lower()
-
-
 def discretize(values: np.ndarray) -> list[int]:
     """Map each normalised number, clipped to [-1, 1], to its level 0…255."""
     edges = np.linspace(-1, 1, BINS + 1)[:-1]
@@ -200,7 +156,9 @@ def goal_case(robot: Embodiment) -> str:
     A robot of one's own: as in training. The benchmark's: as they are given, as in the released
     code.
     """
-    return "lower" if robot.action.space is None else "given"
+    if robot.action.space is None:
+        return "lower"
+    return "given"
 
 
 def spelled(text: str, case: str) -> str:
@@ -215,10 +173,10 @@ def checked_goal(text: object) -> str:
         UserError: it is no text, holds half a character, or nothing but spaces.
     """
     goal = checked_text(text, "the goal")
-    require(
-        goal.strip(),
-        f"The goal is {goal!r}: a policy is told what to do in words. Give the task as a text.",
-    )
+    if not goal.strip():
+        raise UserError(
+            f"The goal is {goal!r}: a policy is told what to do in words. Give the task as a text."
+        )
     return goal
 
 
@@ -226,11 +184,11 @@ def checked_text(text: object, what: str) -> str:
     """`text`, if a tokenizer can take it."""
     if not isinstance(text, str):
         raise UserError(f"{what} must be a text, got {brief(text)}.")
-    require(
-        is_text(text),
-        f"{what} holds half a character (a lone surrogate), which cannot be written:"
-        f" {brief(text)}.",
-    )
+    if not is_text(text):
+        raise UserError(
+            f"{what} holds half a character (a lone surrogate), which cannot be written:"
+            f" {brief(text)}."
+        )
     return text
 
 
@@ -249,13 +207,11 @@ def encode_prompt(
         ids [l] int64, padded on the right with 0; mask [l] bool, False on the padding.
     """
     checked_text(inputs.goal, "the goal")
-    tokens = [
-        token
-        for text, bos in prompt_format.pieces(inputs)
-        for token in tokenizer.encode(text, bos=bos)
-    ]
+    tokens: list[int] = []
+    for text, bos in prompt_format.pieces(inputs):
+        tokens += tokenizer.encode(text, bos=bos)
     if len(tokens) > max_length:
-        _warn_once(
+        warn_once(
             f"A prompt has more tokens than prompt_length={max_length} and loses its end; raise"
             f" prompt_length. The first one, {len(tokens)} tokens long: {brief(inputs.goal, 200)}.",
             key=("truncated", max_length),
@@ -272,7 +228,7 @@ def shorten(text: str, tokenizer: Tokenizer, length: int | None) -> str:
     tokens = tokenizer.encode(text, bos=False)
     if length is None or len(tokens) <= length:
         return text
-    _warn_once(
+    warn_once(
         f"A subgoal has more tokens than subgoal_length={length} and loses its end. The first one:"
         f" {brief(text, 200)}.",
         key=("shortened", length),
@@ -284,7 +240,8 @@ def _one_line(text: str) -> str:
     return text.strip().replace("_", " ").replace("\n", " ")
 
 
-def _warn_once(message: str, key: object = None) -> None:
+def warn_once(message: str, key: object = None) -> None:
+    """Warn the first time that this process has this key, by default the message."""
     if (key or message) not in _warned:
         _warned.add(key or message)
         warnings.warn(message, stacklevel=3)
@@ -301,11 +258,9 @@ class SubgoalText:
 
     kind: `simple_subgoal` or `grounded_subgoal`.
     online_probability: how often the label is the one the simulator reports at test time, which
-    switches a little
-        earlier than the planner's.
+        switches a little earlier than the planner's.
     point_noise: pixels; a text with exactly one point `at <y, x>` gets Gaussian noise on both
-    numbers, cut off here
-        and rounded. 0 adds none. The result may leave the image, as released.
+        numbers, cut off here and rounded. 0 adds none. The result may leave the image, as released.
     """
 
     kind: str
@@ -327,7 +282,9 @@ class SubgoalText:
     @classmethod
     def from_config(cls, config: Mapping[str, Any] | None) -> Self | None:
         """Build from the section `subgoal_text`, or return None where there is none."""
-        return None if config is None else read_section(cls, config, "subgoal_text")
+        if config is None:
+            return None
+        return read_section(cls, config, "subgoal_text")
 
     @property
     def columns(self) -> tuple[str, str]:
@@ -337,8 +294,11 @@ class SubgoalText:
     def __call__(self, texts: Mapping[str, str], rng: np.random.Generator) -> str:
         """Choose among a step's `texts`, by column name, and perturb the point."""
         planner, online = self.columns
-        text = texts[online if rng.random() < self.online_probability else planner]
-        return perturb_point(text, self.point_noise, rng) if self.point_noise else text
+        is_online = rng.random() < self.online_probability
+        text = texts[online] if is_online else texts[planner]
+        if self.point_noise:
+            text = perturb_point(text, self.point_noise, rng)
+        return text
 
 
 def perturb_point(text: str, limit: int, rng: np.random.Generator) -> str:
@@ -350,7 +310,8 @@ def perturb_point(text: str, limit: int, rng: np.random.Generator) -> str:
     shift = np.clip(rng.normal(0, limit * STD_PER_LIMIT, 2), -limit, limit).round().astype(int)
 
     def shifted(match: re.Match[str]) -> str:
-        y, x = (int(match[i + 1]) + int(shift[i]) for i in range(2))
+        y = int(match[1]) + int(shift[0])
+        x = int(match[2]) + int(shift[1])
         return f"at <{y}, {x}>"
 
     return POINT.sub(shifted, text)

@@ -46,8 +46,12 @@ class Client:
         timeout: float = 600,
         open_timeout: float = 60,
     ) -> None:
-        self.url, self.timeout, self.open_timeout = url, timeout, open_timeout
-        self._headers = {} if api_key is None else {"Authorization": f"Api-Key {api_key}"}
+        self.url = url
+        self.timeout = timeout
+        self.open_timeout = open_timeout
+        self._headers = {}
+        if api_key is not None:
+            self._headers["Authorization"] = f"Api-Key {api_key}"
         self._socket: Any = None
         self._ends = ExitStack()
         self.metadata: dict[str, Any] = {}
@@ -100,7 +104,8 @@ class Client:
                 video.
         """
         images = np.asarray(images)
-        images = images[:, None] if images.ndim == 4 else images
+        if images.ndim == 4:
+            images = images[:, None]
         states = np.asarray(states, np.float32)
         return self.request(
             {"add_buffer": True, "images": images, "state": states, "exec_start_idx": exec_start}
@@ -161,7 +166,7 @@ class Client:
             self.close()
             raise UserError(f"The server refuses this request: {response}")
         fields: dict[str, Any] = unpack(response)
-        return {
-            key: value.copy() if isinstance(value, np.ndarray) else value
-            for key, value in fields.items()
-        }
+        for key, value in fields.items():
+            if isinstance(value, np.ndarray):
+                fields[key] = value.copy()  # unpacked arrays cannot be written to
+        return fields

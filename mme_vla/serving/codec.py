@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, missing_extra, require
+from mme_vla.errors import UserError, missing_extra
 
 REFUSED_KINDS = "VOc"  # records and raw bytes, Python objects, complex numbers
 # values of a message, whatever holds them; a frame with all its cameras takes about 130
@@ -60,24 +60,19 @@ def _sizes() -> tuple[tuple[int, int, int], ...]:
         sizes[0x90 + kind] = (1, 0, kind)
     for length in range(32):
         sizes[0xA0 + length] = (1 + length, 0, 0)
-    for kind, width in (
-        (0xC4, 1),
-        (0xC5, 2),
-        (0xC6, 4),
-        (0xD9, 1),
-        (0xDA, 2),
-        (0xDB, 4),
-    ):  # bytes and texts
-        sizes[kind] = (1 + width, width, 0)
-    for kind, width in ((0xC7, 1), (0xC8, 2), (0xC9, 4)):  # extensions carry a type as well
-        sizes[kind] = (2 + width, width, 0)
-    for kind, width in ((0xDC, 2), (0xDD, 4)):
-        sizes[kind] = (1 + width, width, 1)
-        sizes[kind + 2] = (1 + width, width, 2)
-    for kind, bytes_after in zip(
-        (*range(0xCA, 0xD9),), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8, 2, 3, 5, 9, 17), strict=True
-    ):
-        sizes[kind] = (1 + bytes_after, 0, 0)
+    # Bytes, extensions (which carry a type as well) and texts.
+    for step, width in enumerate((1, 2, 4)):
+        sizes[0xC4 + step] = (1 + width, width, 0)
+        sizes[0xC7 + step] = (2 + width, width, 0)
+        sizes[0xD9 + step] = (1 + width, width, 0)
+    # Lists, and maps of two values an entry.
+    for step, width in enumerate((2, 4)):
+        sizes[0xDC + step] = (1 + width, width, 1)
+        sizes[0xDE + step] = (1 + width, width, 2)
+    # Floats, unsigned and signed integers, extensions of a fixed size.
+    numbers = (4, 8, 1, 2, 4, 8, 1, 2, 4, 8, 2, 3, 5, 9, 17)
+    for kind, size in enumerate(numbers, start=0xCA):
+        sizes[kind] = (1 + size, 0, 0)
     return tuple(sizes)
 
 
@@ -90,8 +85,9 @@ def check_size(data: bytes | bytearray | memoryview, most: int = MOST_OBJECTS) -
 
     A message that is cut short or malformed passes; `unpack` says what is wrong with it.
     """
-    at, end, waiting, announced = 0, len(data), 1, 1
-    while waiting and at < end:
+    at = 0  # of the next value's first byte
+    waiting = announced = 1  # values that are not read yet, and all so far
+    while waiting and at < len(data):
         waiting -= 1
         taken, width, more = _SIZES[data[at]]
         if width:
@@ -136,7 +132,8 @@ def _decode(fields: dict[Any, Any]) -> Any:
     if b"__ndarray__" in fields:
         return _array(fields)
     if b"__npgeneric__" in fields:
-        dtype, value = _dtype(fields), fields.get(b"data")
+        dtype = _dtype(fields)
+        value = fields.get(b"data")
         if not isinstance(value, bool | int | float | str | bytes):
             raise UserError(f"A NumPy scalar of dtype {dtype} holds a {type(value).__name__}.")
         try:
@@ -160,7 +157,8 @@ def _array(fields: dict[Any, Any]) -> np.ndarray:
         raise UserError(
             f"An array's shape must be a list of at most 32 whole numbers, got {str(shape)[:80]}."
         )
-    require(isinstance(data, bytes), f"An array's data must be bytes, got {type(data).__name__}.")
+    if not isinstance(data, bytes):
+        raise UserError(f"An array's data must be bytes, got {type(data).__name__}.")
     needed = math.prod(shape) * dtype.itemsize
     if len(data) != needed:
         raise UserError(

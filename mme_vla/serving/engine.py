@@ -52,22 +52,28 @@ class ServerStats:
         }
 
     def snapshot(self) -> dict[str, Any]:
-        batches = self.counts["batch"]
+        mean_batch = None
+        if self.counts["batch"]:
+            mean_batch = round(self.counts["batched"] / self.counts["batch"], 2)
         return {
             "uptime_s": round(time.monotonic() - self._begun, 1),
             "connections": self.connections,
             "counts": dict(sorted(self.counts.items())),
-            "mean_batch": round(self.counts["batched"] / batches, 2) if batches else None,
+            "mean_batch": mean_batch,
             "latency_ms": {kind: self.percentiles(kind) for kind in sorted(self._seconds)},
         }
 
     def line(self) -> str:
+        """One line for the log."""
+        times = "none yet"
         infer = self.percentiles("infer")
-        times = f"p50 {infer['p50']:.0f} ms, p95 {infer['p95']:.0f} ms" if infer else "none yet"
+        if infer:
+            times = f"p50 {infer['p50']:.0f} ms, p95 {infer['p95']:.0f} ms"
         mean = self.snapshot()["mean_batch"]
-        batch = f", {mean} to a batch" if mean else ""
+        if mean:
+            times += f", {mean} to a batch"
         return (
-            f"{self.connections} clients · {self.counts['infer']} inferences ({times}{batch}) · "
+            f"{self.connections} clients · {self.counts['infer']} inferences ({times}) · "
             f"{self.counts['refused']} requests refused, {self.counts['failed']} failed"
         )
 
@@ -131,11 +137,10 @@ class Engine:
             self._task.cancel()
             with suppress(asyncio.CancelledError):
                 await self._task
-        for future in [
-            *(w.future for w in self.scheduler.acting),
-            *(w.future for w in self.scheduler.reading),
-        ]:
-            future.cancel()
+        for acting in self.scheduler.acting:
+            acting.future.cancel()
+        for reading in self.scheduler.reading:
+            reading.future.cancel()
         self._readers.shutdown(wait=False)
         await asyncio.to_thread(self._thread.shutdown)
 
@@ -221,7 +226,10 @@ class Engine:
                 return [error]
         for episode, state in zip(episodes, noise, strict=True):
             episode.noise_state = state  # the same actions as if it had been alone from the start
-        return [chunk for episode in episodes for chunk in self._act([episode])]
+        chunks: list[np.ndarray | Exception] = []
+        for episode in episodes:
+            chunks += self._act([episode])
+        return chunks
 
     async def _piece(self, waiting: _Waiting[Iterator[None]]) -> None:
         if waiting.future.done():
@@ -231,11 +239,14 @@ class Engine:
             finished = await self.call(lambda: next(waiting.work, _END)) is _END
         except Exception as error:
             waiting.pieces = 0
-            return _fail(waiting.future, error)
-        waiting.pieces = 0 if finished else max(1, waiting.pieces - 1)
-        if finished and not waiting.future.done():
+            _fail(waiting.future, error)
+            return
+        if not finished:
+            waiting.pieces = max(1, waiting.pieces - 1)
+            return
+        waiting.pieces = 0
+        if not waiting.future.done():
             waiting.future.set_result(None)
-        return None
 
 
 def _try_out(policy: Policy, n_episodes: int, n_frames: int, flow_steps: int | None) -> None:
@@ -250,7 +261,8 @@ def _try_out(policy: Policy, n_episodes: int, n_frames: int, flow_steps: int | N
             frames[pose_name] = np.tile(np.eye(3, 4, dtype=np.float32), (n_frames, 1, 1))
     episodes = [policy.start_episode("warm up") for _ in range(n_episodes)]
     for episode in episodes:
-        episode.subgoal, episode.options = "warm up", (Option("a", "warm up"),)
+        episode.subgoal = "warm up"
+        episode.options = (Option("a", "warm up"),)
         episode.observe(frames, np.zeros((n_frames, robot.state.width), np.float32))
     policy.act(episodes[:1], flow_steps)
     policy.act(episodes, flow_steps)

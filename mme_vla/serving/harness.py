@@ -7,8 +7,9 @@ chosen.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from http import HTTPStatus
 from typing import Any
 
 import numpy as np
@@ -19,14 +20,15 @@ from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.processing.prompt import subgoal_kind
-from mme_vla.serving.settings import ServeSettings, is_local
+from mme_vla.serving.settings import Limits, ServeSettings, is_local
 
 try:
     from jsonargparse import ActionConfigFile, ArgumentParser
+    from vla_eval.model_servers import serve as harness_serving
     from vla_eval.model_servers.base import SessionContext
     from vla_eval.model_servers.predict import PredictModelServer
-    from vla_eval.model_servers.serve import serve
     from vla_eval.specs import IMAGE_RGB, LANGUAGE, RAW, DimSpec
+    from websockets.asyncio.server import serve as websocket_server
 except ImportError as error:
     raise missing_extra("A model server of vla-evaluation-harness", "harness") from error
 
@@ -96,7 +98,9 @@ class MMEVLAModelServer(PredictModelServer):
         )
         settings = ServeSettings(execute=execute, flow_steps=flow_steps, seed=seed)
         settings.check_robot(robot, self.policy.require_processor().prompt_spec.past_actions)
-        self.flow_steps, self.seed, self.subgoal = flow_steps, seed, subgoal_kind(self.policy)
+        self.flow_steps = flow_steps
+        self.seed = seed
+        self.subgoal = subgoal_kind(self.policy)
         self.sessions: dict[str, Running] = {}
         super().__init__(
             chunk_size=settings.executed(robot),
@@ -123,8 +127,10 @@ class MMEVLAModelServer(PredictModelServer):
     def get_observation_spec(self) -> dict[str, DimSpec]:
         """The images, the state and the words that are read."""
         images = {VIEWS[name]: IMAGE_RGB for name in self.policy.embodiment.camera_names}
-        words = {"language": LANGUAGE} | ({} if self.subgoal is None else {"subgoal": LANGUAGE})
-        return {**images, "state": RAW, **words}
+        spec = {**images, "state": RAW, "language": LANGUAGE}
+        if self.subgoal is not None:
+            spec["subgoal"] = LANGUAGE
+        return spec
 
     async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
         """Begin a session's episode; its goal comes with the first observation."""
@@ -140,14 +146,16 @@ class MMEVLAModelServer(PredictModelServer):
         running = self.sessions.get(ctx.session_id)
         if running is None:
             raise UserError("an observation came before the start of an episode.")
-        images, state = obs.get("images") or {}, obs.get("states", obs.get("state"))
+        images = obs.get("images") or {}
+        state = obs.get("states", obs.get("state"))
         names = self.policy.embodiment.camera_names
-        lacking = [VIEWS[name] for name in names if images.get(VIEWS[name]) is None]
-        if lacking or state is None:
+        missing = [VIEWS[name] for name in names if images.get(VIEWS[name]) is None]
+        if state is None:
+            missing.append("states")
+        if missing:
             raise UserError(
-                "the observation lacks"
-                f" {', '.join([*lacking, *(['states'] if state is None else [])])}: the environment"
-                " failed, or the benchmark does not send what get_observation_params() lists."
+                f"the observation lacks {', '.join(missing)}: the environment failed, or the"
+                " benchmark does not send what get_observation_params() lists."
             )
         running.images.append({name: np.asarray(images[VIEWS[name]]) for name in names})
         running.states.append(np.asarray(state, np.float32))
@@ -165,9 +173,11 @@ class MMEVLAModelServer(PredictModelServer):
     def _caught_up(self, obs: dict[str, Any], ctx: SessionContext) -> Episode:
         """A session's episode, after it has taken the frames since its last chunk."""
         running = self.sessions[ctx.session_id]
-        episode, images, states = running.episode, running.images, running.states
+        images, states = running.images, running.states
         running.images, running.states = [], []
-        episode.goal, episode.subgoal = str(obs["task_description"]), obs.get("subgoal") or None
+        episode = running.episode
+        episode.goal = str(obs["task_description"])
+        episode.subgoal = obs.get("subgoal") or None
         video = obs.get("video_history")
         if video is not None and len(video):
             episode.add_frames(np.stack(video), is_demo=True)
@@ -175,6 +185,26 @@ class MMEVLAModelServer(PredictModelServer):
             {name: np.stack([p[name] for p in images]) for name in images[0]}, np.stack(states)
         )
         return episode
+
+
+def serve_websockets(
+    handler: Any, host: str, port: int, *, process_request: Callable[..., Any], **options: Any
+) -> Any:
+    """Listen as `websockets.serve` does, with the checks of the policy server: no page of a browser
+    is served, and no message is longer than its limit.
+
+    Args:
+        handler, host, port, options: as the harness passes them to `websockets.serve`.
+        process_request: the harness's own replies to HTTP requests.
+    """
+
+    def refuse_pages(connection: Any, request: Any) -> Any:
+        if "Origin" in request.headers and request.path != "/health":
+            return connection.respond(HTTPStatus.FORBIDDEN, "Pages in a browser are not served.\n")
+        return process_request(connection, request)
+
+    options["max_size"] = Limits().message_bytes
+    return websocket_server(handler, host, port, process_request=refuse_pages, **options)
 
 
 def run_server(arguments: Sequence[str] | None = None) -> None:
@@ -207,4 +237,6 @@ def run_server(arguments: Sequence[str] | None = None) -> None:
         logger.warning(
             "host=%s: every client that reaches this port can use it, the harness has no key", host
         )
-    serve(server, host=host, port=port)
+    # The harness has no option for its own websocket server, which takes any origin and any size.
+    harness_serving.ws_serve = serve_websockets
+    harness_serving.serve(server, host=host, port=port)

@@ -292,23 +292,15 @@ class RequestReader:
             if camera.depth:
                 depth_name, pose_name = camera.readings
                 meaning = "depth in millimetres beside every image of the camera"
-                observed[f"see_{depth_name}"] = (
-                    depth,
-                    Field(alias=f"observation/{depth_name}", description=meaning),
-                )
-                listed[f"see_{depth_name}"] = (
-                    depths,
-                    Field(alias=f"{depth_name}_list", description=meaning),
-                )
+                one = Field(alias=f"observation/{depth_name}", description=meaning)
+                many = Field(alias=f"{depth_name}_list", description=meaning)
+                observed[f"see_{depth_name}"] = (depth, one)
+                listed[f"see_{depth_name}"] = (depths, many)
                 meaning = "one pose [3, 4] from the world to the camera beside every image"
-                observed[f"see_{pose_name}"] = (
-                    _shaped(3, 4),
-                    Field(alias=f"observation/{pose_name}", description=meaning),
-                )
-                listed[f"see_{pose_name}"] = (
-                    _shaped(None, 3, 4),
-                    Field(alias=f"{pose_name}_list", description=meaning),
-                )
+                one = Field(alias=f"observation/{pose_name}", description=meaning)
+                many = Field(alias=f"{pose_name}_list", description=meaning)
+                observed[f"see_{pose_name}"] = (_shaped(3, 4), one)
+                listed[f"see_{pose_name}"] = (_shaped(None, 3, 4), many)
         self._observation = create_model("Observation", __base__=ObservationMessage, **observed)
         self._challenge = create_model("Challenge", __base__=ChallengeMessage, **listed)
         self._buffer = create_model(
@@ -386,9 +378,9 @@ class RequestReader:
         for name, view in views.items():
             suffix = "_rgb_list" if name in self._robot.camera_names else "_list"
             lengths[name + suffix] = len(view)
-        _check_lengths(
-            lengths | {"joint_state_list": len(joints), "gripper_state_list": len(grippers)}
-        )
+        lengths["joint_state_list"] = len(joints)
+        lengths["gripper_state_list"] = len(grippers)
+        _check_lengths(lengths)
         self._check_depth(views, "{}_list")
         states = [benchmark_state(*row) for row in zip(joints, grippers, strict=True)]
         return Infer(
@@ -411,12 +403,13 @@ class RequestReader:
         for camera in self._robot.cameras:
             if camera.depth:
                 name = camera.readings[0]
-                size, image = views[name].shape[1:3], views[camera.name][0].shape[:2]
-                require(
-                    size == image,
-                    f"{key.format(name)} must have one number a pixel of the image {list(image)},"
-                    f" got {list(size)}.",
-                )
+                size = views[name].shape[1:3]
+                image = views[camera.name][0].shape[:2]
+                if size != image:
+                    raise UserError(
+                        f"{key.format(name)} must have one number a pixel of the image"
+                        f" {list(image)}, got {list(size)}."
+                    )
 
     def _options(self, message: InferMessage) -> tuple[Option, ...]:
         """What the message offers to a robot that chooses; others are not offered anything."""
@@ -441,5 +434,7 @@ def _unknown(keys: list[str]) -> UserError:
             f"{false}: no request. Send reset=true, or an observation with the keys"
             " observation/image, … or front_rgb_list, …"
         )
-    hint = did_you_mean(unknown[0], KNOWN) if unknown else f"Known: {', '.join(KNOWN)}."
+    hint = f"Known: {', '.join(KNOWN)}."
+    if unknown:
+        hint = did_you_mean(unknown[0], KNOWN)
     return UserError(f"No known request has the keys {keys}. {hint}")

@@ -206,9 +206,8 @@ class PolicyServer:
 
     def _refusal(self, scope: Scope) -> Response | None:
         """The reply to a request that is not let in."""
-        headers, path = Headers(scope=scope), None
-        if scope["type"] == "http":
-            path = scope["path"]
+        headers = Headers(scope=scope)
+        path = scope["path"] if scope["type"] == "http" else None
         if "origin" in headers and path != "/healthz":
             self.stats.count("refused")
             return PlainTextResponse("Pages in a browser are not served.\n", 403)
@@ -302,7 +301,8 @@ class PolicyServer:
                 f"The message has {length} bytes; this server takes {limits.message_bytes}"
                 " (limits.message_mib).",
             )
-        body, last = bytearray(), time.monotonic() + limits.receive_s + length / MIN_BYTES_S
+        body = bytearray()
+        last = time.monotonic() + limits.receive_s + length / MIN_BYTES_S
         while len(body) < length:
             try:
                 seconds = min(limits.receive_s, last - time.monotonic())
@@ -537,21 +537,22 @@ def error_text(error: Exception) -> str:
 
 
 def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool) -> dict[str, Any]:
+    robot = policy.embodiment
     limits = settings.limits
     return {
         "server": "mme_vla",
         "version": version("mme-vla"),
         "model": name,
         "trained": trained,
-        "embodiment": policy.embodiment.name,
-        "cameras": list(policy.embodiment.camera_names),
-        "memory_camera": policy.embodiment.memory_camera,
-        "readings": list(policy.embodiment.readings),
-        "state_dim": policy.embodiment.state.width,
-        "action_space": policy.embodiment.action.answers,
-        "action_dim": policy.embodiment.action.width,
+        "embodiment": robot.name,
+        "cameras": list(robot.camera_names),
+        "memory_camera": robot.memory_camera,
+        "readings": list(robot.readings),
+        "state_dim": robot.state.width,
+        "action_space": robot.action.answers,
+        "action_dim": robot.action.width,
         "horizon": policy.horizon - policy.require_processor().samples.window + 1,
-        "execute": settings.executed(policy.embodiment),
+        "execute": settings.executed(robot),
         "remembers_frames": policy.memory is not None,
         "subgoal": subgoal_kind(policy),
         "schemas": ["mme_vla", "robomme_challenge"],

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment.robomme import benchmark_action
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.serving.engine import Engine
 from mme_vla.serving.requests import AddBuffer, Infer, Request, Reset
@@ -47,22 +47,25 @@ class Session:
             begun: when the message was there whole (`time.perf_counter()`); the reply says how
                 long it took.
         """
-        reply: dict[str, Any]
+        reply: dict[str, Any] = {}
         if isinstance(request, Reset):
-            kind, reply = "reset", {"reset_finished": True}
+            kind = "reset"
             self._begin()
+            reply["reset_finished"] = True
         elif isinstance(request, AddBuffer):
-            kind, reply = "add_buffer", {"add_buffer_finished": True}
+            kind = "add_buffer"
             await self._add_buffer(request)
+            reply["add_buffer_finished"] = True
         else:
-            actions = await self._infer(request)
-            kind, reply = "infer", {"actions": actions}
+            kind = "infer"
+            reply["actions"] = await self._infer(request)
             space = self._engine.policy.embodiment.action
             if space.choice:
-                reply["choices"] = [benchmark_action(space, row) for row in actions]
+                reply["choices"] = [benchmark_action(space, row) for row in reply["actions"]]
         seconds = time.perf_counter() - begun
         self._engine.stats.took(kind, seconds)
-        return reply | {f"{kind}_time_ms": seconds * 1e3}
+        reply[f"{kind}_time_ms"] = seconds * 1e3
+        return reply
 
     async def _add_buffer(self, request: AddBuffer) -> None:
         count = len(request.frames)
@@ -77,7 +80,7 @@ class Session:
         await self._engine.run(self._in_pieces(count, take), self._n_pieces(count))
 
     async def _infer(self, request: Infer) -> np.ndarray:
-        policy, count = self._engine.policy, len(request.states)
+        count = len(request.states)
         # A client that repeats its first request means the same episode, not a longer one.
         if request.first:
             self._begin()
@@ -87,8 +90,10 @@ class Session:
             self._check_capacity(count)
 
         episode = self.episode
-        episode.goal, episode.subgoal = request.goal, self._subgoal(request)
-        episode.options = request.options or episode.options
+        episode.goal = request.goal
+        episode.subgoal = self._subgoal(request)
+        if request.options:
+            episode.options = request.options
         await self._engine.run(self._observe(request), self._n_pieces(count))
         chunk = await self._engine.act(episode)
         if not np.isfinite(chunk).all():
@@ -96,7 +101,7 @@ class Session:
         self._n_frames_at_action = episode.n_observed_frames
         if request.first is None:  # an MME-VLA client cuts the chunk itself
             return chunk
-        return chunk[: self._settings.executed(policy.embodiment)]
+        return chunk[: self._settings.executed(self._engine.policy.embodiment)]
 
     def _check_course(self, request: Infer) -> None:
         """Make sure that the episode has the frames this request continues from.
@@ -105,7 +110,8 @@ class Session:
             NoEpisodeError: the episode that the client means is not here.
             UserError: frames have to be sent before.
         """
-        policy, n_observed = self._engine.policy, self.episode.n_observed_frames
+        policy = self._engine.policy
+        n_observed = self.episode.n_observed_frames
         if request.first is False and n_observed == 0:
             raise NoEpisodeError(
                 "is_first_step is false but this episode has no frame here: its first request must"
@@ -114,17 +120,17 @@ class Session:
             )
         if request.stored:
             return
-        require(
-            n_observed > 0 or policy.memory is None,
-            "This policy remembers past frames: send them with add_buffer, the current one"
-            " included.",
-        )
+        if n_observed == 0 and policy.memory is not None:
+            raise UserError(
+                "This policy remembers past frames: send them with add_buffer, the current one"
+                " included."
+            )
         reads_actions = policy.require_processor().prompt_spec.past_actions > 0
-        require(
-            not reads_actions or self._n_frames_at_action != n_observed,
-            "This policy reads which actions were executed, one a frame: send the frames since"
-            " the last chunk with add_buffer before the observation.",
-        )
+        if reads_actions and self._n_frames_at_action == n_observed:
+            raise UserError(
+                "This policy reads which actions were executed, one a frame: send the frames since"
+                " the last chunk with add_buffer before the observation."
+            )
 
     def _observe(self, request: Infer) -> Iterator[None]:
         if request.stored:
@@ -164,20 +170,23 @@ class Session:
         return max(1, -(-count // self._frames_a_piece()))
 
     def _check_capacity(self, count: int) -> None:
-        total, most = self.episode.n_observed_frames + count, self._settings.limits.frames
-        require(
-            total <= most,
-            f"An episode of {total} frames: this server remembers at most {most} (limits.frames)."
-            " Reset between episodes.",
-        )
+        total = self.episode.n_observed_frames + count
+        most = self._settings.limits.frames
+        if total > most:
+            raise UserError(
+                f"An episode of {total} frames: this server remembers at most {most}"
+                " (limits.frames). Reset between episodes."
+            )
 
     def _subgoal(self, request: Infer) -> str | None:
         """The subgoal this policy was trained to read, of those the request brings."""
         kind = subgoal_kind(self._engine.policy)
         if kind is not None:
             return request.subgoals.get(kind)
-        subgoals = list(request.subgoals.values())
-        return subgoals[0] if len(subgoals) == 1 else None
+        if len(request.subgoals) != 1:
+            return None
+        (subgoal,) = request.subgoals.values()
+        return subgoal
 
 
 Name = tuple[str, str]  # address and X-Session
@@ -189,7 +198,7 @@ LOST = (
 
 
 class BusyError(Exception):
-    """Every session is at work."""
+    """No session can make place for a new one."""
 
 
 @dataclass(eq=False)

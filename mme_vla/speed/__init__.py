@@ -1,19 +1,15 @@
-"""Optional speed of a backbone: compiled attention, CUDA graphs, recomputation, sharding groups,
-real-time chunking.
+"""Optional speed of a backbone: compiled attention, CUDA graphs, recomputation, real-time chunking.
 
-Each is a class to inherit from beside `Backbone`. Callers test for it with `isinstance`.
+Each capability is a class to inherit from beside `Backbone`. Callers test for it with `isinstance`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch.utils.checkpoint import checkpoint, create_selective_checkpoint_contexts
-
-if TYPE_CHECKING:
-    from mme_vla.speed.sharding import ShardGroup
-
 
 Recompute = bool | str
 """What to compute again in the backward pass: True everything inside a layer, False nothing, or
@@ -40,12 +36,10 @@ SAVED_OPS: list[Any] = [
 
 def checkpoint_options(how: Recompute) -> dict[str, Any]:
     """What `torch.utils.checkpoint` and transformers take besides the layer."""
-    contexts = (
-        {"context_fn": partial(create_selective_checkpoint_contexts, SAVED_OPS)}
-        if how == SELECTIVE
-        else {}
-    )
-    return {"use_reentrant": False, **contexts}
+    options: dict[str, Any] = {"use_reentrant": False}
+    if how == SELECTIVE:
+        options["context_fn"] = partial(create_selective_checkpoint_contexts, SAVED_OPS)
+    return options
 
 
 def run_layer(layer: Callable[..., Any], *inputs: Any, how: Recompute) -> Any:
@@ -53,6 +47,21 @@ def run_layer(layer: Callable[..., Any], *inputs: Any, how: Recompute) -> Any:
     if not how or not torch.is_grad_enabled():
         return layer(*inputs)
     return checkpoint(layer, *inputs, **checkpoint_options(how))
+
+
+def fused_kernels(x: torch.Tensor) -> AbstractContextManager[object]:
+    """The context of an attention with a mask: on a GPU, every kernel but cuDNN's.
+
+    cuDNN's, which PyTorch prefers on H100, gives NaN gradients for masks at some lengths
+    (pytorch#196678).
+    """
+    if not x.is_cuda:
+        return nullcontext()
+    from torch.nn.attention import SDPBackend, sdpa_kernel
+
+    return sdpa_kernel(
+        [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
+    )
 
 
 class HasAttentionBackends:
@@ -73,29 +82,16 @@ class Recomputes:
         raise NotImplementedError
 
 
-class Sharded:
-    """Capability of a backbone or policy: it has sharding groups of its own instead of
-    `backbone_groups`.
-    """
-
-    def shard_groups(self) -> "Sequence[ShardGroup]":
-        """Modules that are gathered one by one. All other weights are gathered for a whole pass, in
-        float32.
-        """
-        raise NotImplementedError
-
-
 class CapturableSampling:
     """Capability of a backbone: `sample` never waits for the GPU, so that it can be captured as a
     CUDA graph.
     """
 
-    def compile_sampling(self) -> None:
-        """Keep what depends on weights alone between chunks."""
-        raise NotImplementedError
+    def compile_sampling(self) -> Callable[[], object]:
+        """Keep what depends on weights alone between chunks.
 
-    def sampling_stamp(self) -> object:
-        """Identifies the weights that the kept values were computed from; graphs are captured anew
-        when it changes.
+        Returns:
+            What identifies the weights that the kept values were computed from: graphs are captured
+            anew when it returns another value.
         """
         raise NotImplementedError

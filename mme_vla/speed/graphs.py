@@ -83,15 +83,20 @@ def _filled(x: Tensor, rows: int) -> Tensor:
 
 
 def _map(inputs: Inputs, change: Callable[[Tensor], Tensor]) -> Inputs:
-    return {k: change(x) if isinstance(x, Tensor) else x._map(change) for k, x in inputs.items()}
+    changed: dict[str, Tensor | TensorStruct] = {}
+    for name, x in inputs.items():
+        changed[name] = change(x) if isinstance(x, Tensor) else x._map(change)
+    return changed
 
 
 def _tensors(inputs: Inputs) -> list[Tensor]:
-    return [
-        x
-        for value in inputs.values()
-        for x in ([value] if isinstance(value, Tensor) else value.tensors())
-    ]
+    tensors: list[Tensor] = []
+    for value in inputs.values():
+        if isinstance(value, Tensor):
+            tensors.append(value)
+        else:
+            tensors += value.tensors()
+    return tensors
 
 
 class CapturedSampling:

@@ -37,11 +37,19 @@ def stacked_layers(module: nn.Module) -> Iterator[nn.Module]:
 
 
 def backbone_groups(backbone: nn.Module) -> list[ShardGroup]:
-    """The vision tower `backbone.vision` as one group, and each layer of the rest."""
+    """The vision tower `backbone.vision` as one group, each layer of the rest, and each module with
+    `shard_alone = True`, such as a large embedding, in float32.
+    """
     tower: Any = backbone.vision
     in_tower = set(tower.modules())
-    layers = [ShardGroup(layer) for layer in stacked_layers(backbone) if layer not in in_tower]
-    return [ShardGroup(tower, full=True), *layers]
+    groups = [ShardGroup(tower, full=True)]
+    for layer in stacked_layers(backbone):
+        if layer not in in_tower:
+            groups.append(ShardGroup(layer))
+    for module in backbone.modules():
+        if getattr(module, "shard_alone", False):
+            groups.append(ShardGroup(module, full=True))
+    return groups
 
 
 def float32_modules(group: nn.Module) -> list[nn.Module]:

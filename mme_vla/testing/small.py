@@ -167,9 +167,8 @@ def random_past(policy: MMEPolicy, batch: int, seed: int = 0) -> PastViews | Non
     shape = (batch, *past.images.shape[1:])
     mask = past.mask.repeat(batch, 1)
     mask[0, 0] = False
-    return PastViews(
-        torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8), mask, past.every
-    )
+    images = torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)
+    return PastViews(images, mask, past.every)
 
 
 def moving_frames(count: int, size: int = 64, seed: int = 0) -> np.ndarray:
@@ -188,20 +187,22 @@ def moving_frames(count: int, size: int = 64, seed: int = 0) -> np.ndarray:
 def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -> CachedHistory:
     """What a cache of this whole episode would hold, encoded in one go."""
     memory = policy.require_memory()
-    spec, scorer = memory.storage, memory.make_scorer()
-    stored_frames = spec.stored_frames(len(frames))
+    storage = memory.storage
+    stored_frames = storage.stored_frames(len(frames))
     tokens = policy.encode_frames(frames[stored_frames])
-    rows = [] if scorer is None else [(t, scorer(t, frame)) for t, frame in enumerate(frames)]
-    scored = [(t, values) for t, values in rows if values is not None]
-    scores = (
-        FrameScores(
-            np.array([t for t, _ in scored]), np.stack([v for _, v in scored]).astype(np.float32)
-        )
-        if scored
-        else None
-    )
-    stored = tokens.view(torch.uint16).numpy() if tokens.dtype == torch.bfloat16 else tokens.numpy()
-    return CachedHistory(spec, stored, stored_frames, len(frames), scores, exec_start)
+    if tokens.dtype == torch.bfloat16:
+        tokens = tokens.view(torch.uint16)
+    scored_frames, values = [], []
+    scorer = memory.make_scorer()
+    for t, frame in enumerate(frames):
+        row = None if scorer is None else scorer(t, frame)
+        if row is not None:
+            scored_frames.append(t)
+            values.append(row)
+    scores = None
+    if values:
+        scores = FrameScores(np.array(scored_frames), np.stack(values).astype(np.float32))
+    return CachedHistory(storage, tokens.numpy(), stored_frames, len(frames), scores, exec_start)
 
 
 def online_history(

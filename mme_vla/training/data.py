@@ -118,7 +118,7 @@ def prepare_data(
                 policy.encode_frames,
                 encoder,
                 root=cache["root"],
-                dtype=str(policy.history_dtype).removeprefix("torch."),
+                dtype=str(policy.info.history_dtype).removeprefix("torch."),
                 max_build_frames=cache["max_build_frames"],
                 batch_size=cache["batch_size"],
                 command=cache_command,

@@ -2,8 +2,8 @@
 them (FSDP2).
 
 Sharded, a process keeps 1/n of the weights, gradients, moments and averages, and gathers a group of
-weights (`Sharded.shard_groups`) right before it is needed. All of it is PyTorch's `fully_shard`;
-launchers stay `torchrun` and `accelerate launch`.
+weights (`NetworkPolicy.shard_groups`) right before it is needed. All of it is PyTorch's
+`fully_shard`. Launchers stay `torchrun` and `accelerate launch`.
 """
 
 import os
@@ -26,8 +26,8 @@ from torch.distributed.tensor import DTensor
 from mme_vla.config.sections import PositiveInt
 from mme_vla.errors import require
 from mme_vla.policy.base import Policy
+from mme_vla.policy.network import NetworkPolicy
 from mme_vla.policy.saving import recompute_buffers
-from mme_vla.speed import Sharded
 from mme_vla.speed.sharding import ShardGroup, float32_modules, stacked_layers
 
 FULL_STATE = StateDictOptions(full_state_dict=True, cpu_offload=True)
@@ -97,11 +97,10 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
         )
         fully_shard(module, mesh=mesh, mp_policy=rules)
 
-    groups = (
-        policy.shard_groups()
-        if isinstance(policy, Sharded)
-        else map(ShardGroup, stacked_layers(policy))
-    )
+    if isinstance(policy, NetworkPolicy):
+        groups = policy.shard_groups()
+    else:
+        groups = [ShardGroup(layer) for layer in stacked_layers(policy)]
     for group in groups:
         exact = [] if group.full or low is None or compiled else float32_modules(group.module)
         if exact:

@@ -21,7 +21,7 @@ from mme_vla.policy.tensor_files import (
     dtype_of,
 )
 from mme_vla.processing.base import CONFIG_FILE, read_settings
-from mme_vla.weights.ports import HISTORY, check_window, port_adapter
+from mme_vla.weights.ports import check_window, port_adapter
 from mme_vla.weights.released import members_of, partial_adapter, released_adapter
 from mme_vla.weights.source import Source, method_formats, open_source
 from mme_vla.weights.statistics import read_stats, stats_files
@@ -38,15 +38,14 @@ def adapter_of(fmt: str, policy: Policy) -> Adapter:
     """The name table of a format for a policy; raises an error where the format does not hold such
     a policy.
     """
-    make = _ADAPTERS[fmt] if fmt in _ADAPTERS else method_formats()[fmt].function("adapter")
-    adapter: Adapter = make(policy)
+    if fmt in _ADAPTERS:
+        return _ADAPTERS[fmt](policy)
+    adapter: Adapter = method_formats()[fmt].function("adapter")(policy)
     return adapter
 
 
-# What a memory adds to a policy, as our names, the released leaves, LeRobot's own memory and
-# MemoryVLA's banks tell.
 _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)")
-_MEMORY_LEAF = re.compile(rf"(^|/)mem_|_mem(/|$)|_mem_bank\.|^{HISTORY}\.")
+"""Our names of what a memory adds to a policy."""
 
 
 def load_weights(
@@ -69,7 +68,7 @@ def load_weights(
         source: a folder, a safetensors file, an Orbax run or step, or `owner/name` on the hub.
         dtype: what the weights become, whatever they are stored in. revision, token: of a hub
             repository.
-        base: what a run of OpenVLA-OFT was trained on, where it holds its adapters alone.
+        base: what a run was trained on, where it holds its adapters alone.
     """
     kind = dtype_of(dtype)
     checkpoint = open_source(source, revision, token, base)
@@ -78,7 +77,8 @@ def load_weights(
         f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset."
         " To begin training from it use start_from() (on the command line: init_from=…).",
     )
-    stats, datasets = None, list(stats_files(checkpoint.folder))
+    stats = None
+    datasets = list(stats_files(checkpoint.folder))
     if policy.processor is not None and checkpoint.format != "lerobot" and len(datasets) < 2:
         stats = read_stats(checkpoint.folder)
     assign_tensors(policy, read_as(policy, checkpoint), str(source), kind)
@@ -103,7 +103,8 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
         check_window(policy, source.config, str(source.folder))
     if (of := method_formats().get(source.format)) is not None and of.check is not None:
         of.function("check")(policy, source.config, str(source.folder))
-    adapter, state = adapter_of(source.format, policy), policy.state_dict()
+    adapter = adapter_of(source.format, policy)
+    state = policy.state_dict()
     tensors = source.tensors(lambda values: adapter.check_fit(values, state, source.label))
     return adapter.translate(tensors, state, source.label)
 
@@ -121,10 +122,10 @@ class Start:
     left: list[str]
 
     def __str__(self) -> str:
-        sentence = f"{len(self.taken)} tensors taken, {len(self.new)} new ({_groups(self.new)})"
-        return sentence + (
-            f", {len(self.left)} left behind ({_groups(self.left)})" if self.left else ""
-        )
+        text = f"{len(self.taken)} tensors taken, {len(self.new)} new ({_groups(self.new)})"
+        if self.left:
+            text += f", {len(self.left)} left behind ({_groups(self.left)})"
+        return text
 
 
 def start_from(policy: Policy, source: str | Path, *, revision: str | None = None) -> list[str]:
@@ -148,81 +149,94 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
             " values."
         )
     checkpoint = open_source(source, revision)
-    memory_names, state = memory_parameters(policy), policy.state_dict()
     if checkpoint.format == "ours":
-        source_tensors = merge_state(checkpoint.tensors(), checkpoint.config.get("adapters"))
-        _check_tokenizer(policy, checkpoint.folder)
-        strange = set(source_tensors) - set(state)
-        left = sorted(
-            name for name in strange if _OF_MEMORY.search(name) or _part(policy, name) == "memory"
-        )
-        matched = {name: tensor for name, tensor in source_tensors.items() if name not in left}
-        check_fit(
-            matched,
-            {name: tuple(tensor.shape) for name, tensor in state.items()},
-            str(source),
-            optional=memory_names,
-        )
+        matched, left = _match_ours(policy, checkpoint, str(source))
     else:
-        of_format = (
-            partial_adapter(policy)
-            if checkpoint.format == "released"
-            else adapter_of(checkpoint.format, policy)
-        )
-        memory_names |= of_format.fresh
-        members = [place for place, _ in members_of(policy.memory)]
-
-        def behind(tensors: Mapping[str, Tensor]) -> list[str]:
-            known = {constant.path for constant in of_format.derived}
-            known |= set(_reduced(of_format, memory_names, members, tensors).shapes(state))
-            return sorted(name for name in set(tensors) - known if _MEMORY_LEAF.search(name))
-
-        def fits(tensors: Mapping[str, Tensor]) -> None:
-            left = set(behind(tensors))
-            here = {name: tensor for name, tensor in tensors.items() if name not in left}
-            _reduced(of_format, memory_names, members, tensors).check_fit(here, state, str(source))
-
-        source_tensors = checkpoint.tensors(fits)
-        left = behind(source_tensors)
-        adapter = _reduced(of_format, memory_names, members, source_tensors)
-        source_tensors = {
-            name: tensor for name, tensor in source_tensors.items() if name not in left
-        }
-        matched = adapter.translate(source_tensors, state, str(source))
+        matched, left = _match_foreign(policy, checkpoint, str(source))
+    state = policy.state_dict()
     check_kinds(matched, state, str(source))
     check_values(matched, str(source))
     policy.load_state_dict(matched, strict=False)
     return Start(sorted(matched), sorted(set(state) - set(matched)), left)
 
 
+def _match_ours(
+    policy: Policy, checkpoint: Source, source: str
+) -> tuple[dict[str, Tensor], list[str]]:
+    """The tensors of a checkpoint of ours that a policy has too, and the names of a memory's that
+    it has not.
+    """
+    tensors = merge_state(checkpoint.tensors(), checkpoint.config.get("adapters"))
+    _check_tokenizer(policy, checkpoint.folder)
+    state = policy.state_dict()
+    left = []
+    for name in sorted(set(tensors) - set(state)):
+        if _OF_MEMORY.search(name) or _part(policy, name) == "memory":
+            left.append(name)
+            del tensors[name]
+    shapes = {name: tuple(tensor.shape) for name, tensor in state.items()}
+    check_fit(tensors, shapes, source, optional=memory_parameters(policy))
+    return tensors, left
+
+
+def _match_foreign(
+    policy: Policy, checkpoint: Source, source: str
+) -> tuple[dict[str, Tensor], list[str]]:
+    """The tensors of another format that a policy has too, by our names, and the foreign names of a
+    memory's that it has not.
+    """
+    state = policy.state_dict()
+    if checkpoint.format == "released":
+        adapter = partial_adapter(policy)
+    else:
+        adapter = adapter_of(checkpoint.format, policy)
+    local = memory_parameters(policy) | adapter.fresh
+    members = [place for place, _ in members_of(policy.memory)]
+
+    def split(tensors: Mapping[str, Tensor]) -> tuple[Adapter, dict[str, Tensor], list[str]]:
+        """The part of the name table that these tensors can fill, those of it, and what is left
+        behind.
+        """
+        reduced = _reduced(adapter, local, members, tensors)
+        if adapter.of_memory is None:
+            return reduced, dict(tensors), []
+        known = {constant.path for constant in adapter.derived} | set(reduced.shapes(state))
+        unknown = set(tensors) - known
+        left = sorted(name for name in unknown if re.search(adapter.of_memory, name))
+        kept = {name: tensor for name, tensor in tensors.items() if name not in left}
+        return reduced, kept, left
+
+    def check_names(tensors: Mapping[str, Tensor]) -> None:
+        reduced, kept, _ = split(tensors)
+        reduced.check_fit(kept, state, source)
+
+    tensors = checkpoint.tensors(check_names)
+    reduced, kept, left = split(tensors)
+    return reduced.translate(kept, state, source), left
+
+
 def _part(policy: Policy, name: str) -> str | None:
     """The part of a policy that another's parameter would belong to; None where it has
     none such.
     """
-    return next(
-        (
-            part
-            for part, pattern in policy.finetune_spec.components.items()
-            if re.match(pattern, name)
-        ),
-        None,
-    )
+    for part, pattern in policy.finetune_spec.components.items():
+        if re.match(pattern, name):
+            return part
+    return None
 
 
 def _check_tokenizer(policy: Policy, folder: Path) -> None:
     """Refuse a start from weights whose token ids mean other words."""
-    file = folder / CONFIG_FILE
-    if policy.processor is None or not file.is_file():
+    if policy.processor is None or not (folder / CONFIG_FILE).is_file():
         return
-    source_fingerprint = read_settings(folder).get("tokenizer_fingerprint")
-    processor, target_fingerprint = policy.processor, policy.processor.prompt_spec.fingerprint
-    require(
-        source_fingerprint is None
-        or target_fingerprint is None
-        or source_fingerprint == target_fingerprint,
-        f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than"
-        f" {processor.prompt_spec.encoder!r} ({target_fingerprint}): its ids would mean other"
-        " words. Set processor.tokenizer to that one.",
+    prompt = policy.processor.prompt_spec
+    fingerprint = read_settings(folder).get("tokenizer_fingerprint")
+    if fingerprint is None or prompt.fingerprint is None or fingerprint == prompt.fingerprint:
+        return
+    raise UserError(
+        f"{folder} was trained with another tokenizer ({brief(fingerprint)}) than"
+        f" {prompt.encoder!r} ({prompt.fingerprint}): its ids would mean other words. Set"
+        " processor.tokenizer to that one."
     )
 
 
@@ -232,27 +246,29 @@ def _reduced(
     """Leave out the memory's parameters that the checkpoint does not hold, and members that it does
     not hold whole.
     """
-    absent = {
-        name
-        for name, pieces in adapter.table.items()
-        if not all(piece.path in source_tensors for piece in pieces)
-    }
-    torn = tuple(
-        f"{place}." for place in members if any(name.startswith(f"{place}.") for name in absent)
-    )
-    table = {
-        name: pieces
-        for name, pieces in adapter.table.items()
-        if name not in local or (name not in absent and not name.startswith(torn))
-    }
+    absent = set()
+    for name, pieces in adapter.table.items():
+        if not all(piece.path in source_tensors for piece in pieces):
+            absent.add(name)
+    incomplete = []
+    for member in members:
+        if any(name.startswith(f"{member}.") for name in absent):
+            incomplete.append(f"{member}.")
+    table = {}
+    for name, pieces in adapter.table.items():
+        is_held = name not in absent and not name.startswith(tuple(incomplete))
+        if is_held or name not in local:
+            table[name] = pieces
     return replace(adapter, table=table)
 
 
 def _groups(names: list[str]) -> str:
     """Tensor names in short: numbers become *, and each stem is named once."""
-    stems = {
-        ".".join("*" if part.isdigit() else part for part in name.split(".")[:-1])
-        or name.rpartition("/")[0]
-        for name in names
-    }
+    stems = set()
+    for name in names:
+        if "." in name:
+            stem = re.sub(r"(?<![^.])\d+(?![^.])", "*", name.rpartition(".")[0])
+        else:
+            stem = name.rpartition("/")[0]
+        stems.add(stem)
     return ", ".join(sorted(stems)) or "none"

@@ -81,10 +81,13 @@ def find_params(folder: Path) -> Path | None:
         return folder
     if _holds_arrays(folder / "params"):
         return folder / "params"
-    steps = [
-        path for path in folder.glob("*") if path.name.isdigit() and _holds_arrays(path / "params")
-    ]
-    return max(steps, key=lambda path: int(path.name)) / "params" if steps else None
+    steps = []
+    for path in folder.glob("*"):
+        if path.name.isdigit() and _holds_arrays(path / "params"):
+            steps.append(path)
+    if not steps:
+        return None
+    return max(steps, key=lambda path: int(path.name)) / "params"
 
 
 def variant_of(folders: Sequence[Path]) -> str | None:
@@ -117,30 +120,18 @@ def read_orbax(
     if isinstance(params, Zipped):
         params.check()
     else:
-        parts = []
-        for place in params.rglob("*"):
-            if place.is_symlink():
-                inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
-            if not place.is_dir():  # tensorstore would wait for a pipe without end
-                parts.append(require_file(place, "a part of an Orbax checkpoint"))
-        for folder in (params, params.parent) if params.name == "params" else (params,):
-            check_sums(
-                folder,
-                sorted(part.relative_to(folder).as_posix() for part in parts if part.name != SUMS),
-            )
+        _check_files(params)
     with _reading(params):
-        arrays = _list_arrays(ts, params)
-        pending = {
-            # A part that is missing would otherwise be read as zeros. Orbax and this library write
-            # zeros like the rest.
-            name: ts.open(
-                {"driver": driver, "kvstore": _store(params, path, _is_ocdbt(params)),
-                 "fill_missing_data_reads": False},
-                open=True, read=True,
-            )
-            for path, (name, driver) in arrays.items()
-        }  # fmt: skip
-        # All are asked for before the first is waited for, so that reading overlaps.
+        # All are requested before the first is waited for, so that reading overlaps.
+        pending = {}
+        for path, (name, driver) in _list_arrays(ts, params).items():
+            spec = {
+                "driver": driver,
+                "kvstore": _store(params, path, _is_ocdbt(params)),
+                # A missing part is an error, not zeros: Orbax and this library write zeros too.
+                "fill_missing_data_reads": False,
+            }
+            pending[name] = ts.open(spec, open=True, read=True)
         stores = {name: opened.result() for name, opened in pending.items()}
         for name, store in stores.items():  # a few bytes on disk would fill the memory
             piece = math.prod(store.chunk_layout.read_chunk.shape or ())
@@ -155,6 +146,25 @@ def read_orbax(
         tree = {name: _to_tensor(read.result()) for name, read in reads.items()}
     require(tree, f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
     return tree
+
+
+def _check_files(params: Path) -> None:
+    """Make sure that the arrays' files are files inside their folder, and compare them with the
+    checksums there or in the folder of their step.
+    """
+    parts = []
+    for place in params.rglob("*"):
+        if place.is_symlink():
+            inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
+        if not place.is_dir():  # tensorstore would wait for a pipe without end
+            require_file(place, "a part of an Orbax checkpoint")
+            if place.name != SUMS:
+                parts.append(place)
+    folders = [params]
+    if params.name == "params":
+        folders.append(params.parent)
+    for folder in folders:
+        check_sums(folder, sorted(part.relative_to(folder).as_posix() for part in parts))
 
 
 def leaf_names(params: Path | Zipped) -> set[str]:
@@ -192,27 +202,21 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
             "key_metadata": [{"key": key, "key_type": _DICT_KEY} for key in path],
             "value_metadata": {"value_type": "np.ndarray", "skip_deserialize": False},
         }
-    # shared, and all writes at once: the store then gathers them into few files
+    # One context, and all writes at once: the store then gathers them into few files.
     context = ts.Context()
-    layout = {"compressor": {"id": "zstd", "level": 1}}
-    opened = [
-        ts.open(
-            {
-                "driver": "zarr",
-                "kvstore": _store(params, path, True),
-                "metadata": {**layout, "chunks": array.shape},
-            },
-            create=True,
-            dtype=array.dtype,
-            shape=array.shape,
-            context=context,
+    stores = {}
+    for key, array in arrays.items():
+        compressor = {"id": "zstd", "level": 1}
+        spec = {
+            "driver": "zarr",
+            "kvstore": _store(params, key, True),
+            "metadata": {"compressor": compressor, "chunks": array.shape},
+        }
+        stores[key] = ts.open(
+            spec, create=True, dtype=array.dtype, shape=array.shape, context=context
         )
-        for path, array in arrays.items()
-    ]
-    futures = [
-        store.result().write(array) for store, array in zip(opened, arrays.values(), strict=True)
-    ]
-    for write in futures:
+    writes = [store.result().write(arrays[key]) for key, store in stores.items()]
+    for write in writes:
         write.result()
     about = {"tree_metadata": leaves, "use_ocdbt": True, "use_zarr3": False}
     (params / METADATA).write_text(json.dumps(about))
@@ -225,23 +229,23 @@ def _holds_arrays(folder: Path) -> bool:
 
 
 def _is_ocdbt(params: Path | Zipped) -> bool:
-    return MANIFEST in params.names if isinstance(params, Zipped) else (params / MANIFEST).is_file()
+    if isinstance(params, Zipped):
+        return MANIFEST in params.names
+    return (params / MANIFEST).is_file()
 
 
 def _list_arrays(ts: Any, params: Path | Zipped) -> dict[str, tuple[str, str]]:
+    """The key of each array in its store → its name, and the driver that reads it."""
+    keys = []
     if _is_ocdbt(params):
-        keys = [
-            key.decode()
-            for key in ts.KvStore.open(_store(params, "", True)).result().list().result()
-        ]
+        store = ts.KvStore.open(_store(params, "", True)).result()
+        keys = [key.decode() for key in store.list().result()]
     elif isinstance(params, Zipped):
         keys = [key for key in params.names if key.count("/") == 1]
     else:
-        keys = [
-            f"{file.parent.name}/{file.name}"
-            for name in ARRAY_FILES
-            for file in params.glob(f"*{name}")
-        ]
+        for name in ARRAY_FILES:
+            for file in params.glob(f"*{name}"):
+                keys.append(f"{file.parent.name}/{file.name}")
     arrays = {}
     for key in keys:
         path, slash, file = key.rpartition("/")
@@ -252,19 +256,17 @@ def _list_arrays(ts: Any, params: Path | Zipped) -> dict[str, tuple[str, str]]:
 
 
 def _store(params: Path | Zipped, path: str, ocdbt: bool) -> dict[str, Any]:
+    """Tensorstore's description of where an array lies; an empty path means the store of all."""
+    within = f"{path}/" if path else ""
     if isinstance(params, Zipped):
         archive = {"driver": "zip", "base": f"file://{params.file.as_posix()}"}
-        if not ocdbt:
-            return {**archive, "path": f"{params.place}{path}/"}
-        return {
-            "driver": "ocdbt",
-            "base": {**archive, "path": params.place},
-            "path": f"{path}/" if path else "",
-        }
-    base = f"file://{params.resolve().as_posix()}/"
-    return {"driver": "ocdbt", "base": base, "path": f"{path}/" if path else ""} if ocdbt else {
-        "driver": "file", "path": f"{params.resolve().as_posix()}/{path}/",
-    }  # fmt: skip
+        if ocdbt:
+            return {"driver": "ocdbt", "base": archive | {"path": params.place}, "path": within}
+        return archive | {"path": f"{params.place}{path}/"}
+    place = params.resolve().as_posix()
+    if ocdbt:
+        return {"driver": "ocdbt", "base": f"file://{place}/", "path": within}
+    return {"driver": "file", "path": f"{place}/{path}/"}
 
 
 def _to_tensor(array: np.ndarray) -> Tensor:
@@ -304,7 +306,7 @@ _facts: dict[tuple[Path, int], tempfile.TemporaryDirectory[str]] = {}
 def find_archive(folder: Path) -> Path | None:
     """The archive of the newest step in a folder, such as `79999.zip`; None without any."""
     steps = [file for file in folder.glob(f"*{ARCHIVE_SUFFIX}") if file.stem.isdigit()]
-    return max(steps, key=lambda file: int(file.stem)) if steps else None
+    return max(steps, key=lambda file: int(file.stem), default=None)
 
 
 def open_archive(file: Path) -> tuple[Zipped, Path]:
@@ -329,22 +331,19 @@ def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
     """Refuse what no checkpoint holds. end: offset of the archive's directory, where its last entry
     ends.
     """
-    total, packed = (
-        sum(entry.file_size for entry in entries),
-        sum(entry.compress_size for entry in entries),
-    )
+    total = sum(entry.file_size for entry in entries)
+    packed = sum(entry.compress_size for entry in entries)
     if len(entries) > _MOST_ENTRIES or total > _MOST_BYTES:
         raise UserError(
             f"{file} unpacks to {len(entries):,} files of {total:,} bytes: that is no checkpoint."
         )
     for entry in entries:
-        name, parts = entry.filename, entry.filename.split("/")
+        name = entry.filename
+        parts = name.split("/")
         if name.startswith("/") or "\\" in name or ".." in parts or ":" in parts[0]:
             raise UserError(f"{file} names {brief(name)}, which lies outside of it. {_REMEDY}")
-        require(
-            not (entry.flag_bits & 1),
-            f"{file} is encrypted: unpack it yourself, and name the folder.",
-        )
+        if entry.flag_bits & 1:
+            raise UserError(f"{file} is encrypted: unpack it yourself, and name the folder.")
         if entry.file_size > _SMALL and entry.file_size > _MOST_RATIO * max(entry.compress_size, 1):
             raise UserError(
                 f"{file}: {brief(name)} unpacks to {entry.file_size:,} bytes: that is no"
@@ -356,9 +355,8 @@ def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
     # read.
     names: set[str] = set()
     for entry in entries:
-        require(
-            entry.filename not in names, f"{file} names {brief(entry.filename)} twice. {_REMEDY}"
-        )
+        if entry.filename in names:
+            raise UserError(f"{file} names {brief(entry.filename)} twice. {_REMEDY}")
         names.add(entry.filename)
     ordered = sorted(entries, key=lambda entry: entry.header_offset)
     ends = [*(entry.header_offset for entry in ordered[1:]), end]
@@ -375,17 +373,15 @@ def _arrays(names: list[str]) -> str | None:
     """
     stores = [name.removesuffix(MANIFEST) for name in names if name.split("/")[-1] == MANIFEST]
     if not stores:
-        stores = [
-            "/".join([*name.split("/")[:-2], ""]).lstrip("/")
-            for name in names
-            for array in ARRAY_FILES
-            if name.endswith(array)
-        ]
-    return min(
-        stores,
-        key=lambda place: (not place.endswith("params/"), place.count("/"), place),
-        default=None,
-    )
+        for name in names:
+            if name.endswith(tuple(ARRAY_FILES)):
+                *above, _, _ = name.split("/")  # without the array's folder and file
+                stores.append("/".join([*above, ""]).lstrip("/"))
+
+    def order(place: str) -> tuple[bool, int, str]:
+        return not place.endswith("params/"), place.count("/"), place
+
+    return min(stores, key=order, default=None)
 
 
 def _unpack_facts(file: Path, opened: zipfile.ZipFile, entries: list[zipfile.ZipInfo]) -> Path:
@@ -405,10 +401,10 @@ def _unpack_facts(file: Path, opened: zipfile.ZipFile, entries: list[zipfile.Zip
             target = folder / "assets" / safe_name(above[-1]) / last
         else:
             continue
-        require(
-            entry.file_size <= _SMALL,
-            f"{file}: {brief(entry.filename)} has {entry.file_size:,} bytes. {_REMEDY}",
-        )
+        if entry.file_size > _SMALL:
+            raise UserError(
+                f"{file}: {brief(entry.filename)} has {entry.file_size:,} bytes. {_REMEDY}"
+            )
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(opened.read(entry))
     return folder

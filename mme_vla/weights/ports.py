@@ -66,7 +66,8 @@ def port_adapter(policy: MMEPolicy) -> Adapter:
         table |= {
             f"memory.states.{part}": [Piece(f"{HISTORY}.{part}")] for part in ("weight", "bias")
         }
-    return Adapter(table, names.torch_unread(pi05_of(policy)), names.TIED)
+    unread = names.torch_unread(pi05_of(policy))
+    return Adapter(table, unread, names.TIED, of_memory=rf"^{HISTORY}\.")
 
 
 def is_port(tensor_names: list[str]) -> bool:
@@ -83,15 +84,17 @@ def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
         taken = spelled.setdefault(_respell(name), name)
         require(taken == name, f"{source} holds the same tensor twice, as {taken} and as {name}.")
     renamed = {name: tensors[source_name] for name, source_name in spelled.items()}
-    adaptive = any(
-        name.startswith(names.EXPERTS["action"]) and ".dense." in name for name in renamed
-    )
-    require(
-        adaptive and not any(_PI0.match(name) for name in renamed),
-        f"{source} is not π0.5: its action expert has "
-        + ("a state projection" if adaptive else "no time-conditioned norms")
-        + ", as π0 has. Only π0.5 checkpoints fit.",
-    )
+    action_expert = [name for name in renamed if name.startswith(names.EXPERTS["action"])]
+    difference = None
+    if not any(".dense." in name for name in action_expert):
+        difference = "no time-conditioned norms"
+    elif any(_PI0.match(name) for name in renamed):
+        difference = "a state projection"
+    if difference is not None:
+        raise UserError(
+            f"{source} is not π0.5: its action expert has {difference}, as π0 has. Only π0.5"
+            " checkpoints fit."
+        )
     if names.EMBEDDING not in renamed and names.HEAD in renamed:
         renamed[names.EMBEDDING] = renamed[names.HEAD]
     return renamed
@@ -104,33 +107,31 @@ def window_of(policy: Policy) -> dict[str, bool | int]:
     memory = policy.memory
     if not isinstance(memory, SpaceTime):
         return dict.fromkeys(WINDOW_MEMORY, False)
-    settings = {"frames": memory.frames, "stride": memory.stride, "every": memory.every}
-    memory_settings = {
+    settings: dict[str, bool | int] = {
         "use_visual_memory": memory.past_view_spec is not None,
         "use_proprioceptive_memory": memory.states is not None,
     }
-    return memory_settings | {
-        source_name: settings[target_name] for source_name, (target_name, _) in WINDOW.items()
-    }
+    for source_name, (target_name, _) in WINDOW.items():
+        settings[source_name] = getattr(memory, target_name)
+    return settings
 
 
 def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None:
     """Refuse a checkpoint of LeRobot's π0.5 whose short-window memory is not this policy's."""
     has: dict[str, Any] = {setting: bool(config.get(setting)) for setting in WINDOW_MEMORY}
-    require(
-        any(has.values()) or policy.memory is None,
-        f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset."
-        " To begin training from it use start_from() (on the command line: init_from=…).",
-    )
     if any(has.values()):
-        has |= {
-            source_name: config.get(source_name, default)
-            for source_name, (_, default) in WINDOW.items()
-        }
-    between = getattr(getattr(policy, "integration", None), "mutual", False)
-    if any(window_of(policy).get(setting) != value for setting, value in has.items()) or (
-        has["use_proprioceptive_memory"] and not between
-    ):
+        for source_name, (_, default) in WINDOW.items():
+            has[source_name] = config.get(source_name, default)
+    elif policy.memory is not None:
+        raise UserError(
+            f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay"
+            " unset. To begin training from it use start_from() (on the command line:"
+            " init_from=…)."
+        )
+    expected = window_of(policy)
+    is_equal = all(expected.get(setting) == value for setting, value in has.items())
+    is_mutual = getattr(getattr(policy, "integration", None), "mutual", False)
+    if not is_equal or (has["use_proprioceptive_memory"] and not is_mutual):
         raise UserError(_other_window(has, source))
 
 
@@ -138,16 +139,15 @@ def _other_window(has: Mapping[str, Any], source: str) -> str:
     """What a policy has to be to load a checkpoint with these settings."""
     kinds = [what for setting, what in WINDOW_MEMORY.items() if has[setting]]
     views, states = (str(has[setting]).lower() for setting in WINDOW_MEMORY)
-    integration = (
-        "integration=context integration.mutual=true"
-        if has["use_proprioceptive_memory"]
-        else "integration=none"
-    )
-    window = " ".join(
-        f"memory.{target_name}={brief(has[source_name])}"
-        for source_name, (target_name, _) in WINDOW.items()
-    )
-    frames, stride = (brief(has[key]) for key in ("memory_frames", "memory_stride"))
+    integration = "integration=none"
+    if has["use_proprioceptive_memory"]:
+        integration = "integration=context integration.mutual=true"
+    options = []
+    for source_name, (target_name, _) in WINDOW.items():
+        options.append(f"memory.{target_name}={brief(has[source_name])}")
+    window = " ".join(options)
+    frames = brief(has["memory_frames"])
+    stride = brief(has["memory_stride"])
     return (
         f"{source} reads {' and '.join(kinds)} (LeRobot's short-window memory:"
         f" memory_frames={frames}, memory_stride={stride}), which this policy does not, or not so:"

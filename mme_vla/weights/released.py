@@ -28,10 +28,16 @@ from mme_vla.weights.tables import (
     prefixed,
 )
 
+OF_MEMORY = r"(^|/)mem_|_mem(/|$)"
+"""Leaves that a memory of the released code adds to π0.5."""
+
 
 def released_adapter(policy: MMEPolicy) -> Adapter:
     return Adapter(
-        released_table(policy), released_unread(policy), derived=released_derived(policy)
+        released_table(policy),
+        released_unread(policy),
+        derived=released_derived(policy),
+        of_memory=OF_MEMORY,
     )
 
 
@@ -42,18 +48,19 @@ def partial_adapter(policy: Any) -> Adapter:
     Members of a joined memory have the names that each would have alone: a reader keeps those that
     are there whole.
     """
-    table, state = _table(policy), policy.state_dict()
-    unread, derived = released_unread(policy), released_derived(policy)
+    state = policy.state_dict()
+    table = _table(policy)
+    unread = released_unread(policy)
+    derived = released_derived(policy)
     for place, member in members_of(policy.memory):
         table |= prefixed(place, memory_names.released_names(member))
         unread += memory_names.released_unread(member)
         derived += memory_names.released_derived(member)
-    known = {
-        name: pieces
-        for name, pieces in table.items()
-        if name in state or policy.finetune_spec.component_of(name) != "memory"
-    }
-    return Adapter(known, unread, derived=derived)
+    known = {}
+    for name, pieces in table.items():
+        if name in state or policy.finetune_spec.component_of(name) != "memory":
+            known[name] = pieces
+    return Adapter(known, unread, derived=derived, of_memory=OF_MEMORY)
 
 
 def members_of(memory: Memory | None) -> list[tuple[str, Memory]]:
@@ -68,14 +75,15 @@ def members_of(memory: Memory | None) -> list[tuple[str, Memory]]:
 def released_table(policy: MMEPolicy) -> NameTable:
     """Every parameter of the policy and the released leaves it is made of."""
     table = _table(policy)
-    unnamed = sorted(
-        memory_parameters(policy)
-        ^ {name for name in table if policy.finetune_spec.component_of(name) == "memory"}
-    )
+    component_of = policy.finetune_spec.component_of
+    named = {name for name in table if component_of(name) == "memory"}
+    unnamed = sorted(memory_parameters(policy) ^ named)
     if unnamed:
-        owners = [part for part in (policy.memory, policy.integration) if part is not None]
+        owners = type(policy.integration).__name__
+        if policy.memory is not None:
+            owners = f"{type(policy.memory).__name__} with {owners}"
         raise UserError(
-            f"{' with '.join(type(part).__name__ for part in owners)} has no released names for"
+            f"{owners} has no released names for"
             f" {len(unnamed)} tensors ({listed(unnamed)}): only the released memories and"
             " integrations convert whole. To begin training from a released checkpoint use"
             " start_from() (on the command line: init_from=…), which leaves these as they are."

@@ -1,11 +1,10 @@
 """What a user points at: which format it is in, and its tensors under that format's names."""
 
-import importlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -38,7 +37,10 @@ FORMATS = {
 
 def method_formats() -> dict[str, WeightFormat]:
     """The formats that extensions add, by name."""
-    return {name: of for extension in extensions() for name, of in extension.weight_formats.items()}
+    by_name: dict[str, WeightFormat] = {}
+    for extension in extensions():
+        by_name.update(extension.weight_formats)
+    return by_name
 
 
 def formats() -> dict[str, str]:
@@ -51,23 +53,22 @@ def native_formats() -> list[str]:
     return [name for name, of in method_formats().items() if of.native]
 
 
-def _openvla() -> Any:
-    """The reader of OpenVLA-OFT's adapters and heads, which lie in files of their own."""
-    return importlib.import_module(method_formats()["openvla"].module)
-
-
 VARIANTS = {
     "pi05_baseline": "pi05",
     "symbolic-simple-subgoal": "simplesg",
     "symbolic-grounded-subgoal": "groundsg",
-} | {
-    f"{kind}-{memory}-{integration}": f"{memory}_{integration}"
-    for kind, memories in (
-        ("perceptual", ("framesamp", "tokendrop")),
-        ("recurrent", ("rmt", "ttt")),
-    )
-    for memory in memories
-    for integration in ("context", "modul", "expert")
+    "perceptual-framesamp-context": "framesamp_context",
+    "perceptual-framesamp-modul": "framesamp_modul",
+    "perceptual-framesamp-expert": "framesamp_expert",
+    "perceptual-tokendrop-context": "tokendrop_context",
+    "perceptual-tokendrop-modul": "tokendrop_modul",
+    "perceptual-tokendrop-expert": "tokendrop_expert",
+    "recurrent-rmt-context": "rmt_context",
+    "recurrent-rmt-modul": "rmt_modul",
+    "recurrent-rmt-expert": "rmt_expert",
+    "recurrent-ttt-context": "ttt_context",
+    "recurrent-ttt-modul": "ttt_modul",
+    "recurrent-ttt-expert": "ttt_expert",
 }
 """The released code's names of the variants, and ours."""
 
@@ -99,40 +100,39 @@ class Source:
         """
         if self.params is not None:
             return read_orbax(self.params, fits)
-        if self.format in native_formats():
-            to_native = method_formats()[self.format].function("native")
-            native: dict[str, Tensor] = to_native(
-                read_torch_file(self.files[0]), str(self.files[0])
-            )
-            return native
-        if self.base is not None:
-            heads: dict[str, Tensor] = _openvla().with_heads({}, self.folder)
-            return _openvla().merged(self.base.tensors(), self.folder) | heads
-        tensors = read_files(self.folder, self.files)
-        if self.format == "openvla":
-            tensors = _openvla().with_heads(tensors, self.folder)
-        if (of := method_formats().get(self.format)) is not None and of.spelling is not None:
-            spelled: dict[str, Tensor] = of.function("spelling")(tensors, str(self.folder))
-            return spelled
-        return (
-            from_port(tensors, str(self.folder))
-            if self.format in ("lerobot", "openpi")
-            else tensors
-        )
+        method = method_formats().get(self.format)
+        tensors: dict[str, Tensor]
+        if method is not None and method.native is not None:
+            file = self.files[0]
+            tensors = method.function("native")(read_torch_file(file), str(file))
+        elif method is not None and self.base is not None:
+            tensors = method.function("merge")(self.base.tensors(), self.folder)
+        else:
+            tensors = read_files(self.folder, self.files)
+            if self.format in ("lerobot", "openpi"):
+                tensors = from_port(tensors, str(self.folder))
+            elif method is not None and method.spelling is not None:
+                tensors = method.function("spelling")(tensors, self.folder)
+        return tensors
 
     @property
     def label(self) -> str:
-        return str(self.params if isinstance(self.params, Zipped) else self.folder)
+        """The checkpoint's place, for messages."""
+        if isinstance(self.params, Zipped):
+            return str(self.params)
+        return str(self.folder)
 
     @property
     def config(self) -> dict[str, Any]:
         """What `config.json` beside the weights says; empty without one."""
-        return read_config(self.folder) if (self.folder / CONFIG).is_file() else {}
+        if not (self.folder / CONFIG).is_file():
+            return {}
+        return read_config(self.folder)
 
     @property
     def model(self) -> str | None:
-        """Our name of the variant a checkpoint is, or None where neither words nor tensors tell
-        one.
+        """Our name of the variant a checkpoint is, or None where neither its files nor its tensors
+        tell one.
         """
         return self.variants[0] if len(self.variants) == 1 else None
 
@@ -143,38 +143,39 @@ class Source:
         A word in `history_config.txt` that is no variant of the released code never becomes part of
         a configuration: the names of the tensors tell the variant.
         """
-        if self.format in (*native_formats(), "simplememvla"):
-            return [self.format]
-        if self.format == "openvla":
-            return ["openvla_oft"]
+        if self.format in method_formats():
+            return [method_formats()[self.format].model or self.format]
         if self.params is None:
             return []
         place = self.params.file if isinstance(self.params, Zipped) else self.params
-        beside = [place.parent, place.parent.parent]
-        word = variant_of([self.folder, *beside])
-        if word is not None and word not in VARIANTS:
-            return _variants_with(leaf_names(self.params), word)
-        if word is None:  # published runs lie in folders that are called as they are
-            word = next((folder.name for folder in beside if folder.name in VARIANTS), None)
-        return [] if word is None else [VARIANTS[word]]
+        parents = [place.parent, place.parent.parent]
+        variant = variant_of([self.folder, *parents])
+        if variant in VARIANTS:
+            return [VARIANTS[variant]]
+        if variant is not None:
+            return _variants_with(leaf_names(self.params), variant)
+        for parent in parents:  # published runs lie in folders that have the variant's name
+            if parent.name in VARIANTS:
+                return [VARIANTS[parent.name]]
+        return []
 
     @property
     def lacks_positions(self) -> bool:
         """Whether a released memory was trained without position features
         (`use_pos_emb: false`).
         """
-        leaves = set() if self.params is None else leaf_names(self.params)
-        return (
-            any(leaf.startswith(ENCODER) for leaf in leaves)
-            and f"{ENCODER}/pos_proj/kernel" not in leaves
-        )
+        if self.params is None:
+            return False
+        leaves = leaf_names(self.params)
+        has_encoder = any(leaf.startswith(ENCODER) for leaf in leaves)
+        return has_encoder and f"{ENCODER}/pos_proj/kernel" not in leaves
 
 
-def _variants_with(leaves: Collection[str], word: str) -> list[str]:
+def _variants_with(leaves: Collection[str], variant: str) -> list[str]:
     """Our names of the released variants whose trees have such leaves.
 
-    The tensors of FrameSamp and TokenDrop have the same names. Where `word` has neither name in it,
-    it is one of both.
+    The tensors of FrameSamp and TokenDrop have the same names. Where `variant`, the name in
+    `history_config.txt`, has neither in it, it is one of both.
     """
 
     def has(part: str) -> bool:
@@ -182,13 +183,19 @@ def _variants_with(leaves: Collection[str], word: str) -> list[str]:
 
     if not has(ENCODER):
         return ["pi05", "simplesg", "groundsg"]
-    integration = "modul" if has("/mem_attn/") else "expert" if has("final_norm_mem") else "context"
-    perceptual = [name for name in ("framesamp", "tokendrop") if name in word] or [
-        "framesamp",
-        "tokendrop",
-    ]
-    recurrent = {"recur_layer/W1": ["ttt"], "recur_layer/memory_state": ["rmt"]}
-    memories = next((names for leaf, names in recurrent.items() if has(leaf)), perceptual)
+    if has("/mem_attn/"):
+        integration = "modul"
+    elif has("final_norm_mem"):
+        integration = "expert"
+    else:
+        integration = "context"
+    if has("recur_layer/W1"):
+        memories = ["ttt"]
+    elif has("recur_layer/memory_state"):
+        memories = ["rmt"]
+    else:
+        perceptual = ["framesamp", "tokendrop"]
+        memories = [name for name in perceptual if name in variant] or perceptual
     return [f"{memory}_{integration}" for memory in memories]
 
 
@@ -209,8 +216,8 @@ def open_source(
     On the hub: `owner/name`, or `owner/name/folder/in/it`.
 
     Args:
-        base: OpenVLA, for a run of OpenVLA-OFT that holds its adapters alone. A run's own word for
-            it is not followed.
+        base: for a run that holds adapters alone, what they were trained on. What the run itself
+            names is not fetched.
     """
     path = local_folder(source, revision, token)
     require(path.exists(), f"No checkpoint at {path}: there is no such file or folder.")
@@ -218,18 +225,19 @@ def open_source(
         require_file(path, "a checkpoint")
     is_local = path.is_file() or (path / WEIGHTS).is_file() or (path / INDEX).is_file()
     if base is not None:
-        if is_local or not _openvla().has_adapters(path):
+        adapters = _adapters_in(path)
+        if is_local or adapters is None:
             raise UserError(
-                f"base={str(base)!r} is for a run that holds {_openvla().FOLDER} alone; {path} does"
-                " not: leave it out."
+                f"base={str(base)!r} is for a run that holds adapters alone; {path} does not: leave"
+                " it out."
             )
         base_source = open_source(base)
         require(
-            base_source.format == "openvla",
-            f"base={str(base)!r} is {formats()[base_source.format]}; the adapters in {path} are"
-            " OpenVLA's.",
+            base_source.format == adapters.format,
+            f"base={str(base)!r} is {formats()[base_source.format]}; the adapters in {path} belong"
+            f" to {formats()[adapters.format]}.",
         )
-        return Source("openvla", path, base=base_source)
+        return Source(adapters.format, path, base=base_source)
     if path.is_file() and path.suffix in SUFFIXES:
         return _of_torch_file(path)
     if path.is_file() and path.suffix == ARCHIVE_SUFFIX:
@@ -251,11 +259,12 @@ def open_source(
         )
     if (zipped := find_archive(path)) is not None:
         return _of_archive(zipped)
-    if _openvla().has_adapters(path):
-        original = brief(_openvla().named_base(path))
+    adapters = _adapters_in(path)
+    if adapters is not None:
         raise UserError(
-            f"{path} holds adapters apart from what they were trained on ({original}): name it, "
-            "load_weights(policy, run, base=…), or mme-vla weights <run> <new folder> --base …"
+            f"{path} holds adapters apart from what they were trained on"
+            f" ({brief(adapters.base)}): name it, load_weights(policy, run, base=…), or mme-vla"
+            " weights <run> <new folder> --base …"
         )
     if len(files := find_torch_files(path)) == 1:
         return _of_torch_file(files[0])
@@ -271,6 +280,21 @@ def open_source(
     )
 
 
+class _Adapters(NamedTuple):
+    format: str
+    base: str
+
+
+def _adapters_in(folder: Path) -> _Adapters | None:
+    """The format of a run's adapters, which lie apart from their base, and that base's name."""
+    for name, method in method_formats().items():
+        if method.named_base is not None:
+            base = method.function("named_base")(folder)
+            if base is not None:
+                return _Adapters(name, base)
+    return None
+
+
 def _of_archive(file: Path) -> Source:
     params, folder = open_archive(file)
     return Source("released", folder, params=params)
@@ -282,15 +306,14 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         lerobot = any(name.startswith(LEROBOT_PREFIX) for name in names)
         described = Source("lerobot", folder).config.get("type") is not None
         return Source("lerobot" if lerobot or described else "openpi", folder, files)
-    is_native = "backbone" in Source("ours", folder).config
-    has_qwen = any(name.endswith("model.visual.pos_embed.weight") for name in names)
-    if not is_native and has_qwen and method_formats()["simplememvla"].function("matches")(names):
-        return Source("simplememvla", folder, files)
     # Not every kind of policy has a backbone among its modules; each has one in its configuration.
-    if any(name.startswith("backbone.") for name in names) or is_native:
+    if "backbone" in Source("ours", folder).config:
         return Source("ours", folder, files)
-    if method_formats()["openvla"].function("matches")(names):
-        return Source("openvla", folder, files)
+    for name, method in method_formats().items():
+        if method.native is None and method.function("matches")(names):
+            return Source(name, folder, files)
+    if any(name.startswith("backbone.") for name in names):
+        return Source("ours", folder, files)
     if any(name.startswith("PaliGemma/") for name in names):
         return Source("released", folder, files)
     few = listed(sorted(names), 3) or "none at all"

@@ -14,17 +14,16 @@ from mme_vla.utils import checked_file, read_json
 from mme_vla.weights.source import method_formats
 
 _PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-_FEATURES = {"state": "observation.state", "actions": "action"}
+_STATE, _ACTION = "observation.state", "action"
 
 
 def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None:
     """The statistics in a checkpoint folder, or None where it has none.
 
-    Looked for: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, Diffusion
-    Policy's `stats.json`, OpenVLA-OFT's `dataset_statistics.json` of one dataset, and the file that
-    LeRobot's processor description names as the state of its normaliser. LeRobot's speak of the
-    actions it was trained on: they fit this library's joint deltas if that policy used relative
-    actions with an absolute gripper.
+    Read in this order: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, the
+    files of formats that extensions add, and the file that LeRobot's processor description names as
+    the state of its normaliser. LeRobot's describe the actions it was trained on: they fit this
+    library's joint deltas if that policy used relative actions with an absolute gripper.
 
     Args:
         folder: the checkpoint (for released runs: the step).
@@ -34,16 +33,16 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
     files = stats_files(folder)
     if asset is not None or len(files) > 1:
         if asset not in files:
-            reason = (
-                f"none of {brief(asset)}."
-                if asset
-                else "say which: --asset, or read_stats(folder, asset)."
-            )
+            if asset:
+                reason = f"none of {brief(asset)}."
+            else:
+                reason = "say which: --asset, or read_stats(folder, asset)."
             raise UserError(
                 f"{folder} holds statistics of {listed(files) or 'no dataset'}: {reason}"
             )
         return NormStats.load(_local_file(folder, files[asset]))
-    files |= {"": folder / "norm_stats.json"} if (folder / "norm_stats.json").is_file() else {}
+    if (folder / "norm_stats.json").is_file():
+        files[""] = folder / "norm_stats.json"
     if files:
         return NormStats.load(_local_file(folder, next(iter(files.values()))))
     for fmt in method_formats().values():
@@ -55,10 +54,8 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
 def stats_files(folder: Path) -> dict[str, Path]:
     """The statistics that openpi keeps in a checkpoint, by the name of their dataset."""
     assets = folder / "assets"
-    return {
-        file.parent.relative_to(assets).as_posix(): file
-        for file in sorted(assets.glob("**/norm_stats.json"))
-    }
+    files = sorted(assets.glob("**/norm_stats.json"))
+    return {file.parent.relative_to(assets).as_posix(): file for file in files}
 
 
 def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
@@ -76,9 +73,9 @@ def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
                 f"{folder / name}: state_file={brief(file)} must be the name of a file.",
             )
             tensors = read_safetensors(checked_file(folder, file, "statistics"))
-            if all(f"{feature}.q01" in tensors for feature in _FEATURES.values()):
+            if all(f"{feature}.q01" in tensors for feature in (_STATE, _ACTION)):
                 yield NormStats(
-                    **{target: _quantiles(tensors, source) for target, source in _FEATURES.items()}
+                    state=_quantiles(tensors, _STATE), actions=_quantiles(tensors, _ACTION)
                 )
 
 

@@ -7,7 +7,7 @@ checkpoints.
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -15,7 +15,7 @@ from einops import rearrange
 from torch import Tensor
 
 from mme_vla.backbone.pi05 import Pi05Backbone
-from mme_vla.errors import UserError, listed, require
+from mme_vla.errors import UserError, listed
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import check_fit
 
@@ -39,7 +39,9 @@ class Piece:
         if self.layer is not None:
             # a tensor of its own, which keeps no other layer in memory
             tensor = tensor[self.layer].clone()
-        return rearrange(tensor, self.pattern, **self.axes) if self.pattern else tensor
+        if not self.pattern:
+            return tensor
+        return rearrange(tensor, self.pattern, **self.axes)
 
     def to_source(self, tensor: Tensor) -> Tensor:
         if not self.pattern:
@@ -52,8 +54,10 @@ class Piece:
         pieces share one.
         """
         right = self.pattern.split("->")[1].strip()
-        first = right[1:].split(")")[0] if right.startswith("(") else right.split()[0]
-        return math.prod(self.axes[axis] for axis in first.split())
+        axes = right.split()[:1]
+        if right.startswith("("):  # the leading axis groups several
+            axes = right[1:].split(")")[0].split()
+        return math.prod(self.axes[axis] for axis in axes)
 
 
 NameTable = dict[str, list[Piece]]
@@ -88,20 +92,26 @@ def prefixed(prefix: str, table: NameTable) -> NameTable:
 
 def linear(path: str, *, layer: int | None = None) -> NameTable:
     """A linear layer stored as kernel (in, out), with its bias."""
-    kernel, bias = (
-        Piece(f"{path}/kernel", "i o -> o i", layer=layer),
-        Piece(f"{path}/bias", layer=layer),
-    )
+    kernel = Piece(f"{path}/kernel", "i o -> o i", layer=layer)
+    bias = Piece(f"{path}/bias", layer=layer)
     return {"weight": [kernel], "bias": [bias]}
+
+
+def paths_of(table: NameTable) -> set[str]:
+    """The foreign names of a table."""
+    paths = set()
+    for pieces in table.values():
+        paths |= {piece.path for piece in pieces}
+    return paths
 
 
 def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Translate a foreign checkpoint into our names and layouts."""
-    missing = sorted({p.path for pieces in table.values() for p in pieces} - set(source))
-    require(
-        not missing,
-        f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}",
-    )
+    missing = sorted(paths_of(table) - set(source))
+    if missing:
+        raise UserError(
+            f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}"
+        )
     target = {}
     for name, pieces in table.items():
         try:
@@ -133,16 +143,17 @@ def write(
 
     example = next(iter(target.values()))
     for name, pieces in table.items():
-        parts = (
-            target[name].split([p.rows() for p in pieces]) if len(pieces) > 1 else [target[name]]
-        )
+        parts: Sequence[Tensor] = [target[name]]
+        if len(pieces) > 1:
+            parts = target[name].split([piece.rows() for piece in pieces])
         for piece, part in zip(pieces, parts, strict=True):
             put(piece.path, piece.layer, piece.to_source(part))
     for gap in unread:
         put(gap.path, gap.layer, example.new_zeros(gap.shape))
     for path, by_layer in layers.items():
         released[path] = torch.stack([by_layer[i] for i in sorted(by_layer)])
-    released |= {constant.path: constant.make() for constant in derived}
+    for constant in derived:
+        released[constant.path] = constant.make()
     return released
 
 
@@ -152,10 +163,14 @@ class Adapter:
 
     table: our name → the foreign tensors it is made of.
     unread: foreign tensors, or layers of them, that no action reads: dropped when read, zeros when
-    written. tied: foreign name → the foreign name it repeats: optional when read, written as a
-    copy. derived: foreign constants that follow from the configuration: dropped when read,
-    recomputed when written. fresh: our names that a checkpoint to start from may lack, beside the
-    memory's: heads that are trained anew.
+        written.
+    tied: foreign name → the foreign name it repeats: optional when read, written as a copy.
+    derived: foreign constants that follow from the configuration: dropped when read, recomputed
+        when written.
+    fresh: our names that a checkpoint to start from may lack, beside the memory's: heads that are
+        trained anew.
+    of_memory: pattern of the foreign names of a memory's tensors. A start from a checkpoint leaves
+        them behind where the policy has no place for them.
     """
 
     table: NameTable
@@ -163,20 +178,21 @@ class Adapter:
     tied: Mapping[str, str] = field(default_factory=dict)
     derived: list[Derived] = field(default_factory=list)
     fresh: frozenset[str] = frozenset()
+    of_memory: str | None = None
 
     def needed(self) -> set[str]:
         """Foreign names without which the policy cannot be filled."""
-        return {piece.path for pieces in self.table.values() for piece in pieces}
+        return paths_of(self.table)
 
     def export(self, target: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Write our tensors in the foreign names and layouts, the three lists included."""
-        homeless = sorted(set(target) - set(self.table))
-        require(
-            not homeless,
-            f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds"
-            " memoryless policies without adapters: convert another policy, merge the adapters"
-            " first, or choose another format.",
-        )
+        unnamed = sorted(set(target) - set(self.table))
+        if unnamed:
+            raise UserError(
+                f"{len(unnamed)} tensors have no name in this format: {', '.join(unnamed)}. It"
+                " holds memoryless policies without adapters: convert another policy, merge the"
+                " adapters first, or choose another format."
+            )
         released = write(self.table, self.unread, target, self.derived)
         return released | {name: released[original] for name, original in self.tied.items()}
 
@@ -194,23 +210,23 @@ class Adapter:
     ) -> dict[str, Tensor]:
         """Read foreign tensors into our names; `target` gives the shapes they must have."""
         self.check_fit(released, target, source)
+        tensors = dict(released)
         for constant in self.derived:
-            # what a checkpoint stores of them is what this configuration gives
-            if constant.path in released:
-                stored, expected = (
-                    x.real.float().cpu() for x in (released[constant.path], constant.make())
-                )
-                require(
-                    stored.shape == expected.shape
-                    and torch.allclose(stored, expected, rtol=1e-2, atol=1e-2),
+            if constant.path not in tensors:
+                continue
+            # What a checkpoint stores of them must be what this configuration gives.
+            stored = tensors.pop(constant.path).real.float().cpu()
+            expected = constant.make().real.float().cpu()
+            is_equal = stored.shape == expected.shape and torch.allclose(
+                stored, expected, rtol=1e-2, atol=1e-2
+            )
+            if not is_equal:
+                raise UserError(
                     f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant"
                     f" this configuration gives {tuple(expected.shape)}: it was trained with other"
-                    " sizes or rates; set the same here.",
+                    " sizes or rates; set the same here."
                 )
-        derived = {constant.path for constant in self.derived}
-        return read(
-            self.table, {name: tensor for name, tensor in released.items() if name not in derived}
-        )
+        return read(self.table, tensors)
 
     def check_fit(
         self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str
@@ -218,7 +234,8 @@ class Adapter:
         """Compare names and shapes alone, so that foreign tensors may still be on meta: not read
         yet.
         """
-        shapes, derived = self.shapes(target), {constant.path for constant in self.derived}
+        shapes = self.shapes(target)
+        derived = {constant.path for constant in self.derived}
         tensors = {name: tensor for name, tensor in released.items() if name not in derived}
         check_fit(tensors, shapes, source, optional=set(shapes) - self.needed())
 
@@ -238,6 +255,5 @@ def memory_parameters(policy: Policy) -> set[str]:
     """Names of the tensors a policy has beyond memoryless π0.5: memory, integration, and the
     memory's own expert.
     """
-    return {
-        name for name in policy.state_dict() if policy.finetune_spec.component_of(name) == "memory"
-    }
+    component_of = policy.finetune_spec.component_of
+    return {name for name in policy.state_dict() if component_of(name) == "memory"}

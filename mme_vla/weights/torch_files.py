@@ -37,10 +37,9 @@ def load_torch_file(path: Path, what: str, mapped: bool = False) -> Any:
     require_file(path, what)  # torch would wait for a pipe without end
     if not mapped:
         check_sums(path.parent, [path.name])
+    can_map = mapped and zipfile.is_zipfile(path)
     with decoding(path, what, _REMEDY):
-        return torch.load(
-            path, map_location="cpu", weights_only=True, mmap=mapped and zipfile.is_zipfile(path)
-        )
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=can_map)
 
 
 def read_torch_file(path: Path, mapped: bool = False) -> dict[str, Tensor]:
@@ -52,21 +51,14 @@ def read_torch_file(path: Path, mapped: bool = False) -> dict[str, Tensor]:
         if isinstance(content, dict) and isinstance(content.get(key), dict):
             content = content[key]
             break
-    if (
-        isinstance(content, dict)
-        and content
-        and all(isinstance(part, dict) for part in content.values())
-    ):
-        content = {
-            f"{part}.{name}": tensor
-            for part, tensors in content.items()
-            for name, tensor in tensors.items()
-        }
-    if (
-        not isinstance(content, dict)
-        or not content
-        or not all(isinstance(value, Tensor) for value in content.values())
-    ):
-        description = listed(content) if isinstance(content, dict) else type(content).__name__
-        raise UserError(f"{path} holds no table of tensors, but {description}.")
-    return {str(name): tensor for name, tensor in content.items()}
+    if not isinstance(content, dict):
+        raise UserError(f"{path} holds no table of tensors, but {type(content).__name__}.")
+    tensors = content
+    if content and all(isinstance(part, dict) for part in content.values()):
+        tensors = {}
+        for part, of_part in content.items():
+            for name, tensor in of_part.items():
+                tensors[f"{part}.{name}"] = tensor
+    if not tensors or not all(isinstance(value, Tensor) for value in tensors.values()):
+        raise UserError(f"{path} holds no table of tensors, but {listed(tensors)}.")
+    return {str(name): tensor for name, tensor in tensors.items()}

@@ -14,13 +14,13 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
 from mme_vla.processing.base import DEFAULT
-from mme_vla.processing.normalise import NormStats, QuantileStats
+from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.processor import STATS_FILE, Processor
 from mme_vla.processing.prompt import PROMPTS, GoalPrompt
 from mme_vla.processing.tokenizer import HUB
 from mme_vla.registry import PROCESSORS
 from mme_vla.weights.names.torch_backbone import EMBEDDING
-from mme_vla.weights.orbax import write_orbax
+from mme_vla.weights.orbax import VARIANT_FILE, write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
 from mme_vla.weights.released import released_table, to_released
 from mme_vla.weights.source import VARIANTS, method_formats
@@ -41,18 +41,18 @@ def write_pipelines(
     Returns:
         None, or in words why there are none.
     """
-    words = policy.config.get("processor") or {}
-    tokenizer = str(words.get("tokenizer", ""))
     if stats is None:
         return "there are no normalisation statistics"
-    if (
-        PROCESSORS[words.get("name", DEFAULT)] is not Processor
-        or PROMPTS[words.get("prompt", "plain")] is not GoalPrompt
-    ):
+    words = policy.config.get("processor") or {}
+    processor = PROCESSORS[words.get("name", DEFAULT)]
+    prompt = PROMPTS[words.get("prompt", "plain")]
+    if processor is not Processor or prompt is not GoalPrompt:
         return "LeRobot has no step that writes this policy's prompt"
+    tokenizer = str(words.get("tokenizer", ""))
     if not tokenizer.startswith(HUB):
         return f"its tokenizer ({brief(tokenizer)}) is none that LeRobot could fetch from the hub"
-    inputs, outputs = about["input_features"], about["output_features"]
+    inputs = about["input_features"]
+    outputs = about["output_features"]
     relative = {
         "enabled": about["use_relative_actions"],
         "exclude_joints": about["relative_exclude_joints"],
@@ -66,56 +66,47 @@ def write_pipelines(
         "padding": "max_length",
         "truncation": True,
     }
-    _write(
-        folder,
-        BEFORE,
-        [
-            ("rename_observations_processor", {"rename_map": {}}),
-            ("to_batch_processor", {}),
-            ("relative_actions_processor", relative),
-            (
-                "normalizer_processor",
-                {"eps": 1e-8, "features": inputs | outputs, "norm_map": _QUANTILES},
-            ),
-            ("pi0_new_line_processor", {}),
-            ("tokenizer_processor", reading),
-            ("device_processor", {"device": "cpu", "float_dtype": None}),
-        ],
-        stats,
-    )
-    _write(folder, AFTER, [
-        ("unnormalizer_processor", {"eps": 1e-8, "features": outputs, "norm_map": _QUANTILES}),
+    normalise = {"eps": 1e-8, "features": inputs | outputs, "norm_map": _QUANTILES}
+    unnormalise = {"eps": 1e-8, "features": outputs, "norm_map": _QUANTILES}
+    on_cpu = {"device": "cpu", "float_dtype": None}
+    before: list[Step] = [
+        ("rename_observations_processor", {"rename_map": {}}),
+        ("to_batch_processor", {}),
+        ("relative_actions_processor", relative),
+        ("normalizer_processor", normalise),
+        ("pi0_new_line_processor", {}),
+        ("tokenizer_processor", reading),
+        ("device_processor", on_cpu),
+    ]
+    after: list[Step] = [
+        ("unnormalizer_processor", unnormalise),
         ("absolute_actions_processor", {"enabled": about["use_relative_actions"]}),
-        ("device_processor", {"device": "cpu", "float_dtype": None}),
-    ], stats)  # fmt: skip
+        ("device_processor", on_cpu),
+    ]
+    _write(folder, BEFORE, before, stats)
+    _write(folder, AFTER, after, stats)
     return None
 
 
-def _write(
-    folder: Path, name: str, steps: list[tuple[str, dict[str, Any]]], stats: NormStats
-) -> None:
+Step = tuple[str, dict[str, Any]]
+"""A step of a pipeline: LeRobot's name of it, and its settings."""
+
+
+def _write(folder: Path, name: str, steps: list[Step], stats: NormStats) -> None:
     from safetensors.torch import save_file
 
+    tensors = {}
+    for feature, values in (("observation.state", stats.state), ("action", stats.actions)):
+        for key, value in values.to_dict().items():
+            tensors[f"{feature}.{key}"] = torch.tensor(value, dtype=torch.float32)
     described: list[dict[str, Any]] = []
     for i, (step, config) in enumerate(steps):
-        described.append({"registry_name": step, "config": config})
+        about: dict[str, Any] = {"registry_name": step, "config": config}
         if "norm_map" in config:
-            file = f"{name}_step_{i}_{step}.safetensors"
-            save_file(_tensors(stats), folder / file)
-            described[-1]["state_file"] = file
-    (folder / f"{name}.json").write_text(
-        json.dumps({"name": name, "steps": described}, indent=2) + "\n"
-    )
-
-
-def _tensors(stats: NormStats) -> dict[str, torch.Tensor]:
-    def named(feature: str, of: QuantileStats) -> dict[str, torch.Tensor]:
-        return {
-            f"{feature}.{key}": torch.tensor(value, dtype=torch.float32)
-            for key, value in of.to_dict().items()
-        }
-
-    return named("observation.state", stats.state) | named("action", stats.actions)
+            about["state_file"] = f"{name}_step_{i}_{step}.safetensors"
+            save_file(tensors, folder / about["state_file"])
+        described.append(about)
+    _write_json(folder / f"{name}.json", {"name": name, "steps": described})
 
 
 ASSET = "robomme"  # the name under which openpi's layout keeps a dataset's statistics
@@ -151,19 +142,18 @@ def write_lerobot(
     LeRobot's RoboMME environment.
     """
     policy = mme_of(policy, "LeRobot's layout of π0.5")
-    size, robot = policy.backbone.image_size, policy.embodiment
-    views = [camera.key or camera.name for camera in robot.cameras]
-    features = {
-        f"observation.images.{view}": {"type": "VISUAL", "shape": [3, size, size]} for view in views
-    }
+    size = policy.backbone.image_size
+    robot = policy.embodiment
+    features: dict[str, Any] = {}
+    for camera in robot.cameras:
+        view = camera.key or camera.name
+        features[f"observation.images.{view}"] = {"type": "VISUAL", "shape": [3, size, size]}
+    features["observation.state"] = {"type": "STATE", "shape": [robot.state.width]}
     absolute = [name for i, name in enumerate(robot.action.names) if i not in robot.action.relative]
     about = {
         "type": "pi05",
         "n_obs_steps": 1,
-        "input_features": {
-            **features,
-            "observation.state": {"type": "STATE", "shape": [robot.state.width]},
-        },
+        "input_features": features,
         "output_features": {"action": {"type": "ACTION", "shape": [robot.action.width]}},
         **_SIZES,
         "dtype": _name(dtype),
@@ -177,7 +167,8 @@ def write_lerobot(
         "relative_exclude_joints": absolute,
     }
     _write_json(folder / "config.json", about)
-    if (reason := write_pipelines(policy, folder, about, stats)) is not None:
+    reason = write_pipelines(policy, folder, about, stats)
+    if reason is not None:
         warnings.warn(
             f"Written without processors: {reason}. LeRobot's commands cannot open it;"
             " PI05Policy.from_pretrained can.",
@@ -210,14 +201,12 @@ def write_released(
 ) -> None:
     """A run with one step, 0, as the released JAX code lays it out."""
     policy = mme_of(policy, "The released layout")
-    names = {target: released for released, target in VARIANTS.items()}
-    variant = names.get(str(policy.config.get("name")))
-    if variant is not None and policy.config.get("name") != "pi05":
-        (folder / "history_config.txt").write_text(f"{variant}.yaml\n")
-    write_orbax(
-        {name: cast(tensor, dtype) for name, tensor in to_released(policy).items()},
-        folder / "0" / "params",
-    )
+    name = str(policy.config.get("name"))
+    for variant, target in VARIANTS.items():
+        if target == name and name != "pi05":  # the memoryless baseline has no such file
+            (folder / VARIANT_FILE).write_text(f"{variant}.yaml\n")
+    tree = {leaf: cast(tensor, dtype) for leaf, tensor in to_released(policy).items()}
+    write_orbax(tree, folder / "0" / "params")
     _write_assets(folder / "0", stats)
 
 
@@ -233,8 +222,10 @@ def write_policy(
     policy: Policy, folder: Path, fmt: str, dtype: torch.dtype, stats: NormStats | None
 ) -> None:
     """Write a policy into `folder` in a format of `formats()`."""
-    writer = _WRITERS[fmt] if fmt in _WRITERS else method_formats()[fmt].function("write")
-    writer(policy, folder, dtype, stats)
+    if fmt in _WRITERS:
+        _WRITERS[fmt](policy, folder, dtype, stats)
+    else:
+        method_formats()[fmt].function("write")(policy, folder, dtype, stats)
 
 
 def _write_safetensors(tensors: Mapping[str, Tensor], folder: Path, dtype: torch.dtype) -> None:
@@ -245,8 +236,11 @@ def _write_safetensors(tensors: Mapping[str, Tensor], folder: Path, dtype: torch
     apart = {}
     for name, tensor in tensors.items():
         tensor = cast(tensor.detach(), dtype).cpu()
-        apart[name] = tensor.clone() if tensor.data_ptr() in storages else tensor
-        storages.add(tensor.data_ptr())
+        place = tensor.data_ptr()
+        if place in storages:
+            tensor = tensor.clone()
+        storages.add(place)
+        apart[name] = tensor
     save_file(apart, folder / WEIGHTS, metadata={"format": "pt"})
 
 

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from mme_vla import register
-from mme_vla.backbone.base import Injection
+from mme_vla.backbone.base import BackboneConfig, ExpertConfig, Injection, VisionConfig
 from mme_vla.backbone.building import read_backbone
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig, VisionConfig
 from mme_vla.backbone.flow import FlowHead
 from mme_vla.backbone.layers import PI05_VISIBILITY
 from mme_vla.backbone.pi05 import Pi05Backbone

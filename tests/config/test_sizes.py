@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from mme_vla.backbone.config import BackboneConfig
+from mme_vla.backbone.base import BackboneConfig
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.extras.methods.memoryvla.model import MemoryVlaConfig

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig, VisionConfig
+from mme_vla.backbone.base import BackboneConfig, ExpertConfig, VisionConfig
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.types import Batch, MemoryTokens
 from mme_vla.weights.released import from_released

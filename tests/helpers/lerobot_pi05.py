@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from mme_vla.backbone.config import BackboneConfig
+from mme_vla.backbone.base import BackboneConfig
 
 
 def reduce_sizes(monkeypatch: pytest.MonkeyPatch, sizes: BackboneConfig) -> Any:

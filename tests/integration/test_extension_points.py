@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.backbone.base import Hook
-from mme_vla.backbone.config import ExpertConfig
+from mme_vla.backbone.base import ExpertConfig, Hook
 from mme_vla.backbone.layers import PI05_VISIBILITY, Block
 from mme_vla.config.composition import compose
 from mme_vla.integration.base import Integration, required

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from helpers.golden import error, load, params, vision_config
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.base import BackboneConfig, ExpertConfig
 from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.memory.base import position_features
 from mme_vla.memory.framesamp import FrameSamp

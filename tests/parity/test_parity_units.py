@@ -11,7 +11,7 @@ import torch
 
 from helpers.golden import error, load, params, vision_config
 from mme_vla.backbone import flow
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.base import BackboneConfig, ExpertConfig
 from mme_vla.backbone.gemma import JointBlock
 from mme_vla.backbone.layers import (
     AdaRMSNorm,

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from data.before_the_rooms.make import actions
+from data.earlier_layout.make import actions
 from helpers import REPOSITORY
 from mme_vla import MMEPolicy
 from mme_vla.cli.train import main
 from mme_vla.config.composition import compose
 
-FOLDER = REPOSITORY / "tests" / "data" / "before_the_rooms"
+FOLDER = REPOSITORY / "tests" / "data" / "earlier_layout"
 STEP = Path("checkpoints") / "step_000002"
 EXPECTED = json.loads((FOLDER / "expected.json").read_text())
 

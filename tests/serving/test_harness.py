@@ -20,12 +20,16 @@ from vla_eval.model_servers import serve as harness_serve  # noqa: E402
 from vla_eval.runners.base import ModelActError  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, RAW  # noqa: E402
+from websockets.exceptions import ConnectionClosedError, InvalidStatus  # noqa: E402
+from websockets.sync.client import connect  # noqa: E402
+from websockets.typing import Origin  # noqa: E402
 
 from mme_vla.cli.harness import main  # noqa: E402
 from mme_vla.errors import UserError  # noqa: E402
 from mme_vla.policy.mme import MMEPolicy  # noqa: E402
 from mme_vla.serving import harness  # noqa: E402
 from mme_vla.serving.harness import MMEVLAModelServer  # noqa: E402
+from mme_vla.serving.settings import Limits  # noqa: E402
 from mme_vla.testing.small import small_policy  # noqa: E402
 
 STEPS, VIDEO = 37, 5
@@ -166,6 +170,20 @@ def test_an_observation_without_images_ends_its_episode_alone(policy: MMEPolicy)
         through_the_harness(policy, [failing])
 
 
+def test_no_page_of_a_browser_is_served_and_no_message_above_the_limit(
+    policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(harness_serve, "ws_serve", harness.serve_websockets)
+    monkeypatch.setattr(harness, "Limits", lambda: Limits(message_mib=1))
+    with serve_background(MMEVLAModelServer(policy)) as handle:
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(handle.url, origin=Origin("http://page.example"))
+        with connect(handle.url, compression=None) as client:
+            client.send(b"0" * 2**21)
+            with pytest.raises(ConnectionClosedError, match="1009"):
+                client.recv()
+
+
 def test_it_asks_for_what_the_policy_reads() -> None:
     server = MMEVLAModelServer(small_policy("groundsg"), execute=8)
     expected = {
@@ -216,7 +234,7 @@ def test_the_server_listens_on_this_machine_alone_by_default(
     monkeypatch.setattr(
         harness_serve, "serve", lambda server, host, port: addresses.append((host, port))
     )
-    monkeypatch.setattr(harness, "serve", harness_serve.serve, raising=False)
+    monkeypatch.setattr(harness_serve, "ws_serve", harness_serve.ws_serve)  # put back at the end
     policy.save_pretrained(tmp_path / "checkpoint")
     (tmp_path / "server.yaml").write_text("host: 0.0.0.0\nport: 4\n")
     words = tuple(word.replace("FILE", str(tmp_path / "server.yaml")) for word in words)

@@ -122,7 +122,7 @@ def test_few_sizes_are_captured_and_each_batch_gets_its_reply(
     ]
     expected = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
     policy.compile_sampling()
-    policy._sampler = CapturedSampling(policy.model.sample, policy.backbone.sampling_stamp)
+    policy._sampler = CapturedSampling(policy.model.sample, policy.backbone.compile_sampling())
     chunks = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
     assert captures == [4, 1, 2]
     assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(chunks, expected, strict=True))

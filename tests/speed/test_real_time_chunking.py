@@ -1,5 +1,7 @@
 """Real-time chunking: a chunk agrees with what the robot executes while it is chosen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -105,7 +107,7 @@ def test_a_prefix_that_cannot_be_is_refused(
 
 def test_a_policy_that_answers_at_once_says_that_it_cannot() -> None:
     other = small_policy("pi05")
-    other.supports_rtc = False
+    other.info = replace(other.info, supports_rtc=False)
     episode = episode_of(other)
     episode.set_action_prefix(np.zeros((3, 8)), 1)
     with pytest.raises(UserError, match="does not support real-time chunking"):

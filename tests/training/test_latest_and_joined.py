@@ -18,7 +18,7 @@ from mme_vla.weights import transfer
 from mme_vla.weights.released import to_released
 from mme_vla.weights.source import open_source
 
-RUN = REPOSITORY / "tests" / "data" / "before_the_rooms" / "run"
+RUN = REPOSITORY / "tests" / "data" / "earlier_layout" / "run"
 TTT = {"name": "ttt", "hidden": 16}
 
 

@@ -176,7 +176,7 @@ def evaluate(
     """
     policy.require_processor().require_stats()
     check_subgoals(policy, subgoals)
-    check_sessions(settings.split, policy.n_distractor_episodes)
+    check_sessions(settings.split, policy.info.n_distractor_episodes)
     if base is make_env:
         environment(settings.env).check_embodiment(policy.embodiment)
     run = claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
@@ -230,13 +230,13 @@ def _environments(
         "base": base,
         "max_steps": settings.max_steps,
         "robot": robot,
-        "max_actions": settings.max_actions or policy.max_actions,
+        "max_actions": settings.max_actions or policy.info.max_actions,
     }
     if base is make_env:
         options["env"] = settings.env
         options["render"] = settings.render
         options["action_space"] = robot.action.space
-        options["sessions"] = policy.n_distractor_episodes
+        options["sessions"] = policy.info.n_distractor_episodes
         if settings.only_possible:
             options["only_possible"] = True
         for name in robot.readings:
@@ -266,7 +266,7 @@ def run_settings(
         "dtype": str(next(policy.parameters()).dtype).removeprefix("torch."),
         "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
         "execute": settings.execute or policy.embodiment.action.execute,
-        "flow_steps": settings.flow_steps or policy.sample_steps,
+        "flow_steps": settings.flow_steps or policy.info.sample_steps,
         "seed": settings.seed,
         "split": settings.split,
         "env": settings.env,

@@ -15,14 +15,15 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.base import (
     Backbone,
+    ExpertConfig,
     FineTuneSpec,
     HasExtraExperts,
     Hook,
     Injection,
     bind_hook,
+    check_positive,
 )
 from mme_vla.backbone.choice import ChoiceHead
-from mme_vla.backbone.config import ExpertConfig, check_positive
 from mme_vla.backbone.flow import HasFlowHead, Predict, build_head, time_embedding
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, attend
 from mme_vla.backbone.pi05 import initialise

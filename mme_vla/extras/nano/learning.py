@@ -444,7 +444,7 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
     frames = np.intersect1d(read, made.frames[camera])
     tokens = pool_grid(made.at(camera, frames).float(), memory.storage.grid, memory.storage.pooling)
     stored, scores = (
-        tokens.to(policy.history_dtype).float().numpy(),
+        tokens.to(policy.info.history_dtype).float().numpy(),
         made.scores.get(memory.storage.scorer),
     )
     history = CachedHistory(

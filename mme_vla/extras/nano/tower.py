@@ -10,7 +10,7 @@ from importlib.resources import files
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.config import check_positive
+from mme_vla.backbone.base import check_positive
 from mme_vla.errors import check_choice, check_multiple, require
 
 WEIGHTS = "assets/nano_tower.safetensors"

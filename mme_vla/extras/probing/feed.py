@@ -3,7 +3,7 @@ transformed.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,7 +16,7 @@ from mme_vla.errors import UserError
 from mme_vla.extras.probing.recordings import Recording, all_recordings, stored_frames
 from mme_vla.memory.base import MemoryModule
 from mme_vla.memory.transforms import HistoryTransform, map_frames
-from mme_vla.policy.base import Policy
+from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode, Host
 from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.types import Noise
@@ -207,11 +207,6 @@ class FedPolicy(Policy):
     noise.
     """
 
-    n_distractor_episodes: int = 0
-    """Episodes of a stress split's sessions, which a run names; those of a probe's arm do not
-    count.
-    """
-
     def __init__(self, inner: Policy, feed: Feed, sessions: Sequence[Recording] = ()) -> None:
         """Wrap a policy.
 
@@ -221,10 +216,13 @@ class FedPolicy(Policy):
         super().__init__()
         self.inner, self.feed, self.sessions = inner, feed, list(sessions)[: feed.sessions]
         self.memory, self.processor, self.config = inner.memory, inner.processor, dict(inner.config)
-        self.horizon, self.action_dim = inner.horizon, inner.action_dim
-        self.history_dtype = inner.history_dtype
-        self.sample_steps = inner.sample_steps
-        self.max_actions = inner.max_actions
+        self.horizon = inner.horizon
+        # Episodes of a stress split's sessions count, those of a probe's arm do not.
+        self.info = PolicyInfo(
+            sample_steps=inner.info.sample_steps,
+            max_actions=inner.info.max_actions,
+            history_dtype=inner.info.history_dtype,
+        )
 
     @property
     def before(self) -> int:
@@ -311,7 +309,7 @@ def with_sessions(policy: Policy, split: str, recordings: Any) -> Policy:
             f" {len(recordings)}: name them with recordings=…."
         )
     fed = FedPolicy(policy, Feed(sessions=count), recordings).eval()
-    fed.n_distractor_episodes = count
+    fed.info = replace(fed.info, n_distractor_episodes=count)
     # The names are those of the probe's arm, so that runs of earlier versions continue.
     fed.config["probe"] = [f"distract:{count}", [{"intervention": "Distract", "sessions": count}]]
     fed.config["sessions"] = [recording.name for recording in fed.sessions]

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.config.devices import fused_kernels
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import MemoryModule, all_patches, union_frames
 from mme_vla.memory.history import History
 from mme_vla.memory.recurrent import default_hidden
+from mme_vla.speed import fused_kernels
 
 MLP = 4
 """Width of a block's MLP, in widths of its tokens."""

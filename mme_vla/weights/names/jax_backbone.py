@@ -2,7 +2,7 @@
 expert's end in `_1`.
 """
 
-from mme_vla.backbone.config import BackboneConfig
+from mme_vla.backbone.base import BackboneConfig
 from mme_vla.backbone.gemma import ExpertLayer
 from mme_vla.backbone.pi05 import Pi05Backbone
 from mme_vla.weights.tables import NameTable, Piece, Unread, linear, prefixed

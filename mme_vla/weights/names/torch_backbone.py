@@ -5,7 +5,7 @@ ours do; ours join q, k and v, and gate and up, which here are apart. An expert 
 memory has no names in these formats.
 """
 
-from mme_vla.backbone.config import BackboneConfig, VisionConfig
+from mme_vla.backbone.base import BackboneConfig, VisionConfig
 from mme_vla.backbone.gemma import ExpertLayer
 from mme_vla.backbone.layers import AdaRMSNorm
 from mme_vla.backbone.pi05 import Pi05Backbone

@@ -171,7 +171,7 @@ def test_it_is_evaluated(model: str, loaded: Callable[[str], Policy]) -> None:
         base=base,
         robot=policy.embodiment,
         max_steps=20,
-        max_actions=getattr(policy, "max_actions", None),
+        max_actions=policy.info.max_actions,
     )
     (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=20)
     assert (

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
-from mme_vla.backbone.config import VisionConfig
+from mme_vla.backbone.base import VisionConfig
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, brief, require
 

@@ -3,6 +3,7 @@ with a memory.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -72,7 +73,18 @@ class DiffusionPolicy(NetworkPolicy):
         self.backbone, self.memory, self.integration = backbone, memory, integration
         self.sizes = sizes = backbone.sizes
         self.horizon, self.action_dim = sizes.horizon, sizes.action_dim
-        self.n_past_steps, self.sample_steps = sizes.window - 1, sizes.diffusion_steps
+        self.n_past_steps = sizes.window - 1
+        self.info = replace(
+            self.info,
+            sample_steps=sizes.diffusion_steps,
+            processor_sizes={
+                "picture": sizes.picture,
+                "samples.window": sizes.window,
+                "text.width": sizes.text_dim,
+                "embodiment.action.horizon": sizes.horizon,
+                "memory_size": sizes.memory_tower.image_size,
+            },
+        )
 
     @classmethod
     def from_config(
@@ -275,16 +287,6 @@ class DiffusionPolicy(NetworkPolicy):
         processor = super().require_processor()
         assert isinstance(processor, DiffusionProcessor)
         return processor
-
-    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        processor, sizes = self.require_processor(), self.sizes
-        return {
-            "picture": (processor.picture, sizes.picture),
-            "window": (processor.samples.window, sizes.window),
-            "text_dim": (processor.text.width, sizes.text_dim),
-            "horizon": (processor.embodiment.action.horizon, sizes.horizon),
-            "memory_size": (processor.memory_size, sizes.memory_tower.image_size),
-        }
 
     @property
     def memory_tower(self) -> MemoryTower:

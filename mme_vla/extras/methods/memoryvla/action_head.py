@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.config import check_positive
+from mme_vla.backbone.base import check_positive
 from mme_vla.errors import check_choice, check_multiple, require
 
 STEPS = 100

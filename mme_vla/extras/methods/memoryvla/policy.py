@@ -4,6 +4,7 @@ diffusion head.
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -93,7 +94,16 @@ class MemoryVlaPolicy(NetworkPolicy):
         self.vlm, self.core, self.memory = vlm, core, memory
         self.sizes = core.config
         self.horizon, self.action_dim = core.config.horizon, core.config.action_dim
-        self.sample_steps = core.config.ddim_steps
+        sizes = core.config
+        self.info = replace(
+            self.info,
+            sample_steps=sizes.ddim_steps,
+            processor_sizes={
+                "image_size": sizes.vision.image_size,
+                "action_dim": sizes.action_dim,
+                "embodiment.action.horizon": sizes.horizon,
+            },
+        )
 
     @classmethod
     def from_config(
@@ -379,14 +389,6 @@ class MemoryVlaPolicy(NetworkPolicy):
         processor = super().require_processor()
         assert isinstance(processor, MemoryVlaProcessor)
         return processor
-
-    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        processor, sizes = self.require_processor(), self.sizes
-        return {
-            "image_size": (processor.image_size, sizes.vision.image_size),
-            "action_dim": (processor.action_dim, sizes.action_dim),
-            "horizon": (processor.embodiment.action.horizon, sizes.horizon),
-        }
 
     @property
     def memory_tower(self) -> MemoryTower:

@@ -120,6 +120,7 @@ def memoryvla_adapter(policy: Policy) -> Adapter:
     return Adapter(
         memoryvla_table(names),
         fresh=frozenset(n for n in names if policy.finetune_spec.component_of(n) in _COMPONENTS),
+        of_memory=r"_mem_bank\.",
     )
 
 

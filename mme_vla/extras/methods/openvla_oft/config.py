@@ -5,7 +5,7 @@ around it.
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from mme_vla.backbone.config import check_positive
+from mme_vla.backbone.base import check_positive
 from mme_vla.errors import check_multiple, check_sizes, require
 
 

@@ -12,8 +12,7 @@ from mme_vla.backbone.layers import Block, additive_mask
 from mme_vla.extras.methods.openvla_oft.config import OpenVlaConfig
 from mme_vla.extras.methods.prismatic import Prismatic
 from mme_vla.registry import BACKBONES
-from mme_vla.speed import Recompute, Recomputes, Sharded
-from mme_vla.speed.sharding import ShardGroup, backbone_groups
+from mme_vla.speed import Recompute, Recomputes
 from mme_vla.types import Batch
 
 
@@ -75,7 +74,7 @@ class TokenSequence:
 
 
 @BACKBONES.register("openvla")
-class OpenVlaBackbone(Backbone, HasExtraExperts, Recomputes, Sharded):
+class OpenVlaBackbone(Backbone, HasExtraExperts, Recomputes):
     """`<s>`, images, state, memory, words, a slot of zeros for each number of the chunk, `</s>`.
 
     Nothing is causal and no block is hidden from another, so an integration's visibility table has
@@ -102,6 +101,7 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, Recomputes, Sharded):
         self.image_size, self.grid = config.vision.image_size, config.vision.grid
         self.horizon, self.action_dim = config.horizon, config.action_dim
         self.vlm = Prismatic(config.vision, config.vlm, config.vocab_size)
+        self.vlm.language.model.embed_tokens.shard_alone = True
         self.state_token = StateToken(config.state_dim, width) if config.state_dim else None
         self.head = ActionHead(width, config.action_dim)
         self.heads = ("head",) if self.state_token is None else ("state_token", "head")
@@ -235,10 +235,6 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, Recomputes, Sharded):
 
     def recompute(self, mode: Recompute) -> None:
         self.vlm.recompute(mode)
-
-    def shard_groups(self) -> Sequence[ShardGroup]:
-        """Towers, word embedding, and every layer of the language model."""
-        return [*backbone_groups(self), ShardGroup(self.vlm.language.model.embed_tokens, full=True)]
 
     def compile(self, **options: Any) -> None:
         """Compile the towers and every layer of the language model, each by itself."""

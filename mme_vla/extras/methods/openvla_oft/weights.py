@@ -67,15 +67,24 @@ FOLDER, FILE, SETTINGS = "lora_adapter", "adapter_model.safetensors", "adapter_c
 _BEFORE, _DOWN, _UP = "base_model.model.", ".lora_A.weight", ".lora_B.weight"
 
 
-def has_adapters(folder: Path) -> bool:
-    """Whether a run's adapters lie in it."""
-    return (folder / FOLDER / FILE).is_file()
-
-
-def named_base(folder: Path) -> str:
-    """The base model that a run names; for messages only."""
+def named_base(folder: Path) -> str | None:
+    """The base model that a run's adapters name, for messages only; None where a folder holds no
+    such adapters.
+    """
+    if not (folder / FOLDER / FILE).is_file():
+        return None
     name = _settings(folder).get("base_model_name_or_path")
-    return name if isinstance(name, str) and name else "its base model"
+    if isinstance(name, str) and name:
+        return name
+    return "its base model"
+
+
+def merge_run(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
+    """All tensors of a run: the base's with the run's adapters merged in, its head and its state
+    token.
+    """
+    heads = with_heads({}, folder)
+    return merged(base, folder) | heads
 
 
 def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Self
 
@@ -30,6 +30,7 @@ from mme_vla.extras.methods.sam2act.processor import (
     zoomed_images,
 )
 from mme_vla.extras.methods.sam2act.sam2 import BankState
+from mme_vla.policy.base import PolicyInfo
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.network import NetworkPolicy, processor_for
 from mme_vla.policy.saving import policy_options
@@ -195,6 +196,9 @@ class SAM2ActPolicy(NetworkPolicy):
         check_choice("policy.stage", stage, STAGES)
         self.backbone, self.stage = backbone, stage
         self.horizon, self.action_dim = 1, WIDTH
+        sizes = backbone.sizes
+        processor_sizes = {"text.width": sizes.language, "text.words": sizes.words}
+        self.info = PolicyInfo(processor_sizes=processor_sizes)
         # Single keyframes first, then one more than can be remembered.
         self.keyframes = 1 if stage == "first" else backbone.sizes.remembered + 1
 
@@ -223,9 +227,15 @@ class SAM2ActPolicy(NetworkPolicy):
         return cls(SAM2ActNetwork(sizes), processor, config, **policy_options(cls, config))
 
     @property
-    def max_actions(self) -> int | None:  # type: ignore[override]  # known once it has a processor
-        """Waypoints of an episode, which its clock counts to."""
-        return None if self.processor is None else self.processor.waypoints
+    def info(self) -> PolicyInfo:
+        """Rollouts end after the waypoints of an episode, which the processor's clock counts to."""
+        if self.processor is None:
+            return self._info
+        return replace(self._info, max_actions=self.processor.waypoints)
+
+    @info.setter
+    def info(self, info: PolicyInfo) -> None:
+        self._info = info
 
     @property
     def most_remembered(self) -> int:
@@ -354,10 +364,6 @@ class SAM2ActPolicy(NetworkPolicy):
         processor = super().require_processor()
         assert isinstance(processor, SAM2ActProcessor)
         return processor
-
-    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        text, sizes = self.require_processor().text, self.backbone.sizes
-        return {"language": (text.width, sizes.language), "words": (text.words, sizes.words)}
 
     @property
     def finetune_spec(self) -> FineTuneSpec:

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.backbone.flow import interpolate
-from mme_vla.config.devices import fused_kernels
 from mme_vla.extras.methods.simplememvla.config import HeadSizes
+from mme_vla.speed import fused_kernels
 from mme_vla.types import TensorStruct
 
 TIME_FREQUENCIES = 128

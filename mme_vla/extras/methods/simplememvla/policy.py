@@ -118,10 +118,16 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         self.action_head = ActionHead(sizes.head, *head)
         self.memory, self.sizes = memory, sizes
         self.memory_proj = None if memory is None else nn.Linear(sizes.memory_width, sizes.width)
-        self.horizon, self.action_dim, self.sample_steps = (
-            sizes.horizon,
-            sizes.action_dim,
-            EULER_STEPS,
+        self.horizon, self.action_dim = sizes.horizon, sizes.action_dim
+        self.info = replace(
+            self.info,
+            sample_steps=EULER_STEPS,
+            processor_sizes={
+                "factor": sizes.factor,
+                "image_side": sizes.image_size,
+                "memory_tokens": 0 if memory is None else memory.budget,
+                "embodiment.action.horizon": sizes.horizon,
+            },
         )
 
     @classmethod
@@ -320,7 +326,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         with self.autocast():
             start = noise["noise"].to(self.device)
             return self.action_head.sample(
-                start, condition, self._state(batch), steps or self.sample_steps
+                start, condition, self._state(batch), steps or self.info.sample_steps
             )
 
     @torch.no_grad()
@@ -458,18 +464,6 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         processor = super().require_processor()
         assert isinstance(processor, SimpleMemVlaProcessor)
         return processor
-
-    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
-        processor, sizes = self.require_processor(), self.sizes
-        return {
-            "factor": (processor.factor, sizes.factor),
-            "image_side": (processor.image_side, sizes.image_size),
-            "memory_tokens": (
-                processor.memory_tokens,
-                0 if self.memory is None else self.memory.budget,
-            ),
-            "horizon": (processor.embodiment.action.horizon, sizes.horizon),
-        }
 
     @property
     def memory_tower(self) -> MemoryTower:

@@ -69,7 +69,7 @@ def is_simplememvla(names: Iterable[str]) -> bool:
     return {tower, words} <= present or {f"backbone.{tower}", f"backbone.{words}"} <= present
 
 
-def read_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+def read_names(tensors: Mapping[str, Tensor], source: Path) -> dict[str, Tensor]:
     """Tensors under the published names: Qwen3.5's get the prefix, and its multi-token prediction
     is left out.
     """

@@ -167,7 +167,8 @@ class MMEVLAPolicy(PreTrainedPolicy):
         was executed.
         """
         return (
-            self.model.supports_rtc and self.model.require_processor().prompt_spec.past_actions == 0
+            self.model.info.supports_rtc
+            and self.model.require_processor().prompt_spec.past_actions == 0
         )
 
     def _see(self, batch: Mapping[str, Any]) -> list[Row]:

@@ -36,7 +36,7 @@ def test_every_waypoint_is_requested_once_and_counts_its_frames(policy: SAM2ActP
 
 
 def test_an_episode_ends_after_its_waypoints(policy: SAM2ActPolicy) -> None:
-    assert policy.max_actions == policy.require_processor().waypoints == 40
+    assert policy.info.max_actions == policy.require_processor().waypoints == 40
     envs = InlineEnvs(base=make_depth_env, robot=policy.embodiment, max_steps=10_000, max_actions=2)
     (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=10_000)
     assert (record.outcome, record.extra["chunks"], record.steps) == ("timeout", 2, 2 * MOTION)
