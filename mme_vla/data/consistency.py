@@ -236,14 +236,14 @@ def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTa
     root, starts, listed_tasks = dataset.root, dataset.starts, dataset.episodes.tasks
     meta = root / "meta" / "episodes"
     if "task_index" not in rows:
-        for episode, texts in enumerate(listed_tasks):
+        for episode, tasks in enumerate(listed_tasks):
             require(
-                len(set(texts)) == 1,
-                f"{meta}: tasks of episode {episode} is {brief(list(texts))}, and the rows have no"
+                len(set(tasks)) == 1,
+                f"{meta}: tasks of episode {episode} is {brief(list(tasks))}, and the rows have no"
                 " task_index that says which one each frame has. Expected one text there, or a"
                 " column task_index in the tables.",
             )
-        return FrameTasks(starts, _goals(root, [texts[0] for texts in listed_tasks]))
+        return FrameTasks(starts, _goals(root, [tasks[0] for tasks in listed_tasks]))
     numbers = rows["task_index"]
     texts = read_tasks(root)
     row = _first((numbers < 0) | (numbers >= len(texts)))

@@ -79,7 +79,10 @@ def test_a_signal_is_reported_though_a_finally_fails(
             OSError(errno.ENOSPC, "No space left on device", "a/metrics.jsonl"),
             "a/metrics.jsonl cannot be written",
         ),
-        (OSError(errno.EROFS, "Read-only file system", "b"), "b cannot be written or opened: Read-only file system"),
+        (
+            OSError(errno.EROFS, "Read-only file system", "b"),
+            "b cannot be written or opened: Read-only file system",
+        ),
         (OSError(errno.EFBIG, "File too large", "b"), "File too large"),
         (OSError(errno.EMFILE, "Too many open files", "b"), "Too many open files"),
         (PermissionError(errno.EACCES, "Permission denied", "b"), "Permission denied"),
@@ -87,7 +90,10 @@ def test_a_signal_is_reported_though_a_finally_fails(
             OSError("Unable to create file (name = 'c.h5', errno = 28, error message = '…')"),
             "c.h5",
         ),
-        (RuntimeError("I/O error: No space left on device (os error 28)"), "No space left on device"),
+        (
+            RuntimeError("I/O error: No space left on device (os error 28)"),
+            "No space left on device",
+        ),
         (OSError("4000 requested and 96 written"), "No space left on device"),
     ],
 )
