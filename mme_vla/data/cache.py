@@ -72,11 +72,9 @@ def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) ->
     encoder = sha256(f"{expected['encoder']}{expected['dtype']}".encode()).hexdigest()[:8]
     # RoboMME's memory camera goes without saying, as in caches that were built before there were
     # others.
-    view = (
-        ""
-        if expected["view"] == ROBOMME_JOINT.cameras[0].key
-        else re.sub(r"[^\w.-]", "_", f"-{expected['view']}")
-    )
+    view = ""
+    if expected["view"] != ROBOMME_JOINT.cameras[0].key:
+        view = re.sub(r"[^\w.-]", "_", f"-{expected['view']}")
     name = f"{spec.grid}x{spec.grid}-{spec.pooling}-every{spec.keep_every}{scorer}{view}-{encoder}"
     return root / f"{source.name}-{source.fingerprint[:8]}" / name
 
@@ -130,13 +128,18 @@ class VisionCache:
                 `rebuild=true`.
         """
         check_fingerprint(folder, expected, command)
-        self.folder, self.spec = folder, StorageSpec(**expected["storage"])
-        self._source, self._lengths, self._exec_starts = source, source.lengths, source.exec_starts
-        self._dtype, self._command = DTYPES[expected["dtype"]], command
-        files = (token_file, score_file) if self.spec.scorer else (token_file,)
-        missing = [
-            e for e in range(len(source)) if not all(file(folder, e).is_file() for file in files)
-        ]
+        self.folder = folder
+        self.spec = StorageSpec(**expected["storage"])
+        self._source = source
+        self._lengths = source.lengths
+        self._exec_starts = source.exec_starts
+        self._dtype = DTYPES[expected["dtype"]]
+        self._command = command
+        missing = []
+        for episode in range(len(source)):
+            has_tokens = token_file(folder, episode).is_file()
+            if not has_tokens or (self.spec.scorer and not score_file(folder, episode).is_file()):
+                missing.append(episode)
         if missing:
             raise CacheMissingError(
                 f"The vision cache {folder} is half-written: {len(missing)} of {len(source)}"
@@ -207,16 +210,15 @@ class VisionCache:
             np.load(path) as stored,
         ):
             frames, values = stored["frames"], stored["values"]
-        length, patches = int(self._lengths[episode]), self.spec.grid**2
+        length = int(self._lengths[episode])
+        patches = self.spec.grid**2
+        is_frames = frames.dtype == np.int64 and frames.ndim == 1
         require(
-            (
-                (frames.dtype, values.dtype) == (np.int64, np.float32)
-                and frames.ndim == 1
-                and values.shape == (len(frames), patches)
-                and not (frames < 0).any()
-                and not (frames >= length).any()
-                and np.isfinite(values).all()
-            ),
+            is_frames
+            and values.dtype == np.float32
+            and values.shape == (len(frames), patches)
+            and ((frames >= 0) & (frames < length)).all()
+            and np.isfinite(values).all(),
             f"{path} holds {values.dtype} scores {list(values.shape)} of {frames.dtype} frames"
             f" {list(frames.shape)}, where finite float32 [n, {patches}] of int64 [n] frames below"
             f" {length} are expected. {self._remedy}",

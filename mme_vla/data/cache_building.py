@@ -96,18 +96,19 @@ def build_cache(
         write_json(folder / FINGERPRINT, expected, indent=1)
     check_fingerprint(folder, expected)
     remove_drafts(folder)
-    mine = range(rank, len(source), world)
-    missing = [episode for episode in mine if not token_file(folder, episode).is_file()]
-    total, left = int(source.lengths[list(mine)].sum()), int(source.lengths[missing].sum())
+    share = list(range(rank, len(source), world))
+    missing = [episode for episode in share if not token_file(folder, episode).is_file()]
+    total = int(source.lengths[share].sum())
+    left = int(source.lengths[missing].sum())
     with (
         progress(f"vision cache {source.name}", total, total - left, "frames") as advance,
         # Images are decoded in a thread while the ones before them are encoded.
         closing(ahead(_of_all(source, missing, memory, batch_size), CHUNKS_AHEAD)) as chunks,
     ):
         for episode, of_episode in groupby(chunks, lambda chunk: chunk[0]):
-            some = (chunk for _, chunk in of_episode)
+            parts = (chunk for _, chunk in of_episode)
             _build_episode(
-                source, episode, some, memory, encode, folder, expected["dtype"], advance
+                source, episode, parts, memory, encode, folder, expected["dtype"], advance
             )
     return len(missing)
 
@@ -164,24 +165,26 @@ class _Chunk:
 def _chunks(
     source: EpisodeSource, episode: int, memory: Memory, batch_size: int
 ) -> Iterator[_Chunk]:
-    spec, length = memory.storage, int(source.lengths[episode])
-    stored = stored_frames(source, episode, memory.storage)
+    spec = memory.storage
+    length = int(source.lengths[episode])
+    stored = stored_frames(source, episode, spec)
     scorer = memory.make_scorer()
     scored = np.zeros(0, np.int64) if scorer is None else scorer.frames_scored(length)
     span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
     for start in range(0, length, span):
         stop = min(start + span, length)
-        here = stored[(stored >= start) & (stored < stop)]
-        required = np.union1d(here, scored[(scored >= start) & (scored < stop)])
+        kept = stored[(stored >= start) & (stored < stop)]
+        required = np.union1d(kept, scored[(scored >= start) & (scored < stop)])
         if not len(required):
             continue
         images = source.frames(episode, required)
         frames, values = [], []
         for frame, image in zip(required.tolist(), images, strict=True):
-            if scorer is not None and (row := scorer(frame, image)) is not None:
+            row = None if scorer is None else scorer(frame, image)
+            if row is not None:
                 frames.append(frame)
                 values.append(np.asarray(row, np.float32))
-        yield _Chunk(stop - start, images[np.isin(required, here)], frames, values)
+        yield _Chunk(stop - start, images[np.isin(required, kept)], frames, values)
 
 
 def _build_episode(

@@ -56,10 +56,8 @@ def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
     if name == BOUNDARY:
         return _boundaries(source, name)
     if name == SUBTASK:
-        begun, first = (
-            np.cumsum(_boundaries(source, name)),
-            np.cumsum(source.lengths) - source.lengths,
-        )
+        begun = np.cumsum(_boundaries(source, name))
+        first = np.cumsum(source.lengths) - source.lengths
         return (begun - np.repeat(begun[first] - 1, source.lengths)).astype(np.float32)
     column = _read(source, name, key)
     values = column.combine_chunks()
@@ -131,8 +129,8 @@ def _check(source: EpisodeSource, name: str, key: str, wrong: np.ndarray, proble
         return
     episode, frame = source.locate(int(rows[0]))
     episodes = np.unique(np.searchsorted(np.cumsum(source.lengths), rows, side="right")).tolist()
+    noun = "episode" if len(episodes) == 1 else "episodes"
     raise UserError(
         f"{key}: the column {name!r} of {source.name} {problem} at frame {frame} of episode"
-        f" {episode} (in all: {'episodes' if len(episodes) > 1 else 'episode'} {listed(episodes)})."
-        " Correct the column."
+        f" {episode} (in all: {noun} {listed(episodes)}). Correct the column."
     )

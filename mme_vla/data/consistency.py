@@ -21,8 +21,11 @@ from mme_vla.data.lerobot_files import (
     REMEDY,
     SIDE_FILE,
     TASKS,
-    about_images,
+    EpisodeTable,
+    Info,
+    VideoSpans,
     read_index_columns,
+    read_records,
     read_tasks,
     video_file,
 )
@@ -64,27 +67,30 @@ class FrameTasks:
 class Description:
     """What is compared: the parts of a dataset that were read already.
 
-    root: its folder. info: meta/info.json. episodes: of `read_episode_table`. fps: frames per
-    second. videos, pictures: columns of the cameras that are videos, and of those stored in the
-    tables.
+    root: its folder. info: meta/info.json. episodes: meta/episodes. videos, images: columns of the
+    cameras that are videos, and of those stored in the tables.
     """
 
     root: Path
-    info: Mapping[str, Any]
-    episodes: Mapping[str, Any]
-    fps: float
+    info: Info
+    episodes: EpisodeTable
     videos: tuple[str, ...]
     images: tuple[str, ...]
 
     @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.info.fps
+
+    @property
     def starts(self) -> np.ndarray:
         """First row of each episode, [e] int64."""
-        return np.asarray(self.episodes["starts"])
+        return self.episodes.starts
 
     @property
     def lengths(self) -> np.ndarray:
         """Frames of each episode, [e] int64."""
-        return np.asarray(self.episodes["lengths"])
+        return self.episodes.lengths
 
     def place(self, row: int) -> str:
         """A row in words, by its episode and frame."""
@@ -121,72 +127,80 @@ def check_consistency(dataset: Description, table: Any) -> FrameTasks:
 
 def _check_totals(dataset: Description) -> None:
     """Compare meta/info.json and the column `length` with the places of episodes."""
-    lengths, info = dataset.lengths, dataset.root / "meta" / "info.json"
-    for key, count, what in (
-        ("total_episodes", len(lengths), "episodes"),
-        ("total_frames", lengths.sum(), "frames"),
-    ):
-        declared = dataset.info.get(key)
+    lengths = dataset.lengths
+    totals = (
+        ("total_episodes", dataset.info.total_episodes, len(lengths), "episodes"),
+        ("total_frames", dataset.info.total_frames, lengths.sum(), "frames"),
+    )
+    for key, declared, count, what in totals:
         if declared is not None and declared != count:
             raise UserError(
-                f"{info}: {key} is {brief(declared)}, but meta/episodes describes {count} {what}."
-                f" {_CORRECT}"
+                f"{dataset.root}/meta/info.json: {key} is {brief(declared)}, but meta/episodes"
+                f" describes {count} {what}. {_CORRECT}"
             )
-    declared = np.asarray(dataset.episodes.get("length", lengths))
-    if not np.array_equal(declared, lengths):
-        episode = int(np.flatnonzero(declared != lengths)[0])
+    written = dataset.episodes.declared_lengths
+    if written is None:
+        return
+    episode = _first(written != lengths)
+    if episode is not None:
         raise UserError(
-            f"{dataset.root}/meta/episodes: episode {episode} has length {declared[episode]}, but"
+            f"{dataset.root}/meta/episodes: episode {episode} has length {written[episode]}, but"
             f" dataset_from_index and dataset_to_index give it {lengths[episode]} rows. {_CORRECT}"
         )
+
+
+def _first(wrong: np.ndarray) -> int | None:
+    """The first place at which something is wrong, [n] bool; None where nothing is."""
+    places = np.flatnonzero(wrong)
+    return int(places[0]) if len(places) else None
 
 
 def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
     """Make sure that rows lie in the order of time, none missing and none twice, and that time is
     frame / fps.
     """
-    frames = np.arange(dataset.lengths.sum()) - np.repeat(dataset.starts, dataset.lengths)
+    places = np.arange(dataset.lengths.sum())
+    frames = places - np.repeat(dataset.starts, dataset.lengths)
     root, fps = dataset.root, dataset.fps
-    if "frame_index" in rows and not np.array_equal(rows["frame_index"], frames):
-        row = int(np.flatnonzero(rows["frame_index"] != frames)[0])
-        raise UserError(
-            f"{root}: {dataset.place(row)}, has frame_index {rows['frame_index'][row]}; by its"
-            f" place it is {frames[row]}. Frames are missing, twice there or out of order, so that"
-            " actions would not follow each other. Expected 0, 1, 2, … in every episode."
-            f" {_CORRECT}"
-        )
-    if "index" in rows and not np.array_equal(rows["index"], np.arange(len(frames))):
-        row = int(np.flatnonzero(rows["index"] != np.arange(len(frames)))[0])
-        raise UserError(
-            f"{root}: {dataset.place(row)}, has index {rows['index'][row]}; expected {row}, its"
-            f" place in the tables. {_CORRECT}"
-        )
-    if "timestamp" not in rows:
-        return
-    off = ~(np.abs(rows["timestamp"] * fps - frames) <= HALF)  # not a number is off as well
-    if off.any():
-        row = int(np.flatnonzero(off)[0])
-        raise UserError(
-            f"{root}: {dataset.place(row)}, has timestamp {rows['timestamp'][row]:.4f} s; at"
-            f" fps={fps:g} of meta/info.json it is {frames[row] / fps:.4f} s, more than half a"
-            f" frame away ({off.sum()} such rows). Frames are taken as evenly spaced: correct fps,"
-            " or resample the recording to one rate."
-        )
+    if "frame_index" in rows:
+        row = _first(rows["frame_index"] != frames)
+        if row is not None:
+            raise UserError(
+                f"{root}: {dataset.place(row)}, has frame_index {rows['frame_index'][row]}; by its"
+                f" place it is {frames[row]}. Frames are missing, twice there or out of order, so"
+                " that actions would not follow each other. Expected 0, 1, 2, … in every episode."
+                f" {_CORRECT}"
+            )
+    if "index" in rows:
+        row = _first(rows["index"] != places)
+        if row is not None:
+            raise UserError(
+                f"{root}: {dataset.place(row)}, has index {rows['index'][row]}; expected {row}, its"
+                f" place in the tables. {_CORRECT}"
+            )
+    if "timestamp" in rows:
+        off = ~(np.abs(rows["timestamp"] * fps - frames) <= HALF)  # not a number is off as well
+        row = _first(off)
+        if row is not None:
+            raise UserError(
+                f"{root}: {dataset.place(row)}, has timestamp {rows['timestamp'][row]:.4f} s; at"
+                f" fps={fps:g} of meta/info.json it is {frames[row] / fps:.4f} s, more than half a"
+                f" frame away ({off.sum()} such rows). Frames are taken as evenly spaced: correct"
+                " fps, or resample the recording to one rate."
+            )
 
 
 def _check_phases(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
     """Compare the two columns that say where a conditioning video ends."""
     if not {"exec_start_idx", "is_demo"} <= set(rows):
         return
-    counted = np.add.reduceat(rows["is_demo"], dataset.starts)
     declared = rows["exec_start_idx"]
-    wrong = declared != np.repeat(counted, dataset.lengths)
-    if wrong.any():
-        row = int(np.flatnonzero(wrong)[0])
-        episode = int(np.searchsorted(dataset.starts, row, side="right")) - 1
+    counted = np.repeat(np.add.reduceat(rows["is_demo"], dataset.starts), dataset.lengths)
+    row = _first(declared != counted)
+    if row is not None:
         raise UserError(
             f"{dataset.root}: {dataset.place(row)}, has exec_start_idx {declared[row]}, but is_demo"
-            f" marks the first {counted[episode]} frames of the episode as its conditioning video."
+            f" marks the first {counted[row]} frames of the episode as its conditioning video."
             f" {_CORRECT}"
         )
 
@@ -196,11 +210,7 @@ def _check_side_file(dataset: Description, rows: Mapping[str, np.ndarray]) -> No
     tables alone.
     """
     path = dataset.root / SIDE_FILE
-    if not path.is_file():
-        return
-    records = read_json(path, "what is known of a dataset's episodes").get("episodes")
-    if not isinstance(records, list):
-        return  # reported where it is read
+    records = read_records(dataset.root)
     lengths, starts = dataset.lengths, dataset.starts
     require(
         len(records) <= len(lengths),
@@ -208,8 +218,6 @@ def _check_side_file(dataset: Description, rows: Mapping[str, np.ndarray]) -> No
         " Without the file, episodes have no names of tasks.",
     )
     for episode, record in enumerate(records):
-        if not isinstance(record, Mapping):
-            continue
         facts = {"episode_index": episode, "length": int(lengths[episode])}
         if "exec_start_idx" in rows:
             facts["exec_start_idx"] = int(rows["exec_start_idx"][starts[episode]])
@@ -225,21 +233,21 @@ def _check_side_file(dataset: Description, rows: Mapping[str, np.ndarray]) -> No
 
 def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTasks:
     """The task of every frame: by `task_index` as LeRobot does, else as listed for its episode."""
-    root, starts, listed_tasks = dataset.root, dataset.starts, dataset.episodes["tasks"]
+    root, starts, listed_tasks = dataset.root, dataset.starts, dataset.episodes.tasks
     meta = root / "meta" / "episodes"
     if "task_index" not in rows:
-        for episode, texts in enumerate(listed_tasks):
+        for episode, tasks in enumerate(listed_tasks):
             require(
-                len(set(texts)) == 1,
-                f"{meta}: tasks of episode {episode} is {brief(list(texts))}, and the rows have no"
+                len(set(tasks)) == 1,
+                f"{meta}: tasks of episode {episode} is {brief(list(tasks))}, and the rows have no"
                 " task_index that says which one each frame has. Expected one text there, or a"
                 " column task_index in the tables.",
             )
-        return FrameTasks(starts, _goals(root, [texts[0] for texts in listed_tasks]))
-    numbers, texts = rows["task_index"], read_tasks(root)
-    outside = (numbers < 0) | (numbers >= len(texts))
-    if outside.any():
-        row = int(np.flatnonzero(outside)[0])
+        return FrameTasks(starts, _goals(root, [tasks[0] for tasks in listed_tasks]))
+    numbers = rows["task_index"]
+    texts = read_tasks(root)
+    row = _first((numbers < 0) | (numbers >= len(texts)))
+    if row is not None:
         raise UserError(
             f"{root}: {dataset.place(row)}, has task_index {numbers[row]}, but {TASKS} holds"
             f" {len(texts)} tasks. {_CORRECT}"
@@ -248,10 +256,10 @@ def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTa
     begins[starts] = True
     first = np.flatnonzero(begins)
     episodes = np.searchsorted(starts, first, side="right") - 1
-    known = [{_plain(text) for text in tasks} for tasks in listed_tasks]
     for row, episode in zip(first.tolist(), episodes.tolist(), strict=True):
         text = texts[numbers[row]]
-        if known[episode] and _plain(text) not in known[episode]:
+        known = {_plain(listed_text) for listed_text in listed_tasks[episode]}
+        if known and _plain(text) not in known:
             raise UserError(
                 f"{root}: {dataset.place(row)}, has task_index {numbers[row]}, {brief(text)} in"
                 f" {TASKS}; meta/episodes lists for this episode"
@@ -267,11 +275,11 @@ def _plain(text: str) -> str:
 
 def _goals(root: Path, texts: Sequence[str]) -> tuple[str, ...]:
     """Goals as they are trained on, lower-case; an empty one tells a policy nothing."""
-    if not all(map(str.strip, texts)):
-        raise UserError(
-            f"{root}: the task {brief(next(text for text in texts if not text.strip()))} is empty"
-            f" (in {TASKS} or meta/episodes), and a policy is told what to do in words. Write the"
-            " task there."
+    for text in set(texts):
+        require(
+            text.strip(),
+            f"{root}: the task {brief(text)} is empty (in {TASKS} or meta/episodes), and a policy"
+            " is told what to do in words. Write the task there.",
         )
     spelled = {text: text.lower() for text in set(texts)}  # one text in memory for all its runs
     return tuple(spelled[text] for text in texts)
@@ -279,7 +287,7 @@ def _goals(root: Path, texts: Sequence[str]) -> tuple[str, ...]:
 
 def _check_colour(dataset: Description, column: str) -> None:
     """Refuse depth by what meta/info.json says of a camera: a policy reads colours of 8 bits."""
-    about = about_images(dataset.info["features"][column])
+    about = dataset.info.features[column].about_images
     depth = about.get("is_depth_map", about.get("video.is_depth_map", False))
     if depth is True:
         raise _depth(dataset.root, column, "is_depth_map is true in meta/info.json")
@@ -339,10 +347,10 @@ def _check_images(dataset: Description, column: str, table: Any) -> None:
 
 def _compare_size(dataset: Description, column: str, width: int, height: int) -> None:
     """Warn of pictures of another size than described: all are scaled for the network anyway."""
-    shape = dataset.info["features"][column]["shape"]
+    shape = dataset.info.features[column].shape
     # colours last, or first
-    sides = [[shape[0], shape[1]], [shape[-2], shape[-1]]] if len(shape) == 3 else []
-    if [height, width] not in sides:
+    sides = [shape[:2], shape[-2:]]
+    if len(shape) != 3 or (height, width) not in sides:
         log.warning(
             "%s: meta/info.json gives %s the shape %s, but its pictures have %d rows and %d"
             " columns.",
@@ -375,42 +383,39 @@ def _check_videos(dataset: Description, column: str) -> None:
     """Compare the spans of episodes in video files with each other, with their lengths, and with
     the files.
     """
-    episodes, fps = dataset.episodes, dataset.fps
-    begins = np.asarray(episodes[f"{column}/from_timestamp"])
-    _check_ends(dataset, column, begins)
-    places = np.stack([episodes[f"{column}/chunk_index"], episodes[f"{column}/file_index"]], axis=1)
+    spans = dataset.episodes.videos[column]
+    _check_ends(dataset, column, spans)
+    # Which episodes each file holds, in the order of their images.
+    episodes_of: dict[Path, np.ndarray] = {}
+    places = np.stack([spans.chunk, spans.file], axis=1)
     files, file_of_episode = np.unique(places, axis=0, return_inverse=True)
-    order = {}
     for number, (chunk, file) in enumerate(files.tolist()):
-        path = video_file(dataset.root, dataset.info.get("video_path"), column, chunk, file)
-        inside = np.flatnonzero(file_of_episode.reshape(-1) == number)
-        order[path] = inside[np.argsort(begins[inside], kind="stable")]
-    for path, inside in order.items():
-        _check_neighbours(dataset, column, path, inside, begins[inside])
+        path = video_file(dataset.root, dataset.info.video_path, column, chunk, file)
+        episodes = np.flatnonzero(file_of_episode.reshape(-1) == number)
+        episodes_of[path] = episodes[np.argsort(spans.begin[episodes], kind="stable")]
+    for path, episodes in episodes_of.items():
+        _check_neighbours(dataset, column, path, episodes, spans.begin[episodes])
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        headers = dict(zip(order, pool.map(_read_header, order), strict=True))
+        headers = list(pool.map(_read_header, episodes_of))
     sizes = set()
-    for path, inside in order.items():
-        header = headers[path]
+    for (path, episodes), header in zip(episodes_of.items(), headers, strict=True):
         if _is_deep_grey(header.pixel_format):
             raise _depth(dataset.root, column, f"{path.name} is stored as {header.pixel_format}")
         sizes.add((header.width, header.height))
-        lengths = dataset.lengths[inside]
-        if _is_even(header, begins[inside], lengths, fps):
-            continue
-        _check_frames_of_video(dataset, column, path, inside, begins[inside])
+        begins = spans.begin[episodes]
+        if not _is_even(header, begins, dataset.lengths[episodes], dataset.fps):
+            _check_frames_of_video(dataset, column, path, episodes, begins)
     for width, height in sizes:
         _compare_size(dataset, column, width, height)
 
 
-def _check_ends(dataset: Description, column: str, begins: np.ndarray) -> None:
-    ends = dataset.episodes.get(f"{column}/to_timestamp")
-    if ends is None:
+def _check_ends(dataset: Description, column: str, videos: VideoSpans) -> None:
+    if videos.end is None:
         return
-    spans = (np.asarray(ends) - begins) * dataset.fps
-    wrong = ~(np.abs(spans - dataset.lengths) <= HALF)
-    if wrong.any():
-        episode = int(np.flatnonzero(wrong)[0])
+    begins, ends = videos.begin, videos.end
+    spans = (ends - begins) * dataset.fps
+    episode = _first(~(np.abs(spans - dataset.lengths) <= HALF))
+    if episode is not None:
         raise UserError(
             f"{dataset.root}/meta/episodes: the pictures of {column} of episode {episode} lie"
             f" between {begins[episode]:.4f} s and {ends[episode]:.4f} s, {spans[episode]:.2f}"
@@ -424,9 +429,8 @@ def _check_neighbours(
 ) -> None:
     """Make sure that no two episodes have the same pictures of a file."""
     ends = begins + dataset.lengths[inside] / dataset.fps
-    overlaps = (ends[:-1] - begins[1:]) * dataset.fps > HALF
-    if overlaps.any():
-        k = int(np.flatnonzero(overlaps)[0])
+    k = _first((ends[:-1] - begins[1:]) * dataset.fps > HALF)
+    if k is not None:
         raise UserError(
             f"{dataset.root}/meta/episodes: episodes {inside[k]} and {inside[k + 1]} overlap in the"
             f" video {path.name} of {column}: one ends at {ends[k]:.4f} s, and the other begins at"
@@ -445,12 +449,13 @@ def _read_header(path: Path) -> _Header:
         stream = container.streams.video[0]
         tick = float(stream.time_base or 0)
         average, base = float(stream.average_rate or 0), float(stream.base_rate or 0)
+        is_constant = abs(average - base) <= 1e-3 * base
         context = stream.codec_context
         header = _Header(
             images=stream.frames,
             begin=(stream.start_time or 0) * tick,
             seconds=(stream.duration or 0) * tick,
-            rate=average if abs(average - base) <= 1e-3 * base else 0.0,
+            rate=average if is_constant else 0.0,
             pixel_format=str(context.pix_fmt),
             width=context.width,
             height=context.height,
@@ -489,19 +494,18 @@ def _check_frames_of_video(
     ):
         targets = begin + np.arange(length) / fps
         after = np.clip(np.searchsorted(times, targets), 1, max(len(times) - 1, 1))
-        nearest = np.where(
-            targets - times[after - 1] <= times[np.minimum(after, len(times) - 1)] - targets,
-            after - 1,
-            np.minimum(after, len(times) - 1),
-        )
+        following = np.minimum(after, len(times) - 1)
+        is_before_nearer = targets - times[after - 1] <= times[following] - targets
+        nearest = np.where(is_before_nearer, after - 1, following)
         away = np.abs(times[nearest] - targets) * fps
         # With a picture for every row, the n-th row's is the n-th. Otherwise only the distance
         # tells.
-        wrong = (nearest != before + np.arange(length)) if exact else away > QUARTER
-        wrong |= away > HALF + 1e-6
+        wrong = away > QUARTER
+        if exact:
+            wrong = nearest != before + np.arange(length)
         before += length
-        if wrong.any():
-            frame = int(np.flatnonzero(wrong)[0])
+        frame = _first(wrong | (away > HALF + 1e-6))
+        if frame is not None:
             raise UserError(
                 f"{path}: frame {frame} of episode {episode} is looked for at {targets[frame]:.4f}"
                 f" s ({column}/from_timestamp {begin:.4f} s, fps={fps:g}), but the video, with"
@@ -538,18 +542,16 @@ def compare_stats(root: Path, name: str, least: np.ndarray, greatest: np.ndarray
     if not path.is_file():
         return
     stats = read_json(path, "a dataset's statistics").get(name)
-    if not isinstance(stats, Mapping):
-        return
     try:
-        low, high = (np.asarray(stats[key], np.float64).reshape(-1) for key in ("min", "max"))
-    except (KeyError, TypeError, ValueError):
+        low = np.asarray(stats["min"], np.float64).reshape(-1)
+        high = np.asarray(stats["max"], np.float64).reshape(-1)
+    except (KeyError, TypeError, ValueError):  # other statistics than LeRobot's
         return
     if low.shape != least.shape or high.shape != greatest.shape:
         return
     slack = 1e-3 * np.maximum(np.abs(greatest - least), 1e-3)
-    wrong = np.flatnonzero((np.abs(low - least) > slack) | (np.abs(high - greatest) > slack))
-    if len(wrong):
-        d = int(wrong[0])
+    d = _first((np.abs(low - least) > slack) | (np.abs(high - greatest) > slack))
+    if d is not None:
         log.warning(
             "%s: by meta/stats.json number %d of %s lies within %.4g and %.4g, in the rows within"
             " %.4g and %.4g. Statistics are computed anew here; LeRobot's own policies read these.",
@@ -577,13 +579,10 @@ def compare_units(
     Args:
         names, units: of each number. scales: the greatest size of each, [w].
     """
-    beyond = [
-        d
-        for d, unit in enumerate(units)
-        if scales[d] > LARGEST_IN.get(unit.strip().casefold(), np.inf)
-    ]
-    if beyond:
-        d = beyond[0]
+    largest = [LARGEST_IN.get(unit.strip().casefold(), np.inf) for unit in units]
+    beyond = scales > np.array(largest)
+    d = _first(beyond)
+    if d is not None:
         log.warning(
             "%s: the action's %s reaches %.4g, which is hardly in %s, as embodiment.action.units"
             " says (%d such). Correct the units, or convert the data.",
@@ -591,7 +590,7 @@ def compare_units(
             names[d],
             scales[d],
             units[d],
-            len(beyond),
+            beyond.sum(),
         )
 
 
@@ -615,11 +614,12 @@ def compare_names(
     """
     if not first or not second:
         return
-    ours, theirs = ([named_alike(name) for name in names] for names in (first, second))
-    if ours == theirs:
+    compared_first = [named_alike(name) for name in first]
+    compared_second = [named_alike(name) for name in second]
+    if compared_first == compared_second:
         return
     both = f"{of_first}: {listed(first, 24)}; {of_second}: {listed(second, 24)}"
-    if sorted(ours) == sorted(theirs):
+    if sorted(compared_first) == sorted(compared_second):
         raise UserError(
             f"The numbers of the {what} have the same names in another order. {both}. {same_place}"
         )

@@ -75,24 +75,24 @@ TILES, COLUMNS, SIDE = 12, 6, 192
 
 def episode_sheet(frames: Sequence[RawFrame], title: str) -> "Image":
     """Front views spread evenly over an episode, each with its step and sub-task."""
-    displayed = [(step, frames[step]) for step in evenly_spaced(len(frames), TILES)]
-    tiles = [
-        Tile(
-            frame.front,
-            f"{step} {frame.subgoals['simple_subgoal_online']}",
-            RED if frame.is_demo else None,
+    tiles = []
+    for step in evenly_spaced(len(frames), TILES):
+        frame = frames[step]
+        outline = RED if frame.is_demo else None
+        tiles.append(
+            Tile(frame.front, f"{step} {frame.subgoals['simple_subgoal_online']}", outline)
         )
-        for step, frame in displayed
-    ]
     return contact_sheet(tiles, COLUMNS, title, side=SIDE)
 
 
 def write_previews(file: Path, index: int, task: str, folder: Path) -> tuple[Path, Path]:
     """Write `<task>-<index>.png` and `.mp4` of a recorded episode; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    sheet, video = (folder / f"{task}-{index:04d}.{end}" for end in ("png", "mp4"))
+    sheet = folder / f"{task}-{index:04d}.png"
+    video = folder / f"{task}-{index:04d}.mp4"
     with open_episode(EpisodeRef(file, index, task)) as episode:
-        frames, goal = list(episode), episode.goals[0]
+        frames = list(episode)
+        goal = episode.goals[0]
     episode_sheet(frames, f"{task} {index}: {goal}").save(sheet)
     images = (
         video_frame((f.front, f.wrist), f.subgoals["simple_subgoal_online"], f.is_demo)
@@ -102,8 +102,10 @@ def write_previews(file: Path, index: int, task: str, folder: Path) -> tuple[Pat
     return sheet, video
 
 
-_PARTS, _MERGED, _KEYFRAMES = "episodes", "merged", "keyframes.npz"
+_PARTS = "episodes"
+_MERGED = "merged"
 _WRITING = "writing"
+_KEYFRAMES = "keyframes.npz"
 _WORK = (f"{_PARTS}/[0-9][0-9][0-9][0-9][0-9][0-9]-*-*", _MERGED, _WRITING)
 """What a conversion writes into its work folder."""
 
@@ -114,22 +116,20 @@ class ConvertOptions:
 
     images: `video`, or `png` for lossless images inside the tables (about ten times larger).
     names: of the columns: `robomme`, as in the released datasets, or `lerobot`, as LeRobot's own
-    policies ask for
-        (`lerobot_files.NAMES`). Readers here take either.
+        policies ask for (`lerobot_files.NAMES`). Readers here take either.
     fps: frames per second; 20 is the simulator's control rate.
     codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless
-    but for the rounding
-        between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop
-        relies on that.
+        but for the rounding between RGB and YUV, so a patch in which nothing moves stays exactly
+        the same: TokenDrop relies on that.
     poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all
-    episodes have. tool_pose: a column of where the tool was; `convert` keeps it where all episodes
-    have it. choices: a column of what was chosen among a task's options, and these options beside
-    the tables; `convert` keeps
-        them where all episodes have them.
-    keyframes: keep the keyframes' depth and camera poses beside the tables too
-    (`SIDE_FILES`). partly: say in two more columns which frames were drawn; `convert`
-    does where an episode was recorded at a choice of
-        frames. The images of the others repeat an earlier one, and readers refuse them.
+        episodes have.
+    tool_pose: a column of where the tool was; `convert` keeps it where all episodes have it.
+    choices: a column of what was chosen among a task's options, and these options beside the
+        tables; `convert` keeps them where all episodes have them.
+    keyframes: keep the keyframes' depth and camera poses beside the tables too (`SIDE_FILES`).
+    partly: say in two more columns which frames were rendered; `convert` does where an episode was
+        recorded at a choice of frames. The images of the others repeat an earlier one, and readers
+        refuse them.
     """
 
     images: str = "video"
@@ -162,37 +162,32 @@ class ConvertOptions:
 
 def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
     """The dataset's columns, spelt as `options.names` says."""
-    tool = [*POSE, "gripper"]
     joints = [*(f"joint{i}" for i in range(1, ARM_JOINTS + 1)), "gripper"]
     kind = "video" if options.images == "video" else "image"
-    choice = {"dtype": "float32", "shape": (len(CHOICE_NUMBERS),), "names": CHOICE_NUMBERS}
     view = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
     columns = {
-        "image": dict(view),
+        "image": view,
         "wrist_image": dict(view),
-        "state": {"dtype": "float32", "shape": (len(joints),), "names": joints},
-        "actions": {"dtype": "float32", "shape": (len(joints),), "names": joints},
-        **{
-            name: {"dtype": "float32", "shape": (len(tool),), "names": tool}
-            for name in options.poses
-        },
-        **(
-            {POSE_STATE: {"dtype": "float32", "shape": (len(POSE),), "names": list(POSE)}}
-            if options.tool_pose
-            else {}
-        ),
-        **({CHOICE_ACTIONS: choice} if options.choices else {}),
-        "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
-        "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
-        "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
-        **{name: {"dtype": "string", "shape": (1,), "names": None} for name in SUBGOALS},
-        **{
-            f"{c}{RENDERED_SUFFIX}": {"dtype": "bool", "shape": (1,), "names": None}
-            for c in CAMERAS
-            if options.partly
-        },
+        "state": _vector(joints),
+        "actions": _vector(joints),
     }
+    for name in options.poses:
+        columns[name] = _vector([*POSE, "gripper"])
+    if options.tool_pose:
+        columns[POSE_STATE] = _vector(list(POSE))
+    if options.choices:
+        columns[CHOICE_ACTIONS] = _vector(CHOICE_NUMBERS)
+    scalars = {"is_demo": "bool", "exec_start_idx": "int32", "step_idx": "int32"}
+    scalars |= dict.fromkeys(SUBGOALS, "string")
+    if options.partly:
+        scalars |= {f"{camera}{RENDERED_SUFFIX}": "bool" for camera in CAMERAS}
+    for name, dtype in scalars.items():
+        columns[name] = {"dtype": dtype, "shape": (1,), "names": None}
     return _spelt(columns, options)
+
+
+def _vector(names: list[str]) -> dict[str, Any]:
+    return {"dtype": "float32", "shape": (len(names),), "names": names}
 
 
 def _spelt(columns: dict[str, Any], options: ConvertOptions) -> dict[str, Any]:
@@ -237,13 +232,15 @@ def _work_folder(output: Path) -> Path:
 
 
 def planned_options(options: ConvertOptions) -> dict[str, Any]:
-    """The options as a plan holds them; what plans from before had none of stands beside them, or
-    where it is said.
+    """The options that stand among the options of a plan; those that add content stand beside
+    them, and `names` is left out where it is the default.
     """
-    beside = ["poses", "tool_pose", "choices", "partly", "keyframes"] + ["names"] * (
-        options.names == "robomme"
-    )
-    return {key: value for key, value in asdict(options).items() if key not in beside}
+    planned = asdict(options)
+    for key in ("poses", "tool_pose", "choices", "partly", "keyframes"):
+        del planned[key]
+    if options.names == "robomme":
+        del planned["names"]
+    return planned
 
 
 def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
@@ -256,25 +253,19 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
         for file in files:
             sums[file] = file_sum(file)
             advance(file.stat().st_size)
-    origins = [
-        {
-            "file": ref.file.name,
-            "bytes": ref.file.stat().st_size,
-            "sha256": sums[ref.file],
-            "episode": ref.index,
-        }
-        for ref in episodes
-    ]
-    content = {
-        "poses": list(options.poses),
-        **{key: getattr(options, key) for key in ("tool_pose", "choices")},
-    }
-    content["keyframes"] = options.keyframes
-    return {
-        "options": planned_options(options),
-        "episodes": origins,
-        **{k: v for k, v in content.items() if v},
-    }
+    origins = []
+    for ref in episodes:
+        size = ref.file.stat().st_size
+        origins.append(
+            {"file": ref.file.name, "bytes": size, "sha256": sums[ref.file], "episode": ref.index}
+        )
+    plan: dict[str, Any] = {"options": planned_options(options), "episodes": origins}
+    if options.poses:
+        plan["poses"] = list(options.poses)
+    for key in ("tool_pose", "choices", "keyframes"):
+        if getattr(options, key):
+            plan[key] = True
+    return plan
 
 
 def _convert(
@@ -312,20 +303,9 @@ def _finished(output: Path, plan: dict[str, Any]) -> bool:
     if not output.exists() or (output.is_dir() and not any(output.iterdir())):
         return False
     side = output / SIDE_FILE
-    if side.is_file():
-        stored = read_json(side, "the facts of a converted dataset").get("plan")
-        if isinstance(stored, dict) and not any(
-            "sha256" in origin for origin in stored.get("episodes", ())
-        ):
-            # Plans from before contents were compared name files and sizes only.
-            plan = {
-                **plan,
-                "episodes": [
-                    {k: v for k, v in o.items() if k != "sha256"} for o in plan["episodes"]
-                ],
-            }
-        if stored == plan:
-            return True
+    about = "the facts of a converted dataset"
+    if side.is_file() and read_json(side, about).get("plan") == plan:
+        return True
     raise UserError(
         f"{output} exists and is not the result of this conversion (other files, other content of a"
         " file, other episodes or options). Choose another output, or remove that folder yourself."
@@ -349,9 +329,11 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
             "goals": episode.goals,
             "length": episode.length,
             "exec_start_idx": episode.exec_start,
-            **({"options": episode.options} if options.choices else {}),
-            **({"frames": episode.frames} if episode.frames is not None else {}),
         }
+        if options.choices:
+            side["options"] = episode.options
+        if episode.frames is not None:
+            side["frames"] = episode.frames
     (draft / SIDE_FILE).write_text(json.dumps(side))
     draft.rename(part)
 
@@ -388,23 +370,21 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
                 # it be.
                 encoder_queue_maxsize=episode.length + 1,
             )
-        row = {
+        row: dict[str, Any] = {
             "image": frame.front,
             "wrist_image": frame.wrist,
             "state": frame.state,
             "actions": frame.action.astype(np.float32),
-            **{name: rows[step] for name, rows in tool.items()},
             "is_demo": np.array([frame.is_demo]),
             "exec_start_idx": np.array([episode.exec_start], np.int32),
             "step_idx": np.array([step], np.int32),
-            **frame.subgoals,
-            **{
-                f"{c}{RENDERED_SUFFIX}": np.array([c in frame.rendered])
-                for c in CAMERAS
-                if options.partly
-            },
             "task": goal,
         }
+        row |= frame.subgoals
+        row |= {name: rows[step] for name, rows in tool.items()}
+        if options.partly:
+            for camera in CAMERAS:
+                row[f"{camera}{RENDERED_SUFFIX}"] = np.array([camera in frame.rendered])
         dataset.add_frame(_spelt(row, options))
     assert dataset is not None  # an episode has at least one frame
     dataset.save_episode(parallel_encoding=False)

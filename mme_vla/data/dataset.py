@@ -69,9 +69,13 @@ class FurtherColumns:
     def items(self, episode: int, frame: int) -> dict[str, Any]:
         """What a sample at a frame has of these: `labels` and `weight`, where there are any."""
         (row,) = self._source.rows(episode, np.array([frame]))
-        labels = {name: torch.as_tensor(self._labels[name][row]) for name in self._current}
-        weight = {} if self._weights is None else {"weight": torch.as_tensor(self._weights[row])}
-        return ({"labels": labels} if labels else {}) | weight
+        items: dict[str, Any] = {}
+        if self._current:
+            labels = {name: torch.as_tensor(self._labels[name][row]) for name in self._current}
+            items["labels"] = labels
+        if self._weights is not None:
+            items["weight"] = torch.as_tensor(self._weights[row])
+        return items
 
     def of_memory(self, episode: int) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
         """The labels that the memory reads, by name: values of an episode's frames [n]."""
@@ -149,31 +153,44 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         if subgoal is not None:
             _check_subgoals(sources, subgoal)
         rate = processor.embodiment.fps
-        if processor.samples.history is not None and (
-            other := [s for s in sources if rate not in (None, s.fps)]
-        ):
-            raise UserError(
-                f"{other[0].name} has {other[0].fps:g} frames per second and"
-                f" embodiment.fps={rate:g}: the video would be shown at another speed than it is"
-                " read at. Convert the data to that rate, or set embodiment.fps."
-            )
-        self.sources, self.processor, self.memory = list(sources), processor, memory
-        self.caches = list(caches) if memory is not None and caches is not None else []
-        self.action_offset, self.mask_padding = action_offset, mask_padding
-        self.jitter, self.subgoal, self.seed, self.epoch = jitter, subgoal, seed, 0
+        if processor.samples.history is not None and rate is not None:
+            for source in sources:
+                require(
+                    source.fps == rate,
+                    f"{source.name} has {source.fps:g} frames per second and"
+                    f" embodiment.fps={rate:g}: the video would be shown at another speed than it"
+                    " is read at. Convert the data to that rate, or set embodiment.fps.",
+                )
+        self.sources = list(sources)
+        self.processor = processor
+        self.memory = memory
+        self.caches: list[VisionCache] = []
+        if memory is not None and caches is not None:
+            self.caches = list(caches)
+        self.action_offset = action_offset
+        self.mask_padding = mask_padding
+        self.jitter = jitter
+        self.subgoal = subgoal
+        self.seed = seed
+        self.epoch = 0
         self.transforms = tuple(transforms)
         self.columns = [
             FurtherColumns(source, labels, labels_read(memory), weights) for source in sources
         ]
-        selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
-        self._source = np.concatenate(
-            [np.full(len(part), i) for i, part in enumerate(selected)]
-        ).astype(np.int64)
-        self._episode = np.concatenate([np.asarray(part, np.int64) for part in selected])
-        pairs = zip(self._source, self._episode, strict=True)
-        self._ends = np.cumsum(
-            [len(self.decisions(int(s), int(e))) for s, e in pairs], dtype=np.int64
-        )
+        # Source and number of each episode, and where its items end.
+        if episodes is None:
+            episodes = [np.arange(len(source)) for source in sources]
+        of_source: list[int] = []
+        numbers: list[int] = []
+        counts: list[int] = []
+        for s, selected in enumerate(episodes):
+            for episode in np.asarray(selected, np.int64).tolist():
+                of_source.append(s)
+                numbers.append(episode)
+                counts.append(len(self.decisions(s, episode)))
+        self._source = np.array(of_source, np.int64)
+        self._episode = np.array(numbers, np.int64)
+        self._ends = np.cumsum(counts, dtype=np.int64)
         require(self.steps, "The data hold no execution step of this robot.")
 
     def __len__(self) -> int:
@@ -191,11 +208,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         where that counts.
         """
         decisions = self.sources[source].decisions(episode)
-        short = (
-            self.processor.embodiment.action.horizon - 1
-            if self.processor.samples.full_chunks_only
-            else 0
-        )
+        if not self.processor.samples.full_chunks_only:
+            return decisions
+        short = self.processor.embodiment.action.horizon - 1
         return decisions[: max(len(decisions) - short, 0)]
 
     def set_epoch(self, epoch: int) -> None:
@@ -208,7 +223,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         at = int(np.searchsorted(self._ends, index, side="right"))
         source, episode = int(self._source[at]), int(self._episode[at])
         decisions = self.decisions(source, episode)
-        return source, episode, int(decisions[len(decisions) - (int(self._ends[at]) - index)])
+        first = int(self._ends[at]) - len(decisions)
+        return source, episode, int(decisions[index - first])
 
     def item_at(self, source: int, episode: int, frame: int) -> int:
         """The item of a frame; frames at which the robot does not decide share their episode's
@@ -254,7 +270,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         """The robot's own actions right before the chunk, [n, w], as many as the prompt reads and
         there are.
         """
-        source, most = self.sources[step.source], self.processor.prompt_spec.past_actions
+        source = self.sources[step.source]
+        most = self.processor.prompt_spec.past_actions
         if frames is None or source.robot.action.frames is None:
             return source.past_actions(step.episode, step.index, most, self.action_offset)
         now = int(frames.transformed(np.array(step.index)))
@@ -309,13 +326,15 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 
         frames: the map of a transformed episode; all that is read of the past goes through it.
         """
-        now = step.index if frames is None else int(frames.transformed(np.array(step.index)))
+        now, real = step.index, None
+        if frames is not None:
+            now, real = int(frames.transformed(np.array(step.index))), frames.real
         subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
         item = self.processor.item(self._sample(step, subgoal, now, frames))
         if self.mask_padding:
             item["action_mask"] = torch.from_numpy(step.recorded)
-        for name, value in self.columns[step.source].items(step.episode, step.index).items():
-            item[name] = value
+        columns = self.columns[step.source]
+        item.update(columns.items(step.episode, step.index))
         if self.memory is not None:
             history: History = self.caches[step.source].history(step.episode)
             if self.memory.uses_proprio:
@@ -324,11 +343,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             if frames is not None:
                 history = TransformedHistory(history, frames)
             selection = self.memory.gather_selection(history, now, rng if self.jitter else None)
-            real = None if frames is None else frames.real
-            item["history"] = with_labels(
-                selection, self.columns[step.source].of_memory(step.episode), real
-            )
-            if (spec := self.memory.past_view_spec) is not None:
+            item["history"] = with_labels(selection, columns.of_memory(step.episode), real)
+            spec = self.memory.past_view_spec
+            if spec is not None:
                 read = partial(self._images, step.source, step.episode, frames)
                 item["past"] = past_views(spec, now, read, self.processor.images)
         return item
@@ -336,7 +353,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     def _images(
         self, source: int, episode: int, frame_map: FrameMap | None, frames: np.ndarray
     ) -> list[np.ndarray]:
-        frames = frames if frame_map is None else frame_map.real[frames]
+        if frame_map is not None:
+            frames = frame_map.real[frames]
         return [self.sources[source].frames(episode, frames, name) for name in self._cameras]
 
     @property
@@ -352,20 +370,23 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         """A step with the frames of its window; before the first frame of the execution that one is
         repeated.
         """
-        source, cameras = self.sources[step.source], self._cameras
+        source = self.sources[step.source]
+        samples = self.processor.samples
+        # The frames of the window, and those of the history that the memory camera shows, as they
+        # are recorded.
         start = int(source.exec_starts[step.episode]) if frames is None else frames.exec_start
-        window = np.arange(now - self.processor.samples.window + 1, now + 1).clip(
-            min=min(start, now)
-        )
-        window = window if frames is None else frames.real[window]
+        window = np.arange(now - samples.window + 1, now + 1).clip(min=min(start, now))
+        past = None if samples.history is None else samples.history(now)
+        if frames is not None:
+            window = frames.real[window]
+            past = None if past is None else frames.real[past]
         first = int(window[0])
         states = source.states(step.episode, first, step.index + 1)
-        history, memory_camera = self.processor.samples.history, source.robot.memory_camera
         views = {}
-        for name in cameras:
+        for name in self._cameras:
             read = window
-            if history is not None and name == memory_camera:
-                read = history(now) if frames is None else frames.real[history(now)]
+            if past is not None and name == source.robot.memory_camera:
+                read = past
             distinct, places = np.unique(read, return_inverse=True)
             views[name] = source.frames(step.episode, distinct, name)[places]
         return Sample(
@@ -407,15 +428,15 @@ class GroupDataset(TrainingDataset):
             raise IndexError(f"group {index} of {len(self)}")
         at = index % len(self._episode)
         s, episode = int(self._source[at]), int(self._episode[at])
-        length, size = int(self.sources[s].lengths[episode]), self.processor.samples.group_size
+        length = int(self.sources[s].lengths[episode])
+        size = self.processor.samples.group_size
         rng = np.random.default_rng([self.seed, self.epoch, index])
         if length >= size:
             frames = np.sort(rng.choice(length, size, replace=False))
         else:
             frames = np.minimum(np.arange(size), length - 1)
-        return self._group(
-            s, episode, frames, rng, self._frame_map(s, episode, frames, index, self.transforms)
-        )
+        frame_map = self._frame_map(s, episode, frames, index, self.transforms)
+        return self._group(s, episode, frames, rng, frame_map)
 
     def observation(self, index: int) -> dict[str, Any]:
         """The group that ends at a step: the moments before it at which the policy would have been
@@ -424,9 +445,8 @@ class GroupDataset(TrainingDataset):
         s, episode, frame = self.locate(index)
         stride = self.processor.embodiment.action.execute
         frames = np.arange(frame, -1, -stride)[: self.processor.samples.group_size][::-1]
-        return self._group(
-            s, episode, frames, np.random.default_rng([self.seed, self.epoch, index])
-        )
+        rng = np.random.default_rng([self.seed, self.epoch, index])
+        return self._group(s, episode, frames, rng)
 
     def _group(
         self,
@@ -437,11 +457,10 @@ class GroupDataset(TrainingDataset):
         frame_map: FrameMap | None = None,
     ) -> dict[str, Any]:
         steps = [self.step_at(s, episode, int(frame)) for frame in frames]
+        times = frames if frame_map is None else frame_map.transformed(frames)
         return {
             "moments": [self.inputs_at(step, rng, frame_map) for step in steps],
-            "times": (frames if frame_map is None else frame_map.transformed(frames)).astype(
-                np.int64
-            ),
+            "times": times.astype(np.int64),
             "goal": steps[-1].goal,
             "subgoals": steps[-1].subgoals,
             "place": (s, episode, int(frames[-1])),

@@ -33,22 +33,21 @@ from mme_vla.data.lerobot_files import (
     content_fingerprint,
     find_columns,
     flat,
-    lossy_coding,
     names_of,
     open_table,
     read_episode_table,
     read_exec_starts,
     read_info,
+    read_records,
     resolve_root,
     video_file,
-    width_of,
 )
 from mme_vla.data.video import VideoReader
 from mme_vla.data.waypoints import Motions, find_choices, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.action_space import numbered, read_options
 from mme_vla.errors import UserError, brief, did_you_mean, listed, require
-from mme_vla.utils import Sums, decoding, read_json
+from mme_vla.utils import Sums, decoding
 
 log = logging.getLogger(__name__)
 
@@ -91,14 +90,7 @@ class EpisodeSource:
         self.root = resolve_root(root)
         self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
         info = read_info(self.root)
-        features = info["features"]
-        matches = find_columns(self.root, features, robot)
-        self.state_names = names_of([features[column] for column in matches.state])
-        self.action_names = names_of([features[column] for column in matches.action])
-        self._compare_names(robot)
-        self.robot = replace(robot, action=robot.action.with_names(self.action_names))
-        columns, self.columns = list(matches.tables), matches.cameras
-        self.fps = float(info["fps"])
+        self.fps = info.fps
         if robot.fps is not None and robot.fps != self.fps:
             log.warning(
                 "%s has %g frames per second; the robot %s has %g.",
@@ -107,63 +99,74 @@ class EpisodeSource:
                 robot.name,
                 robot.fps,
             )
+
+        # Columns, and the names of their numbers.
+        features = info.features
+        matches = find_columns(self.root, features, robot)
+        columns = list(matches.tables)
+        self.columns = matches.cameras
+        self.state_names = names_of([features[column] for column in matches.state])
+        self.action_names = names_of([features[column] for column in matches.action])
+        self._compare_names(robot)
+        self.robot = replace(robot, action=robot.action.with_names(self.action_names))
         self._vectors_of = {
-            kind: {name: width_of(features[name]) for name in names}
-            for kind, names in (
-                ("state", matches.state),
-                ("action", matches.action),
-                ("pose", matches.pose),
-            )
+            "state": {name: features[name].width for name in matches.state},
+            "action": {name: features[name].width for name in matches.action},
+            "pose": {name: features[name].width for name in matches.pose},
         }
-        self._motions: dict[int, Motions] = {}
-        videos = {
-            name: column
-            for name, column in self.columns.items()
-            if features[column]["dtype"] == "video"
-        }
-        self.video_cameras = tuple(videos)
-        self.lossy = {
-            name: coding for name, c in videos.items() if (coding := lossy_coding(features[c]))
-        }
-        """Of cameras whose videos lost something when they were made: how they were coded."""
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
-        # What every opening reads anyway; tables that hold images are left to `verify`.
-        opened = ("meta/", "data/") if len(videos) == len(self.columns) else ("meta/",)
-        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
-        sums.check(*(name for name in sums.table if name.startswith(opened)))
+        videos: dict[str, str] = {}
+        images: list[str] = []
+        self.lossy: dict[str, str] = {}
+        """Of cameras whose videos lost something when they were made: how they were coded."""
+        for camera, column in self.columns.items():
+            if features[column].dtype != "video":
+                images.append(column)
+                continue
+            videos[camera] = column
+            coding = features[column].lossy_coding
+            if coding is not None:
+                self.lossy[camera] = coding
+        self.video_cameras = tuple(videos)
         video_columns = tuple(dict.fromkeys(videos.values()))
-        episodes = read_episode_table(self.root, video_columns)
-        self._starts, self.lengths = np.asarray(episodes["starts"]), np.asarray(episodes["lengths"])
-        self._episodes: dict[str, Any] = episodes
-        self._video_path = info.get("video_path")
+
+        # Checksums of what every opening reads anyway; tables that hold images are left to
+        # `verify`.
+        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
+        opened = ("meta/",) if images else ("meta/", "data/")
+        sums.check(*(name for name in sums.table if name.startswith(opened)))
+
+        # Episodes and rows.
+        self._episodes = read_episode_table(self.root, video_columns)
+        self._starts = self._episodes.starts
+        self.lengths = self._episodes.lengths
+        self._video_path = info.video_path
         self._table = open_table(self.root, columns, features)
         self._reader = VideoReader(max_open_videos)
+        self._motions: dict[int, Motions] = {}
         self._check_rows()
         self.scales: dict[str, np.ndarray] = {}
         for kind, vectors in self._vectors_of.items():
-            greatest_sizes = []
-            for name, width in vectors.items():
-                least, greatest = check_vectors(self.root, self._table, name, width)
-                compare_stats(self.root, name, least, greatest)
-                greatest_sizes.append(np.maximum(np.abs(least), np.abs(greatest)))
-            if greatest_sizes:
-                self.scales[kind] = np.concatenate(greatest_sizes)
-        compare_units(
-            self.root, self.robot.action.names, self.robot.action.units, self.scales["action"]
+            sizes = []
+            for column, width in vectors.items():
+                least, greatest = check_vectors(self.root, self._table, column, width)
+                compare_stats(self.root, column, least, greatest)
+                sizes.append(np.maximum(np.abs(least), np.abs(greatest)))
+            if sizes:
+                self.scales[kind] = np.concatenate(sizes)
+        action = self.robot.action
+        compare_units(self.root, action.names, action.units, self.scales["action"])
+        image_columns = tuple(dict.fromkeys(images))
+        self.tasks = check_consistency(
+            Description(self.root, info, self._episodes, video_columns, image_columns), self._table
         )
-        pictures = tuple(column for column in self.columns.values() if column not in video_columns)
-        description = Description(
-            self.root, info, episodes, self.fps, video_columns, tuple(dict.fromkeys(pictures))
-        )
-        self.tasks = check_consistency(description, self._table)
-        self._rendered = {
-            name: self._column(f"{name}{RENDERED_SUFFIX}").astype(bool)
-            for name in self.columns
-            if f"{name}{RENDERED_SUFFIX}" in columns
-        }
-        self.exec_starts = self._read_exec_starts(
-            columns, None if exec_starts is None else Path(exec_starts)
-        )
+        self._rendered: dict[str, np.ndarray] = {}
+        for camera in self.columns:
+            if f"{camera}{RENDERED_SUFFIX}" in columns:
+                rendered = self._column(f"{camera}{RENDERED_SUFFIX}")
+                self._rendered[camera] = rendered.astype(bool)
+        side_file = None if exec_starts is None else Path(exec_starts)
+        self.exec_starts = self._read_exec_starts(columns, side_file)
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -180,7 +183,7 @@ class EpisodeSource:
         The table of tasks counts where meta/episodes does not name the one task of every episode.
         """
         parts = ["data", "videos", "meta/episodes"]
-        if any(len(texts) != 1 for texts in self._episodes["tasks"]):
+        if any(len(texts) != 1 for texts in self._episodes.tasks):
             parts.append(TASKS)
         return content_fingerprint(self.root, parts)
 
@@ -189,13 +192,7 @@ class EpisodeSource:
         """What the converter knows of each episode beside the columns: task, seed, difficulty, …;
         may be empty.
         """
-        side = self.root / SIDE_FILE
-        if not side.exists() and not side.is_symlink():
-            return []
-        records = read_json(side, "what is known of a dataset's episodes").get("episodes")
-        if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
-            raise UserError(f"{side} holds no list of episodes. {REMEDY}")
-        return records
+        return read_records(self.root)
 
     def locate(self, row: int) -> tuple[int, int]:
         """The episode and the frame in it of a row of the tables; LeRobot calls the row `index`."""
@@ -288,8 +285,9 @@ class EpisodeSource:
         shows.
         """
         first, length = int(self.exec_starts[episode]), int(self.lengths[episode])
-        motions = self.robot.action.frames is None
-        decided = self._motions_of(episode).decisions if motions else range(first, length)
+        decided: Sequence[int] | np.ndarray = range(first, length)
+        if self.robot.action.frames is None:
+            decided = self._motions_of(episode).decisions
         if not self._rendered:
             return decided
         rendered = np.logical_and.reduce([self.rendered(episode, name) for name in self.columns])
@@ -326,11 +324,10 @@ class EpisodeSource:
         start += offset
         length = int(self.lengths[episode])
         steps = np.arange(start, start + horizon)
+        known = steps < length
         first = min(start, length - 1)
-        recorded = self.actions(
-            episode, first, min(start + horizon, length) if start < length else length
-        )
-        chunk, known = recorded[np.minimum(steps, length - 1) - first], steps < length
+        recorded = self.actions(episode, first, min(start + horizon, length))
+        chunk = recorded[np.minimum(steps, length - 1) - first]
         for place in self.robot.action.of_pose:
             chunk[~known, place] = 0
         return chunk, known
@@ -358,29 +355,36 @@ class EpisodeSource:
             of the execution, and nowhere where an action is a motion of many frames.
         """
         stop = int(np.max(frames, initial=0)) + 1
-        is_known = (frames > self.exec_starts[episode]) & (self.robot.action.frames is not None)
-        led = np.clip(frames - 1 + offset, 0, stop - 1)
-        return self.states(episode, 0, stop)[frames], self.actions(episode, 0, stop)[led], is_known
+        is_known = frames > self.exec_starts[episode]
+        if self.robot.action.frames is None:
+            is_known = np.zeros_like(is_known)
+        before = np.clip(frames - 1 + offset, 0, stop - 1)
+        states = self.states(episode, 0, stop)[frames]
+        return states, self.actions(episode, 0, stop)[before], is_known
 
     def _motions_of(self, episode: int) -> Motions:
         if episode not in self._motions:
             first = int(self.exec_starts[episode])
-            rows, letters = self.actions(episode, first), self.robot.action.choice
-            self._motions[episode] = (
-                find_choices(rows, first, letters) if letters else find_motions(rows, first)
-            )
+            rows = self.actions(episode, first)
+            letters = self.robot.action.choice
+            if letters:
+                self._motions[episode] = find_choices(rows, first, letters)
+            else:
+                self._motions[episode] = find_motions(rows, first)
         return self._motions[episode]
 
     def subgoals(self, episode: int, step: int) -> dict[str, str]:
         """The subgoal texts of one step, lower-case, under the names in `subgoal_names`."""
         row = self._rows(episode, step, step + 1)
-        texts = {name: flat(row[name])[0].as_py() for name in self.subgoal_names}
-        for name, text in texts.items():
+        texts = {}
+        for name in self.subgoal_names:
+            text = flat(row[name])[0].as_py()
             require(
                 text is not None,
                 f"{self.root}: {name} of frame {step} of episode {episode} has no value. {REMEDY}",
             )
-        return {name: str(text).lower() for name, text in texts.items()}
+            texts[name] = str(text).lower()
+        return texts
 
     def frames(
         self, episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None
@@ -399,26 +403,25 @@ class EpisodeSource:
             camera in self.columns,
             f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}",
         )
-        if not (rendered := self.rendered(episode, camera)[indices]).all():
+        rendered = self.rendered(episode, camera)[indices]
+        if not rendered.all():
             raise UserError(
                 f"{self.name}, episode {episode}: {camera} was not rendered at frames"
                 f" {indices[~rendered].tolist()[:5]}. It was recorded at a choice of frames: record"
                 " it again with frames=… that holds these, or frames=all."
             )
-        column, start = self.columns[camera], int(self._starts[episode])
+        column = self.columns[camera]
         if camera in self.video_cameras:
-            chunk, file = (
-                int(self._episodes[f"{column}/{key}"][episode])
-                for key in ("chunk_index", "file_index")
-            )
+            spans = self._episodes.videos[column]
+            chunk, file = int(spans.chunk[episode]), int(spans.file[episode])
             path = video_file(self.root, self._video_path, column, chunk, file)
-            offset = float(self._episodes[f"{column}/from_timestamp"][episode])
-            return self._reader.read(path, offset + indices / self.fps, self.fps)
+            timestamps = float(spans.begin[episode]) + indices / self.fps
+            return self._reader.read(path, timestamps, self.fps)
         from PIL import Image
 
-        cells = [
-            self._table[start + int(i) : start + int(i) + 1][column][0].as_py() for i in indices
-        ]
+        cells = []
+        for row in self.rows(episode, indices).tolist():
+            cells.append(self._table[row : row + 1][column][0].as_py())
         with decoding(f"{self.root}, episode {episode}, {column}", "pictures", REMEDY):
             pictures = [Image.open(io.BytesIO(cell["bytes"])) for cell in cells]
             for picture in pictures:
@@ -447,7 +450,9 @@ class EpisodeSource:
         """Compare the names of numbers: the dataset's with the robot's, and of states with actions
         relative to them.
         """
-        own = robot.action.names if robot.action.names != numbered(robot.action.width) else ()
+        own = robot.action.names
+        if own == numbered(robot.action.width):
+            own = ()
         compare_names(
             self.action_names,
             own,
@@ -457,11 +462,8 @@ class EpisodeSource:
             "Order embodiment.action.names as the dataset's column is, or choose the robot that"
             " recorded it.",
         )
-        relative = [
-            i
-            for i in robot.action.relative
-            if i < min(len(self.state_names), len(self.action_names))
-        ]
+        named = min(len(self.state_names), len(self.action_names))
+        relative = [place for place in robot.action.relative if place < named]
         compare_names(
             [self.state_names[i] for i in relative],
             [self.action_names[i] for i in relative],
@@ -474,13 +476,14 @@ class EpisodeSource:
 
     def _check_rows(self) -> None:
         """The tables hold the episodes back to back, as the metadata say."""
-        index = flat(
-            self._table.with_format("arrow").select_columns("episode_index")[:]["episode_index"]
-        )
-        total = int(self.lengths.sum())  # before anything of that size is made
-        expected = np.repeat(np.arange(len(self)), self.lengths) if len(index) == total else None
+        index = self._column("episode_index")
+        total = int(self.lengths.sum())
+        # The sizes first: a damaged length may be larger than memory.
+        is_complete = len(index) == total
+        if is_complete:
+            is_complete = np.array_equal(index, np.repeat(np.arange(len(self)), self.lengths))
         require(
-            expected is not None and np.array_equal(index.to_numpy(zero_copy_only=False), expected),
+            is_complete,
             f"{self.root}: the tables hold {len(index)} rows where meta/episodes describes {total}"
             f" in {len(self)} episodes; the dataset is incomplete or mixed up. Copy, download or"
             " convert it again.",
@@ -514,8 +517,9 @@ class EpisodeSource:
                 " and exec_start_idx (0 for an episode without video). A robot whose episodes"
                 " never begin with a video has embodiment.conditioning_video=false."
             )
-        if (starts < 0).any() or (starts >= self.lengths).any():
-            episode = int(np.flatnonzero((starts < 0) | (starts >= self.lengths))[0])
+        outside = np.flatnonzero((starts < 0) | (starts >= self.lengths))
+        if len(outside):
+            episode = int(outside[0])
             raise UserError(
                 f"{side_file or self.root}: episode {episode} starts execution at frame"
                 f" {starts[episode]}, but has {self.lengths[episode]} frames."

@@ -105,22 +105,27 @@ class RawEpisode:
     """
 
     def __init__(self, ref: EpisodeRef, group: Any) -> None:
-        self.ref, self._group = ref, group
+        self.ref = ref
+        self._group = group
+        steps = []
         with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
-            steps = sorted(
-                int(name[9:]) for name in group if re.fullmatch(r"timestep_\d{1,9}", name)
-            )
-        require(
-            steps == list(range(len(steps))) and steps,
-            f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(len(steps) - 1, 0)}"
-            f" without gaps, found {len(steps)}"
-            f" steps{f', the last is {steps[-1]}' if steps else ''}. The file is damaged.",
-        )
+            for name in group:
+                if re.fullmatch(r"timestep_\d{1,9}", name):
+                    steps.append(int(name.removeprefix("timestep_")))
+        steps.sort()
         self.length = len(steps)
+        require(
+            steps and steps == list(range(self.length)),
+            f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(self.length - 1, 0)}"
+            f" without gaps, found {self.length} steps, the last of them {steps[-1:]}. The file is"
+            " damaged.",
+        )
+        needed = ["setup/task_goal"]
+        needed += [f"timestep_0/{name}" for name in _REQUIRED]
         with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
             # A recording at a chosen list of frames has images at these alone.
-            image_keys = () if FRAMES in group else _IMAGE_KEYS.values()
-            needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in (*image_keys, *_REQUIRED)))
+            if FRAMES not in group:
+                needed += [f"timestep_0/{name}" for name in _IMAGE_KEYS.values()]
             missing = [name for name in needed if name not in group]
         require(
             not missing,
@@ -158,14 +163,17 @@ class RawEpisode:
         return array
 
     def _numbers(self, step: int, name: str, count: int, finite: bool = True) -> np.ndarray:
-        valid = self._checked(
-            f"timestep_{step}/{name}",
-            lambda x: (
-                x.ndim <= 1 and x.size >= count and (not finite or bool(np.isfinite(x).all()))
-            ),
-            f"at least {count} {'finite ' if finite else ''}numbers",
-        )
-        return np.atleast_1d(valid)[:count]
+        expected = f"at least {count} numbers"
+        if finite:
+            expected = f"at least {count} finite numbers"
+
+        def is_valid(numbers: np.ndarray) -> bool:
+            if numbers.ndim > 1 or numbers.size < count:
+                return False
+            return not finite or bool(np.isfinite(numbers).all())
+
+        numbers = self._checked(f"timestep_{step}/{name}", is_valid, expected)
+        return np.atleast_1d(numbers)[:count]
 
     def _flag(self, step: int, name: str) -> bool:
         flag = self._checked(
@@ -194,8 +202,9 @@ class RawEpisode:
     def goals(self) -> list[str]:
         """All wordings of the goal, lower-case; the first is the one to train with."""
         with decoding(self._path("setup/task_goal"), "texts", REMEDY):
-            first, *others = np.atleast_1d(self._value("setup/task_goal"))
-            return [_decode(goal).lower() for goal in (first, *others)]
+            goals = np.atleast_1d(self._value("setup/task_goal"))
+            first, *others = [_decode(goal).lower() for goal in goals]
+            return [first, *others]
 
     @property
     def seed(self) -> int | None:
@@ -224,21 +233,20 @@ class RawEpisode:
     @cached_property
     def rendered(self) -> dict[str, np.ndarray]:
         """Which steps each camera shows, bool [t]."""
-        if self.frames is None:
-            return {camera: np.ones(self.length, bool) for camera in CAMERAS}
-        return {
-            camera: np.array([f"timestep_{k}/{name}" in self._group for k in range(self.length)])
-            for camera, name in _IMAGE_KEYS.items()
-        }
+        rendered = {camera: np.ones(self.length, bool) for camera in CAMERAS}
+        if self.frames is not None:
+            for camera, name in _IMAGE_KEYS.items():
+                for k in range(self.length):
+                    rendered[camera][k] = f"timestep_{k}/{name}" in self._group
+        return rendered
 
     def subgoals(self) -> Iterator[dict[str, str]]:
         """The four texts of every step, as in `RawFrame`, without reading images."""
         subgoals: dict[str, str] = {}
         for k in range(self.length):
             if not subgoals or not self._flag(k, "info/is_completed"):
-                subgoals = {
-                    name: self._text(f"timestep_{k}/info/{name}").lower() for name in SUBGOALS
-                }
+                texts = [self._text(f"timestep_{k}/info/{name}").lower() for name in SUBGOALS]
+                subgoals = dict(zip(SUBGOALS, texts, strict=True))
             yield subgoals
 
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
@@ -276,14 +284,15 @@ class RawEpisode:
         """
         rows = np.zeros((self.length, len(CHOICE_NUMBERS)), np.float32)
         for k in range(self.length):
-            begins = self._flag(k, "info/is_subgoal_boundary") and not self._flag(
-                k, "info/is_completed"
-            )
+            begins = self._flag(k, "info/is_subgoal_boundary")
+            if begins and self._flag(k, "info/is_completed"):
+                begins = False
             if begins or k == self.exec_start:
                 name = f"timestep_{k}/action/choice_action"
                 with self._reported_at(name):
                     row = row_of(self._text(name))
-                rows[k] = 0 if row is None else row
+                if row is not None:
+                    rows[k] = row
         return rows
 
     @cached_property
@@ -317,9 +326,8 @@ class RawEpisode:
         for name, shape in shapes.items():
             valid = partial(_is_finite_array, size=math.prod(shape))
             values = self._checked(parts[name], valid, f"{list(shape)} finite numbers")
-            arrays[name] = values.reshape(shape).astype(
-                np.float32 if name == "depth" else np.float64
-            )
+            precision = np.float32 if name == "depth" else np.float64
+            arrays[name] = values.reshape(shape).astype(precision)
         return arrays
 
     @contextmanager
@@ -338,25 +346,24 @@ class RawEpisode:
         return self._image(step, "front")
 
     def __iter__(self) -> Iterator[RawFrame]:
+        # The latest image of each camera; before there is any, the first one that follows.
+        latest: dict[str, np.ndarray] = {}
         for camera, rendered in self.rendered.items():
             require(
                 rendered.any(),
                 f"{self.ref.file} {self.ref.group} has no image of the camera {camera!r}. {REMEDY}",
             )
-        latest = {
-            camera: self._image(int(rendered.argmax()), camera)
-            for camera, rendered in self.rendered.items()
-        }
+            latest[camera] = self._image(int(rendered.argmax()), camera)
         for k, subgoals in enumerate(self.subgoals()):
+            joints = self._numbers(k, "obs/joint_state", 7)
             fingers = self._numbers(k, "obs/gripper_state", 1)
             now = frozenset(camera for camera, rendered in self.rendered.items() if rendered[k])
-            latest |= {camera: self._image(k, camera) for camera in now}
+            for camera in now:
+                latest[camera] = self._image(k, camera)
             yield RawFrame(
                 **latest,
                 rendered=now,
-                state=np.concatenate([self._numbers(k, "obs/joint_state", 7), fingers]).astype(
-                    np.float32
-                ),
+                state=np.concatenate([joints, fingers]).astype(np.float32),
                 action=self._numbers(k, "action/joint_action", 8),
                 is_demo=k < self.exec_start,
                 subgoals=subgoals,
@@ -394,15 +401,16 @@ def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
     refs = []
     for file in files:
         task = re.sub(r"^record_dataset_", "", file.stem)
+        numbers = []
         with _open(file) as handle, decoding(file, "HDF5", REMEDY):
-            numbers = sorted(
-                int(name[8:]) for name in handle if re.fullmatch(r"episode_\d{1,9}", name)
-            )
+            for name in handle:
+                if re.fullmatch(r"episode_\d{1,9}", name):
+                    numbers.append(int(name.removeprefix("episode_")))
         require(
             numbers,
             f"{file} has no episode_<number> group: it is not a RoboMME demonstration file.",
         )
-        refs += [EpisodeRef(file, number, task) for number in numbers]
+        refs += [EpisodeRef(file, number, task) for number in sorted(numbers)]
     return refs
 
 

@@ -7,7 +7,6 @@ here, read the table of episodes through a cache whose key is the files' paths a
 take several seconds to import.
 """
 
-import math
 import re
 import string
 from collections.abc import Mapping, Sequence
@@ -15,15 +14,17 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import POSE_WIDTH
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.utils import decoding, file_sum, inside, read_json, require_file, user_cache
+from mme_vla.utils.validation import validated
 
 SIDE_FILE = "meta/robomme_episodes.json"
 """What LeRobot's columns have no place for: task, seed, difficulty, options of a choice."""
@@ -41,6 +42,76 @@ NAMES: Mapping[str, Mapping[str, str]] = {
 }
 """Spellings of a dataset's columns, each by how it differs from the released datasets'."""
 _ACTION = ("action", "actions")
+REMEDY = "Copy, download or convert the dataset again."
+TASKS = "meta/tasks.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+"""Where LeRobot keeps videos unless info.json says otherwise."""
+
+
+class Feature(BaseModel):
+    """A column by `meta/info.json`.
+
+    info, video_info: what is said of a camera's images, today and by older writers.
+    """
+
+    dtype: str
+    shape: tuple[Annotated[int, Field(strict=True, gt=0, lt=2**20)], ...]
+    names: Any = None
+    info: Any = None
+    video_info: Any = None
+
+    @property
+    def width(self) -> int:
+        """How many numbers a row holds; 0 for what is no vector."""
+        return self.shape[0] if len(self.shape) == 1 else 0
+
+    @property
+    def number_names(self) -> tuple[str, ...]:
+        """The names of a row's numbers; empty unless each has one.
+
+        LeRobot writes a list, or a list under one key such as `motors`.
+        """
+        names = self.names
+        if isinstance(names, Mapping) and len(names) == 1:
+            names = next(iter(names.values()))
+        if not isinstance(names, list | tuple) or len(names) != self.width:
+            return ()
+        return tuple(map(str, names))
+
+    @property
+    def about_images(self) -> dict[str, Any]:
+        """What is said of a camera's images beside their shape; empty where nothing is."""
+        for about in (self.info, self.video_info):
+            if isinstance(about, dict) and about:
+                return about
+        return {}
+
+    @property
+    def lossy_coding(self) -> str | None:
+        """The lossy codec of a video, such as `av1 at crf 30`; None for a lossless one, or without
+        information.
+
+        LeRobot's default before it wrote the quality was AV1 at crf 30.
+        """
+        codec = self.about_images.get("video.codec")
+        crf = self.about_images.get("video.crf")
+        if not isinstance(codec, str) or crf == 0:
+            return None
+        name = brief(codec, quote=False)
+        if crf is None:
+            return name if codec == "av1" else None
+        return f"{name} at crf {brief(crf)}"
+
+
+class Info(BaseModel):
+    """`meta/info.json`, as far as it is read."""
+
+    features: dict[str, Feature]
+    fps: Annotated[float, Field(strict=True, gt=0, le=1000)]
+    codebase_version: Any = "unknown"
+    video_path: Any = VIDEO_PATH
+    total_episodes: Any = None
+    total_frames: Any = None
 
 
 @dataclass(frozen=True)
@@ -60,96 +131,86 @@ class Columns:
     tables: tuple[str, ...]
 
 
-def find_columns(
-    root: Path, features: Mapping[str, Mapping[str, Any]], robot: Embodiment
-) -> Columns:
-    """Match a robot with a dataset."""
-    spellings = {
-        camera.name: [
-            spelling
-            for name in ((camera.key, camera.name) if camera.key else (camera.name,))
-            for spelling in (name, f"observation.images.{name}")
-        ]
-        for camera in robot.cameras
-    }
-    spellings |= {
-        key: [key, f"observation.{key}"] for key in (*robot.state.key, *robot.action.pose_key)
-    }
-    spellings |= {key: [key, *(_ACTION if key in _ACTION else ())] for key in robot.action.key}
+def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment) -> Columns:
+    """Match a robot with a dataset.
+
+    Raises:
+        UserError: a column is missing, or holds something else than the robot has.
+    """
+    spellings: dict[str, list[str]] = {}
+    for camera in robot.cameras:
+        spellings[camera.name] = []
+        for name in (camera.key, camera.name):
+            if name:
+                spellings[camera.name] += [name, f"observation.images.{name}"]
+    for key in (*robot.state.key, *robot.action.pose_key):
+        spellings[key] = [key, f"observation.{key}"]
+    for key in robot.action.key:
+        spellings[key] = [key]
+        if key in _ACTION:
+            spellings[key] += _ACTION
     if not robot.state.key:
         spellings["state"] = ["observation.state", "state"]
     if not robot.action.key:
         spellings["action"] = [*_ACTION]
-    matches = {
-        key: next((name for name in names if name in features), None)
-        for key, names in spellings.items()
-    }
+
+    columns: dict[str, str] = {}
+    missing = []
     keys = {camera.name: camera.key or camera.name for camera in robot.cameras}
-    missing = [keys.get(name, name) for name, column in matches.items() if column is None]
+    for name, candidates in spellings.items():
+        present = [candidate for candidate in candidates if candidate in features]
+        if present:
+            columns[name] = present[0]
+        else:
+            missing.append(keys.get(name, name))
+    plural = "" if len(missing) == 1 else "s"
     require(
         not missing,
-        f"{root} lacks the feature{'s'[: len(missing) > 1]} {', '.join(missing)}; it has"
+        f"{root} lacks the feature{plural} {', '.join(missing)}; it has"
         f" {listed(features)}. These are the names of the robot {robot.name!r}: choose"
         " embodiment=<the robot this dataset is of>, or name its columns in a configs/embodiment"
         " file of your own. (RoboMME's poses and waypoints are columns of datasets that this"
         " library converts or records.)",
     )
-    columns = {name: str(column) for name, column in matches.items()}
+
     cameras = {name: columns[name] for name in robot.camera_names}
     for name, column in cameras.items():
+        kind = features[column].dtype
         require(
-            features[column]["dtype"] in ("image", "video"),
-            f"{root}: {column} holds {brief(features[column]['dtype'])}, no images: it cannot be"
+            kind in ("image", "video"),
+            f"{root}: {column} holds {brief(kind)}, no images: it cannot be"
             f" the camera {name!r} of the robot {robot.name!r} (embodiment.cameras.{name}.key).",
         )
     state = tuple(columns[key] for key in robot.state.key or ("state",))
     action = tuple(columns[key] for key in robot.action.key or ("action",))
     pose = tuple(columns[key] for key in robot.action.pose_key)
-    vectors = {"state": (state, robot.state.width), "action": (action, robot.action.width)}
-    for what, (names, width) in (
-        vectors | ({"tool's pose": (pose, POSE_WIDTH)} if pose else {})
-    ).items():
-        if sum(width_of(features[name]) for name in names) != width:
-            shapes = ", ".join(
-                f"{name} has shape {list(features[name]['shape'])}" for name in names
-            )
+    vectors = [("state", state, robot.state.width), ("action", action, robot.action.width)]
+    if pose:
+        vectors.append(("tool's pose", pose, POSE_WIDTH))
+    for what, names, width in vectors:
+        if sum(features[name].width for name in names) != width:
+            shapes = [f"{name} has shape {list(features[name].shape)}" for name in names]
             raise UserError(
-                f"{root}: {shapes}; expected [{width}], the {what} of the robot {robot.name!r}."
+                f"{root}: {', '.join(shapes)}; expected [{width}], the {what} of the robot"
+                f" {robot.name!r}."
             )
-    tables = [
-        "episode_index",
-        *state,
-        *action,
-        *pose,
-        *(name for name in OPTIONAL if name in features),
-    ]
-    tables += [
-        f"{name}{RENDERED_SUFFIX}" for name in cameras if f"{name}{RENDERED_SUFFIX}" in features
-    ]
-    tables += [column for column in cameras.values() if features[column]["dtype"] == "image"]
+
+    tables = ["episode_index", *state, *action, *pose]
+    tables += [name for name in OPTIONAL if name in features]
+    for name in cameras:
+        if f"{name}{RENDERED_SUFFIX}" in features:
+            tables.append(f"{name}{RENDERED_SUFFIX}")
+    tables += [column for column in cameras.values() if features[column].dtype == "image"]
     return Columns(cameras, state, action, pose, tuple(dict.fromkeys(tables)))
 
 
-def width_of(feature: Mapping[str, Any]) -> int:
-    """How many numbers a row of this feature holds."""
-    shape = tuple(feature["shape"])
-    return shape[0] if len(shape) == 1 else 0
-
-
-def names_of(features: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """What a dataset calls the numbers of some features, joined; empty where one of them has no
-    name for each number.
-
-    LeRobot writes a list, or a list under one key such as `motors`.
-    """
+def names_of(features: Sequence[Feature]) -> tuple[str, ...]:
+    """What a dataset calls the numbers of some features, joined; empty unless each has a name."""
     names: list[str] = []
     for feature in features:
-        listed = feature.get("names")
-        if isinstance(listed, Mapping) and len(listed) == 1:
-            listed = next(iter(listed.values()))
-        if not isinstance(listed, list | tuple) or len(listed) != width_of(feature):
+        if not feature.number_names:
             return ()
-        names += map(str, listed)
+        names += feature.number_names
     return tuple(names)
 
 
@@ -166,85 +227,45 @@ def resolve_root(root: str | Path) -> Path:
         " 'sample'. From the hub: `hf download <owner>/<dataset> --repo-type dataset --local-dir"
         " <folder>`; from HDF5 files: `mme-vla convert input=<files> output=<folder>`.",
     )
-    version = brief(read_info(path).get("codebase_version", "unknown"), quote=False)
+    version = brief(read_info(path).codebase_version, quote=False)
     require(
         version.startswith("v3."),
         f"{path} is a LeRobot {version} dataset; v3.0 is needed. Convert it with LeRobot's own"
         f" command: `python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={path.name}"
         f" --root={path} --push-to-hub=false`.",
     )
-    there = {TASKS: (path / TASKS).exists()}
-    there |= {
-        f"{folder}/*/*.parquet": bool(_tables(path, folder)) for folder in ("meta/episodes", "data")
-    }
-    for pattern, present in there.items():
-        if not present:
-            raise UserError(
-                f"{path} has no {pattern}: the dataset is incomplete. Copy, download or convert it"
-                " again."
-            )
+    missing = [
+        f"{part}/*/*.parquet" for part in ("meta/episodes", "data") if not _tables(path, part)
+    ]
+    if not (path / TASKS).exists():
+        missing.insert(0, TASKS)
+    require(
+        not missing,
+        f"{path} has no {listed(missing)}: the dataset is incomplete. Copy, download or convert it"
+        " again.",
+    )
     return path
 
 
-def read_info(root: Path) -> dict[str, Any]:
-    """Return `meta/info.json`: features with a `dtype` and a `shape`, frames per second, and
-    others.
-    """
+def read_info(root: Path) -> Info:
+    """Read and check `meta/info.json`."""
     path = root / "meta" / "info.json"
-    info = read_json(path, "a dataset's description")
-    features = info.get("features")
-    if not isinstance(features, dict) or not all(
-        _is_feature(feature) for feature in features.values()
-    ):
-        raise UserError(
-            f"{path} does not describe its features by dtype and shape. Copy or download it again."
-        )
-    fps = info.get("fps")
-    if (
-        isinstance(fps, bool)
-        or not isinstance(fps, int | float)
-        or not 0 < fps <= 1000
-        or not math.isfinite(fps)
-    ):
-        raise UserError(
-            f"{path}: fps is {brief(fps)}; expected frames per second, above 0 and at most 1000."
-        )
-    described = {
-        name: {**feature, "shape": tuple(feature["shape"])} for name, feature in features.items()
-    }
-    return {"video_path": VIDEO_PATH, **info, "features": described}
+    values = read_json(path, "a dataset's description")
+    try:
+        return validated(Info, values, "The description")
+    except UserError as error:
+        raise UserError(f"{path}: {error} {REMEDY}") from None
 
 
-def about_images(feature: Mapping[str, Any]) -> dict[str, Any]:
-    """What a dataset says of a camera's images beside their shape, empty where it says nothing.
-
-    LeRobot writes it under `info`; older writers did under `video_info`.
-    """
-    for key in ("info", "video_info"):
-        about = feature.get(key)
-        if isinstance(about, dict) and about:
-            return about
-    return {}
-
-
-def lossy_coding(feature: Mapping[str, Any]) -> str | None:
-    """The lossy codec of a video, such as `av1 at crf 30`; None for a lossless one, or without
-    information.
-
-    LeRobot's default before it wrote the quality was AV1 at crf 30.
-    """
-    about = about_images(feature)
-    codec, crf = about.get("video.codec"), about.get("video.crf")
-    if not isinstance(codec, str) or crf == 0 or (crf is None and codec != "av1"):
-        return None
-    return brief(codec, quote=False) + ("" if crf is None else f" at crf {brief(crf)}")
-
-
-def _is_feature(feature: object) -> bool:
-    if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
-        return False
-    shape = feature.get("shape")
-    return isinstance(shape, list) and all(type(side) is int and 0 < side < 2**20 for side in shape)
+def read_records(root: Path) -> list[dict[str, Any]]:
+    """Read the side file: what is known of each episode beside the columns; empty without one."""
+    path = root / SIDE_FILE
+    if not path.exists() and not path.is_symlink():
+        return []
+    records = read_json(path, "what is known of a dataset's episodes").get("episodes")
+    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
+        raise UserError(f"{path} holds no list of episodes. {REMEDY}")
+    return records
 
 
 def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
@@ -259,27 +280,24 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
         " episode_index and exec_start_idx, all whole numbers from 0."
     )
     require_file(file, "exec_starts, first execution frames")
+    table: dict[Any, Any] = {}
     if file.suffix == ".json":
-        entries = list(read_json(file, "first execution frames").items())
-        pairs = [
-            (int(key) if key.isdecimal() and len(key) < 10 else key, value)
-            for key, value in entries
-        ]
+        for key, value in read_json(file, "first execution frames").items():
+            is_number = key.isdecimal() and len(key) < 10
+            table[int(key) if is_number else key] = value
     else:
         import pyarrow.parquet as pq
 
         with decoding(file, "a parquet table", expected), pq.ParquetFile(file) as opened:
             columns = opened.read(columns=["episode_index", "exec_start_idx"]).to_pydict()
-            pairs = list(zip(columns["episode_index"], columns["exec_start_idx"], strict=True))
-    for pair in pairs:
-        if not all(type(number) is int and 0 <= number < 2**40 for number in pair):
-            raise UserError(f"{file} says {brief(pair[1])} of episode {brief(pair[0])}. {expected}")
-    table = dict(pairs)
-    lost = [episode for episode in range(episodes) if episode not in table]
+            table.update(zip(columns["episode_index"], columns["exec_start_idx"], strict=True))
+    for episode, start in table.items():
+        if not all(type(number) is int and 0 <= number < 2**40 for number in (episode, start)):
+            raise UserError(f"{file} says {brief(start)} of episode {brief(episode)}. {expected}")
+    missing = [episode for episode in range(episodes) if episode not in table]
     require(
-        not lost,
-        f"{file} covers no episode {lost[:5]}{'…' if len(lost) > 5 else ''}; it must name all"
-        f" {episodes}.",
+        not missing,
+        f"{file} covers no episode {listed(missing, 5)}; it must name all {episodes}.",
     )
     return np.array([table[episode] for episode in range(episodes)], np.int64)
 
@@ -318,10 +336,6 @@ def content_fingerprint(
     return digest.hexdigest()[:16]
 
 
-REMEDY = "Copy, download or convert the dataset again."
-TASKS = "meta/tasks.parquet"
-VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-"""Where LeRobot keeps videos unless info.json says otherwise."""
 _MOST_FRAMES = 2**40  # of a dataset; a larger number is damage
 _INTEGER_COLUMNS = ("episode_index", "is_demo", "exec_start_idx")
 _FIELDS = {"video_key": ("",), "chunk_index": ("", "d", "03d"), "file_index": ("", "d", "03d")}
@@ -358,78 +372,107 @@ def parquet_files(root: Path, folder: str) -> list[Path]:
     ]
 
 
-def read_episode_table(
-    root: Path, video_views: Sequence[str]
-) -> dict[str, np.ndarray | list[tuple[str, ...]]]:
+@dataclass(frozen=True)
+class VideoSpans:
+    """Where the images of each episode lie in the video files of a column, [e] each.
+
+    chunk, file: numbers of the file, int64. begin, end: seconds, float64; `end` may be missing.
+    """
+
+    chunk: np.ndarray
+    file: np.ndarray
+    begin: np.ndarray
+    end: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class EpisodeTable:
+    """`meta/episodes`.
+
+    starts, lengths: [e] int64, rows of the tables. tasks: [e], those listed for each episode, none
+    where they are not listed. declared_lengths: the lengths once more, where they are written.
+    videos: by column.
+    """
+
+    starts: np.ndarray
+    lengths: np.ndarray
+    tasks: list[tuple[str, ...]]
+    declared_lengths: np.ndarray | None
+    videos: Mapping[str, VideoSpans]
+
+
+def read_episode_table(root: Path, video_columns: Sequence[str]) -> EpisodeTable:
     """Read and check `meta/episodes`.
 
-    Returns:
-        `starts` and `lengths`, [e] int64 rows of the tables; `tasks`, [e] the tasks listed for each
-        episode, none where they are not listed; and for every view `<view>/chunk_index`,
-        `<view>/file_index` [e] int64, `<view>/from_timestamp` [e] float64, seconds, and
-        `<view>/to_timestamp` where there is one. `length`, the lengths once more, where they are
-        written.
+    Raises:
+        UserError: a column is missing, or a value that cannot be; it names the episode.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     meta = root / "meta" / "episodes"
-    files = [f"{view}/{key}" for view in video_views for key in ("chunk_index", "file_index")]
-    times = [f"{view}/from_timestamp" for view in video_views]
-    ends = [f"{view}/to_timestamp" for view in video_views]
-    integers = [
-        "episode_index",
-        "dataset_from_index",
-        "dataset_to_index",
-        *(f"videos/{name}" for name in files),
-    ]
-    needed = {name: pa.int64() for name in integers} | {
-        f"videos/{name}": pa.float64() for name in times
-    }
-    more = {"length": pa.int64()} | {f"videos/{name}": pa.float64() for name in ends}
+    kinds = dict.fromkeys(("episode_index", "dataset_from_index", "dataset_to_index"), pa.int64())
+    optional = {"length": pa.int64()}
+    for column in video_columns:
+        kinds[f"videos/{column}/chunk_index"] = pa.int64()
+        kinds[f"videos/{column}/file_index"] = pa.int64()
+        kinds[f"videos/{column}/from_timestamp"] = pa.float64()
+        optional[f"videos/{column}/to_timestamp"] = pa.float64()
     with decoding(meta, "tables of episodes", REMEDY):
-        opened = [pq.ParquetFile(file) for file in parquet_files(root, "meta/episodes")]
-        there = set.intersection(*(set(file.schema_arrow.names) for file in opened))
-    missing = [name for name in needed if name not in there]
+        files = [pq.ParquetFile(file) for file in parquet_files(root, "meta/episodes")]
+        present = set.intersection(*(set(file.schema_arrow.names) for file in files))
+    missing = [name for name in kinds if name not in present]
+    plural = "" if len(missing) == 1 else "s"
     require(
         not missing,
-        f"{meta} lacks the column{'s'[: len(missing) > 1]} {listed(missing)}; LeRobot writes them"
-        " in every dataset of version v3.0. It has"
-        f" {listed(sorted(name for name in there if not name.startswith('stats/')))}.",
+        f"{meta} lacks the column{plural} {listed(missing)}; LeRobot writes them in every dataset"
+        " of version v3.0. It has"
+        f" {listed(sorted(name for name in present if not name.startswith('stats/')))}.",
     )
-    kinds = needed | {name: kind for name, kind in more.items() if name in there}
+    kinds |= {name: kind for name, kind in optional.items() if name in present}
+
+    parts = []
+    cells: list[Any] = []
     with decoding(meta, "tables of episodes", REMEDY):
-        parts = [file.read([*kinds, *(["tasks"] if "tasks" in there else [])]) for file in opened]
-        table = pa.concat_tables(
-            [part.select(list(kinds)).cast(pa.schema(list(kinds.items()))) for part in parts]
-        )
+        for file in files:
+            if "tasks" in present:
+                part = file.read([*kinds, "tasks"])
+                cells += part["tasks"].to_pylist()
+            else:
+                part = file.read([*kinds])
+                cells += [None] * part.num_rows
+            parts.append(part.select(list(kinds)).cast(pa.schema(list(kinds.items()))))
+        table = pa.concat_tables(parts)
         empty = [name for name in kinds if table[name].null_count]
         columns = {name: table[name].to_numpy() for name in kinds}
-        cells = [None] * table.num_rows
-        if "tasks" in there:
-            cells = [cell for part in parts for cell in part["tasks"].to_pylist()]
     require(
         not empty and table.num_rows,
         f"{meta} describes {table.num_rows} episodes; empty cells in: {listed(empty) or 'none'}."
         f" {REMEDY}",
     )
+
+    numbers = columns["episode_index"]
     starts, stops = columns["dataset_from_index"], columns["dataset_to_index"]
+    before = np.concatenate([[0], stops[:-1]])
     checks = {
-        "episode_index": (columns["episode_index"] == np.arange(len(starts)), "0, 1, 2, …"),
-        "dataset_from_index": (
-            starts == np.concatenate([[0], stops[:-1]]),
-            "the row after the episode before",
-        ),
+        "episode_index": (numbers == np.arange(len(numbers)), "0, 1, 2, …"),
+        "dataset_from_index": (starts == before, "the row after the episode before"),
         "dataset_to_index": ((stops > starts) & (stops <= _MOST_FRAMES), "at least one row"),
-        **{
-            f"videos/{n}": (((v := columns[f"videos/{n}"]) >= 0) & (v <= _MOST_FRAMES), "a number")
-            for n in files
-        },
-        **{
-            f"videos/{n}": (np.isfinite(v := columns[f"videos/{n}"]) & (v >= 0), "seconds from 0")
-            for n in times
-        },
     }
+    videos = {}
+    for column in video_columns:
+        name = f"videos/{column}"
+        spans = VideoSpans(
+            columns[f"{name}/chunk_index"],
+            columns[f"{name}/file_index"],
+            columns[f"{name}/from_timestamp"],
+            columns.get(f"{name}/to_timestamp"),
+        )
+        for key, values in (("chunk_index", spans.chunk), ("file_index", spans.file)):
+            checks[f"{name}/{key}"] = ((values >= 0) & (values <= _MOST_FRAMES), "a number")
+        is_time = np.isfinite(spans.begin) & (spans.begin >= 0)
+        checks[f"{name}/from_timestamp"] = (is_time, "seconds from 0")
+        videos[column] = spans
     for name, (valid, expected) in checks.items():
         if not valid.all():
             episode = int(np.argmin(valid))
@@ -437,20 +480,17 @@ def read_episode_table(
             raise UserError(
                 f"{meta}: {name} of episode {episode} is {value}; expected {expected}. {REMEDY}"
             )
-    named = {
-        name.removeprefix("videos/"): columns[name]
-        for name in columns
-        if name in more or name in needed
-    }
     tasks = [_listed_tasks(meta, episode, cell) for episode, cell in enumerate(cells)]
-    return {**named, "starts": starts, "lengths": stops - starts, "tasks": tasks}
+    return EpisodeTable(starts, stops - starts, tasks, columns.get("length"), videos)
 
 
 def _listed_tasks(meta: Path, episode: int, cell: Any) -> tuple[str, ...]:
     """The tasks of an episode: LeRobot writes a list of texts; one text alone, an empty list or
     nothing is read too.
     """
-    texts = list(cell or ()) if isinstance(cell, list | None) else [cell]
+    if cell is None:
+        return ()
+    texts = cell if isinstance(cell, list) else [cell]
     if not all(isinstance(text, str) for text in texts):
         raise UserError(
             f"{meta}: tasks of episode {episode} is {brief(cell)}; expected a list of texts."
@@ -475,10 +515,12 @@ def read_tasks(root: Path) -> list[str]:
     )
     with decoding(require_file(path, "a table of tasks"), "a table of tasks", expected):
         table = pd.read_parquet(path)
-        texts = list(table["task"] if "task" in table.columns else table.index)
-        numbers = (
-            list(table["task_index"]) if "task_index" in table.columns else list(range(len(texts)))
-        )
+        texts = list(table.index)
+        if "task" in table.columns:
+            texts = list(table["task"])
+        numbers = list(range(len(texts)))
+        if "task_index" in table.columns:
+            numbers = list(table["task_index"])
     wrong = [text for text in texts if not isinstance(text, str)]
     require(
         not wrong, f"{path} holds {brief(wrong[:1])} where the text of a task belongs. {expected}"
@@ -522,7 +564,7 @@ def read_index_columns(root: Path, extra: Sequence[str] = ()) -> dict[str, np.nd
     return columns
 
 
-def open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> Any:
+def open_table(root: Path, columns: Sequence[str], features: Mapping[str, Feature]) -> Any:
     """Memory-map these columns of all tables, through the `datasets` library as LeRobot does.
 
     Its copy of the tables lies in a folder that is named after their content: the library itself
@@ -534,14 +576,15 @@ def open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> 
     from datasets import Dataset, Features
 
     for name in _INTEGER_COLUMNS:
-        if name in columns and not features[name]["dtype"].startswith(("int", "uint", "bool")):
-            raise UserError(
-                f"{root}: {name} is {brief(features[name]['dtype'])}; expected whole numbers."
-                f" {REMEDY}"
+        if name in columns:
+            kind = features[name].dtype
+            require(
+                kind.startswith(("int", "uint", "bool")),
+                f"{root}: {name} is {brief(kind)}; expected whole numbers. {REMEDY}",
             )
     with decoding(root / "meta" / "info.json", "a description of features", REMEDY):
-        target = Features({name: _kind(**features[name]) for name in columns})
-    large = any(features[name]["dtype"] == "image" for name in columns)
+        target = Features({name: _kind(features[name]) for name in columns})
+    large = any(features[name].dtype == "image" for name in columns)
     files = parquet_files(root, "data")
     folder = user_cache("tables") / _tables_key(root, files, large)
     with (
@@ -587,19 +630,20 @@ def flat(column: Any) -> Any:
     return array
 
 
-def _kind(dtype: str, shape: tuple[int, ...], **_: Any) -> Any:
+def _kind(feature: Feature) -> Any:
     """What `datasets` calls such a feature. LeRobot could say it, at the price of four seconds for
     importing it.
     """
     import datasets
 
-    if dtype == "image":
+    if feature.dtype == "image":
         return datasets.Image()
-    if shape == (1,):
-        return datasets.Value(dtype)
-    if len(shape) == 1:
-        return datasets.List(datasets.Value(dtype), length=shape[0])
-    return getattr(datasets, f"Array{len(shape)}D")(shape=shape, dtype=dtype)
+    if feature.shape == (1,):
+        return datasets.Value(feature.dtype)
+    if len(feature.shape) == 1:
+        return datasets.List(datasets.Value(feature.dtype), length=feature.shape[0])
+    array = getattr(datasets, f"Array{len(feature.shape)}D")
+    return array(shape=feature.shape, dtype=feature.dtype)
 
 
 def check_vectors(root: Path, table: Any, name: str, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -612,19 +656,19 @@ def check_vectors(root: Path, table: Any, name: str, width: int) -> tuple[np.nda
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    least, greatest = np.full(width, np.inf), np.full(width, -np.inf)
-    first, list_kinds = 0, (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
+    least = np.full(width, np.inf)
+    greatest = np.full(width, -np.inf)
+    first = 0
     for chunk in table.data[name].chunks:
         # Counting is not enough: rows of 7 and 9 numbers have 8 on average.
-        is_list = any(is_kind(chunk.type) for is_kind in list_kinds)
-        lengths = (
-            pc.list_value_length(chunk).fill_null(-1).to_numpy(zero_copy_only=False)
-            if is_list
-            else width
-        )
-        wrong = np.broadcast_to(lengths != width, len(chunk))
+        if pa.types.is_nested(chunk.type):
+            lengths = pc.list_value_length(chunk).fill_null(-1).to_numpy(zero_copy_only=False)
+            numbers = chunk.flatten()
+        else:
+            lengths = np.ones(len(chunk), np.int64)
+            numbers = chunk
+        wrong = lengths != width
         if not wrong.any():
-            numbers = chunk.flatten() if is_list else chunk
             values = numbers.to_numpy(zero_copy_only=False).reshape(-1, width)  # nulls become NaN
             with np.errstate(over="ignore"):
                 wrong = ~np.isfinite(values.astype(np.float32)).all(axis=1)  # as policies read them
@@ -636,32 +680,28 @@ def check_vectors(root: Path, table: Any, name: str, width: int) -> tuple[np.nda
                 f" within float32 (to 3.4e38). {REMEDY}"
             )
         if len(chunk):
-            least, greatest = (
-                np.minimum(least, values.min(axis=0)),
-                np.maximum(greatest, values.max(axis=0)),
-            )
+            least = np.minimum(least, values.min(axis=0))
+            greatest = np.maximum(greatest, values.max(axis=0))
         first += len(chunk)
     return least, greatest
 
 
 def video_file(root: Path, template: object, view: str, chunk: int, file: int) -> Path:
     """The place of a video: `video_path` of meta/info.json, filled in."""
-    info = root / "meta" / "info.json"
+    fields: list[tuple[str, str]] = []
     try:
-        fields = [
-            (name, spec or "")
-            for _, name, spec, _ in string.Formatter().parse(str(template))
-            if name is not None
-        ]
+        for _, name, spec, _ in string.Formatter().parse(str(template)):
+            if name is not None:
+                fields.append((name, spec or ""))
+        is_known = all(spec in _FIELDS.get(name, ()) for name, spec in fields)
     except ValueError:
-        fields = [("", "")]
-    if not isinstance(template, str) or any(
-        spec not in _FIELDS.get(name, ()) for name, spec in fields
-    ):
+        is_known = False
+    if not isinstance(template, str) or not is_known:
         raise UserError(
-            f"{info}: video_path is {brief(template)}; expected a path with the fields"
-            f" {{video_key}}, {{chunk_index:03d}} and {{file_index:03d}}. {REMEDY}"
+            f"{root / 'meta' / 'info.json'}: video_path is {brief(template)}; expected a path with"
+            f" the fields {{video_key}}, {{chunk_index:03d}} and {{file_index:03d}}. {REMEDY}"
         )
+
     return inside(
         root, template.format(video_key=view, chunk_index=chunk, file_index=file), "video"
     )

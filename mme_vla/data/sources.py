@@ -40,12 +40,11 @@ def split_episodes(
     named: dict[str, list[int]] = {}
     for name in val_episodes or ():
         source_name, _, number = str(name).rpartition("/")
-        if not number.isdigit() or (not source_name and len(sources) > 1):
-            reason = ", since there are several sources." if number.isdigit() else "."
-            raise UserError(
-                f"val_episodes: {name!r} should read <source>/<episode>, such as"
-                f" {sources[0].name}/0{reason}"
-            )
+        require(
+            number.isdigit() and (source_name or len(sources) == 1),
+            f"val_episodes: {name!r} should read <source>/<episode>, such as {sources[0].name}/0;"
+            " with several sources the name is needed.",
+        )
         named.setdefault(source_name or sources[0].name, []).append(int(number))
     unknown = set(named) - {source.name for source in sources}
     require(
@@ -68,10 +67,11 @@ def split_episodes(
             )
             held_out = np.isin(episodes, named[source.name])
         else:
-            sums = (sha256(f"{source.name}/{e}".encode()).digest()[:8] for e in episodes)
-            held_out = np.array(
-                [int.from_bytes(number, "big") / 2**64 < val_fraction for number in sums], bool
-            )
+            held_out = np.zeros(len(source), bool)
+            for episode in range(len(source)):
+                digest = sha256(f"{source.name}/{episode}".encode()).digest()
+                share = int.from_bytes(digest[:8], "big") / 2**64
+                held_out[episode] = share < val_fraction
         split.train.append(episodes[~held_out])
         split.val.append(episodes[held_out])
     if not sum(map(len, split.train)):
@@ -141,13 +141,13 @@ def compare_sources(first: EpisodeSource, second: EpisodeSource) -> None:
     Raises:
         UserError: their numbers have the same names in another order.
     """
-    for kind, ours, theirs in (
+    for kind, first_names, second_names in (
         ("state", first.state_names, second.state_names),
         ("action", first.action_names, second.action_names),
     ):
         compare_names(
-            ours,
-            theirs,
+            first_names,
+            second_names,
             kind,
             f"the source {first.name}",
             f"the source {second.name}",
@@ -167,15 +167,16 @@ def compare_sources(first: EpisodeSource, second: EpisodeSource) -> None:
 
 
 def _compare_scales(first: EpisodeSource, second: EpisodeSource, kind: str) -> None:
-    ours, theirs = first.scales[kind], second.scales[kind]
-    moving = (ours > 0) & (theirs > 0)
+    first_scales, second_scales = first.scales[kind], second.scales[kind]
+    moving = (first_scales > 0) & (second_scales > 0)
     if not moving.any():
         return
-    ratios = np.log(ours[moving] / theirs[moving])
-    apart = float(np.exp(np.median(ratios)))
-    if max(apart, 1 / apart) < UNITS_APART:
+    ratios = np.log(first_scales[moving] / second_scales[moving])
+    median = np.median(ratios)
+    if abs(median) < np.log(UNITS_APART):
         return
-    d = int(np.flatnonzero(moving)[int(np.argmin(np.abs(ratios - np.median(ratios))))])
+    # the number that shows it best
+    d = int(np.flatnonzero(moving)[np.argmin(np.abs(ratios - median))])
     log.warning(
         "The %s of %s and of %s seem to have different units: number %d reaches %.4g in one and"
         " %.4g in the other (degrees beside radians differ by 57). Statistics are computed over"
@@ -184,6 +185,6 @@ def _compare_scales(first: EpisodeSource, second: EpisodeSource, kind: str) -> N
         first.name,
         second.name,
         d + 1,
-        ours[d],
-        theirs[d],
+        first_scales[d],
+        second_scales[d],
     )

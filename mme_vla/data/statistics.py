@@ -69,23 +69,27 @@ def compute_norm_stats(
     if not every:
         np.random.default_rng(seed).shuffle(steps)
     batches = -(-len(steps) // BATCH) if every else max(len(steps) // BATCH, 1)
-    states, actions = (ExactStats() if exact else RunningStats() for _ in range(2))
+    kind = ExactStats if exact else RunningStats
+    states, actions = kind(), kind()
     with progress("statistics", batches, unit="batches") as advance:
         for i in range(batches):
-            rows = steps[i * BATCH : (i + 1) * BATCH].tolist()
-            state = torch.from_numpy(
-                np.stack([sources[s].states(e, t, t + 1)[0] for s, e, t in rows])
+            of_batch, chunks = [], []
+            for s, episode, step in steps[i * BATCH : (i + 1) * BATCH].tolist():
+                of_batch.append(sources[s].states(episode, step, step + 1)[0])
+                chunks.append(sources[s].action_chunk(episode, step, horizon, action_offset)[0])
+            state = np.stack(of_batch)
+            states.update(state)
+            relative = robot.action.to_relative(
+                torch.from_numpy(np.stack(chunks)), torch.from_numpy(state)
             )
-            chunks = [sources[s].action_chunk(e, t, horizon, action_offset)[0] for s, e, t in rows]
-            chunk = torch.from_numpy(np.stack(chunks))
-            states.update(state.numpy())
-            actions.update(robot.action.to_relative(chunk, state).numpy())
+            actions.update(relative.numpy())
             advance(1)
     values = actions.result(extremes).to_dict()
-    for name, value in {"q01": 0.0, "q99": 1.0, "min": 0.0, "max": 1.0}.items():
-        for place in robot.action.choice if name in values else ():
-            # a letter that is seldom chosen has no range
-            values[name][place] = value
+    # a letter that is seldom chosen has no range
+    for name, value in (("q01", 0.0), ("q99", 1.0), ("min", 0.0), ("max", 1.0)):
+        if name in values:
+            for place in robot.action.choice:
+                values[name][place] = value
     stats = NormStats(state=states.result(extremes), actions=QuantileStats.from_dict(values))
     return check_ranges(stats, sources, episodes, horizon, action_offset, robot, video, narrow)
 
@@ -133,11 +137,9 @@ def check_ranges(
     changed = {}
     for kind, ends in (("state", state), ("actions", actions)):
         of = getattr(stats, kind)
-        places = [
-            place
-            for place in narrow_numbers(of, *ends)
-            if kind == "state" or place not in robot.action.choice
-        ]
+        places = narrow_numbers(of, *ends)
+        if kind == "actions":
+            places = [place for place in places if place not in robot.action.choice]
         if not places:
             continue
         lines = []
@@ -176,32 +178,42 @@ def _extremes(
     """Least and greatest of the states, [s] each, and of the actions as they are predicted, [w]
     each.
     """
-    bounds_of: dict[str, list[np.ndarray]] = {"state": [], "actions": []}
+    state_ends: list[np.ndarray] = []
+    action_ends: list[np.ndarray] = []
     for i, source in enumerate(sources):
         for number in range(len(source)) if episodes is None else episodes[i]:
             episode = int(number)
-            length = int(source.lengths[episode])
-            steps = np.arange(length) if video else np.asarray(source.decisions(episode), np.int64)
+            steps = _steps_of(source, episode, video)
             if not len(steps):
                 continue
             states = source.states(episode)[steps]
-            bounds_of["state"] += [states.min(axis=0), states.max(axis=0)]
+            state_ends += [states.min(axis=0), states.max(axis=0)]
             if robot.action.frames is None:
                 chunks = np.stack(
                     [source.action_chunk(episode, int(t), horizon, action_offset)[0] for t in steps]
                 )
             else:
+                length = int(source.lengths[episode])
                 later = steps[:, None] + action_offset + np.arange(horizon)
                 chunks = source.actions(episode)[np.minimum(later, length - 1)]
                 for place in robot.action.of_pose:
-                    chunks[..., place][later >= length] = (
-                        0  # as `action_chunk` has them past the end
-                    )
+                    # as `action_chunk` has them past the end
+                    chunks[..., place][later >= length] = 0
             relative = robot.action.to_relative(
                 torch.from_numpy(chunks), torch.from_numpy(states)
             ).numpy()
-            bounds_of["actions"] += [relative.min(axis=(0, 1)), relative.max(axis=(0, 1))]
-    return tuple((np.min(ends, axis=0), np.max(ends, axis=0)) for ends in bounds_of.values())  # type: ignore[return-value]
+            action_ends += [relative.min(axis=(0, 1)), relative.max(axis=(0, 1))]
+    return (
+        (np.min(state_ends, axis=0), np.max(state_ends, axis=0)),
+        (np.min(action_ends, axis=0), np.max(action_ends, axis=0)),
+    )
+
+
+def _steps_of(source: EpisodeSource, episode: int, video: bool) -> np.ndarray:
+    """The steps of an episode that count, int64 [n]: its decisions, or all frames."""
+    if video:
+        return np.arange(int(source.lengths[episode]))
+    return np.asarray(source.decisions(episode), np.int64)
 
 
 def _counted_steps(
@@ -211,12 +223,7 @@ def _counted_steps(
     parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
     for i, source in enumerate(sources):
         for episode in range(len(source)) if episodes is None else episodes[i]:
-            every = (
-                range(int(source.lengths[int(episode)]))
-                if video
-                else source.decisions(int(episode))
-            )
-            step = np.asarray(every, np.int32)
+            step = _steps_of(source, int(episode), video).astype(np.int32)
             parts.append(
                 np.stack([np.full_like(step, i), np.full_like(step, episode), step], axis=1)
             )

@@ -1,69 +1,58 @@
 """`ActionSpace`: what the numbers of an action mean, as recorded, as predicted and as commanded."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from string import ascii_lowercase
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+)
+from pydantic.dataclasses import dataclass as checked_dataclass
+from pydantic_core import PydanticUseDefault
 
-from mme_vla.config.sections import section_keys
-from mme_vla.errors import UserError, brief, check_integer, require
+from mme_vla.errors import LARGEST, UserError, brief, require
+from mme_vla.utils.validation import validated
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
-def columns(value: Any, where: str) -> tuple[str, ...]:
-    """One column of a dataset or several to be joined; none where the usual names are meant."""
-    names = [] if value is None else [value] if isinstance(value, str) else value
-    require(
-        isinstance(names, Sequence) and all(isinstance(name, str) and name for name in names),
-        f"{where} must be a column of the dataset or a list of columns, got {brief(value)}.",
-    )
-    return tuple(names)
+def _as_list(value: Any) -> Any:
+    """Take one entry without a list around it, and null for none."""
+    if value is None:
+        return ()
+    return (value,) if isinstance(value, str | int | float) else value
 
 
-def column_indices(value: Any, where: str, width: int) -> tuple[int, ...]:
-    """Places of numbers in a vector of `width`, each once, counted from 0."""
-    numbers = [] if value is None else list(value) if isinstance(value, Sequence) else [value]
-    require(
-        all(isinstance(i, int) and not isinstance(i, bool) and 0 <= i < width for i in numbers),
-        f"{where} must list numbers from 0 to {width - 1}, got {brief(value)}.",
-    )
-    require(len(set(numbers)) >= len(numbers), f"{where}={brief(value)} names a number twice.")
-    return tuple(sorted(numbers))
+def _use_default(value: Any) -> Any:
+    if value is None:
+        raise PydanticUseDefault
+    return value
 
 
-def centres(value: Any, where: str, width: int) -> dict[int, float]:
-    """A centre in radians for some numbers of a vector; keys may be texts, as JSON writes them."""
-    mapping = {} if value is None else value
-    try:
-        read = {int(place): float(centre) for place, centre in mapping.items()}
-        if not all(map(math.isfinite, read.values())):
-            raise ValueError
-    except (AttributeError, TypeError, ValueError, OverflowError):
-        raise UserError(
-            f"{where} must be a map such as {{3: 3.14}}, number to centre, got {brief(value)}."
-        ) from None
-    column_indices(list(read), where, width)
-    return read
-
-
-def words(value: Any, where: str, width: int, default: Sequence[str]) -> tuple[str, ...]:
-    """One text for each of `width` numbers."""
-    texts = list(default) if value is None else value
-    require(
-        not isinstance(texts, str) and isinstance(texts, Sequence) and len(texts) == width,
-        f"{where} must hold {width} texts, one a number, got {brief(value)}.",
-    )
-    return tuple(map(str, texts))
-
-
-Place = tuple[float, float]
+Size = Annotated[int, Field(strict=True, ge=1, le=LARGEST)]
+"""Of a robot's vectors and chunks."""
+Columns = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], BeforeValidator(_as_list)]
+"""One column of a dataset or several to be joined; none where the usual names are meant."""
+Places = Annotated[
+    tuple[Annotated[int, Field(strict=True)], ...],
+    BeforeValidator(_as_list),
+    AfterValidator(sorted),
+    AfterValidator(tuple),
+]
+"""Places of numbers in a vector, each once, counted from 0, ascending."""
+NullIsDefault = BeforeValidator(_use_default)
+Point = tuple[float, float]
 MOST_WORDS = 400  # characters of an option
-MIDDLE: Place = (0.5, 0.5)
+MIDDLE: Point = (0.5, 0.5)
 """The point of a choice that needs none, as shares of the image's height and width."""
 
 
@@ -90,8 +79,17 @@ class Option:
         return {"label": self.label, "action": self.action, "need_parameter": self.needs_point}
 
 
+class _OptionRow(BaseModel):
+    """An option as the benchmark writes it; other keys are ignored."""
+
+    label: Annotated[str, BeforeValidator(lambda label: str(label).strip().lower())]
+    action: Annotated[str, Field(max_length=MOST_WORDS)]
+    need_parameter: StrictBool = False
+    possible: Any = True
+
+
 def read_options(value: Any, letters: int) -> tuple[Option, ...]:
-    """Options as the benchmark gives them: a list of `label`, `action` and `need_parameter`.
+    """Read options as the benchmark gives them: a list of `label`, `action`, `need_parameter`.
 
     Args:
         letters: how many there can be.
@@ -105,36 +103,34 @@ def read_options(value: Any, letters: int) -> tuple[Option, ...]:
         isinstance(value, Sequence) and not isinstance(value, str) and 1 <= len(value) <= letters,
         f"The options to choose from are {brief(value)}; expected {expected}.",
     )
-    options = []
-    for option in value:
-        right = isinstance(option, Mapping) and isinstance(option.get("action"), str)
-        label = str(option.get("label")).strip().lower() if right else ""
-        needs = option.get("need_parameter", False) if right else None
-        wordy = right and len(option["action"]) > MOST_WORDS
-        if not (len(label) == 1 and label in known and not wordy and isinstance(needs, bool)):
-            raise UserError(f"The option {brief(option)} cannot be chosen; expected {expected}.")
-        options.append(
-            Option(
-                label,
-                " ".join(option["action"].split()),
-                needs,
-                option.get("possible", True) is True,
-            )
-        )
+    options: dict[str, Option] = {}
+    for entry in value:
+        try:
+            row = validated(_OptionRow, entry, "The option")
+            require(row.label in list(known), f"The label is {brief(row.label)}.")
+        except UserError as error:
+            raise UserError(
+                f"The option {brief(entry)} cannot be chosen; expected {expected}. {error}"
+            ) from None
+        require(row.label not in options, f"The options {brief(value)} have a letter twice.")
+        action = " ".join(row.action.split())
+        options[row.label] = Option(row.label, action, row.need_parameter, row.possible is True)
     require(
-        len({option.label for option in options}) >= len(options),
-        f"The options {brief(value)} have a letter twice.",
-    )
-    require(
-        any(option.possible for option in options),
+        any(option.possible for option in options.values()),
         f"None of the options {brief(value)} is possible.",
     )
-    return tuple(options)
+    return tuple(options.values())
 
 
 def in_words(options: Sequence[Option]) -> str:
-    """The options as a prompt lists them: `a pick up the cube (point), b press the button`."""
-    return ", ".join(f"{o.label} {o.action}{' (point)' * o.needs_point}" for o in options)
+    """List the options as a prompt has them: `a pick up the cube (point), b press the button`."""
+    texts = []
+    for option in options:
+        text = f"{option.label} {option.action}"
+        if option.needs_point:
+            text += " (point)"
+        texts.append(text)
+    return ", ".join(texts)
 
 
 POSE_WIDTH = 6
@@ -142,131 +138,146 @@ POSE_WIDTH = 6
 ANGLES = (3, 4, 5)
 """The angles' places in it."""
 DELTA = "ee_delta"
-_KEYS = (
-    "key",
-    "space",
-    "width",
-    "names",
-    "units",
-    "relative",
-    "angles",
-    "binary",
-    "horizon",
-    "execute",
-    "frames",
-    "choice",
-    "point",
-    "options_length",
-    "of_pose",
-    "pose_key",
-)
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class ActionSpace:
     """The actions of a policy.
 
-    width: w; numbers of an action. key: columns of the dataset that hold them, joined; empty for
-    the usual names. space: the benchmark's action space that takes them; None for a robot that is
-    not the benchmark's. names, units: of each number, for plots and reports. Without names a
-    dataset's are taken (`with_names`). relative: numbers predicted relative to the state's number
-    at the same place; the others are absolute. angles: number → centre in radians; what is
-    predicted lies within π of the centre, so that it does not jump by 2π. binary: numbers that are
-    commanded as −1 or 1 and nothing between. horizon: h; actions of a chunk. execute: how many of
-    them are executed before the policy is asked again. frames: camera frames an action takes; None
-    where an action is one planned motion of any length. choice: numbers of which one is 1 and the
-    others 0, the letters a, b, … of the options that an episode offers; what
-        is predicted are scores, and `decide` takes the best that is offered. Normalised as [0, 1],
-        never by statistics.
+    width: w; numbers of an action.
+    key: columns of the dataset that hold them, joined; empty for the usual names.
+    space: the benchmark's action space that takes them; None for a robot that is not the
+        benchmark's.
+    names, units: of each number, for plots and reports. Without names a dataset's are taken
+        (`with_names`).
+    relative: numbers predicted relative to the state's number at the same place; the others are
+        absolute.
+    angles: number → centre in radians. What is predicted lies within π of the centre, so that it
+        does not jump by 2π.
+    binary: numbers that are commanded as −1 or 1 and nothing between.
+    horizon: h; actions of a chunk.
+    execute: how many of them are executed before the policy is asked again.
+    frames: camera frames an action takes; None where an action is one planned motion of any length.
+    choice: numbers of which one is 1 and the others 0, the letters a, b, … of the options that an
+        episode offers. Scores are predicted, and `decide` takes the best that is offered.
+        Normalised as [0, 1], never by statistics.
     point: the two numbers of a point in the memory camera's image: y and x as shares of its height
-    and width. of_pose: numbers that are differences to the tool's pose at their own step, i. e. to
-    the pose's number at the same
-        place, angles (from the fourth on) by the shorter way: recorded, predicted and sent as such.
-            Who executes an
-        action adds the pose of that moment (`beside_pose`). Past a recording's end they are 0.
-    pose_key: columns of the dataset that hold that pose.
+        and width.
     options_length: tokens that the prompt has for the options, beside the processor's
-    `prompt_length`.
+        `prompt_length`.
+    pose_key: columns of the dataset that hold the tool's pose.
+    of_pose: numbers that are differences to the tool's pose at their own step, i. e. to the pose's
+        number at the same place, angles (from the fourth on) by the shorter way: recorded,
+        predicted and sent as such. Who executes an action adds the pose of that moment
+        (`beside_pose`). Past a recording's end they are 0.
     """
 
-    width: int
-    key: tuple[str, ...] = ()
+    width: Size
+    key: Columns = ()
     space: str | None = None
-    names: tuple[str, ...] = ()
-    units: tuple[str, ...] = ()
-    relative: tuple[int, ...] = ()
-    angles: Mapping[int, float] = field(default_factory=dict)
-    binary: tuple[int, ...] = ()
-    horizon: int = 20
-    execute: int = 16
+    names: Annotated[tuple[str, ...], NullIsDefault] = Field(
+        default_factory=lambda fields: numbered(fields["width"])
+    )
+    units: Annotated[tuple[str, ...], NullIsDefault] = Field(
+        default_factory=lambda fields: ("",) * fields["width"]
+    )
+    relative: Places = ()
+    angles: Annotated[dict[int, Annotated[float, Field(allow_inf_nan=False)]], NullIsDefault] = (
+        Field(default_factory=dict)
+    )
+    binary: Places = ()
+    horizon: Size = 20
+    execute: Annotated[Size, NullIsDefault] = Field(
+        default_factory=lambda fields: min(16, fields["horizon"])
+    )
     frames: int | None = 1
-    choice: tuple[int, ...] = ()
-    point: tuple[int, ...] = ()
-    options_length: int = 0
-    of_pose: tuple[int, ...] = ()
-    pose_key: tuple[str, ...] = ()
+    choice: Places = ()
+    point: Places = ()
+    options_length: Annotated[int, Field(strict=True, ge=0, le=LARGEST)] = 0
+    of_pose: Places = ()
+    pose_key: Columns = ()
 
     @classmethod
     def from_dict(cls, section: Any, state_width: int) -> Self:
-        """Read the section `embodiment.action`."""
+        """Read the section `embodiment.action`.
+
+        Raises:
+            UserError: a value that cannot be, by its key.
+        """
         where = "embodiment.action"
-        values = section_keys(section, where, _KEYS, required=("width",))
-        width = check_integer(f"{where}.width", values["width"])
-        horizon = check_integer(f"{where}.horizon", values.get("horizon", 20))
-        execute = check_integer(f"{where}.execute", values.get("execute", min(16, horizon)))
+        space = validated(cls, section, where, where)
+        limits = dict.fromkeys(("angles", "binary", "choice", "point"), space.width)
+        limits["relative"] = min(space.width, state_width)
+        limits["of_pose"] = min(space.width, POSE_WIDTH)
+        for key, limit in limits.items():
+            places = list(getattr(space, key))
+            require(
+                all(0 <= place < limit for place in places),
+                f"{where}.{key} must list numbers from 0 to {limit - 1}, got {brief(places)}.",
+            )
+            require(
+                len(set(places)) == len(places),
+                f"{where}.{key}={brief(places)} names a number twice.",
+            )
+        for key in ("names", "units"):
+            texts = list(getattr(space, key))
+            require(
+                len(texts) == space.width,
+                f"{where}.{key} must hold {space.width} texts, one a number, got {brief(texts)}.",
+            )
         require(
-            execute <= horizon,
-            f"{where}.execute={execute}: a chunk has {horizon} actions (horizon); execute fewer.",
+            space.execute <= space.horizon,
+            f"{where}.execute={space.execute}: a chunk has {space.horizon} actions (horizon);"
+            " execute fewer.",
         )
-        frames = values.get("frames", 1)
         require(
-            frames in (1, None),
-            f"{where}.frames={brief(frames)}: expected 1; null if an action is one planned motion.",
+            space.frames in (1, None),
+            f"{where}.frames={space.frames}: expected 1; null if an action is one planned motion.",
         )
-        choice, point, length = _choices(values, where, width)
-        return cls(
-            width=width,
-            key=columns(values.get("key"), f"{where}.key"),
-            space=None if values.get("space") is None else str(values["space"]),
-            names=words(values.get("names"), f"{where}.names", width, numbered(width)),
-            units=words(values.get("units"), f"{where}.units", width, [""] * width),
-            relative=column_indices(
-                values.get("relative"), f"{where}.relative", min(width, state_width)
-            ),
-            angles=centres(values.get("angles"), f"{where}.angles", width),
-            binary=column_indices(values.get("binary"), f"{where}.binary", width),
-            horizon=horizon,
-            execute=execute,
-            frames=frames,
-            choice=choice,
-            point=point,
-            options_length=length,
-            of_pose=_of_pose(values, where, width),
-            pose_key=columns(values.get("pose_key"), f"{where}.pose_key"),
+        letters = len(ascii_lowercase)
+        require(
+            not space.choice or (len(space.choice) <= letters and space.frames is None),
+            f"{where}.choice: at most {letters} letters, each a motion of any length: frames=null.",
         )
+        is_point = len(space.point) == 2 and bool(space.choice)
+        require(
+            not space.point or (is_point and not set(space.point) & set(space.choice)),
+            f"{where}.point={list(space.point)}: expected the two numbers y, x beside the"
+            " choice's.",
+        )
+        has_poses = bool(space.pose_key) and space.frames == 1 and not space.relative
+        require(
+            not space.of_pose or has_poses,
+            f"{where}.of_pose={list(space.of_pose)}: name the columns of the tool's pose"
+            " (pose_key), one action a frame (frames=1), and nothing relative to the state besides"
+            " (relative=[]).",
+        )
+        return space
 
     def to_dict(self) -> dict[str, Any]:
-        """The section that `from_dict` reads, fit for JSON."""
-        listed = {
-            name: list(getattr(self, name))
-            for name in ("key", "names", "units", "relative", "binary")
-        }
-        scalars = {
-            name: getattr(self, name) for name in ("space", "width", "horizon", "execute", "frames")
-        }
-        choices = {
-            "choice": list(self.choice),
-            "point": list(self.point),
-            "options_length": self.options_length,
-        }
-        posed = {"of_pose": list(self.of_pose), "pose_key": list(self.pose_key)}
-        return {
-            **scalars,
-            **listed,
+        """Return the section that `from_dict` reads, fit for JSON."""
+        section: dict[str, Any] = {
+            "space": self.space,
+            "width": self.width,
+            "horizon": self.horizon,
+            "execute": self.execute,
+            "frames": self.frames,
+            "key": list(self.key),
+            "names": list(self.names),
+            "units": list(self.units),
+            "relative": list(self.relative),
+            "binary": list(self.binary),
             "angles": {str(place): centre for place, centre in self.angles.items()},
-            **(choices if self.choice else {}),  # absent in files of earlier versions
-            **(posed if self.of_pose else {}),  # likewise
         }
+        # Keys that a robot does not need are absent, as in the files of earlier versions.
+        if self.choice:
+            section["choice"] = list(self.choice)
+            section["point"] = list(self.point)
+            section["options_length"] = self.options_length
+        if self.of_pose:
+            section["of_pose"] = list(self.of_pose)
+            section["pose_key"] = list(self.pose_key)
+        return section
 
     def with_names(self, names: Sequence[str]) -> Self:
         """The same space with a dataset's names of the numbers, where it has none of its own."""
@@ -371,37 +382,3 @@ def _require(options: Sequence[Option]) -> None:
         "This policy chooses among options, and the episode offers none: set episode.options. The "
         "benchmark's are info['available_multi_choices'] of the action space multi_choice.",
     )
-
-
-def _of_pose(values: Mapping[str, Any], where: str, width: int) -> tuple[int, ...]:
-    """`of_pose`, which needs poses to differ from, and steps that have one."""
-    places = column_indices(values.get("of_pose"), f"{where}.of_pose", min(width, POSE_WIDTH))
-    if places and (
-        not values.get("pose_key") or values.get("frames", 1) is None or values.get("relative")
-    ):
-        raise UserError(
-            f"{where}.of_pose={list(places)}: name the columns of the tool's pose (pose_key), one"
-            " action a frame (frames=1), and nothing relative to the state besides (relative=[])."
-        )
-    return places
-
-
-def _choices(
-    values: Mapping[str, Any], where: str, width: int
-) -> tuple[tuple[int, ...], tuple[int, ...], int]:
-    """`choice`, `point` and `options_length`."""
-    choice = column_indices(values.get("choice"), f"{where}.choice", width)
-    point = column_indices(values.get("point"), f"{where}.point", width)
-    if len(point) not in (0, 2) or set(point) & set(choice) or (point and not choice):
-        raise UserError(
-            f"{where}.point={brief(values.get('point'))}: expected the two numbers y, x beside the"
-            " choice's."
-        )
-    require(
-        len(choice) <= len(ascii_lowercase)
-        and (not (choice and values.get("frames", 1) is not None)),
-        f"{where}.choice: at most {len(ascii_lowercase)} letters, each a motion of any length:"
-        " frames=null.",
-    )
-    length = values.get("options_length", 0)
-    return choice, point, check_integer(f"{where}.options_length", length) if length else 0

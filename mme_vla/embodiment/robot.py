@@ -5,18 +5,19 @@ One YAML of `configs/embodiment` describes one; it is saved with every checkpoin
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self
 
-from mme_vla.config.sections import section_keys
-from mme_vla.embodiment import action_space
-from mme_vla.embodiment.action_space import ActionSpace
-from mme_vla.errors import UserError, brief, check_choice, check_integer, did_you_mean, require
+from pydantic import BaseModel, ConfigDict, Field, StrictBool
+from pydantic.dataclasses import dataclass as checked_dataclass
 
-AUGMENTATIONS = ("all", "colour", "none")
-_KEYS = ("name", "cameras", "memory_camera", "state", "action", "fps", "conditioning_video")
+from mme_vla.embodiment.action_space import ActionSpace, Columns, Size
+from mme_vla.errors import UserError, brief, did_you_mean, require
+from mme_vla.utils.validation import validated
+
+_STRICT = ConfigDict(extra="forbid")
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=_STRICT)
 class Camera:
     """One view of the scene.
 
@@ -27,8 +28,8 @@ class Camera:
 
     name: str
     key: str | None = None
-    augment: str = "all"
-    depth: bool = False
+    augment: Literal["all", "colour", "none"] = "all"
+    depth: StrictBool = False
 
     @property
     def readings(self) -> tuple[str, ...]:
@@ -40,14 +41,27 @@ class Camera:
         return (f"{self.name}_depth", f"{self.name}_camera_extrinsic") if self.depth else ()
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=_STRICT)
 class State:
     """What the robot feels: `width` numbers, in the columns `key` of the dataset (empty for the
     usual names).
     """
 
-    width: int
-    key: tuple[str, ...] = ()
+    width: Size
+    key: Columns = ()
+
+
+class _Section(BaseModel):
+    """The section `embodiment`; its parts are checked one by one, each by its own key."""
+
+    model_config = _STRICT
+    name: str
+    cameras: Any
+    memory_camera: str | None = None
+    state: Any
+    action: Any
+    fps: Annotated[float, Field(strict=True, gt=0, le=1000)] | None = None
+    conditioning_video: StrictBool = False
 
 
 @dataclass(frozen=True)
@@ -88,53 +102,54 @@ class Embodiment:
         Raises:
             UserError: an unknown or missing key, or a value that cannot be; it is named.
         """
-        values = section_keys(
-            section, "embodiment", _KEYS, required=("name", "cameras", "state", "action")
+        values = validated(_Section, section, "embodiment", "embodiment")
+        require(
+            isinstance(values.cameras, Mapping) and values.cameras,
+            "embodiment.cameras must name at least one camera with its settings, got"
+            f" {brief(values.cameras)}.",
         )
-        cameras = _cameras(values["cameras"])
+        cameras = []
+        for name, settings in values.cameras.items():
+            where = f"embodiment.cameras.{name}"
+            options = settings or {}
+            require(
+                isinstance(options, Mapping),
+                f"{where} must be a section of keys, got {brief(options)}.",
+            )
+            require(
+                name != "state",
+                f"{where}: the state goes under this name in messages; call the camera something"
+                " else.",
+            )
+            cameras.append(validated(Camera, {**options, "name": name}, where, where))
         names = [camera.name for camera in cameras]
-        memory_camera = values.get("memory_camera") or names[0]
+        memory_camera = values.memory_camera or names[0]
         if memory_camera not in names:
-            near = did_you_mean(str(memory_camera), names)
+            near = did_you_mean(memory_camera, names)
             raise UserError(
                 f"embodiment.memory_camera={brief(memory_camera)} is none of the cameras. {near}"
             )
-        state = section_keys(
-            values["state"], "embodiment.state", ("key", "width"), required=("width",)
-        )
-        width = check_integer("embodiment.state.width", state["width"])
-        fps, video = values.get("fps"), values.get("conditioning_video", False)
-        require(
-            not (
-                fps is not None
-                and (
-                    isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= 1000
-                )
-            ),
-            f"embodiment.fps must be a positive number to 1000 or null, got {brief(fps)}.",
-        )
-        require(
-            isinstance(video, bool),
-            f"embodiment.conditioning_video must be true or false, got {brief(video)}.",
-        )
+        state = validated(State, values.state, "embodiment.state", "embodiment.state")
         return cls(
-            name=str(values["name"]),
-            cameras=cameras,
-            memory_camera=str(memory_camera),
-            state=State(width, action_space.columns(state.get("key"), "embodiment.state.key")),
-            action=ActionSpace.from_dict(values["action"], width),
-            fps=None if fps is None else float(fps),
-            conditioning_video=video,
+            name=values.name,
+            cameras=tuple(cameras),
+            memory_camera=memory_camera,
+            state=state,
+            action=ActionSpace.from_dict(values.action, state.width),
+            fps=values.fps,
+            conditioning_video=values.conditioning_video,
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The section that `from_dict` reads, fit for JSON."""
-        depth = {True: {"depth": True}, False: {}}  # absent in files of earlier versions
+        """Return the section that `from_dict` reads, fit for JSON."""
+        cameras: dict[str, dict[str, Any]] = {}
+        for camera in self.cameras:
+            cameras[camera.name] = {"key": camera.key, "augment": camera.augment}
+            if camera.depth:  # absent in files of earlier versions
+                cameras[camera.name]["depth"] = True
         return {
             "name": self.name,
-            "cameras": {
-                c.name: {"key": c.key, "augment": c.augment, **depth[c.depth]} for c in self.cameras
-            },
+            "cameras": cameras,
             "memory_camera": self.memory_camera,
             "state": {"key": list(self.state.key), "width": self.state.width},
             "action": self.action.to_dict(),
@@ -163,29 +178,3 @@ class Embodiment:
             f"embodiment.action.horizon={self.action.horizon} and backbone.horizon={horizon} are"
             " the same length of a chunk: set the embodiment's, which the backbone follows.",
         )
-
-
-def _cameras(section: Any) -> tuple[Camera, ...]:
-    require(
-        isinstance(section, Mapping) and section,
-        "embodiment.cameras must name at least one camera with its settings, got"
-        f" {brief(section)}.",
-    )
-    cameras = []
-    for name, settings in section.items():
-        where = f"embodiment.cameras.{name}"
-        options = section_keys(settings or {}, where, ("key", "augment", "depth"))
-        augment, key = options.get("augment", "all"), options.get("key")
-        check_choice(f"{where}.augment", augment, AUGMENTATIONS)
-        require(
-            isinstance(key, str | None),
-            f"{where}.key must be a column of the dataset, got {brief(key)}.",
-        )
-        if not isinstance(depth := options.get("depth", False), bool):
-            raise UserError(f"{where}.depth must be true or false, got {brief(depth)}.")
-        require(
-            name != "state",
-            f"{where}: the state goes under this name in messages; call the camera something else.",
-        )
-        cameras.append(Camera(str(name), key, augment, depth))
-    return tuple(cameras)

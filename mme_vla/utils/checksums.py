@@ -34,11 +34,17 @@ def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = Fa
     Files are read once more for it, in blocks and several at a time. With `keep`, the sums that are
     there of other files stay.
     """
-    files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    chosen = sorted(set(names) if names is not None else {name for name in files if name != SUMS})
-    table = _read_sums(folder / SUMS) if keep and (folder / SUMS).exists() else {}
+    if names is None:
+        names = [
+            path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
+        ]
+    chosen = sorted(set(names) - {SUMS})
+    table: dict[str, str] = {}
+    if keep and (folder / SUMS).exists():
+        table = _read_sums(folder / SUMS)
     with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
-        table |= zip(chosen, pool.map(lambda name: file_sum(folder / name), chosen), strict=True)
+        sums = pool.map(lambda name: file_sum(folder / name), chosen)
+        table.update(zip(chosen, sums, strict=True))
     with write_atomically(folder / SUMS) as draft:
         draft.write_text("".join(f"{table[name]}  {name}\n" for name in sorted(table)))
 
@@ -70,27 +76,25 @@ class Sums:
         Datasets have such files: rows of the user's own, results of other programs. Of checkpoints,
         `check_sums` asks.
         """
-        paths = {
-            name: inside(self.folder, name)
-            for name in names
-            if name in self.table and name not in self._compared
-        }
-        for path in paths.values():
+        paths = {}
+        for name in names:
+            if name not in self.table or name in self._compared:
+                continue
+            paths[name] = inside(self.folder, name)
             require(
-                path.is_file(),
-                f"{path} is missing, though {self.folder / self.name} lists it. Copy the whole"
-                " folder again.",
+                paths[name].is_file(),
+                f"{paths[name]} is missing, though {self.folder / self.name} lists it. Copy the"
+                " whole folder again.",
             )
         with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
-            for (name, path), checksum in zip(
-                paths.items(), pool.map(file_sum, paths.values()), strict=True
-            ):
-                require(
-                    checksum == self.table[name],
-                    f"{path} is damaged: its content is not what was written (SHA-256 differs from"
-                    f" {self.name}). {self.remedy}; if you changed it on purpose, delete"
-                    f" {self.name}.",
-                )
+            checksums = list(pool.map(file_sum, paths.values()))
+        for (name, path), checksum in zip(paths.items(), checksums, strict=True):
+            require(
+                checksum == self.table[name],
+                f"{path} is damaged: its content is not what was written (SHA-256 differs from"
+                f" {self.name}). {self.remedy}; if you changed it on purpose, delete"
+                f" {self.name}.",
+            )
         self._compared |= set(paths)
 
 

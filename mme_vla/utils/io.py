@@ -22,60 +22,51 @@ from typing import Any
 
 from mme_vla.errors import UserError, brief, require
 
-# "errno = 28" (HDF5), "os error 28" (Rust)
-_NUMBER = re.compile(r"\b(?:errno|os error)(?: ?= ?| )(\d+)\b", re.IGNORECASE)
-_NAME = re.compile(r"\bname = '([^']+)'")  # HDF5
+# What a disk refuses: a number that the system gives to an error.
+_REFUSALS = frozenset(
+    {
+        errno.EEXIST,
+        errno.ENOTDIR,
+        errno.ENOSPC,
+        errno.EDQUOT,
+        errno.EFBIG,
+        errno.EROFS,
+        errno.EACCES,
+        errno.EPERM,
+        errno.EMFILE,
+        errno.ENFILE,
+        errno.EIO,
+    }
+)
+# Libraries that write files themselves raise errors of their own, with the number in the text:
+# "errno = 28" (HDF5), "os error 28" (Rust).
+_NUMBER_IN_TEXT = re.compile(r"\b(?:errno|os error)(?: ?= ?| )(\d+)\b", re.IGNORECASE)
 # NumPy counts what it could not write and does not say why.
 _SHORT_WRITE = re.compile(r"\d+ requested and \d+ written")
-_AGAIN = "and repeat the same command: what was finished is kept."
-_PERMIT = (
-    "Change the permissions of it or its folder, or choose another, and repeat the same command."
-)
-_MOVE = "Choose another place, or move that file away yourself, and repeat."
-_ADVICE = {
-    errno.EEXIST: ("a file is where a folder has to be", _MOVE),
-    errno.ENOTDIR: ("a part of its path is a file", _MOVE),
-    errno.ENOSPC: ("there is no room left for it", f"Free some room {_AGAIN}"),
-    errno.EDQUOT: ("your share of the disk is used up", f"Free some room {_AGAIN}"),
-    errno.EFBIG: (
-        "it would be larger than files may be here",
-        f"Raise that limit (see `ulimit -f`) {_AGAIN}",
-    ),
-    errno.EROFS: (
-        "its disk can only be read",
-        "Choose another folder, or make that one writable, and repeat.",
-    ),
-    errno.EACCES: ("permission is denied", _PERMIT),
-    errno.EPERM: ("that is not permitted", _PERMIT),
-    errno.EMFILE: ("too many files are open", f"Raise that limit (`ulimit -n 4096`) {_AGAIN}"),
-    errno.ENFILE: ("the system has too many files open", f"Close other programs {_AGAIN}"),
-    errno.EIO: ("its disk does not answer", f"Look after the disk {_AGAIN}"),
-}
 
 
 def disk_trouble(error: BaseException) -> str | None:
-    """One sentence on what the disk refused and what to do; None if this error, or what caused it,
-    is another matter.
+    """Describe an error of the disk in one sentence: the place, the system's reason, what to do.
 
-    Libraries wrap such errors in their own: the number is looked for in their texts and in what
-    they were raised from.
+    The error, or one that it was raised from, has the number that the system gave it.
+
+    Returns:
+        None for other errors, such as a port that may not be opened.
     """
-    number, place, visited = None, None, set[int]()
+    number: int | None = None
+    place: str | None = None
     current: BaseException | None = error
-    while current is not None and id(current) not in visited:
-        visited.add(id(current))
-        number = _number(current) if number is None else number
-        place = getattr(current, "filename", None) or place
-        if place is None and number is not None and (named := _NAME.search(str(current))):
-            place = named[1]
+    while current is not None:
+        number = number or _refusal(current)
+        place = place or getattr(current, "filename", None)
         current = current.__cause__ or current.__context__
     if number is None or (place is None and number in (errno.EACCES, errno.EPERM)):
-        # a port, not a file
         return None
-    reason, advice = _ADVICE[number]
+    if place is None:
+        place = f"{Path.cwd()} ({brief(str(error), 300, quote=False)})"
     return (
-        f"{place or Path.cwd()} cannot be written or opened: {reason} ({os.strerror(number)})."
-        f" {advice}"
+        f"{place} cannot be written or opened: {os.strerror(number)}. Mend that, or choose another"
+        " place, and repeat the same command: what was finished is kept."
     )
 
 
@@ -83,42 +74,45 @@ def name_place(error: BaseException | None, place: Path) -> None:
     """Note where an error of the disk happened, if it does not say: those of writing to an open
     file never do.
     """
-    if error is not None and not getattr(error, "filename", None) and _number(error) is not None:
+    if error is None or getattr(error, "filename", None) is not None:
+        return
+    if _refusal(error) is not None:
         error.filename = str(place)  # type: ignore[attr-defined]
 
 
-def _number(error: BaseException) -> int | None:
-    """The system's number of an error that `_ADVICE` knows."""
+def _refusal(error: BaseException) -> int | None:
+    """The system's number of an error of the disk."""
     number = getattr(error, "errno", None)
-    if isinstance(number, int) and number in _ADVICE:
+    if number in _REFUSALS:
         return number
-    if not isinstance(error, Exception) or isinstance(error, ValueError | TypeError | LookupError):
-        return None
-    if isinstance(error, OSError) and _SHORT_WRITE.search(str(error)):
+    text = str(error)
+    if isinstance(error, OSError) and _SHORT_WRITE.search(text):
         return errno.ENOSPC
-    for match in _NUMBER.finditer(str(error)):
-        if int(match[1]) in _ADVICE:
-            return int(match[1])
-    return None
+    match = _NUMBER_IN_TEXT.search(text)
+    # Messages of users' mistakes may quote such a text.
+    if match is None or isinstance(error, ValueError | TypeError | LookupError):
+        return None
+    number = int(match[1])
+    return number if number in _REFUSALS else None
 
 
 def require_file(path: Path, what: str = "a file") -> Path:
     """Return `path` if it is a regular file, which can be opened without waiting."""
+    name = brief(str(path), 300, quote=False)
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
-        raise UserError(f"{_short_path(path)} is missing; expected {what}.") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(
-            f"{_short_path(path)} cannot be read as {what}: {brief(reason, 300, quote=False)}."
-        ) from None
-    require(stat.S_ISREG(mode), f"{_short_path(path)} is not a file; expected {what}.")
+        raise UserError(f"{name} is missing; expected {what}.") from None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        reason = brief(_reason(error), 300, quote=False)
+        raise UserError(f"{name} cannot be read as {what}: {reason}.") from None
+    require(stat.S_ISREG(mode), f"{name} is not a file; expected {what}.")
     return path
 
 
-def _short_path(path: Path) -> str:
-    return brief(str(path), 300, quote=False)
+def _reason(error: Exception) -> str:
+    """The system's words for an error, or the error's own."""
+    return getattr(error, "strerror", None) or str(error)
 
 
 @contextmanager
@@ -135,11 +129,9 @@ def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
     except Exception as error:
         # some wrap what happened in a sentence without content
         message = " ".join(str(error.__cause__ or error).split())
-        reason = (
-            f"{type(error).__name__}: {brief(message, 200, quote=False)}"
-            if message
-            else type(error).__name__
-        )
+        reason = type(error).__name__
+        if message:
+            reason += f": {brief(message, 200, quote=False)}"
         raise UserError(
             f"{path} is damaged: it cannot be read as {what} ({reason}). {remedy}"
         ) from error
@@ -151,33 +143,27 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
     A snapshot in the hub's cache is made of links to the files of its repository's folder,
     `../../blobs/…`: these count as its own.
     """
-    place, root = folder / name, folder.resolve()
+    place = folder / name
+    root = folder.resolve()
     try:
-        resolved = place.resolve()
+        target = place.resolve()
     except (OSError, ValueError, RuntimeError):  # a null character, a loop of links
-        resolved = Path("/")
-    within = resolved.is_relative_to(root) and resolved != root
-    linked = ".." not in Path(name).parts and any(
-        resolved.is_relative_to(blobs) for blobs in _blobs_of(root)
-    )
+        target = Path("/")
+    allowed = target.is_relative_to(root) and target != root
+    if not allowed and ".." not in Path(name).parts:
+        # the hub's cache: <repository>/snapshots/<revision>, of which `root` is one or lies in one
+        for snapshot in (root, *root.parents):
+            repository = snapshot.parent.parent
+            if snapshot.parent.name == "snapshots" and _HUB_REPOSITORY.match(repository.name):
+                allowed = target.is_relative_to(repository / "blobs")
+                break
     require(
-        name and not Path(name).is_absolute() and (within or linked),
+        name and not Path(name).is_absolute() and allowed,
         f"{folder} names the {what} {brief(name)}, which lies outside of it. Nothing outside a"
         " checkpoint's or dataset's own folder is read for it; copy the file into the folder, or"
         " correct the name.",
     )
     return place
-
-
-def _blobs_of(root: Path) -> list[Path]:
-    """Where the hub's cache keeps the files of the snapshot that `root` is, or lies in; nowhere for
-    other folders.
-    """
-    for place in (root, *root.parents):
-        repository = place.parent.parent
-        if place.parent.name == "snapshots" and _HUB_REPOSITORY.match(repository.name):
-            return [repository / "blobs"]
-    return []
 
 
 def require_replaceable(path: Path, *suffixes: str) -> Path:
@@ -265,60 +251,46 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; expected {what}.") from None
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
-        reason = (
-            "a folder"
-            if isinstance(error, IsADirectoryError)
-            else getattr(error, "strerror", None) or error
-        )
-        raise UserError(f"{path} cannot be read as {what}: {reason}.") from None
-
-
-def read_unpacked(path: Path, what: str = "data", limit: int = LOG_LIMIT) -> bytes:
-    """Read a file of at most `limit` bytes, a file `*.xz` unpacked: all of its streams, and nothing
-    else in it.
-    """
-    data = read_bytes(path, what, limit)
-    return unpack_xz(data, path, what, limit) if path.suffix == ".xz" else data
+        raise UserError(f"{path} cannot be read as {what}: {_reason(error)}.") from None
 
 
 # bytes that a stream's unpacker is given at once: it copies those that it leaves over
 _BLOCK = 2**14
 
 
-def unpack_xz(
-    packed: bytes, source: Path | str, what: str = "data", limit: int = LOG_LIMIT
-) -> bytes:
-    """Unpack the content of an `.xz` file to its end: all its streams, as `xz -dc` does.
+def read_unpacked(path: Path, what: str = "data", limit: int = LOG_LIMIT) -> bytes:
+    """Read a file of at most `limit` bytes; a file `*.xz` is unpacked, all of its streams.
 
     Args:
-        packed: the file's bytes. source: the file, for messages. what: it holds.
-        limit: bytes of the unpacked content, over all streams.
+        limit: bytes of the file, and of its unpacked content over all streams.
 
     Raises:
-        UserError: it is cut off, damaged, larger than `limit`, or something else follows its last
-            stream.
+        UserError: the packed file is cut off, damaged, or something else follows its last stream.
     """
-    remedy = "Copy it again."
+    packed = read_bytes(path, what, limit)
+    if path.suffix != ".xz":
+        return packed
     stream = lzma.LZMADecompressor(lzma.FORMAT_XZ)
-    pieces, size, position = list[bytes](), 0, 0
+    pieces: list[bytes] = []
+    size = 0
+    position = 0
     while not stream.eof or position < len(packed):
         if stream.eof:
             stream = lzma.LZMADecompressor(lzma.FORMAT_XZ)
-        # what lies behind a stream is copied once a stream
         block = packed[position : position + _BLOCK]
-        require(block, f"{source} is cut off: its last stream has no end. {remedy}")
-        with decoding(source, what, remedy):
+        require(block, f"{path} is cut off: its last stream has no end. Copy it again.")
+        with decoding(path, what, "Copy it again."):
             # one more byte shows that there is more
             piece = stream.decompress(block, limit + 1 - size)
         size += len(piece)
         require(
             size <= limit,
-            f"{source} has more than {limit:,} bytes of {what}, unpacked; that is the limit.",
+            f"{path} has more than {limit:,} bytes of {what}, unpacked; that is the limit.",
         )
         pieces.append(piece)
         position += len(block) - len(stream.unused_data)
+        # padding between streams, by the format
         while stream.eof and packed[position : position + 4] == bytes(4):
-            # padding between streams, by the format
             position += 4
     return b"".join(pieces)
 
@@ -361,23 +333,17 @@ def parse_json(
         kind: what the outermost value must be.
         finite: whether NaN and infinities, which JSON does not have but Python writes, are refused.
     """
+    # Python's own constants are looked at only where they are refused: hooks slow the parser down.
+    hooks: dict[str, Any] = {}
+    if finite:
+        hooks = {"parse_float": _finite, "parse_constant": _finite}
     try:
-        # Python's own constants are looked at only where they are refused: hooks slow the parser
-        # down.
-        value = (
-            json.loads(text, parse_float=_finite, parse_constant=_finite)
-            if finite
-            else json.loads(text)
-        )
+        value = json.loads(text, **hooks)
     except RecursionError:
         raise UserError(f"{source} is nested too deeply to be JSON of this library.") from None
-    except (
-        ValueError,
-        OverflowError,
-    ) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
-        raise UserError(
-            f"{source} is not valid JSON: {brief(str(error), 200, quote=False)}."
-        ) from None
+    except (ValueError, OverflowError) as error:  # also UnicodeDecodeError and JSONDecodeError
+        reason = brief(str(error), 200, quote=False)
+        raise UserError(f"{source} is not valid JSON: {reason}.") from None
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         expected = " or ".join(_KINDS.get(k, k.__name__) for k in kinds)
@@ -415,30 +381,25 @@ def read_lines[T](
         finite: raise an error for NaN and infinities.
     """
     # Not splitlines(): a JSON text may hold U+2028, which is no line end in a file.
-    data = read_unpacked(path, what, limit)
-    *complete, last = data.split(b"\n")
+    lines = read_unpacked(path, what, limit).split(b"\n")
     values = []
-    for number, line in enumerate([*complete, last], start=1):
+    for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         source = f"{path}, line {number}"
         try:
-            values.append(_read_line(line, kind, source, finite))
+            row = verified(parse_json(line, source, finite=finite), source)
+            try:
+                values.append(kind(row))
+            except UserError as error:
+                raise UserError(f"{source}: {error}") from None
         except UserError:
-            if number <= len(complete):
+            if number < len(lines):
                 raise
             warnings.warn(
                 f"{path}: ignored a half-written last line ({len(line)} bytes).", stacklevel=2
             )
     return values
-
-
-def _read_line[T](line: bytes, kind: Callable[[dict[str, Any]], T], source: str, finite: bool) -> T:
-    row = verified(parse_json(line, source, finite=finite), source)
-    try:
-        return kind(row)
-    except UserError as error:
-        raise UserError(f"{source}: {error}") from None
 
 
 def to_line(row: Mapping[str, Any]) -> str:

@@ -15,12 +15,9 @@ from mme_vla.errors import UserError
 from mme_vla.utils.io import is_draft, name_place, read_json, remove_drafts, write_json
 
 LOCK = ".lock"
-_NO_LOCKS = (
-    errno.ENOSYS,
-    errno.ENOTSUP,
-    errno.EOPNOTSUPP,
-    errno.ENOLCK,
-)  # errors of a file system without locks
+_ATTEMPTS = 100  # to make and lock a folder that others remove
+# errors of a file system without locks
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)
 
 
 class FolderLock:
@@ -36,8 +33,9 @@ class FolderLock:
     """
 
     def __init__(self, folder: Path, what: str = "run", name: str = LOCK) -> None:
-        self.folder, self.what, self.path = Path(folder), what, Path(folder) / name
-        self._process = os.getpid()
+        self.folder = Path(folder)
+        self.what = what
+        self.path = self.folder / name
         # A second attempt counts where the process before removes the file between opening and
         # locking it.
         self._lock = FileLock(
@@ -46,13 +44,13 @@ class FolderLock:
 
     def acquire(self) -> Self:
         """Lock the folder; raises an error that names the process which has locked it."""
-        for last in (False,) * 99 + (True,):
+        for attempt in range(_ATTEMPTS):
             self.folder.mkdir(parents=True, exist_ok=True)
             try:
                 self._lock.acquire()
                 break
             except FileNotFoundError:  # the process before has just removed the folder
-                if last:
+                if attempt == _ATTEMPTS - 1:
                     raise
             except Timeout:
                 raise UserError(
@@ -69,7 +67,7 @@ class FolderLock:
 
     def release(self) -> None:
         """Unlock the folder; harmless if this process has not locked it."""
-        if os.getpid() != self._process or not self._lock.is_locked:
+        if not self._lock.is_locked:
             return
         with suppress(OSError):  # the folder may have been moved or removed meanwhile
             self.path.unlink()
@@ -77,13 +75,12 @@ class FolderLock:
         self._lock.release()
 
     def _holder(self) -> str:
+        """What the lock's file says of the process that has it."""
         try:
-            return (
-                self.path.read_text(errors="replace")[:200].strip()
-                or "a process that has just started"
-            )
+            text = self.path.read_text(errors="replace")[:200].strip()
         except OSError:
             return "a process that has just ended"
+        return text or "a process that has just started"
 
     def __enter__(self) -> Self:
         return self.acquire()
@@ -113,18 +110,21 @@ def claim_plan(folder: Path, plan: Any) -> bool:
         Whether the folder is this plan's; False where it holds something else.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    record, about = folder / PLAN, "the plan of a command's work"
+    record = folder / PLAN
     if record.exists():
         try:
-            if read_json(record, about, kind=(dict, list)) == plan:
-                remove_drafts(folder)
-                return True
+            stored = read_json(record, "the plan of a command's work", kind=(dict, list))
         except UserError:
             pass  # cut off when the machine went down: free, if there is no work yet
         else:
+            if stored == plan:
+                remove_drafts(folder)
+            return bool(stored == plan)
+    for path in folder.iterdir():
+        if path.name in (PLAN, LOCK) or is_draft(path):
+            continue
+        if not path.is_dir() or any(path.iterdir()):
             return False
-    if any(_is_work(path) for path in folder.iterdir()):
-        return False
     remove_drafts(folder)
     write_json(record, plan, indent=1)
     return True
@@ -140,21 +140,17 @@ def drop_plan(folder: Path, *work: str) -> None:
         work: patterns, relative to the folder, of what the command writes there: `episodes/*.h5`,
             `merged`.
     """
-    places = [path for pattern in work for path in folder.glob(pattern)]
-    for path in places:
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
-    parents = {parent for pattern in work for parent in Path(pattern).parents if parent != Path()}
+    parents: set[Path] = set()
+    for pattern in work:
+        parents.update(Path(pattern).parents)
+        for path in list(folder.glob(pattern)):
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+    parents.discard(Path())
     for parent in sorted(parents, reverse=True):  # inner ones first
         with suppress(OSError):  # something else lies in it, or it is not there
             (folder / parent).rmdir()
     remove_drafts(folder)
     (folder / PLAN).unlink(missing_ok=True)
-
-
-def _is_work(path: Path) -> bool:
-    if path.name in (PLAN, LOCK) or is_draft(path):
-        return False
-    return not path.is_dir() or any(path.iterdir())

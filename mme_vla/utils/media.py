@@ -37,17 +37,19 @@ class VideoWriter:
     """
 
     def __init__(
-        self, target: Path | BinaryIO, fps: float = FPS, crf: int = 20, preset: str = "veryfast"
+        self,
+        target: Path | str | BinaryIO,
+        fps: float = FPS,
+        crf: int = 20,
+        preset: str = "veryfast",
     ) -> None:
         import av
 
-        self._container: Any = av.open(
-            str(target) if isinstance(target, Path) else target, "w", format="mp4"
-        )
-        self._rate, self._options = (
-            Fraction(fps),
-            {"crf": str(crf), "preset": preset, "threads": "1", **_routines()},
-        )
+        if isinstance(target, Path):
+            target = str(target)
+        self._container: Any = av.open(target, "w", format="mp4")
+        self._rate = Fraction(fps)
+        self._options = {"crf": str(crf), "preset": preset, "threads": "1", **_routines()}
         self._stream: Any = None
         self.frames = 0
 
@@ -132,7 +134,8 @@ def video_frame(
     Returns:
         Sides are even, as the format wants them.
     """
-    height, width = max(len(view) for view in views), sum(view.shape[1] for view in views)
+    height = max(len(view) for view in views)
+    width = sum(view.shape[1] for view in views)
     canvas = np.zeros((height + height % 2 + CAPTION, width + width % 2, 3), np.uint8)
     left = 0
     for view in views:
@@ -157,7 +160,9 @@ def of_one_size(images: Sequence["Image"]) -> Iterator[np.ndarray]:
     """
     from PIL import Image
 
-    width, height = (-(-max(image.size[axis] for image in images) // 2) * 2 for axis in (0, 1))
+    width = max(image.width for image in images)
+    height = max(image.height for image in images)
+    width, height = width + width % 2, height + height % 2  # as the format wants them
     for image in images:
         canvas = Image.new("RGB", (width, height), "white")
         canvas.paste(image)
@@ -188,19 +193,25 @@ def contact_sheet(
     """
     from PIL import Image, ImageDraw
 
-    rows, columns = -(-len(tiles) // columns), min(columns, len(tiles))
-    width = 2 * MARGIN + max(columns * (side + GAP) - GAP, header.width if header else 0)
-    top = MARGIN + (LABEL + MARGIN if title else 0) + (header.height if header else 0)
+    rows = -(-len(tiles) // columns)
+    columns = min(columns, len(tiles))
+    inner = columns * (side + GAP) - GAP
+    top = MARGIN
+    if title:
+        top += LABEL + MARGIN
+    if header is not None:
+        inner = max(inner, header.width)
+        top += header.height
+    width = 2 * MARGIN + inner
     sheet = Image.new("RGB", (width, top + rows * (side + LABEL + GAP) + MARGIN), "white")
     draw = ImageDraw.Draw(sheet)
     draw.text((MARGIN, MARGIN), fitted(title, width - 2 * MARGIN, 17), INK, font(17))
     if header is not None:
         sheet.paste(header, (MARGIN, top - header.height))
     for place, tile in enumerate(tiles):
-        x, y = (
-            MARGIN + place % columns * (side + GAP),
-            top + place // columns * (side + LABEL + GAP),
-        )
+        row, column = divmod(place, columns)
+        x = MARGIN + column * (side + GAP)
+        y = top + row * (side + LABEL + GAP)
         sheet.paste(thumbnail(tile.image, side), (x, y))
         if tile.outline is not None:
             draw.rectangle(

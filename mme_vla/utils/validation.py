@@ -25,6 +25,9 @@ _TYPES = {
     )
     for problem in ("type", "parsing")
 }
+_TYPES["dataclass_type"] = "a section of keys"
+_TYPES["dict_type"] = "a map of keys"
+_TYPES["tuple_type"] = "a list"
 """What a value must be, by pydantic's names of mistakes."""
 
 
@@ -64,7 +67,9 @@ def _sentence(error: ErrorDetails, kind: Any, what: str, where: str) -> str:
     if rule == "missing":
         meaning = _descriptions(kind).get(str(error["loc"][-1]), "")
         present = listed(value) if isinstance(value, Mapping) and value else "none"
-        lacking = f"{key} ({meaning})" if meaning else key
+        lacking = _key("", error["loc"])
+        if meaning:
+            lacking += f" ({meaning})"
         return f"{what} lacks {lacking}; it has {present}."
     if rule in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _descriptions(kind) if len(error["loc"]) == 1 else {}

@@ -79,16 +79,22 @@ def test_a_signal_is_reported_though_a_finally_fails(
             OSError(errno.ENOSPC, "No space left on device", "a/metrics.jsonl"),
             "a/metrics.jsonl cannot be written",
         ),
-        (OSError(errno.EROFS, "Read-only file system", "b"), "can only be read"),
-        (OSError(errno.EFBIG, "File too large", "b"), "ulimit -f"),
-        (OSError(errno.EMFILE, "Too many open files", "b"), "ulimit -n"),
-        (PermissionError(errno.EACCES, "Permission denied", "b"), "permission is denied"),
+        (
+            OSError(errno.EROFS, "Read-only file system", "b"),
+            "b cannot be written or opened: Read-only file system",
+        ),
+        (OSError(errno.EFBIG, "File too large", "b"), "File too large"),
+        (OSError(errno.EMFILE, "Too many open files", "b"), "Too many open files"),
+        (PermissionError(errno.EACCES, "Permission denied", "b"), "Permission denied"),
         (
             OSError("Unable to create file (name = 'c.h5', errno = 28, error message = '…')"),
-            "c.h5 cannot be written",
+            "c.h5",
         ),
-        (RuntimeError("I/O error: No space left on device (os error 28)"), "no room left"),
-        (OSError("4000 requested and 96 written"), "no room left"),
+        (
+            RuntimeError("I/O error: No space left on device (os error 28)"),
+            "No space left on device",
+        ),
+        (OSError("4000 requested and 96 written"), "No space left on device"),
     ],
 )
 def test_what_the_disk_refuses_is_reported_in_one_sentence(

@@ -197,7 +197,7 @@ def test_a_training_that_begins_anew_removes_drafts_alone(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("output", "reason"),
-    [("file.txt", "a file is where a folder has to be"), ("file.txt/run", "a part of its path")],
+    [("file.txt", "File exists"), ("file.txt/run", "Not a directory")],
 )
 def test_an_output_in_the_place_of_a_file_is_named(
     output: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -206,5 +206,5 @@ def test_an_output_in_the_place_of_a_file_is_named(
     with pytest.raises(SystemExit), print_user_errors():
         (tmp_path / output).mkdir(parents=True, exist_ok=True)  # as Hydra makes a run's folder
     error = capsys.readouterr().err
-    assert f"{output} cannot be written or opened: {reason}" in error and "Choose another" in error
+    assert f"{output} cannot be written or opened: {reason}" in error and "choose another" in error
     assert (tmp_path / "file.txt").read_text() == "mine"

@@ -32,7 +32,7 @@ from helpers.lerobot_tables import (
     write_video,
 )
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.lerobot_files import SAMPLE, content_fingerprint, lossy_coding
+from mme_vla.data.lerobot_files import SAMPLE, EpisodeTable, Feature, Info, content_fingerprint
 from mme_vla.data.sources import open_sources
 from mme_vla.errors import UserError
 
@@ -237,14 +237,8 @@ def test_rounded_time_stamps_of_long_episodes_are_in_order(tmp_path: Path, fps: 
     from mme_vla.data import consistency
 
     frames = np.arange(3 * 3600 * int(fps))  # three hours in float32
-    dataset: Any = consistency.Description(
-        tmp_path,
-        {"features": {}},
-        {"starts": np.array([0]), "lengths": np.array([len(frames)])},
-        fps,
-        (),
-        (),
-    )
+    episodes = EpisodeTable(np.array([0]), np.array([len(frames)]), [()], None, {})
+    dataset = consistency.Description(tmp_path, Info(features={}, fps=fps), episodes, (), ())
     consistency._check_rows(dataset, {"timestamp": np.float32(frames / fps).astype(np.float64)})
     with pytest.raises(UserError, match="timestamp"):
         consistency._check_rows(dataset, {"timestamp": frames / fps * 1.001})
@@ -547,9 +541,9 @@ def test_numbers_too_large_for_the_robots_unit_are_noticed(tmp_path: Path, caplo
 
 def test_what_is_known_of_a_video_is_read_under_both_names() -> None:
     about = {"video.codec": "av1", "video.crf": 30}
-    assert lossy_coding({"info": about}) == lossy_coding({"video_info": about}) == "av1 at crf 30"
-    assert lossy_coding({"info": {}, "video_info": about}) == "av1 at crf 30"
-    assert lossy_coding({"info": None}) is None
+    for parts in ({"info": about}, {"video_info": about}, {"info": {}, "video_info": about}):
+        assert Feature(dtype="video", shape=(8, 8, 3), **parts).lossy_coding == "av1 at crf 30"
+    assert Feature(dtype="video", shape=(8, 8, 3)).lossy_coding is None
 
 
 @pytest.mark.parametrize("folder", ["data", "meta/episodes"])
