@@ -460,7 +460,7 @@ class RoboMMEEnv(gymnasium.Env):
             possible = [
                 choice.candidates is None
                 or any(
-                    np.linalg.norm(thing.position - base) < _REACH for thing in choice.candidates()
+                    np.linalg.norm(thing.position - base) < _REACH for thing in choice.candidates
                 )
                 for choice in choices
             ]

@@ -159,7 +159,7 @@ class MultiChoice(ActionSpace):
         require(point is not None and len(point), needed)
         pixel = _numbers(point, 2, "a pixel's row and column")
         nearest = min(
-            choice.candidates(),
+            choice.candidates,
             key=lambda thing: float(np.linalg.norm(project(thing.position) - pixel)),
         )
         choice.run(control.demonstrator, nearest)

@@ -95,7 +95,7 @@ class Choice:
     action: str
     run: Callable[["Demonstrator", Any], None]
     """Gets the object the point chose, or None where the option needs no point."""
-    candidates: Callable[[], Sequence["Thing"]] | None = None
+    candidates: Sequence["Thing"] | None = None
     """Objects a point may choose among; an option with candidates needs a point."""
 
     @property

@@ -51,15 +51,13 @@ class PegPrimitives(RobotControl):
         self.announce(end, OPEN)
         self.open()
 
-    def hook(self, cube: Thing, goal: Thing, side: int | None = None) -> None:
+    def hook(self, cube: Thing, goal: Thing) -> None:
         """Draw a cube to a goal with a peg that is held by its tail, then let go.
 
-        Args:
-            side: +1 if the gripper passes the cube on the right of the way (the peg reaches to the
-                left), -1 for the other; by default by the sides of cube and goal.
+        Where the cube stands to the left of the goal, the gripper passes it on the right of the way
+        and the peg reaches to the left, otherwise the other way round.
         """
-        if side is None:
-            side = 1 if cube.position[1] > goal.position[1] else -1
+        side = 1 if cube.position[1] > goal.position[1] else -1
         way, z = _direction(cube, goal), cube.position[2]
         lateral = side * np.array([-way[1], way[0]])
         q, aside = pointing_down(-lateral if self._reversed else lateral), HOOK_ASIDE * lateral

@@ -152,11 +152,15 @@ class Swap:
                 thing.move_to(pose)
 
 
-def sequential_swaps(initiators: Sequence[Thing], group: Sequence[Thing], start: int) -> list[Swap]:
+def sequential_swaps(
+    initiators: Sequence[Thing], group: Sequence[Thing], start: int, steps: int = SWAP_STEPS
+) -> list[Swap]:
     """One swap after another, the first at step `start`; the partner is the nearest object when a
     swap begins.
     """
-    return [Swap(thing, group, start + i * SWAP_STEPS) for i, thing in enumerate(initiators)]
+    return [
+        Swap(thing, group, start + i * steps, steps=steps) for i, thing in enumerate(initiators)
+    ]
 
 
 def blend(a: np.ndarray, b: np.ndarray, alpha: float) -> np.ndarray:
