@@ -103,7 +103,6 @@ class RouteStick(Task):
 
     def cues(self) -> list[Cue]:
         """Of the next move: a disc under its target, and smaller ones along its arc."""
-
         cues = [Cue("yellow", partial(self._arc_point, -1), CUE_RADIUS)]
         for i in DOTS:
             cues.append(Cue("yellow", partial(self._arc_point, i), DOT_RADIUS))

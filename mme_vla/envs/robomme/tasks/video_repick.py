@@ -234,8 +234,9 @@ class VideoRepick(Task):
         ]
 
     def _strayed(self, kind: str, i: int) -> bool:
-        """Whether another cube is up, or the button is down in the window of a stage; in RoboMME-OOD
-        each round has a window of its own.
+        """Whether another cube is up, or the button is down in the window of a stage.
+
+        In RoboMME-OOD each round has a window of its own.
         """
         if any_picked_up(self, self.wrong_cubes):
             return True
