@@ -6,7 +6,7 @@ A task says which objects there are (`plan`, `build`, `start_episode`), what hap
 Everything else is here.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, ClassVar
 
@@ -54,6 +54,8 @@ class Task(Stage):
 
     dials: ClassVar[frozenset[str]] = frozenset()
     """Dials of `metadata.DIALS` that the task has."""
+    evidence_choices: ClassVar[str | None] = None
+    """Letters of the options whose ends show what is to be remembered; None: all of them."""
 
     def __init__(
         self,
@@ -150,21 +152,22 @@ class Task(Stage):
         """
         return ()
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
         """Names of the facts that the present frame shows and that the episode needs later.
 
-        By default the key poses: the end of each sub-task of the video that a policy could choose,
-        or, in a task without a video, of the execution.
+        By default the key poses: the end of each sub-task of the video that a policy could choose
+        (`evidence_choices`), or, in a task without a video, of the execution.
 
         Args:
             ended: the sub-tasks that have ended in the last frames, by their number.
         """
         has_video = any(subtask.video for subtask in self.progress.subtasks)
-        return {
-            f"{i} {subtask.text}"
-            for i, subtask in ended.items()
-            if subtask.choice and subtask.video == has_video
-        }
+        facts = set()
+        for i, subtask in ended.items():
+            counts = self.evidence_choices is None or subtask.choice in self.evidence_choices
+            if subtask.choice and subtask.video == has_video and counts:
+                facts.add(f"{i} {subtask.text}")
+        return facts
 
     def failure(self) -> bool:
         """What counts as failure at any time, whatever the sub-task."""

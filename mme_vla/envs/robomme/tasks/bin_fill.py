@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -23,7 +23,6 @@ from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import (
     add_button,
-    choices_made,
     press,
     press_choice,
 )
@@ -51,6 +50,7 @@ class BinFill(Task):
     spectator = ((1, 0, 0.4), (0, 0, 0.4))
     latch_failure = True
     recovery_sampled_per_episode = True
+    evidence_choices = "b"
 
     def build(self, draws: Draws) -> None:
         values = self.values
@@ -231,9 +231,6 @@ class BinFill(Task):
                     cube.move_to(IN_BIN)
                     return True
         return False
-
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        return choices_made(ended, "b", video=False)
 
     def choices(self) -> list[Choice]:
         return [

@@ -2,7 +2,7 @@
 pick up just those.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, Highlight, active_motions, under
@@ -92,7 +92,7 @@ class PickHighlight(Task):
         for highlight in self.highlights:
             highlight.apply(k)
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
         return active_motions(self.highlights)
 
     def failure(self) -> bool:

@@ -2,8 +2,6 @@
 button.
 """
 
-from collections.abc import Collection, Mapping
-
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, row, tally
 from mme_vla.envs.robomme.scene.objects import H
@@ -15,7 +13,6 @@ from mme_vla.envs.robomme.tasks.families.stages import (
     add_cubes,
     add_distractors,
     add_target,
-    choices_made,
     choose_cube,
     pick,
     place,
@@ -40,6 +37,7 @@ class PickXtimes(Task):
 
     latch_failure = True
     dials = frozenset({"count"})
+    evidence_choices = "b"
 
     def plan(self, draws: Draws) -> None:
         self.repetitions = sample_repetitions(self, draws, REPETITIONS[self.difficulty])
@@ -103,9 +101,6 @@ class PickXtimes(Task):
     def _mistaken(self) -> str:
         """Stopping too early is a count forgotten; which cube, the goal says."""
         return "how many" if pressed(self.button) else ""
-
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        return choices_made(ended, "b", video=False)
 
     def choices(self) -> list[Choice]:
         return [

@@ -3,7 +3,7 @@ right visit.
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import sapien
@@ -115,10 +115,10 @@ class StopCube(Task):
             return not (self._on_target() and self._in_time())
         return self.steps_done > self.deadline
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
         if self.stopped_at is None and self._on_target():
             return {f"visit {self.steps_done // self.interval}"}
-        return ()
+        return set()
 
     def checkpoints(self) -> list[int]:
         """Steps until which the arm waits: every 100th, then the one at which to press."""

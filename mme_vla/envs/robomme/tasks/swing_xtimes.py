@@ -2,8 +2,6 @@
 the button.
 """
 
-from collections.abc import Collection, Mapping
-
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import TALLY_SPACING, Cue, Mark, build_mark, tally
 from mme_vla.envs.robomme.scene.objects import Cube, Disc, H
@@ -16,7 +14,6 @@ from mme_vla.envs.robomme.tasks.families.stages import (
     add_cubes,
     add_distractors,
     add_target,
-    choices_made,
     choose_cube,
     pick,
     press,
@@ -71,6 +68,7 @@ class SwingXtimes(Task):
 
     latch_failure = True
     dials = frozenset({"count"})
+    evidence_choices = "b"
 
     def plan(self, draws: Draws) -> None:
         self.repetitions = sample_repetitions(self, draws, SWINGS[self.difficulty])
@@ -166,9 +164,6 @@ class SwingXtimes(Task):
     def _mistaken(self) -> str:
         """Swings too few or too many are a count forgotten; which cube, the goal says."""
         return "" if any_picked_up(self, self.wrong_cubes) else "how many"
-
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        return choices_made(ended, "b", video=False)
 
     def choices(self) -> list[Choice]:
         return [

@@ -2,7 +2,7 @@
 now.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import (
@@ -23,7 +23,6 @@ from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import (
     add_button,
     add_cube,
-    choices_made,
     delay,
     end_video,
     go_home,
@@ -54,6 +53,7 @@ class VideoRepick(Task):
     latch_failure = True
     recovery_sampled_per_episode = True
     dials = frozenset({"count", "delay"})
+    evidence_choices = "a"
 
     def plan(self, draws: Draws) -> None:
         self.repetitions = self.values.integer(
@@ -153,9 +153,12 @@ class VideoRepick(Task):
 
         return [under(self.cube), *tally(row(self.repetitions), left)]
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        ended_choices = choices_made(ended, "a", video=True) | choices_made(ended, "b", video=False)
-        return ended_choices | active_motions(self.swaps)
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
+        facts = super().evidence(ended) | active_motions(self.swaps)
+        for i, subtask in ended.items():
+            if subtask.choice == "b" and not subtask.video:  # one repetition is done
+                facts.add(f"{i} {subtask.text}")
+        return facts
 
     def failure(self) -> bool:
         """Notes whether the swaps may begin, one step after their stage is entered; the rules

@@ -2,7 +2,7 @@
 them down.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -269,7 +269,7 @@ class Unmask(ContainerTask):
                 return
             self.containers.append(container)
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
         return active_motions(self.covers[:1])
 
     def start_episode(self, draws: Draws) -> None:
@@ -382,7 +382,7 @@ class UnmaskSwap(ContainerTask):
         """The step at which the last swap ends."""
         return COVER_STEPS + self.swap_steps * self.swap_count
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
         return active_motions(self.visible_motions)
 
     def start_episode(self, draws: Draws) -> None:

@@ -1,6 +1,6 @@
 """Sub-tasks, options and placements that several tasks share."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TypedDict, Unpack
 
 import numpy as np
@@ -322,17 +322,6 @@ def end_stick_video(env: Task, steps: int = 30) -> list[SubTask]:
             video=True,
         ),
     ]
-
-
-def choices_made(ended: Mapping[int, SubTask], letters: str, video: bool) -> set[str]:
-    """Of the sub-tasks that have ended, those of the video or of the execution that are one of some
-    options.
-    """
-    return {
-        f"{i} {subtask.text}"
-        for i, subtask in ended.items()
-        if subtask.choice and subtask.choice in letters and subtask.video == video
-    }
 
 
 # Options of multi-choice --------------------------------------------------------------------------

@@ -3,7 +3,7 @@ of them again.
 """
 
 from abc import abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import ClassVar
 
 import sapien
@@ -19,7 +19,6 @@ from mme_vla.envs.robomme.tasks.families.stages import (
     add_cubes,
     add_target,
     check_colour,
-    choices_made,
     delay,
     end_video,
     go_home,
@@ -60,6 +59,7 @@ class VideoPlace(Task):
     """
 
     dials = frozenset({"delay"})
+    evidence_choices = "bc"
     spot_radius: ClassVar[float]
     """How far the spot where the video puts the cube at its end stays from the edge of
     its region.
@@ -148,8 +148,8 @@ class VideoPlace(Task):
     def cues(self) -> list[Cue]:
         return [under(self.goal_target)]
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        facts = choices_made(ended, "bc", video=True)
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
+        facts = super().evidence(ended)
         if self._swap is not None:
             facts |= active_motions([self._swap])
         return facts
