@@ -80,7 +80,8 @@ def choose_episodes(
 
 def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
     """The value of `tasks=`, or of `task=`, which means the same."""
-    names, task = config.get("tasks"), config.get("task")
+    names: Any = config.get("tasks")
+    task = config.get("task")
     if task is not None:
         is_one = names in (None, ALL, task)
         require(is_one, f"tasks={names} and task={task} mean the same: give one of them.")

@@ -162,7 +162,7 @@ class Observer:
         """
         self._taken = set()
         qpos = self.task.qpos
-        fingers = np.zeros(2)
+        fingers: np.ndarray = np.zeros(2)
         if not self.task.stick:
             fingers = qpos[-2:].astype(np.float32)
         frame: dict[str, Any] = {

@@ -371,17 +371,17 @@ def make_vec_env(
     names = [tasks] if isinstance(tasks, str) else list(tasks)
     require(names, "No task given; expected a task name or several.")
     source = environment(env)
-    if factory is make_env:
-        source.check_installed()
-        if env != ROBOMME:
-            factory = partial(open_episode, env)
     jobs = []
     for name in names:
-        if factory is make_env:
+        if factory is make_env and env == ROBOMME:
             check_names(name, action_space, None, None)
         numbers = episodes
         if numbers is None:
             numbers = range(len(source.episodes(name, split)))
         for number in numbers:
             jobs.append(Job(name, split, source.episode(name, split, number).episode))
+    if factory is make_env:
+        source.check_installed()
+        if env != ROBOMME:
+            factory = partial(open_episode, env)
     return VecEnv(jobs, workers, factory, {"action_space": action_space, **options}, timeout)

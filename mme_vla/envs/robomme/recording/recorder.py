@@ -202,7 +202,7 @@ class Recorder:
         self._in_video = video
 
     def _observation(self, evaluated: dict[str, Any]) -> dict[str, Any]:
-        cameras = CAMERAS
+        cameras: tuple[str, ...] = CAMERAS
         if self._render_request is not None:
             cameras = self._render_request.cameras(self._result.stored, newest=False)
         frame = self._observer.frame(evaluated, cameras)

@@ -73,17 +73,14 @@ class PegPrimitives(RobotControl):
         self.announce(end, OPEN)
         self.open()
 
-    def grasp_peg(self, peg: Peg, end: Thing | PegEnd, flip: bool = False) -> None:
+    def grasp_peg(self, peg: Peg, end: PegEnd, flip: bool = False) -> None:
         """Grasp a peg by one of its ends and lift it.
 
         Args:
-            end: `peg.head` or `peg.tail`, or its name.
             flip: hold the hand the other way round.
         """
         self.open()
-        if isinstance(end, str):
-            end = getattr(peg, end)
-        grasp = _peg_grasp(end, flip)
+        grasp = _peg_grasp(getattr(peg, end), flip)
         self._reversed = bool(self.env.tier) and _looks_back(grasp)
         if self._reversed:
             grasp = sapien.Pose(grasp.p, turned(grasp.q, "z", np.pi))
@@ -93,7 +90,7 @@ class PegPrimitives(RobotControl):
         self.move_to(self.at([*grasp.p[:2], ABOVE_PEG], grasp.q), CLOSE)
         self.close()
 
-    def insert_peg(self, peg: Peg, grasped_end: Thing | PegEnd, side: int, box: Thing) -> None:
+    def insert_peg(self, peg: Peg, grasped_end: PegEnd, side: int, box: Thing) -> None:
         """Put the free end of a held peg into the hole of a box, as the benchmark's demonstrator
         does.
 
@@ -105,7 +102,7 @@ class PegPrimitives(RobotControl):
             side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
             box: its hole runs along its x axis, which points to the left.
         """
-        head_first = grasped_end in ("tail", peg.tail)
+        head_first = grasped_end == "tail"
         free = peg.head if head_first else peg.tail
         outward = -1 if head_first else 1
         flip = head_first != (side > 0)
@@ -129,14 +126,14 @@ class PegPrimitives(RobotControl):
         self.move_to(station(-INSERT_PAST), CLOSE)
 
     def insert_peg_fully(
-        self, peg: Peg, grasped_end: Thing | PegEnd, side: int, box: Thing, begun: bool = False
+        self, peg: Peg, grasped_end: PegEnd, side: int, box: Thing, begun: bool = False
     ) -> None:
         """Put the free end of a held peg into the middle of a box, whichever way the hand holds it.
 
         Args:
             begun: the peg is in the hole already; the other arguments are those of `insert_peg`.
         """
-        head_first = grasped_end in ("tail", peg.tail)
+        head_first = grasped_end == "tail"
         free = peg.head if head_first else peg.tail
         hole = box.pose
         if head_first != (side > 0):
