@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from mme_vla.envs.robomme.scene.motions import Cue, build_cue, show_cue
+from mme_vla.envs.robomme.scene.motions import Cue, Motion, build_cue, show_cue
 from mme_vla.envs.robomme.scene.objects import Disc
 from mme_vla.envs.robomme.scene.placement import Draws
 from mme_vla.envs.robomme.scene.stage import Stage
@@ -139,7 +139,9 @@ class Task(Stage):
         raise NotImplementedError
 
     def before_physics(self, k: int) -> None:
-        """Scripted changes before the physics of a step; `k` steps have been done."""
+        """Scripted changes before the physics of a step, and before its `motions`; `k` steps have
+        been done.
+        """
 
     def after_step(self, k: int) -> None:
         """Scripted changes after a step's physics, evaluation and observation; `k` steps have been
@@ -203,6 +205,8 @@ class Task(Stage):
         for attempt in range(2):
             for thing in self.things:
                 thing.restore()
+            self.motions: list[Motion] = []
+            """Set by the task: what is moved before the physics of every step."""
             self.start_episode(self.draws)
             subtasks = self.subtasks()
             if self.recovery and (attempt == 0 or self.recovery_sampled_per_episode):
@@ -262,6 +266,8 @@ class Task(Stage):
 
     def _before_control_step(self) -> None:
         self.before_physics(self.steps_done)
+        for motion in self.motions:
+            motion.apply(self.steps_done)
         self._show_cues()
 
     def _show_cues(self) -> None:

@@ -7,7 +7,7 @@ Motions are functions of the number of control steps done, or of the state of th
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import sapien
@@ -49,6 +49,13 @@ def parked(group: int | None, i: int) -> Place:
     if group is None:
         return AWAY
     return 20 + 0.5 * (i % PARKED_ROW), 20 + 0.5 * (4 * group + i // PARKED_ROW), 10.0
+
+
+class Motion(Protocol):
+    """What the script moves before the physics of a step."""
+
+    def apply(self, k: int) -> None:
+        """Move the objects for the step before which `k` steps were done."""
 
 
 class Appear:

@@ -155,11 +155,10 @@ class BinFill(Task):
         )
         self.order = [ORDERED[i] for i in order]
         self.filled: Counter[str] = Counter()
-        self._streams: list[Appear] = []
         if self.streaming:
             for cubes in self.cubes.values():
                 for i, cube in enumerate(cubes[1:], 1):
-                    self._streams.append(Appear(cube, APPEAR_EVERY * i))
+                    self.motions.append(Appear(cube, APPEAR_EVERY * i))
 
     def cues(self) -> list[Cue]:
         """A disc for each cube that is still to be put into the bin, of its colour."""
@@ -173,10 +172,6 @@ class BinFill(Task):
 
     def _missing(self, colour: str) -> int:
         return self.goal[colour] - self.filled[colour]
-
-    def before_physics(self, k: int) -> None:
-        for stream in self._streams:
-            stream.apply(k)
 
     def all_cubes(self) -> list[Cube]:
         """Every cube of the scene."""

@@ -86,11 +86,8 @@ class PickHighlight(Task):
     def start_episode(self, draws: Draws) -> None:
         pairs = zip(self._discs, self.goal_cubes, strict=True)
         self.highlights = [Highlight(disc, cube, *HIGHLIGHTED) for disc, cube in pairs]
+        self.motions = [*self.highlights]
         self.picked: set[Cube] = set()
-
-    def before_physics(self, k: int) -> None:
-        for highlight in self.highlights:
-            highlight.apply(k)
 
     def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
         return active_motions(self.highlights)

@@ -144,8 +144,7 @@ class VideoRepick(Task):
                 self.swaps = planned_swaps(self.pairs, self.cubes, start=k)
             else:
                 self.swaps = sequential_swaps(self.initiators, self.cubes, start=k)
-        for swap in self.swaps:
-            swap.apply(k)
+            self.motions = [*self.swaps]
 
     def cues(self) -> list[Cue]:
         def left() -> int:

@@ -270,17 +270,12 @@ class Unmask(ContainerTask):
             self.containers.append(container)
 
     def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
-        return active_motions(self.covers[:1])
+        return active_motions([self.cover])
 
     def start_episode(self, draws: Draws) -> None:
-        self.covers = [
-            Cover(self.containers, self.parking_group("inner")),
-            Cover(self.outer.containers, self.parking_group("outer")),
-        ]
-
-    def before_physics(self, k: int) -> None:
-        for cover in self.covers:
-            cover.apply(k)
+        self.cover = Cover(self.containers, self.parking_group("inner"))
+        outer = Cover(self.outer.containers, self.parking_group("outer"))
+        self.motions = [self.cover, outer]
 
 
 CONTAINERS = {"easy": 3, "medium": 4, "hard": 4}
@@ -395,7 +390,7 @@ class UnmaskSwap(ContainerTask):
         cover = Cover(inner, self.parking_group("inner"))
         pairs = list(zip(self.cubes, self.over_cubes, strict=True))
         self.visible_motions: list[Cover | Swap] = [cover, *swaps]
-        self.motions: list[Cover | Swap | Hide] = [
+        self.motions = [
             cover,
             Cover(outer, self.parking_group("outer")),
             *swaps,
@@ -403,7 +398,3 @@ class UnmaskSwap(ContainerTask):
             Hide(pairs, start, end, self.parking_group("inner cubes")),
             Hide(self.outer.hidden, start, end, self.parking_group("outer cubes")),
         ]
-
-    def before_physics(self, k: int) -> None:
-        for motion in self.motions:
-            motion.apply(k)

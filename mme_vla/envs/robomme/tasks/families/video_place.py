@@ -135,24 +135,21 @@ class VideoPlace(Task):
 
     def start_episode(self, draws: Draws) -> None:
         self._homes = {cube: Place(cube) for cube in self.cubes}
-        self._swap: Swap | None = None
+        self._swaps: list[Swap] = []
         self._swap_due = False
 
     def before_physics(self, k: int) -> None:
-        if self._swap_due and self._swap is None:
+        if self._swap_due and not self._swaps:
             first, second = self._swapped
-            self._swap = Swap(first, self.targets, start=k, lane=SWAP_LANE, partner=second)
-        if self._swap is not None:
-            self._swap.apply(k)
+            swap = Swap(first, self.targets, start=k, lane=SWAP_LANE, partner=second)
+            self._swaps = [swap]
+            self.motions = [swap]
 
     def cues(self) -> list[Cue]:
         return [under(self.goal_target)]
 
     def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
-        facts = super().evidence(ended)
-        if self._swap is not None:
-            facts |= active_motions([self._swap])
-        return facts
+        return super().evidence(ended) | active_motions(self._swaps)
 
     def failure(self) -> bool:
         """Notes whether the swap may begin, one step after its stage is entered; the rules belong
