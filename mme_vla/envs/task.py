@@ -139,9 +139,11 @@ class Task(Stage):
         raise NotImplementedError
 
     def before_physics(self, k: int) -> None:
-        """Scripted changes before the physics of a step, and before its `motions`; `k` steps have
+        """Scripted changes before the physics of a step, by default the `motions`; `k` steps have
         been done.
         """
+        for motion in self.motions:
+            motion.apply(k)
 
     def after_step(self, k: int) -> None:
         """Scripted changes after a step's physics, evaluation and observation; `k` steps have been
@@ -266,8 +268,6 @@ class Task(Stage):
 
     def _before_control_step(self) -> None:
         self.before_physics(self.steps_done)
-        for motion in self.motions:
-            motion.apply(self.steps_done)
         self._show_cues()
 
     def _show_cues(self) -> None:

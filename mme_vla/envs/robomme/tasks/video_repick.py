@@ -145,6 +145,7 @@ class VideoRepick(Task):
             else:
                 self.swaps = sequential_swaps(self.initiators, self.cubes, start=k)
             self.motions = [*self.swaps]
+        super().before_physics(k)
 
     def cues(self) -> list[Cue]:
         def left() -> int:

@@ -144,6 +144,7 @@ class VideoPlace(Task):
             swap = Swap(first, self.targets, start=k, lane=SWAP_LANE, partner=second)
             self._swaps = [swap]
             self.motions = [swap]
+        super().before_physics(k)
 
     def cues(self) -> list[Cue]:
         return [under(self.goal_target)]
