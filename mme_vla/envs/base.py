@@ -134,19 +134,21 @@ class Environment(ABC):
         """Make sure that a policy with this robot can be evaluated here."""
         if self.embodiment is None:
             return
-        mine = Embodiment.from_dict(self.embodiment)
-        for what, here, there in (
-            ("cameras", set(robot.camera_names) - set(mine.camera_names), set[str]()),
-            ("numbers of the state", robot.state.width, mine.state.width),
-            ("numbers of an action", robot.action.width, mine.action.width),
-        ):
-            require(
-                here == there,
-                f"The robot {robot.name!r} of this policy does not fit the environment's"
-                f" {mine.name!r}, which has the cameras {', '.join(mine.camera_names)},"
-                f" {mine.state.width} numbers of state and {mine.action.width} of an action"
-                f" ({what}). Train with env=<this environment>.",
-            )
+        local = Embodiment.from_dict(self.embodiment)
+        misfits = []
+        if set(robot.camera_names) - set(local.camera_names):
+            misfits.append("cameras")
+        if robot.state.width != local.state.width:
+            misfits.append("numbers of the state")
+        if robot.action.width != local.action.width:
+            misfits.append("numbers of an action")
+        require(
+            not misfits,
+            f"The robot {robot.name!r} of this policy does not fit the environment's"
+            f" {local.name!r}, which has the cameras {', '.join(local.camera_names)},"
+            f" {local.state.width} numbers of state and {local.action.width} of an action"
+            f" ({', '.join(misfits)}). Train with env=<this environment>.",
+        )
 
     def episode(self, task: str, split: str, number: int) -> EpisodeSpec:
         """One episode of a split."""
@@ -179,7 +181,10 @@ class Environment(ABC):
 
     def suite_of(self, task: str) -> str | None:
         """The suite of a task."""
-        return next((suite for suite, tasks in self.suites.items() if task in tasks), None)
+        for suite, tasks in self.suites.items():
+            if task in tasks:
+                return suite
+        return None
 
     def open(
         self,
@@ -201,6 +206,22 @@ def environment(name: str) -> Environment:
     """The environment of this name."""
     made: Environment = ENVS[name]()
     return made
+
+
+def open_episode(
+    env: str,
+    task: str,
+    split: str,
+    episode: int,
+    *,
+    action_space: str | None = None,
+    max_steps: int | None = None,
+    render: bool = True,
+) -> Any:
+    """One episode of the environment of this name; importable by worker processes."""
+    return environment(env).open(
+        task, split, episode, action_space=action_space, max_steps=max_steps, render=render
+    )
 
 
 class EpisodeEnv:
@@ -225,9 +246,14 @@ class EpisodeEnv:
         max_steps: int,
         by_choice: bool = False,
     ) -> None:
-        self.environment, self.env, self.spec = environment, env, spec
-        self.max_steps, self._by_choice = max_steps, by_choice
-        self.goal, self._steps, self._limit = "", 0, max_steps
+        self.environment = environment
+        self.env = env
+        self.spec = spec
+        self.max_steps = max_steps
+        self.goal = ""
+        self._by_choice = by_choice
+        self._steps = 0
+        self._limit = max_steps
         self._choices: dict[str, Actions] = {}
         self.scene_digest = NOT_BUILT
 
@@ -238,19 +264,23 @@ class EpisodeEnv:
             isinstance(info.get("goal"), str),
             f"{self.spec.task}: reset() must return the goal in info['goal'].",
         )
-        self.goal, self._steps, self._limit = info["goal"], 0, self.max_steps
+        self.goal = info["goal"]
+        self._steps = 0
+        self._limit = self.max_steps
         values = self.environment.scene_values(self.env)
         self.scene_digest = NO_VALUES if values is None else scene_digest(values)
         return self._lists([*info.get("video", ()), observation]), self._info(info, False, False)
 
     def step(self, action: Any) -> tuple[dict[str, list[Any]], float, bool, bool, dict[str, Any]]:
         """Perform one action, all actions of a choice, or a `Hold`."""
-        frames, total = [], 0.0
+        parts: Actions = [action]
         if isinstance(action, Hold):
-            parts: Actions = [self.hold_action] * action.steps
+            parts = [self.hold_action] * action.steps
             self._limit += action.steps
-        else:
-            parts = self._choices[action["choice"].lower()] if self._by_choice else [action]
+        elif self._by_choice:
+            parts = self._choices[action["choice"].lower()]
+        frames = []
+        total = 0.0
         for part in parts:
             observation, reward, terminated, truncated, info = self.env.step(part)
             frames.append(observation)
@@ -270,9 +300,9 @@ class EpisodeEnv:
         """The choice that a script takes next; None where the environment has no method `oracle()`,
         or this says so.
         """
-        choice: Mapping[str, Any] | None = (
-            self.env.oracle() if hasattr(self.env, "oracle") else None
-        )
+        if not hasattr(self.env, "oracle"):
+            return None
+        choice: Mapping[str, Any] | None = self.env.oracle()
         return choice
 
     def close(self) -> None:
@@ -301,45 +331,52 @@ class EpisodeEnv:
             yield observation, action, False
             observation, _, terminated, truncated, info = self.env.step(action)
             self.success = bool(info.get("success", False))
-            if terminated or truncated or (action := next(actions, None)) is None:
+            if terminated or truncated:
+                return
+            action = next(actions, None)
+            if action is None:
                 return
 
     def _lists(self, frames: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
         lists: dict[str, list[Any]] = {
             "state_list": [np.asarray(frame["state"], np.float32) for frame in frames]
         }
-        cameras = [name for name in frames[0] if name != "state"] if frames else []
-        lists |= {
-            f"{name}_rgb_list": [np.asarray(frame[name]) for frame in frames] for name in cameras
-        }
+        if not frames:
+            return lists
+        cameras = [name for name in frames[0] if name != "state"]
+        for name in cameras:
+            lists[f"{name}_rgb_list"] = [np.asarray(frame[name]) for frame in frames]
         if self._by_choice and cameras:
             lists.setdefault("front_rgb_list", lists[f"{cameras[0]}_rgb_list"])  # what `play` shows
         return lists
 
     def _info(self, info: Mapping[str, Any], terminated: bool, truncated: bool) -> dict[str, Any]:
-        success = bool(info.get("success", False))
-        over = "fail" if terminated else "timeout" if truncated else "ongoing"
         report: dict[str, Any] = {
             "task_goal": [self.goal],
-            "status": "success" if success and (terminated or truncated) else over,
+            "status": "ongoing",
             "simple_subgoal_online": str(info.get("subgoal", "")),
         }
-        if (terminated or truncated) and info.get("error_message"):
-            report |= {"status": "error", "error_message": str(info["error_message"])}
-        if self._by_choice and report["status"] == "ongoing":
-            choices, name = (
-                dict(self.environment.choices(self.env)),
-                type(self.environment).__name__,
-            )
+        if terminated or truncated:
+            if info.get("error_message"):
+                report["status"] = "error"
+                report["error_message"] = str(info["error_message"])
+            elif info.get("success", False):
+                report["status"] = "success"
+            else:
+                report["status"] = "fail" if terminated else "timeout"
+        elif self._by_choice:
+            choices = dict(self.environment.choices(self.env))
+            name = type(self.environment).__name__
             require(choices, f"{name} offers no choices to play: implement choices(env).")
             empty = [text for text, actions in choices.items() if not len(actions)]
             require(
                 not empty,
                 f"{name}.choices(env) has no actions for {empty[:1]}: leave it out, or add one.",
             )
-            self._choices = dict(zip(_LETTERS, choices.values(), strict=False))
-            options = [
-                Option(letter, text) for letter, text in zip(_LETTERS, choices, strict=False)
-            ]
-            report["available_multi_choices"] = [option.to_dict() for option in options]
+            self._choices = {}
+            options = []
+            for letter, (text, actions) in zip(_LETTERS, choices.items(), strict=False):
+                self._choices[letter] = actions
+                options.append(Option(letter, text).to_dict())
+            report["available_multi_choices"] = options
         return report

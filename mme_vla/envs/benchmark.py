@@ -1,7 +1,7 @@
 """RoboMME as the entry `mme_vla` of the registry of environments."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import check_benchmark
@@ -18,7 +18,6 @@ class RoboMME(Environment):
     demonstrates them.
     """
 
-    name: ClassVar[str] = "mme_vla"
     tasks = TASK_NAMES
 
     def check_task(self, task: str) -> None:
@@ -45,7 +44,7 @@ class RoboMME(Environment):
 
     def make(self, spec: EpisodeSpec, render: bool = True) -> Any:
         """The episode in joint angles."""
-        return make.make_env(spec.task, spec.split, spec.episode, env=self.name, render=render)
+        return make.make_env(spec.task, spec.split, spec.episode, render=render)
 
     def check_hold(self) -> None:
         """Every episode takes a `Hold`."""
@@ -72,5 +71,15 @@ class RoboMME(Environment):
         finally:
             task.close()
 
-    def open(self, task: str, split: str, episode: int, **options: Any) -> Any:
-        return make.make_env(task, split, episode, env=self.name, **options)
+    def open(
+        self,
+        task: str,
+        split: str,
+        episode: int,
+        *,
+        action_space: str | None = None,
+        max_steps: int | None = None,
+        render: bool = True,
+    ) -> Any:
+        action_space = action_space or make.ACTION_SPACES[0]
+        return make.make_env(task, split, episode, action_space, max_steps=max_steps, render=render)

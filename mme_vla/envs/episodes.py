@@ -22,10 +22,12 @@ def choose_tasks(tasks: str | Sequence[str], env: str = "mme_vla") -> list[str]:
             of names. Tasks of the user's own need the plugin that registers them.
         env: the environment.
     """
-    names = tasks.split(",") if isinstance(tasks, str) else list(tasks)
-    names = [str(name).strip() for name in names]
+    if isinstance(tasks, str):
+        tasks = tasks.split(",")
+    names = [str(name).strip() for name in tasks]
     source = environment(env)
-    names = list(source.tasks) if names == [ALL] else names
+    if names == [ALL]:
+        names = list(source.tasks)
     for name in names:
         source.check_task(name)
     once = names and len(set(names)) == len(names)
@@ -45,13 +47,10 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
     if episodes is None or episodes == ALL:
         return list(range(count))
     if isinstance(episodes, int) and not isinstance(episodes, bool):
-        alone = (
-            f" For number {episodes} alone write episodes=[{episodes}]."
-            if 0 <= episodes < count
-            else ""
-        )
-        first = f"episodes={episodes} means the first {episodes}; {what} has {count}.{alone}"
-        require(1 <= episodes <= count, first)
+        problem = f"episodes={episodes} means the first {episodes}; {what} has {count}."
+        if 0 <= episodes < count:
+            problem += f" For number {episodes} alone write episodes=[{episodes}]."
+        require(1 <= episodes <= count, problem)
         return list(range(episodes))
     ranges = spans(episodes, "episodes", GRAMMAR)
     last = max((span.stop for span in ranges), default=0) - 1
@@ -74,22 +73,25 @@ def choose_episodes(
     specs = []
     for task in choose_tasks(tasks, env):
         known = environment(env).episodes(task, split)
-        specs += [
-            known[number] for number in choose_numbers(episodes, len(known), f"{task} in {split!r}")
-        ]
+        numbers = choose_numbers(episodes, len(known), f"{task} in {split!r}")
+        specs += [known[number] for number in numbers]
     return specs
 
 
 def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
     """The value of `tasks=`, or of `task=`, which means the same."""
-    tasks, task = (config.get(key) for key in ("tasks", "task"))
-    one = task is None or tasks in (None, ALL, task)
-    require(one, f"tasks={tasks} and task={task} mean the same: give one of them.")
-    names: Any = tasks if task is None else task
+    names: Any = config.get("tasks")
+    task = config.get("task")
+    if task is not None:
+        is_one = names in (None, ALL, task)
+        require(is_one, f"tasks={names} and task={task} mean the same: give one of them.")
+        names = task
     require(
         names is not None, "Name the tasks: tasks=StopCube, tasks=[StopCube,BinFill] or tasks=all."
     )
-    return names if isinstance(names, str) else [str(name) for name in names]
+    if isinstance(names, str):
+        return names
+    return [str(name) for name in names]
 
 
 def spans(value: Any, key: str, grammar: str) -> list[range]:
@@ -98,13 +100,11 @@ def spans(value: Any, key: str, grammar: str) -> list[range]:
     Args:
         key, grammar: for messages.
     """
-    parts = (
-        value.split(",")
-        if isinstance(value, str)
-        else value
-        if isinstance(value, Sequence)
-        else [None]
-    )
+    parts: Sequence[Any] = [None]
+    if isinstance(value, str):
+        parts = value.split(",")
+    elif isinstance(value, Sequence):
+        parts = value
     ranges = []
     for part in parts:
         match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))

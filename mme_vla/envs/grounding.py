@@ -17,10 +17,8 @@ PLACE = "<>"
 
 def project(point: np.ndarray) -> np.ndarray:
     """Pixel [y, x] (float64) of a point [3] of the world in the front image."""
-    extrinsic = front_extrinsic().astype(np.float64)
-    x, y, depth = INTRINSIC.astype(np.float64) @ (
-        extrinsic @ np.append(np.asarray(point, np.float64), 1.0)
-    )
+    in_camera = front_extrinsic().astype(np.float64) @ np.append(np.asarray(point, np.float64), 1.0)
+    x, y, depth = INTRINSIC.astype(np.float64) @ in_camera
     return np.array([y, x]) / depth
 
 
@@ -33,7 +31,9 @@ def centroid(segmentation: np.ndarray, ids: Sequence[int]) -> tuple[int, int] | 
         ids: of the objects that share a placeholder.
     """
     rows, columns = np.nonzero(np.isin(segmentation, list(ids)))
-    return (int(rows.mean()), int(columns.mean())) if len(rows) else None
+    if not len(rows):
+        return None
+    return int(rows.mean()), int(columns.mean())
 
 
 def ground(text: str, targets: Sequence["Thing"], segmentation: np.ndarray) -> str | None:
@@ -43,7 +43,9 @@ def ground(text: str, targets: Sequence["Thing"], segmentation: np.ndarray) -> s
     A single `<>` takes all targets together; several take one target each, in order.
     """
     places = text.count(PLACE)
-    groups = [list(targets)] if places == 1 else [[target] for target in targets]
+    groups = [[target] for target in targets]
+    if places == 1:
+        groups = [list(targets)]
     if len(groups) != places or not all(groups):
         raise ValueError(f"{text!r} has {places} places for {len(targets)} targets")
     for group in groups:

@@ -65,12 +65,16 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
     ) -> None:
         check_choice("action_space", action_space, SPACES)
         check_known("reward", reward, REWARDS)
-        limit = step_limit(split) if max_steps is None else max_steps
+        limit = max_steps
+        if limit is None:
+            limit = step_limit(split)
         require(
             type(limit) is int and limit >= 1,
             f"max_steps is {limit!r}; expected a positive integer.",
         )
-        self.task, self.split, self.episode = task, split, episode
+        self.task = task
+        self.split = split
+        self.episode = episode
         self.images = images or render_mode is not None
         self.render_mode = render_mode
         # The environment itself times out a step after its limit, as the benchmark does.
@@ -88,19 +92,19 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         # a fork.
         load_tasks(task)
         self._stick = TASKS[task].stick
-        pose = [_POSITION] * 3 + [_ANGLE] * 3
-        low, high = (
-            (_LOWEST, _HIGHEST) if action_space == "joint_angle" else ([-x for x in pose], pose)
-        )
-        gripper = [] if self._stick else [1.0]
-        self.action_space = gymnasium.spaces.Box(
-            np.array([*low, *(-x for x in gripper)], np.float32),
-            np.array([*high, *gripper], np.float32),
-        )
-        image = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
-        views: dict[str, Any] = dict.fromkeys(CAMERAS, image) if self.images else {}
-        state = gymnasium.spaces.Box(-100.0, 100.0, (_STATE,), np.float32)
-        self.observation_space = gymnasium.spaces.Dict({**views, "state": state})
+        high = np.array([_POSITION] * 3 + [_ANGLE] * 3, np.float32)
+        low = -high
+        if action_space == "joint_angle":
+            low, high = np.array(_LOWEST, np.float32), np.array(_HIGHEST, np.float32)
+        if not self._stick:  # the gripper closes at -1 and opens at 1
+            low, high = np.append(low, np.float32(-1)), np.append(high, np.float32(1))
+        self.action_space = gymnasium.spaces.Box(low, high)
+        spaces: dict[str, gymnasium.Space[Any]] = {}
+        if self.images:
+            image = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
+            spaces |= dict.fromkeys(CAMERAS, image)
+        spaces["state"] = gymnasium.spaces.Box(-100.0, 100.0, (_STATE,), np.float32)
+        self.observation_space = gymnasium.spaces.Dict(spaces)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -131,12 +135,15 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
             self._take(frames)
         steps = self._env.steps_counted - 1  # one passes before the first action
         if steps >= self._limit and not terminated:
-            truncated, info = True, {**info, "status": "timeout"}
+            truncated = True
+            info = {**info, "status": "timeout"}
         return self._copy(), float(reward), bool(terminated), bool(truncated), self._info(info)
 
     def render(self) -> np.ndarray | None:
         """The newest front image [256, 256, 3]."""
-        return self._observation["front"].copy() if self.images and self._observation else None
+        if not self.images or not self._observation:
+            return None
+        return self._observation["front"].copy()
 
     def close(self) -> None:
         """Free the simulator; closing twice is harmless."""
@@ -154,28 +161,27 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         return self._env
 
     def _take(self, frames: Mapping[str, Sequence[Any]]) -> None:
-        state = benchmark_state(frames["joint_state_list"][-1], frames["gripper_state_list"][-1])
-        views = {
-            name: np.asarray(frames[f"{name}_rgb_list"][-1], np.uint8)
-            for name in CAMERAS
-            if self.images
-        }
-        self._observation = {**views, "state": state}
+        self._observation = {}
+        if self.images:
+            for name in CAMERAS:
+                self._observation[name] = np.asarray(frames[f"{name}_rgb_list"][-1], np.uint8)
+        joints, fingers = frames["joint_state_list"][-1], frames["gripper_state_list"][-1]
+        self._observation["state"] = benchmark_state(joints, fingers)
 
     def _copy(self) -> dict[str, np.ndarray]:
         return {name: value.copy() for name, value in self._observation.items()}
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
-        goals = info.get("task_goal")
         status = str(info.get("status", ""))
-        texts = {
-            "goal": goals[0] if goals else "",
+        goals = info.get("task_goal") or [""]
+        report: dict[str, Any] = {
+            "goal": goals[0],
             "subgoal": str(info.get("simple_subgoal_online", "")),
         }
-        reasons = {
-            key: str(info[key]) for key in ("error_message", "exception_type") if info.get(key)
-        }
-        return {**texts, **reasons, "status": status, "success": status == "success"}
+        for key in ("error_message", "exception_type"):
+            if info.get(key):
+                report[key] = str(info[key])
+        return report | {"status": status, "success": status == "success"}
 
 
 for _task in TASK_NAMES:

@@ -38,7 +38,7 @@ from mme_vla.errors import UserError, check_known, require
 from mme_vla.registry import REWARDS
 
 if TYPE_CHECKING:
-    from mme_vla.envs.subtasks import SubTask
+    from mme_vla.envs.subtasks import Choice, SubTask
     from mme_vla.envs.task import Task
 
 log = logging.getLogger(__name__)
@@ -77,14 +77,15 @@ class EpisodeState:
 
     def check(self, other: "EpisodeState") -> None:
         """Make sure that an environment whose own state is `other` can continue from here."""
-        names = [field.name for field in fields(self) if field.name not in ("options", "actions")]
-        pairs = [(name, getattr(self, name), getattr(other, name)) for name in names]
-        differences = ", ".join(
-            f"{name} {value!r} (here {here!r})" for name, value, here in pairs if value != here
-        )
+        differences = []
+        for name in (entry.name for entry in fields(self)):
+            value, present = getattr(self, name), getattr(other, name)
+            if name not in ("options", "actions") and value != present:
+                differences.append(f"{name} {value!r} (here {present!r})")
         require(
             not differences,
-            f"This state is of another environment: {differences}. Make one of the same episode.",
+            f"This state is of another environment: {', '.join(differences)}. Make one of the same"
+            " episode.",
         )
 
 
@@ -134,8 +135,6 @@ class RoboMMEEnv(gymnasium.Env):
             count.
         include: what observations and infos hold beyond the standard keys.
         render: whether there are images.
-        only_possible: mark options whose every object is out of the arm's reach as not possible.
-            The benchmark offers them, and choosing one ends the episode.
         reward: `none`, as in the benchmark, `sparse`, `subtask` (`mme_vla.envs.subtasks`), or your
             own in `REWARDS`.
 
@@ -157,14 +156,14 @@ class RoboMMEEnv(gymnasium.Env):
         include: Include | None = None,
         render: bool = True,
         reward: str = "none",
-        only_possible: bool = False,
     ) -> None:
         is_count = type(max_steps) is int and max_steps >= 1
         require(is_count, f"max_steps is {max_steps!r}; expected a positive integer.")
         check_known("reward", reward, REWARDS)
-        self._space, self._total_reward = action_space(action), REWARDS[reward]
+        self._space = action_space(action)
+        self._total_reward = REWARDS[reward]
         self.include = include or Include()
-        self.max_steps, self._only_possible = max_steps, only_possible
+        self.max_steps = max_steps
         self.on_frame: FrameHook | None = None
         self.render_request: RenderRequest | None = None
         self.render_mode = "rgb_array" if render else None
@@ -275,16 +274,19 @@ class RoboMMEEnv(gymnasium.Env):
 
     def _state(self, options: dict[str, Any], actions: Sequence[Any]) -> EpisodeState:
         task = self.task
-        scene = (
-            type(task).__name__,
-            task.seed,
-            task.difficulty,
-            task.recovery,
-            task.in_view,
-            task.stress,
-            task.row,
+        return EpisodeState(
+            task=type(task).__name__,
+            seed=task.seed,
+            difficulty=task.difficulty,
+            recovery=task.recovery,
+            in_view=task.in_view,
+            stress=task.stress,
+            row=task.row,
+            action_space=self._space.name,
+            max_steps=self.max_steps,
+            options=options,
+            actions=tuple(actions),
         )
-        return EpisodeState(*scene, self._space.name, self.max_steps, options, tuple(actions))
 
     def restore_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Continue from a saved state of the same episode, which may come from another environment
@@ -300,10 +302,8 @@ class RoboMMEEnv(gymnasium.Env):
         state.check(self._state({}, ()))
         hook, request = self.on_frame, self.render_request
         grounded = request is None or request.grounded
-        hidden, newest = (
-            RenderRequest({}, now=(), grounded=grounded),
-            RenderRequest({}, grounded=grounded),
-        )
+        hidden = RenderRequest({}, now=(), grounded=grounded)
+        newest = RenderRequest({}, grounded=grounded)
         self.on_frame = None
         try:
             self.render_request = hidden if state.actions else newest
@@ -424,16 +424,17 @@ class RoboMMEEnv(gymnasium.Env):
         task = self.task
         subtask = run.displayed
         success, fail = evaluated["success"].clone(), evaluated["fail"].clone()
+        status = "ongoing"
+        if success:
+            status = "success"
+        elif fail:
+            status = "fail"
+        elif self._timed_out(run):
+            status = "timeout"
         info: dict[str, Any] = {
             "task_goal": list(task.goals()),
             "simple_subgoal_online": subtask.text,
-            "status": "success"
-            if success
-            else "fail"
-            if fail
-            else "timeout"
-            if self._timed_out(run)
-            else "ongoing",
+            "status": status,
             "success": success,
             "fail": fail,
             "elapsed_steps": evaluated["elapsed_steps"].clone(),
@@ -451,22 +452,21 @@ class RoboMMEEnv(gymnasium.Env):
     def _options(self) -> list[dict[str, Any]]:
         """What the task offers to choose from."""
         choices = self.task.choices()
-        options: list[dict[str, Any]] = [
-            {"label": choice.label, "action": choice.action, "need_parameter": choice.needs_point}
-            for choice in choices
-        ]
-        if self._only_possible:
-            base = self.task.agent.robot.pose.sp.p
-            possible = [
-                choice.candidates is None
-                or any(
-                    np.linalg.norm(thing.position - base) < _REACH for thing in choice.candidates()
-                )
-                for choice in choices
-            ]
-            for option, here in zip(options, possible, strict=True):
-                option["possible"] = here or not any(possible)
+        options = [choice.to_dict() for choice in choices]
+        if self.include.possible:
+            possible = [self._is_possible(choice) for choice in choices]
+            if not any(possible):  # something has to be chosen
+                possible = [True] * len(choices)
+            for option, flag in zip(options, possible, strict=True):
+                option["possible"] = flag
         return options
+
+    def _is_possible(self, choice: "Choice") -> bool:
+        """Whether an object that an option fits is within the arm's reach."""
+        if choice.candidates is None:
+            return True
+        base = self.task.agent.robot.pose.sp.p
+        return any(np.linalg.norm(thing.position - base) < _REACH for thing in choice.candidates)
 
     def _timed_out(self, run: _Run) -> bool:
         return run.count >= self.max_steps + run.hold_steps + _MARGIN

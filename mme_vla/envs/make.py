@@ -1,6 +1,7 @@
 """`make_env`: one benchmark episode as an environment, in one line."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -34,12 +35,11 @@ def make_env(
     row: Mapping[str, Any] | None = None,
     render: bool = True,
     reward: str = "none",
-    env: str = "mme_vla",
-    sessions: int = 0,
-    only_possible: bool = False,
-    **include: bool,
+    include: Include | None = None,
 ) -> "RoboMMEEnv":
-    """Make the environment of one episode.
+    """Make the environment of one episode of RoboMME.
+
+    Environments of the user's own are opened by `environment(name).open(task, split, episode)`.
 
     Args:
         task: one of the 16 task names, or a task of your own registered in `TASKS`.
@@ -62,62 +62,40 @@ def make_env(
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds.
             `subtask`: an equal share for each sub-task of the execution as it is done, 1 in all. Or
             your own, registered in `REWARDS`.
-        env: `mme_vla`, or an environment of the user's own. Of the options the latter reads
-            `max_steps`, `render` and the action space `multi_choice`.
-        sessions: unrelated episodes that the caller shows the policy first, as
-            `split=stress:sessions=<n>` requires.
-        only_possible: by choices, mark options that no object within reach fits (`RoboMMEEnv`).
-        include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,
-            `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`,
-            `include_wrist_camera_intrinsic`, `include_available_multi_choices`,
-            `include_maniskill_obs`.
+        include: what observations and infos hold beyond the standard keys, such as
+            `Include(front_depth=True)`.
 
     Returns:
         The environment; call `reset()` first. Close it when done.
     """
-    if env != ROBOMME:
-        from mme_vla.envs.base import environment
-
-        options: Any = {"action_space": action_space, "max_steps": max_steps, "render": render}
-        opened: Any = environment(env).open(task, split, episode, **options)
-        return opened
     check_names(task, action_space, difficulty, seed)
-    check_sessions(split, sessions)
-    max_steps = metadata.step_limit(split) if max_steps is None else max_steps
+    check_sessions(split, 0)
+    if max_steps is None:
+        max_steps = metadata.step_limit(split)
     scene: dict[str, Any] = {"seed": seed, "difficulty": difficulty}
     if row is not None:
         spec = metadata.read_row(row)
-        fits = spec.task == task and seed is None
         require(
-            fits,
+            spec.task == task and seed is None,
             f"row is a scene of {spec.task} with its own seed: name that task, and leave out seed.",
         )
         scene = spec.options
     elif seed is None:
         scene = metadata.episode(task, split, episode).options
+    if recovery is not None:
+        scene["recovery"] = recovery
+    include = include or Include()
     if action_space == "multi_choice":
         # A policy that chooses a pixel needs the front camera's matrices.
-        include = include | {
-            "include_front_camera_extrinsic": True,
-            "include_front_camera_intrinsic": True,
-        }
-    included = Include.from_options(include)
-    obs_mode = (
-        ("rgb+depth+segmentation" if render else "state_dict") if included.maniskill_obs else "none"
-    )
+        include = replace(include, front_camera_extrinsic=True, front_camera_intrinsic=True)
+    obs_mode = "none"
+    if include.maniskill_obs:
+        obs_mode = "rgb+depth+segmentation" if render else "state_dict"
     require_simulator()
     from mme_vla.envs.interface import RoboMMEEnv
 
-    scene |= {} if recovery is None else {"recovery": recovery}
-    return RoboMMEEnv(
-        make_task(task, render=render, obs_mode=obs_mode, **scene),
-        action_space,
-        max_steps,
-        included,
-        render,
-        reward,
-        only_possible,
-    )
+    simulated = make_task(task, render=render, obs_mode=obs_mode, **scene)
+    return RoboMMEEnv(simulated, action_space, max_steps, include, render, reward)
 
 
 def check_sessions(split: str, sessions: int) -> None:
@@ -128,7 +106,8 @@ def check_sessions(split: str, sessions: int) -> None:
         required == sessions,
         f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown."
         " `python -m mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded"
-        " ones; other callers declare them: make_env(…, sessions=2).",
+        " ones; callers that show them themselves make the scenes of split=test, which are the"
+        " same.",
     )
 
 

@@ -76,9 +76,10 @@ DEFAULT_STEPS = 1300
 
 def step_limit(split: str) -> int:
     """Control steps that an episode of a split may take, the conditioning video not counted."""
-    variant = read_variant(split)
-    base = split if variant is None else variant.base
-    return STEPS.get(OOD if is_row_split(base) else base, DEFAULT_STEPS)
+    base = base_of(split)
+    if is_row_split(base):
+        base = OOD
+    return STEPS.get(base, DEFAULT_STEPS)
 
 
 @dataclass(frozen=True)
@@ -94,10 +95,12 @@ class Variant:
     @property
     def options(self) -> dict[str, Any]:
         """Keyword arguments of the task."""
-        stress = (
-            {"stress": {self.dial: self.turned}} if self.turned and self.dial != SESSIONS else {}
-        )
-        return stress | ({"in_view": True} if self.twin else {})
+        options: dict[str, Any] = {}
+        if self.turned and self.dial != SESSIONS:
+            options["stress"] = {self.dial: self.turned}
+        if self.twin:
+            options["in_view"] = True
+        return options
 
     @property
     def sessions(self) -> int:
@@ -106,11 +109,11 @@ class Variant:
 
     def check(self, task: str) -> None:
         """Make sure that a task of the benchmark can be varied so."""
-        alone = (
+        require(
+            task in TASK_NAMES,
             f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is"
-            " none."
+            " none.",
         )
-        require(task in TASK_NAMES, alone)
         if self.dial and self.dial != SESSIONS:
             dials = ", ".join(dial for dial, tasks in DIALS.items() if task in tasks) or "none"
             which = f"it has {dials}. {self.dial} is for {', '.join(DIALS[self.dial])}."
@@ -123,8 +126,8 @@ def read_variant(split: str) -> Variant | None:
         return Variant(twin=True)
     if str(split).startswith(f"{TWIN}:"):
         base = split.removeprefix(f"{TWIN}:")
-        varied = read_variant(base)
-        return Variant(twin=True, base=base) if varied is None else replace(varied, twin=True)
+        varied = read_variant(base) or Variant(base=base)
+        return replace(varied, twin=True)
     if not str(split).startswith(STRESS):
         return None
     match, known = _STRESS.fullmatch(split), (*DIALS, SESSIONS)
@@ -138,6 +141,12 @@ def read_variant(split: str) -> Variant | None:
         f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], known)}",
     )
     return Variant(dial=match[1], turned=int(match[2]))
+
+
+def base_of(split: str) -> str:
+    """The split whose scenes a variant varies; any other split itself."""
+    variant = read_variant(split)
+    return split if variant is None else variant.base
 
 
 SPLITS = {"train": 100, "val": 50, "test": 50}
@@ -184,25 +193,22 @@ class EpisodeSpec:
     @property
     def options(self) -> dict[str, Any]:
         """Keyword arguments of the task that make this episode's scene."""
+        options: dict[str, Any] = {"seed": self.seed, "difficulty": self.difficulty}
+        if self.row is not None:
+            options = task_options(self.row)
         variant = read_variant(self.split)
-        varied = {} if variant is None else variant.options
-        scene = (
-            {"seed": self.seed, "difficulty": self.difficulty}
-            if self.row is None
-            else task_options(self.row)
-        )
-        return scene | varied
+        if variant is not None:
+            options |= variant.options
+        return options
 
     @property
     def recovery(self) -> str | None:
         """How the demonstration's one failed grasp misses: `z` in train episodes 0-2, `xy` in 3-5,
         None elsewhere.
         """
-        return (
-            _RECOVERY[self.episode]
-            if self.split == "train" and self.episode < len(_RECOVERY)
-            else None
-        )
+        if self.split != "train" or self.episode >= len(_RECOVERY):
+            return None
+        return _RECOVERY[self.episode]
 
 
 def formula(task: str, split: str, episode: int) -> tuple[int, str]:
@@ -210,8 +216,12 @@ def formula(task: str, split: str, episode: int) -> tuple[int, str]:
     were number 0.
     """
     offset, stride = _FIRST_SEED[split]
-    number = TASK_NAMES.index(task) + 1 if task in TASK_NAMES else 0
-    place = _further_place(split, episode) if split in FURTHER_SPLITS else episode
+    number = 0
+    if task in TASK_NAMES:
+        number = TASK_NAMES.index(task) + 1
+    place = episode
+    if split in FURTHER_SPLITS:
+        place = _further_place(split, episode)
     return offset + stride * number + 100 * place, _CYCLE[place % 4]
 
 
@@ -267,30 +277,27 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
     folder = folder or os.environ.get(FOLDER_VARIABLE)
     if folder:
         return read_official(Path(folder) / split / file_name(task), task, split)
-    spec = find_spec("robomme")
-    for place in (spec.submodule_search_locations or ()) if spec is not None else ():
-        installed = Path(place) / "env_metadata" / split / file_name(task)
-        if installed.is_file():
-            return read_official(installed, task, split)
+    official = find_spec("robomme")
+    if official is not None:
+        for place in official.submodule_search_locations or ():
+            installed = Path(place) / "env_metadata" / split / file_name(task)
+            if installed.is_file():
+                return read_official(installed, task, split)
     return list(_table(split)[task])
 
 
 def check_split(split: str) -> Variant | None:
     """Make sure that a split exists; returns its variant where it has one."""
-    variant = read_variant(split)
-    base = split if variant is None else variant.base
+    base = base_of(split)
     if base not in KNOWN and not is_row_split(base):
-        known = (
-            f"{did_you_mean(str(base), [*KNOWN, TWIN, STRESS])} A file of scenes ends in .jsonl."
-        )
-        raise UserError(f"Unknown split {split!r}. {known}")
-    return variant
+        known = did_you_mean(str(base), [*KNOWN, TWIN, STRESS])
+        raise UserError(f"Unknown split {split!r}. {known} A file of scenes ends in .jsonl.")
+    return read_variant(split)
 
 
 def is_other(split: str) -> bool:
     """Whether a split has other episodes than those that the paper's figures are about."""
-    variant = read_variant(split)
-    base = split if variant is None else variant.base
+    base = base_of(split)
     return base in FURTHER_SPLITS or base in (HARD, CHALLENGE, RESERVED) or is_row_split(base)
 
 
@@ -305,9 +312,8 @@ def read_row(value: Any) -> EpisodeSpec:
 
 
 def _spec_of(row: Mapping[str, Any], split: str, number: int) -> EpisodeSpec:
-    return EpisodeSpec(
-        row["task"], split, number, row["seed"], row.get("tier") or row.get("difficulty", HARD), row
-    )
+    difficulty = row.get("tier") or row.get("difficulty", HARD)
+    return EpisodeSpec(row["task"], split, number, row["seed"], difficulty, row)
 
 
 def episode(
@@ -350,8 +356,9 @@ def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
     specs = []
     for record in records:
         fields: dict[str, Any] = record if isinstance(record, dict) else {}
-        values: list[Any] = [fields.get(key) for key in ("episode", "seed", "difficulty")]
-        number, seed, difficulty = values
+        number: Any = fields.get("episode")
+        seed: Any = fields.get("seed")
+        difficulty: Any = fields.get("difficulty")
         full = all(type(n) is int and 0 <= n < 2**31 for n in (number, seed))
         require(
             full and difficulty in list(_CYCLE),

@@ -22,20 +22,16 @@ if TYPE_CHECKING:
     from mme_vla.envs.task import Task
 
 
-NOTHING: Container[int] = frozenset()
-
-
 @dataclass(frozen=True)
 class RenderRequest:
     """The frames of an episode that are rendered: a control step costs milliseconds, an image of it
     some fifty.
 
     frames: camera (`front`, `wrist`) → numbers of the frames it shows, counted from the reset on,
-    those of the
-        conditioning video first. A `range` may reach beyond the episode's end.
+        those of the conditioning video first. A `range` may reach beyond the episode's end.
     now: the cameras that show, whatever its number, the newest frame of each call of `reset` and
-    `step`. grounded: whether texts need pixels, for which the front camera renders where a sub-task
-    begins.
+        `step`.
+    grounded: whether texts need pixels, for which the front camera renders where a sub-task begins.
     """
 
     frames: Mapping[str, Container[int]] = field(default_factory=dict)
@@ -44,11 +40,12 @@ class RenderRequest:
 
     def cameras(self, frame: int, newest: bool) -> tuple[str, ...]:
         """The cameras that show a frame of this number."""
-        # some environments have more than the benchmark
-        known = dict.fromkeys((*CAMERAS, *self.frames, *self.now))
-        return tuple(
-            c for c in known if frame in self.frames.get(c, NOTHING) or (newest and c in self.now)
-        )
+        cameras = []
+        # some environments have more cameras than the benchmark
+        for camera in dict.fromkeys((*CAMERAS, *self.frames, *self.now)):
+            if frame in self.frames.get(camera, ()) or (newest and camera in self.now):
+                cameras.append(camera)
+        return tuple(cameras)
 
 
 FOCAL_LENGTH = SIDE / 2  # pixels: the side is seen under 90 degrees
@@ -65,7 +62,11 @@ _FRONT_EYE, _FRONT_TARGET = np.array([0.3, 0.0, 0.4]), np.array([0.0, 0.0, -0.2]
 
 @dataclass(frozen=True)
 class Include:
-    """What a frame or an info dict holds beyond the standard keys."""
+    """What a frame or an info dict holds beyond the standard keys.
+
+    possible: with `available_multi_choices`, whether an object that each option fits is within
+        reach. (The benchmark offers such options, and choosing one ends the episode.)
+    """
 
     front_depth: bool = False
     wrist_depth: bool = False
@@ -75,15 +76,19 @@ class Include:
     wrist_camera_intrinsic: bool = False
     available_multi_choices: bool = False
     maniskill_obs: bool = False
+    possible: bool = False
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            require(isinstance(value, bool), f"{name} is {value!r}; expected True or False.")
 
     @classmethod
-    def from_options(cls, options: dict[str, Any]) -> "Include":
-        """Read `include_front_depth=True` and the like."""
-        known = {f"include_{field.name}" for field in fields(cls)}
-        for name, value in options.items():
+    def from_options(cls, options: Mapping[str, Any]) -> "Include":
+        """Read `include_front_depth=True` and the like, as the benchmark names them."""
+        known = {f"include_{field.name}": field.name for field in fields(cls)}
+        for name in options:
             check_known("option", name, known)
-            require(isinstance(value, bool), f"{name} is {value!r}; expected True or False.")
-        return cls(**{name.removeprefix("include_"): value for name, value in options.items()})
+        return cls(**{known[name]: value for name, value in options.items()})
 
 
 class AngleTrack:
@@ -157,10 +162,13 @@ class Observer:
         """
         self._taken = set()
         qpos = self.task.qpos
+        fingers: np.ndarray = np.zeros(2)
+        if not self.task.stick:
+            fingers = qpos[-2:].astype(np.float32)
         frame: dict[str, Any] = {
             "joint_state": qpos[:ARM_JOINTS].astype(np.float32),
             "eef_state": self._eef.copy(),
-            "gripper_state": np.zeros(2) if self.task.stick else qpos[-2:].astype(np.float32),
+            "gripper_state": fingers,
         }
         if self.include.maniskill_obs:
             frame["maniskill_obs"] = self.task.simulator_obs(info)
@@ -170,13 +178,14 @@ class Observer:
         for name in SENSORS:
             if self.render:
                 depth = getattr(self.include, f"{name}_depth")
-                is_rendered = name in cameras
-                images = read_images(self.task, name, rgb=True, depth=depth) if is_rendered else {}
-                frame[f"{name}_rgb"] = images.get("rgb")
+                images: dict[str, Any] = {"rgb": None, "depth": None}
+                if name in cameras:
+                    images = read_images(self.task, name, rgb=True, depth=depth)
+                    if depth:
+                        images["depth"] = images["depth"].astype(np.int16)
+                frame[f"{name}_rgb"] = images["rgb"]
                 if depth:
-                    frame[f"{name}_depth"] = (
-                        images["depth"].astype(np.int16) if is_rendered else None
-                    )
+                    frame[f"{name}_depth"] = images["depth"]
             if getattr(self.include, f"{name}_camera_extrinsic"):
                 frame[f"{name}_camera_extrinsic"] = self.extrinsic(name)
         return frame
@@ -194,9 +203,8 @@ class Observer:
         if name == "front":
             return front_extrinsic()
         pose = self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose
-        return (_OPENCV @ np.asarray(pose.inv().to_transformation_matrix(), np.float64)[:3]).astype(
-            np.float32
-        )
+        world_to_camera = np.asarray(pose.inv().to_transformation_matrix(), np.float64)
+        return (_OPENCV @ world_to_camera[:3]).astype(np.float32)
 
     def _render_cameras(self, cameras: Collection[str]) -> None:
         cameras = [name for name in cameras if name in SENSORS]
@@ -221,11 +229,8 @@ def read_images(
     sensor = task.scene.sensors[SENSORS[camera]]
     shader = sensor.config.shader_config
     images: dict[str, Tensor] = {}
-    requested = {
-        name
-        for name, flag in (("rgb", rgb), ("depth", depth), ("segmentation", segmentation))
-        if flag
-    }
+    flags = {"rgb": rgb, "depth": depth, "segmentation": segmentation}
+    requested = {name for name, flag in flags.items() if flag}
     for texture, kinds in shader.texture_names.items():
         if requested.intersection(kinds):
             images |= shader.texture_transforms[texture](_read_texture(sensor.camera, texture))
@@ -269,13 +274,16 @@ def list_key(key: str) -> str:
 
 def frame_keys(include: Include, render: bool) -> list[str]:
     """The keys of every frame, in the benchmark's order."""
-    keys = ["front_rgb", "wrist_rgb"] if render else []
-    keys += ["joint_state", "eef_state", "gripper_state"]
+    keys = ["joint_state", "eef_state", "gripper_state"]
+    if render:
+        keys = ["front_rgb", "wrist_rgb", *keys]
     for kind in ("depth", "camera_extrinsic"):
         for name in SENSORS:
             if getattr(include, f"{name}_{kind}") and (render or kind != "depth"):
                 keys.append(f"{name}_{kind}")
-    return [*keys, *(["maniskill_obs"] if include.maniskill_obs else [])]
+    if include.maniskill_obs:
+        keys.append("maniskill_obs")
+    return keys
 
 
 def observation_space(keys: Sequence[str]) -> "gymnasium.spaces.Dict":
@@ -292,7 +300,9 @@ def observation_space(keys: Sequence[str]) -> "gymnasium.spaces.Dict":
         "eef_state": gymnasium.spaces.Box(-np.inf, np.inf, (6,), np.float64),
         "gripper_state": gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64),
     }
-    spaces = {list_key(key): boxes.get(key) or boxes.get(key.rsplit("_", 1)[-1]) for key in keys}
-    return gymnasium.spaces.Dict(
-        {key: gymnasium.spaces.Sequence(box) for key, box in spaces.items() if box is not None}
-    )
+    spaces: dict[str, gymnasium.Space] = {}
+    for key in keys:
+        kind = key.rsplit("_", 1)[-1]
+        if key in boxes or kind in boxes:
+            spaces[list_key(key)] = gymnasium.spaces.Sequence(boxes.get(key) or boxes[kind])
+    return gymnasium.spaces.Dict(spaces)

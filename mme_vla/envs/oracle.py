@@ -40,7 +40,7 @@ def oracle_choice(task: Any) -> tuple[dict[str, Any], str]:
         _stuck(f"the sub-task {subtask.text!r} has no option")
     if choice.candidates is None:
         return {"choice": choice.label, "point": None}, subtask.text
-    candidates = list(choice.candidates())
+    candidates = list(choice.candidates)
     # A sub-task may name the button it ends at as well: the point is of what the option chooses
     # among.
     targets = [

@@ -89,7 +89,9 @@ def mesa_version() -> int | None:
     command = ["dpkg-query", "-W", "-f=${Version}", "mesa-vulkan-drivers"]
     output = subprocess.run(command, capture_output=True, text=True, check=False).stdout
     major = re.match(r"(?:\d+:)?(\d+)\.", output)
-    return int(major.group(1)) if major else None
+    if major is None:
+        return None
+    return int(major.group(1))
 
 
 _CHECK_SIZE = 8
@@ -130,8 +132,12 @@ def renderer_works() -> bool:
 def _render_once(device: "sapien.Device") -> None:
     import sapien
 
-    lean = lean_shaders() if device.is_cpu() else None
-    sapien.render.set_camera_shader_dir("default" if lean is None else lean.shader_pack)
+    shaders = "default"
+    if device.is_cpu():
+        lean = lean_shaders()
+        if lean is not None:
+            shaders = lean.shader_pack
+    sapien.render.set_camera_shader_dir(shaders)
     scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
     camera = scene.add_camera("check", _CHECK_SIZE, _CHECK_SIZE, 1.0, 0.01, 1.0)
     scene.update_render()
@@ -176,12 +182,11 @@ def _pipeline_folder() -> Path | None:
     from mme_vla.utils import user_cache, write_atomically
 
     stock = Path(sapien.__file__).parent / "vulkan_shader"
-    shaders = {
-        file.relative_to(stock): file.read_text(encoding="utf-8")
-        for part in (PACK, "common")
-        for file in sorted((stock / part).glob("*"))
-        if file.is_file()
-    }
+    shaders = {}
+    for part in (PACK, "common"):
+        for file in sorted((stock / part).glob("*")):
+            if file.is_file():
+                shaders[file.relative_to(stock)] = file.read_text(encoding="utf-8")
     lean = {name: without_table(text) for name, text in shaders.items()}
     if lean == shaders or any(_TABLE in text for text in lean.values()):
         logging.getLogger(__name__).debug("unknown shaders are used unchanged: %s", stock)
@@ -209,9 +214,8 @@ def culled(
     A software renderer spends a millisecond on each link of the robot whose triangles all lie
     outside the image.
     """
-    beyond = _beyond(
-        camera, np.array([body.get_global_aabb_fast() for body in bodies]).reshape(-1, 2, 3)
-    )
+    boxes = np.array([body.get_global_aabb_fast() for body in bodies]).reshape(-1, 2, 3)
+    beyond = _beyond(camera, boxes)
     hidden = [(body, body.visibility) for body, flag in zip(bodies, beyond, strict=True) if flag]
     try:
         for body, _ in hidden:
@@ -227,8 +231,8 @@ def _beyond(camera: "sapien.render.RenderCameraComponent", boxes: np.ndarray) ->
     [n, 2, 3].
     """
     view = camera.global_pose.inv().to_transformation_matrix()
-    # [n, 8, 3]
     corners = np.stack([boxes[:, ends, range(3)] for ends in product((0, 1), repeat=3)], 1)
+    # each [n, 8]
     x, y, z = np.moveaxis(corners @ view[:3, :3].T + view[:3, 3], -1, 0)  # forward, left, up
     right, top = x * np.tan(camera.fovx / 2), x * np.tan(camera.fovy / 2)
     outside = np.stack([y - right, -y - right, z - top, -z - top]) > MARGIN  # [4, n, 8]

@@ -141,7 +141,10 @@ def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
 
 def task_options(row: Mapping[str, Any]) -> dict[str, Any]:
     """Keyword arguments of the task whose scene a row describes."""
-    options = {name: row.get(name) for name in ("recovery",)} | {
-        "in_view": bool(row.get("in_view"))
+    return {
+        "seed": row["seed"],
+        "difficulty": row.get("difficulty", "hard"),
+        "row": row,
+        "recovery": row.get("recovery"),
+        "in_view": bool(row.get("in_view")),
     }
-    return {"seed": row["seed"], "difficulty": row.get("difficulty", "hard"), "row": row} | options

@@ -29,6 +29,7 @@ from mme_vla.errors import UserError, check_known, did_you_mean, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
+    from mme_vla.envs.robomme.scene.things import Thing
     from mme_vla.envs.task import Task
 
 
@@ -111,8 +112,11 @@ class Waypoint(ActionSpace):
         stick = control.task.stick
         numbers = _pose_numbers(action, stick)
         robot = control.demonstrator
-        grip = None if stick else {-1.0: robot.close, 1.0: robot.open}.get(numbers[6])
-        robot.and_then = 0 if grip is None else GRIPPER_STEPS
+        grip = None
+        if not stick:  # any other number leaves the gripper as it is
+            grip = {-1.0: robot.close, 1.0: robot.open}.get(numbers[6])
+        if grip is not None:
+            robot.and_then = GRIPPER_STEPS
         try:
             robot.move_to(_pose(numbers))
         finally:
@@ -152,17 +156,17 @@ class MultiChoice(ActionSpace):
             choice.run(control.demonstrator, None)
             return
         point = action.get("point")
-        needed = (
+        require(
+            point is not None and len(point),
             f"Choice {label!r} ({choice.action}) needs a point: the pixel [y, x] of the object"
-            " meant."
+            " meant.",
         )
-        require(point is not None and len(point), needed)
         pixel = _numbers(point, 2, "a pixel's row and column")
-        nearest = min(
-            choice.candidates(),
-            key=lambda thing: float(np.linalg.norm(project(thing.position) - pixel)),
-        )
-        choice.run(control.demonstrator, nearest)
+
+        def distance(thing: "Thing") -> float:
+            return float(np.linalg.norm(project(thing.position) - pixel))
+
+        choice.run(control.demonstrator, min(choice.candidates, key=distance))
 
 
 SPACES: dict[str, ActionSpace] = {
@@ -184,9 +188,13 @@ def _numbers(action: Any, size: int, meaning: str, longer: bool = False) -> np.n
         raise UserError(
             f"Action {action!r} is not made of numbers; expected {size}: {meaning}."
         ) from None
-    fits = numbers.ndim == 1 and (len(numbers) == size or (longer and len(numbers) > size))
-    least = "at least " if longer else ""
-    require(fits, f"Action has shape {numbers.shape}; expected {least}{size} numbers: {meaning}.")
+    if longer:
+        fits = numbers.ndim == 1 and len(numbers) >= size
+        expected = f"at least {size}"
+    else:
+        fits = numbers.shape == (size,)
+        expected = str(size)
+    require(fits, f"Action has shape {numbers.shape}; expected {expected} numbers: {meaning}.")
     require(
         np.isfinite(numbers).all(), f"Action {numbers.tolist()} holds numbers that are not finite."
     )
@@ -200,6 +208,5 @@ def _pose_numbers(action: Any, stick: bool) -> np.ndarray:
 
 
 def _pose(numbers: np.ndarray) -> sapien.Pose:
-    return sapien.Pose(
-        numbers[:3], Rotation.from_euler("xyz", numbers[3:6]).as_quat(scalar_first=True)
-    )
+    rotation = Rotation.from_euler("xyz", numbers[3:6])
+    return sapien.Pose(numbers[:3], rotation.as_quat(scalar_first=True))

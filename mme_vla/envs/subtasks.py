@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from mme_vla.errors import brief, require
+from mme_vla.errors import UserError, brief, require
 from mme_vla.registry import REWARDS
 
 if TYPE_CHECKING:
@@ -15,17 +15,8 @@ if TYPE_CHECKING:
 
 
 ORDINALS = (
-    "first",
-    "second",
-    "third",
-    "fourth",
-    "fifth",
-    "sixth",
-    "seventh",
-    "eighth",
-    "ninth",
-    "tenth",
-)
+    "first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth",
+)  # fmt: skip
 NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
@@ -34,8 +25,10 @@ def ordinal(index: int) -> str:
     if index < len(ORDINALS):
         return ORDINALS[index]
     count = index + 1
-    teens = 10 < count % 100 < 14
-    return f"{count}{'th' if teens else {1: 'st', 2: 'nd', 3: 'rd'}.get(count % 10, 'th')}"
+    ending = "th"
+    if not 10 < count % 100 < 14:
+        ending = {1: "st", 2: "nd", 3: "rd"}.get(count % 10, "th")
+    return f"{count}{ending}"
 
 
 def number(count: int) -> str:
@@ -95,13 +88,17 @@ class Choice:
     action: str
     run: Callable[["Demonstrator", Any], None]
     """Gets the object the point chose, or None where the option needs no point."""
-    candidates: Callable[[], Sequence["Thing"]] | None = None
+    candidates: Sequence["Thing"] | None = None
     """Objects a point may choose among; an option with candidates needs a point."""
 
     @property
     def needs_point(self) -> bool:
         """Whether a pixel of the front image must come with the choice."""
         return self.candidates is not None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The option as the benchmark lists it."""
+        return {"label": self.label, "action": self.action, "need_parameter": self.needs_point}
 
 
 class Progress:
@@ -131,11 +128,13 @@ class Progress:
             self.failed = False
         if self.succeeded:  # and stays so, whatever happens next
             return
-        now, before = self.subtasks[self.index], self.failed
-        self.failed = self.failed or failed or (now.failed is not None and now.failed())
-        if self.failed and not before:
-            self.mistaken = now.operation if isinstance(now.operation, str) else now.operation()
-        if not self.failed and now.done():
+        subtask = self.subtasks[self.index]
+        had_failed = self.failed
+        self.failed = had_failed or failed or (subtask.failed is not None and subtask.failed())
+        if self.failed and not had_failed:
+            operation = subtask.operation
+            self.mistaken = operation if isinstance(operation, str) else operation()
+        if not self.failed and subtask.done():
             self.index += 1
 
     @property
@@ -220,12 +219,13 @@ class ProcessScore:
     @classmethod
     def from_dict(cls, value: Any) -> "ProcessScore":
         """Read what `to_dict` made."""
+        unknown = f"process={brief(value)} of a record is no process score."
         try:
             score = cls(**value)
-            is_known = score.operation in (MOTION, "", *OPERATIONS) and score.broke in (*BROKEN, "")
         except TypeError:
-            is_known = False
-        require(is_known, f"process={brief(value)} of a record is no process score.")
+            raise UserError(unknown) from None
+        require(score.operation in (MOTION, "", *OPERATIONS), unknown)
+        require(score.broke in (*BROKEN, ""), unknown)
         return score
 
 

@@ -6,12 +6,14 @@ A task says which objects there are (`plan`, `build`, `start_episode`), what hap
 Everything else is here.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import Any, ClassVar
 
 import torch
 
-from mme_vla.envs.robomme.scene.motions import Cue, build_cue, show_cue
+from mme_vla.envs.robomme.scene.motions import Cue, Motion, build_cue, show_cue
+from mme_vla.envs.robomme.scene.objects import Disc
 from mme_vla.envs.robomme.scene.placement import Draws
 from mme_vla.envs.robomme.scene.stage import Stage
 from mme_vla.envs.robomme.scene.values import Values
@@ -34,8 +36,8 @@ class Task(Stage):
         row: the scene's values (`metadata.SceneRow`); nothing is sampled then, and its `tier`, if
             it has one, brings the rules of RoboMME-OOD.
         second_tries: the demonstrator continues where the benchmark's own gives up; without it, it
-            fails where that
-        does. robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's names for
+            fails where that does.
+        robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's names for
             `recovery`.
     """
 
@@ -52,6 +54,8 @@ class Task(Stage):
 
     dials: ClassVar[frozenset[str]] = frozenset()
     """Dials of `metadata.DIALS` that the task has."""
+    evidence_choices: ClassVar[str | None] = None
+    """Letters of the options whose ends show what is to be remembered; None: all of them."""
 
     def __init__(
         self,
@@ -69,28 +73,29 @@ class Task(Stage):
         require(seed >= 0, f"seed is {seed}; expected a non-negative integer.")
         if robomme_failure_recovery:
             recovery = robomme_failure_recovery_mode or recovery
-            needed = (
+            require(
+                recovery is not None,
                 "robomme_failure_recovery needs a robomme_failure_recovery_mode of"
-                f" {RECOVERY_MODES}."
+                f" {RECOVERY_MODES}.",
             )
-            require(recovery is not None, needed)
-        names = (
-            ("difficulty", difficulty, DIFFICULTIES),
-            ("recovery mode", recovery, RECOVERY_MODES),
-        )
-        for kind, value, known in names:
-            if value is not None:
-                check_known(kind, value, known)
-        dials = f"its dials are {', '.join(sorted(self.dials)) or 'none'}, and turn up only."
+        if difficulty is not None:
+            check_known("difficulty", difficulty, DIFFICULTIES)
+        if recovery is not None:
+            check_known("recovery mode", recovery, RECOVERY_MODES)
+        self.stress: dict[str, int] = {}
+        """Dials that are turned, and how far."""
         for dial, turned in (stress or {}).items():
-            can_turn = dial in self.dials and turned >= 0
-            require(can_turn, f"{type(self).__name__} cannot turn {dial!r} by {turned}: {dials}")
+            require(
+                dial in self.dials and turned >= 0,
+                f"{type(self).__name__} cannot turn {dial!r} by {turned}: its dials are"
+                f" {', '.join(sorted(self.dials)) or 'none'}, and turn up only.",
+            )
+            if turned:
+                self.stress[dial] = turned
         self.in_view = in_view
         self.row = row
         """The scene's values, where it is not sampled from its seed."""
         self.tier = (row or {}).get("tier") or ""
-        self.stress = {dial: turned for dial, turned in (stress or {}).items() if turned}
-        """Dials that are turned, and how far."""
         self.difficulty = difficulty or DIFFICULTIES[seed % 3]
         self.recovery = recovery
         self.on_frame: Callable[[dict[str, Any]], None] | None = None
@@ -134,7 +139,11 @@ class Task(Stage):
         raise NotImplementedError
 
     def before_physics(self, k: int) -> None:
-        """Scripted changes before the physics of a step; `k` steps have been done."""
+        """Scripted changes before the physics of a step, by default the `motions`; `k` steps have
+        been done.
+        """
+        for motion in self.motions:
+            motion.apply(k)
 
     def after_step(self, k: int) -> None:
         """Scripted changes after a step's physics, evaluation and observation; `k` steps have been
@@ -147,17 +156,22 @@ class Task(Stage):
         """
         return ()
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
         """Names of the facts that the present frame shows and that the episode needs later.
 
-        By default the key poses: the end of each sub-task of the video that a policy could choose,
-        or, in a task without a video, of the execution.
+        By default the key poses: the end of each sub-task of the video that a policy could choose
+        (`evidence_choices`), or, in a task without a video, of the execution.
 
         Args:
             ended: the sub-tasks that have ended in the last frames, by their number.
         """
         has_video = any(subtask.video for subtask in self.progress.subtasks)
-        return {f"{i} {s.text}" for i, s in ended.items() if s.choice and s.video == has_video}
+        facts = set()
+        for i, subtask in ended.items():
+            counts = self.evidence_choices is None or subtask.choice in self.evidence_choices
+            if subtask.choice and subtask.video == has_video and counts:
+                facts.add(f"{i} {subtask.text}")
+        return facts
 
     def failure(self) -> bool:
         """What counts as failure at any time, whatever the sub-task."""
@@ -170,48 +184,55 @@ class Task(Stage):
     # The scene ------------------------------------------------------------------------------------
 
     def _load_scene(self, options: dict) -> None:
-        self.set_up()
+        super()._load_scene(options)
         row = self.row or {}
-        self.values = Values(
-            row.get("spec"), str(row.get("where", f"{type(self).__name__}, seed {self.seed}"))
-        )
-        draws = Draws(self.seed)
-        self.plan(draws)
+        where = row.get("where", f"{type(self).__name__}, seed {self.seed}")
+        self.values = Values(row.get("spec"), str(where))
+        self.draws = Draws(self.seed)
+        self.plan(self.draws)
         if not self.shared_draws:
-            draws = Draws(self.seed)
-        self.build(draws)
-        self.draws, self._draws_state = draws, draws.state()
-        cues = self.cues() if self.in_view else ()
-        self._cues = [(build_cue(self, f"cue_{i}", cue), cue) for i, cue in enumerate(cues)]
+            self.draws = Draws(self.seed)
+        self.build(self.draws)
+        self._draws_state = self.draws.state()
+        self._cues: list[tuple[Disc, Cue]] = []
+        if self.in_view:
+            for i, cue in enumerate(self.cues()):
+                self._cues.append((build_cue(self, f"cue_{i}", cue), cue))
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        self.tidy(env_idx)
+        super()._initialize_episode(env_idx, options)
         self.draws.restore(self._draws_state)
         # The official construction initialises an episode twice, and the samples of the second one
         # count.
         for attempt in range(2):
             for thing in self.things:
                 thing.restore()
+            self.motions: list[Motion] = []
+            """Set by the task: what is moved before the physics of every step."""
             self.start_episode(self.draws)
             subtasks = self.subtasks()
             if self.recovery and (attempt == 0 or self.recovery_sampled_per_episode):
-                self.failed_pick = self._failed_pick(sum(s.pick and not s.video for s in subtasks))
+                self._sample_failed_pick(subtasks)
         self.progress = Progress(subtasks, self.latch_failure)
         self._show_cues()
 
-    def _failed_pick(self, picks: int) -> int | None:
-        if not picks:
-            return None
-        return self.values.integer(
-            "actions.failed_pick", lambda: self.draw_failed_pick(self.draws, picks), most=picks - 1
-        )
+    def _sample_failed_pick(self, subtasks: Sequence[SubTask]) -> None:
+        picks = sum(subtask.pick and not subtask.video for subtask in subtasks)
+        self.failed_pick = None
+        if picks:
+            self.failed_pick = self.values.integer(
+                "actions.failed_pick",
+                lambda: self.draw_failed_pick(self.draws, picks),
+                most=picks - 1,
+            )
 
     def scene_values(self) -> dict[str, Any]:
         """The row of this scene: `make_env` builds the same scene from it, to the last bit."""
-        names = {"recovery": self.recovery, "tier": self.tier, "in_view": self.in_view}
-        facts = {name: value for name, value in names.items() if value}
-        scene = {"task": type(self).__name__, "seed": self.seed, "difficulty": self.difficulty}
-        return scene | facts | {"spec": self.values.copy().spec}
+        row = {"task": type(self).__name__, "seed": self.seed, "difficulty": self.difficulty}
+        for name in ("recovery", "tier", "in_view"):
+            if getattr(self, name):
+                row[name] = getattr(self, name)
+        return row | {"spec": deepcopy(self.values.spec)}
 
     def placed_values(self) -> dict[str, Any]:
         """What was sampled, and position and quaternion [7] of every object; right after the reset,
@@ -219,10 +240,10 @@ class Task(Stage):
 
         The discs of `in_view` do not count: the twin of a scene is the same scene.
         """
-        poses = {
-            thing.name: [*thing.pose.p.tolist(), *thing.pose.q.tolist()] for thing in self.things
-        }
-        return {"spec": self.values.copy().spec, "poses": poses}
+        poses = {}
+        for thing in self.things:
+            poses[thing.name] = [*thing.pose.p.tolist(), *thing.pose.q.tolist()]
+        return {"spec": deepcopy(self.values.spec), "poses": poses}
 
     def draw_failed_pick(self, draws: Draws, picks: int) -> int:
         """Which of the execution's `picks` a recovery demonstration fails first."""

@@ -284,10 +284,10 @@ def test_the_stick_goes_straight_and_remembers_where_it_arrived() -> None:
     demonstrator.stick_to(things(env)["disc"], store=True)
     assert distance_xy(env.tcp_pose.p, np.array([-0.1, 0.1])) < 0.01
     assert log.actions[0].shape == (7,) and log.grips == [-1]
-    np.testing.assert_allclose(demonstrator.stored_qpos, env.qpos)
+    np.testing.assert_allclose(env.stored_qpos, env.qpos)
     stored = env.qpos
     demonstrator.hard_reset()
-    demonstrator.hard_reset(qpos=demonstrator.stored_qpos)
+    demonstrator.hard_reset(qpos=env.stored_qpos)
     assert np.abs(env.qpos - stored).max() < 0.01
 
 

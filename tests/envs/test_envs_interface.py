@@ -17,7 +17,7 @@ pytest.importorskip(
 
 from mme_vla.envs import make, make_env, rendering
 from mme_vla.envs.grounding import Grounding, centroid, ground, project
-from mme_vla.envs.observations import AngleTrack, front_extrinsic
+from mme_vla.envs.observations import AngleTrack, Include, front_extrinsic
 from mme_vla.envs.robomme.robot.control import PlanningError
 from mme_vla.errors import UserError
 
@@ -52,7 +52,8 @@ def test_the_stick_s_video_leaves_out_what_is_not_recorded(make_unrendered) -> N
 
 
 def test_a_step_gives_lists_of_one_frame_and_the_official_info(make_unrendered) -> None:
-    env = make_unrendered(include_front_camera_extrinsic=True, include_front_camera_intrinsic=True)
+    include = Include(front_camera_extrinsic=True, front_camera_intrinsic=True)
+    env = make_unrendered(include=include)
     first, info = env.reset()
     assert {key: len(value) for key, value in first.items()} == dict.fromkeys(first, 1)
     observation, reward, terminated, truncated, info = env.step(STILL)
@@ -81,7 +82,7 @@ def test_a_step_gives_lists_of_one_frame_and_the_official_info(make_unrendered) 
 
 def test_multi_choice_provides_what_is_needed_to_choose(make_unrendered) -> None:
     env = make_unrendered(
-        "PickXtimes", "train", 8, "multi_choice", include_front_camera_extrinsic=False
+        "PickXtimes", "train", 8, "multi_choice", include=Include(front_camera_extrinsic=False)
     )
     observation, info = env.reset()
     assert "front_camera_extrinsic_list" in observation
@@ -172,9 +173,6 @@ def test_a_closed_or_unstarted_environment_says_so(make_unrendered) -> None:
         ({"task": "PickXtimes", "split": "eval"}, "Unknown split"),
         ({"task": "PickXtimes", "episode": 50}, "expected 0 to 49"),
         ({"task": "PickXtimes", "action_space": "joint"}, "Unknown action space"),
-        ({"task": "PickXtimes", "env": "robomme"}, "Unknown environment"),
-        ({"task": "PickXtimes", "include_depth": True}, "include_front_depth"),
-        ({"task": "PickXtimes", "include_front_depth": "yes"}, "True or False"),
         ({"task": "PickXtimes", "difficulty": "easy"}, "needs a seed"),
         ({"task": "PickXtimes", "seed": 1, "difficulty": "tough"}, "Unknown difficulty"),
         ({"task": "PickXtimes", "max_steps": 0, "render": False}, "positive integer"),
@@ -183,6 +181,13 @@ def test_a_closed_or_unstarted_environment_says_so(make_unrendered) -> None:
 def test_unknown_names_are_refused_with_what_exists(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(UserError, match=words):
         make_env(**arguments)
+
+
+def test_observations_that_do_not_exist_are_refused() -> None:
+    with pytest.raises(UserError, match="include_front_depth"):
+        Include.from_options({"include_depth": True})
+    with pytest.raises(UserError, match="front_depth is 'yes'; expected True or False"):
+        Include(front_depth="yes")  # type: ignore[arg-type]
 
 
 def test_a_missing_simulator_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:

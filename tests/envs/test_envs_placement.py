@@ -125,7 +125,6 @@ def test_what_cannot_be_touched_is_no_obstacle(scene):
     ("draw", "per_trial"),
     [
         (lambda draws: draw_cube(draws, REGION, [EVERYWHERE]), 3),
-        (lambda draws: draw_cube(draws, REGION, [EVERYWHERE], yaw=False), 2),
         (lambda draws: draw_disc(draws, REGION, 0.04, [EVERYWHERE]), 2),
         (lambda draws: draw_container(draws, REGION, [EVERYWHERE]), 2),
     ],

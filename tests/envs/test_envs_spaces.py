@@ -46,7 +46,7 @@ def control(stick: bool = False, reachable: bool = True) -> tuple[Control, list,
     hand = Hand(reachable)
     cubes = [Cube(0.0, -0.1, 0.02), Cube(0.0, 0.1, 0.02)]
     choices = [
-        Choice("a", "pick up the cube", lambda demo, thing: demo.done.append(thing), lambda: cubes),
+        Choice("a", "pick up the cube", lambda demo, thing: demo.done.append(thing), cubes),
         Choice("b", "press the button", lambda demo, thing: demo.done.append("pressed")),
     ]
     task = SimpleNamespace(

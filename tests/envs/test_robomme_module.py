@@ -11,6 +11,7 @@ import pytest
 
 from helpers.plugins import plugin
 from mme_vla.envs import make_env, metadata
+from mme_vla.envs.observations import Include
 from mme_vla.errors import UserError
 
 pytest.importorskip(
@@ -69,7 +70,8 @@ def test_its_environment_is_make_envs(wrapper: ModuleType) -> None:
     importlib.import_module("robomme.robomme_env")
     builder = wrapper.BenchmarkEnvBuilder("StopCube", dataset="val", max_steps=5)
     benchmark_env = builder.make_env_for_episode(3, include_front_depth=True)
-    local_env = make_env("StopCube", "val", 3, max_steps=5, include_front_depth=True)
+    include = Include(front_depth=True)
+    local_env = make_env("StopCube", "val", 3, max_steps=5, include=include)
     try:
         assert (
             benchmark_env.unwrapped.difficulty == metadata.episode("StopCube", "val", 3).difficulty

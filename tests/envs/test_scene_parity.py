@@ -24,7 +24,7 @@ from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes
 from mme_vla.envs import make_env
 from mme_vla.envs.base import Hold
 from mme_vla.envs.make import make_task
-from mme_vla.envs.observations import RenderRequest
+from mme_vla.envs.observations import Include, RenderRequest
 from mme_vla.envs.robomme.recording.recorder import RecordedStep, Recorder
 from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
 
@@ -180,14 +180,14 @@ def test_the_goal_and_the_sub_tasks_have_the_recorded_words(episode: Episode) ->
 
 @pytest.mark.parametrize("space", SPACES)
 def test_replaying_the_execution_succeeds(episode: Episode, space: str) -> None:
-    included = {"include_wrist_camera_extrinsic": True, "include_available_multi_choices": True}
+    include = Include(wrist_camera_extrinsic=True, available_multi_choices=True)
     env = make_env(
         episode.ref.task,
         action_space=space,
         render=False,
         max_steps=5000,
         **episode.scene,
-        **included,
+        include=include,
     )
     # drops and waits are judged as when the episode was recorded
     env.task.recording = space == "joint_angle"

@@ -16,6 +16,7 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.api import policy_of_split
 from mme_vla.evaluation.results.curves import stress_curves
+from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.evaluation.rollout.evaluation import evaluate
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.arms import read_arm
@@ -60,6 +61,19 @@ def test_nobody_evaluates_such_a_split_without_showing_them(tmp_path: Path) -> N
     with pytest.raises(UserError, match="split=test shows none"):
         policy_of_split(policy, "test", made_up())
     assert with_sessions(policy, "stress:sessions=0", made_up()) is policy
+
+
+def test_the_scenes_of_such_a_split_are_those_of_the_test_split() -> None:
+    splits = []
+
+    def base(**options: Any) -> ScriptedEnv:
+        splits.append(options["split"])
+        return make_moving_env(**options)
+
+    make_rollout_env("StopCube", SPLIT, 0, base=base, sessions=2)
+    assert splits == ["test"]
+    with pytest.raises(UserError, match="2 unrelated episodes come before each, and 1 are shown"):
+        make_rollout_env("StopCube", SPLIT, 0, base=base, sessions=1)
 
 
 class TellingEnv(ScriptedEnv):

@@ -13,18 +13,21 @@ Processes inherit nothing of the script that makes one (`worker.py`), which ther
 under `if __name__ == "__main__":`.
 """
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing.connection import wait
 from typing import Any
 
 import numpy as np
 
 from mme_vla.config.plugins import import_plugins, imported_plugins
-from mme_vla.envs.base import environment
+from mme_vla.envs.base import environment, open_episode
 from mme_vla.envs.make import ROBOMME, check_names, make_env
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
@@ -69,9 +72,11 @@ class Reply:
     @property
     def done(self) -> bool:
         """Whether the episode is over."""
-        info = self.info
-        status = info.status if isinstance(info, Report) else info.get("status")
-        return self.terminated or self.truncated or status == "error"
+        if self.terminated or self.truncated:
+            return True
+        if isinstance(self.info, Report):
+            return self.info.status == "error"
+        return self.info.get("status") == "error"
 
     @classmethod
     def of_outcome(cls, worker: int, job: Job, resetting: bool, outcome: tuple) -> "Reply":
@@ -111,7 +116,7 @@ class _Worker:
     running: bool = False
     """A command was given and its result is due."""
     resetting: bool = False
-    deadline: float = float("inf")
+    deadline: float = math.inf
     arrays: list[np.ndarray] = field(default_factory=list)
 
     @property
@@ -182,16 +187,19 @@ class VecEnv:
         self.start(worker, job)
         return job
 
-    def start(self, worker: int, job: Job, **how: Any) -> None:
+    def start(self, worker: int, job: Job, draw: RenderRequest | None = None) -> None:
         """Let a worker begin an episode; its reply carries the first observation.
 
         Args:
-            how: arguments of the environment's `reset`.
+            draw: the images that are requested of the reset, where the environment takes chunks;
+                by default all.
         """
         state = self._idle(worker)
-        state.job, state.resetting = job, True
+        state.job = job
+        state.resetting = True
         arguments = {"task": job.task, "split": job.split, "episode": job.episode}
-        self._command(worker, protocol.RESET, arguments, how)
+        options = {} if draw is None else {"draw": draw}
+        self._command(worker, protocol.RESET, arguments, options)
 
     def send(self, worker: int, action: Any) -> None:
         """Let a worker perform an action; returns at once."""
@@ -216,12 +224,17 @@ class VecEnv:
             Replies in the order of the workers; empty when the time is up or nothing is under way.
         """
         self._require_open()
-        until = time.monotonic() + (float("inf") if timeout is None else timeout)
+        until = math.inf
+        if timeout is not None:
+            until = time.monotonic() + timeout
         while True:
-            replies, self._lost = self._lost, []
+            replies = self._lost
+            self._lost = []
             for index, state in enumerate(self._workers):
-                if state.running and (reply := self._poll(index, state)) is not None:
-                    replies.append(reply)
+                if state.running:
+                    reply = self._poll(index, state)
+                    if reply is not None:
+                        replies.append(reply)
             if replies or not self.busy or time.monotonic() >= until:
                 return sorted(replies, key=lambda reply: reply.worker)
             running = [state for state in self._workers if state.running]
@@ -254,14 +267,14 @@ class VecEnv:
     # Workers --------------------------------------------------------------------------------------
 
     def _spawn(self) -> _Worker:
-        here, there = self._context.Pipe()
+        connection, remote = self._context.Pipe()
         block = self._context.RawArray("B", protocol.BLOCK_BYTES)
-        work = (imported_plugins(), there, block, self._factory, self._options)
+        work = (imported_plugins(), remote, block, self._factory, self._options)
         process = self._context.Process(target=begin, args=(settings(), _work, *work), daemon=True)
         with signals_deferred():
             process.start()
-        there.close()
-        return _Worker(process, here, block)
+        remote.close()
+        return _Worker(process, connection, block)
 
     def _idle(self, worker: int) -> _Worker:
         self._require_open()
@@ -274,10 +287,11 @@ class VecEnv:
 
     def _command(self, worker: int, *message: Any) -> None:
         state = self._workers[worker]
-        state.running, state.arrays = True, []
-        state.deadline = (
-            time.monotonic() + self.timeout + (_STARTING_SECONDS if state.resetting else 0)
-        )
+        state.running = True
+        state.arrays = []
+        state.deadline = time.monotonic() + self.timeout
+        if state.resetting:
+            state.deadline += _STARTING_SECONDS
         try:
             protocol.send(state.connection, *message)
         except OSError:
@@ -296,12 +310,8 @@ class VecEnv:
                     protocol.send(state.connection, protocol.CONTINUE)
                 elif kind == protocol.RESULT:
                     state.running = False
-                    return Reply.of_outcome(
-                        index,
-                        state.begun,
-                        state.resetting,
-                        protocol.restore(content[0], state.arrays),
-                    )
+                    outcome = protocol.restore(content[0], state.arrays)
+                    return Reply.of_outcome(index, state.begun, state.resetting, outcome)
                 elif kind == protocol.FAILURE:
                     state.running = False
                     return Reply.of_failure(index, state.begun, state.resetting, *content)
@@ -335,13 +345,14 @@ def _work(plugins: Sequence[str], *arguments: Any) -> None:
 
 def make_vec_env(
     tasks: str | Sequence[str],
-    episodes: Iterable[int] | None = None,
+    episodes: Sequence[int] | None = None,
     workers: int = 2,
     split: str = "test",
     action_space: str = "joint_angle",
     *,
     timeout: float = 600.0,
     factory: Callable[..., Any] = make_env,
+    env: str = ROBOMME,
     **options: Any,
 ) -> VecEnv:
     """Environments for all given episodes of all given tasks.
@@ -354,18 +365,23 @@ def make_vec_env(
         action_space: as for `make_env`.
         timeout: seconds after which a command without result counts as hung.
         factory: what makes an environment, importable by name.
-        options: further arguments of `make_env`, such as `max_steps`, `render` and `include_…`.
+        env: the environment whose tasks these are; another one than RoboMME is opened itself.
+        options: further arguments of `make_env`, such as `max_steps`, `render` and `include`.
     """
     names = [tasks] if isinstance(tasks, str) else list(tasks)
     require(names, "No task given; expected a task name or several.")
-    numbers = None if episodes is None else list(episodes)
-    jobs, env = [], options.get("env", "mme_vla")
     source = environment(env)
+    jobs = []
     for name in names:
-        if factory is make_env:
-            if env == ROBOMME:
-                check_names(name, action_space, None, None)
-            source.check_installed()
-        for number in range(len(source.episodes(name, split))) if numbers is None else numbers:
+        if factory is make_env and env == ROBOMME:
+            check_names(name, action_space, None, None)
+        numbers = episodes
+        if numbers is None:
+            numbers = range(len(source.episodes(name, split)))
+        for number in numbers:
             jobs.append(Job(name, split, source.episode(name, split, number).episode))
+    if factory is make_env:
+        source.check_installed()
+        if env != ROBOMME:
+            factory = partial(open_episode, env)
     return VecEnv(jobs, workers, factory, {"action_space": action_space, **options}, timeout)

@@ -58,8 +58,7 @@ BLOCK_BYTES = FRAMES_PER_BLOCK * 2 * 256 * 256 * 3
 
 # Messages from a worker. PIECE: the arrays described lie in the block, and the worker waits for any
 # reply. RESULT: the outcome of a command. FAILURE: the command raised. LOST: it raised, and the
-# process is of no
-# further use.
+# process is of no further use.
 PIECE, RESULT, FAILURE, LOST = "piece", "result", "failure", "lost"
 # Commands to a worker.
 RESET, STEP, CLOSE, CONTINUE = "reset", "step", "close", "continue"
@@ -95,12 +94,11 @@ def receive(connection: Any) -> tuple:
 
 def read(block: Any, slots: list[Slot]) -> list[np.ndarray]:
     """Copies of the arrays that lie in a block."""
-    return [
-        np.frombuffer(block, slot.dtype, int(np.prod(slot.shape)), slot.offset)
-        .reshape(slot.shape)
-        .copy()
-        for slot in slots
-    ]
+    arrays = []
+    for slot in slots:
+        array = np.frombuffer(block, slot.dtype, int(np.prod(slot.shape)), slot.offset)
+        arrays.append(array.reshape(slot.shape).copy())
+    return arrays
 
 
 def restore(value: Any, arrays: list[np.ndarray]) -> Any:
@@ -175,11 +173,8 @@ def _hand_over(connection: Any, block: Any, outcome: Any) -> None:
 
 def _lift(value: Any, large: list[np.ndarray]) -> Any:
     """Take the large arrays out of a nested value."""
-    if (
-        isinstance(value, np.ndarray)
-        and LARGE <= value.nbytes <= BLOCK_BYTES
-        and value.dtype != object
-    ):
+    is_array = isinstance(value, np.ndarray) and value.dtype != object
+    if is_array and LARGE <= value.nbytes <= BLOCK_BYTES:
         large.append(value)
         return Placed(len(large) - 1)
     if isinstance(value, dict):
@@ -210,11 +205,9 @@ def last_words(process: Any) -> str:
     """How a process ended."""
     process.join(1.0)
     code = process.exitcode
-    return (
-        f"died of signal {-code}"
-        if code is not None and code < 0
-        else f"ended with exit code {code}"
-    )
+    if code is not None and code < 0:
+        return f"died of signal {-code}"
+    return f"ended with exit code {code}"
 
 
 def end(process: Any) -> None:

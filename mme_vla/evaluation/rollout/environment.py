@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,9 @@ import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state, choice_row
-from mme_vla.envs.base import Hold
-from mme_vla.envs.make import make_env
-from mme_vla.envs.metadata import DEFAULT_STEPS, STICK_TASKS
+from mme_vla.envs.base import Hold, open_episode
+from mme_vla.envs.make import ROBOMME, check_sessions, make_env
+from mme_vla.envs.metadata import BASE, DEFAULT_STEPS, STICK_TASKS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
@@ -374,14 +375,25 @@ def make_rollout_env(
     robot: Embodiment = ROBOMME_JOINT,
     max_actions: int | None = None,
     oracle: bool = False,
+    env: str = ROBOMME,
+    sessions: int = 0,
     **options: Any,
 ) -> ChunkEnv:
     """What every worker builds for an episode.
 
     base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`.
+    env: the environment of the user's own that is opened instead; of the options it has `render`
+    and `action_space`. sessions: unrelated episodes that the caller shows the policy before, as
+    `split=stress:sessions=<n>` requires; the scenes of such a split are those of the test split.
     videos: folder, and which outcomes are kept: `all`, `success` or `failure`. robot, max_actions:
     the policy's. oracle: see `ChunkEnv`.
     """
+    if sessions:
+        check_sessions(split, sessions)
+        split = BASE
+    if env != ROBOMME:
+        base = partial(open_episode, env)
+        options = {name: options[name] for name in ("render", "action_space") if name in options}
     video = None
     if videos is not None:
         folder, save_on = videos

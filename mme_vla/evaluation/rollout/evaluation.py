@@ -13,6 +13,7 @@ from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
+from mme_vla.envs.observations import Include
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.receipts import receipt
@@ -237,10 +238,8 @@ def _environments(
         options["render"] = settings.render
         options["action_space"] = robot.action.space
         options["sessions"] = policy.info.n_distractor_episodes
-        if settings.only_possible:
-            options["only_possible"] = True
-        for name in robot.readings:
-            options[f"include_{name}"] = True
+        readings = dict.fromkeys(robot.readings, True)
+        options["include"] = Include(**readings, possible=settings.only_possible)
     if settings.video != "none":
         options["videos"] = (str(output / VIDEOS), settings.video)
     return VecEnv([], workers, make_rollout_env, options, settings.timeout_s)

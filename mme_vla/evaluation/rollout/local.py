@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
@@ -23,14 +24,14 @@ class LocalEnvs:
         """Whether a reply is waiting."""
         return bool(self._replies)
 
-    def start(self, worker: int, job: Job, **how: Any) -> None:
-        """Begin an episode."""
+    def start(self, worker: int, job: Job, draw: RenderRequest | None = None) -> None:
+        """Begin an episode; `draw` are the requested images, by default all."""
         self._close()
         self._job = job
 
         def begin() -> Any:
             self._env = make_rollout_env(job.task, job.split, job.episode, **self._options)
-            return self._env.reset(**how)
+            return self._env.reset(draw)
 
         self._run(worker, True, begin)
 

@@ -17,6 +17,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, choose_tasks
 from mme_vla.envs.make import make_env, make_task
 from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.observations import Include
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeRecord
@@ -134,7 +135,7 @@ def play_episode(job: Play) -> EpisodeRecord:
     player = FrequentPlayer(job.moves) if job.name == FREQUENT else players[job.name]()
     env = make_env(
         spec.task, spec.split, spec.episode, "multi_choice", max_steps=rules.steps, render=False,
-        only_possible=rules.only_possible,
+        include=Include(possible=rules.only_possible),
     )  # fmt: skip
     session = ChoiceSession(env, spec, rules.max_choices or MAX_CHOICES, images=False)
     try:

@@ -24,10 +24,10 @@ def make_session(
     episode: which one. env: name of the environment. max_steps, max_choices: when it has timed out.
     images: whether the player reads them.
     """
-    from mme_vla.envs import make_env
+    from mme_vla.envs.base import CHOICES, open_episode
 
     which = (episode.task, episode.split, episode.episode)
-    made = make_env(*which, "multi_choice", max_steps=max_steps, env=env, render=images)
+    made = open_episode(env, *which, action_space=CHOICES, max_steps=max_steps, render=images)
     try:
         return ChoiceSession(made, episode, max_choices, images)
     except BaseException:

@@ -16,6 +16,7 @@ from mme_vla.backbone.choice import ChoiceHead
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.config.sections import read_section
 from mme_vla.envs.make import make_env
+from mme_vla.envs.observations import Include
 from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import UserError, check_known, require
@@ -247,7 +248,8 @@ def _env_options(
     check_known("reward", reward, REWARDS)
     options |= {"base": make_env, "env": env, "render": settings.render, "reward": reward}
     options["action_space"] = robot.action.space
-    return options | {f"include_{name}": True for name in robot.readings}
+    options["include"] = Include(**dict.fromkeys(robot.readings, True))
+    return options
 
 
 @dataclass

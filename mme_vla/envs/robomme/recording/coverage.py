@@ -33,9 +33,8 @@ def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, 
     if dataset is not None:
         from mme_vla.data.lerobot_files import SIDE_FILE
 
-        for episode in read_json(dataset / SIDE_FILE, "the facts of a recorded dataset")[
-            "episodes"
-        ]:
+        side = read_json(dataset / SIDE_FILE, "the facts of a recorded dataset")
+        for episode in side["episodes"]:
             goals.setdefault(episode["task"], set()).add(episode["goals"][0])
         return goals
     from mme_vla.data.hdf5 import list_episodes, open_episode
@@ -63,13 +62,10 @@ class TaskCoverage:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
-        counts = {
+        return {
             "goals": self.goals,
             "goals_covered": self.goals - len(self.missing),
             "episodes": self.episodes,
-        }
-        return {
-            **counts,
             "episodes_covered": self.episodes - self.missing_episodes,
             "missing": self.missing,
         }
@@ -105,8 +101,6 @@ def in_words(coverage: Mapping[str, TaskCoverage], split: str) -> str:
             f"{name}: {covered} of {task.goals} goals of {split!r}, {episodes} of {task.episodes}"
             " episodes"
         )
-        lines += [
-            f"  never shown: {goal} (episode {listed(numbers, 5)})"
-            for goal, numbers in task.missing.items()
-        ]
+        for goal, numbers in task.missing.items():
+            lines.append(f"  never shown: {goal} (episode {listed(numbers, 5)})")
     return "\n".join(lines)

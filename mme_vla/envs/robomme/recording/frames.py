@@ -40,13 +40,11 @@ class FrameChoice:
     """The rendered frames of every demonstration; all other steps have no images.
 
     at: the frames that both cameras show. `decisions`: the last frame before each planned motion of
-    the execution,
-        where a waypoint policy acts; `choices`: the last frame before each part of it, where one
-        acts that chooses among options; n: the execution's first frame and every n-th after it; or
-        numbers and ranges, counted from the episode's first stored frame.
+        the execution, where a waypoint policy acts; `choices`: the last frame before each part of
+        it, where one acts that chooses among options; n: the execution's first frame and every n-th
+        after it; or numbers and ranges, counted from the episode's first stored frame.
     memory: a section of a memory; the front camera also shows what this memory may read at those
-    frames, and so does
-        the other where the memory gives a backbone past views.
+        frames, and so does the other where the memory gives a backbone past views.
     every: stride over the decisions, for a policy that executes several motions of a chunk.
     """
 
@@ -78,10 +76,10 @@ class FrameChoice:
         frames = {camera: frozenset(numbers) for camera in CAMERAS}
         if self.memory is not None:
             read = self.read(np.array(numbers, np.int64), video)
-            for camera in (
-                CAMERAS if _build(self.memory).past_view_spec is not None else (MEMORY_CAMERA,)
-            ):
-                frames[camera] |= read
+            reads_all_views = _build(self.memory).past_view_spec is not None
+            for camera in CAMERAS:
+                if camera == MEMORY_CAMERA or reads_all_views:
+                    frames[camera] |= read
         return RenderRequest(frames, now=())
 
     def read(self, frames: np.ndarray, exec_start: int) -> frozenset[int]:
@@ -123,8 +121,10 @@ def choices_of(steps: Sequence["RecordedStep"]) -> Motions:
     rows = np.zeros((len(steps), len(CHOICE_NUMBERS)), np.float32)
     for k, step in enumerate(steps):
         begins = step.info["is_subgoal_boundary"] and not step.info["is_completed"]
-        row = row_of(step.action["choice_action"]) if begins or k == video else None
-        rows[k] = 0 if row is None else row
+        if begins or k == video:
+            row = row_of(step.action["choice_action"])
+            if row is not None:
+                rows[k] = row
     return find_choices(rows[video:], video, range(len(LETTERS)))
 
 

@@ -41,10 +41,7 @@ class EpisodeWriter:
         self._file = h5py.File(path, "w")
         self._episode = self._file.create_group(f"episode_{index}")
         self._steps = 0
-        choices = [
-            {"label": c.label, "action": c.action, "need_parameter": c.needs_point}
-            for c in task.choices()
-        ]
+        choices = [choice.to_dict() for choice in task.choices()]
         setup = self._episode.create_group("setup")
         setup["seed"] = np.int64(task.seed)
         texts = {"difficulty": task.difficulty, "available_multi_choices": json.dumps(choices)}
@@ -128,8 +125,10 @@ class Job:
     def plan(self) -> dict[str, Any]:
         """What decides the result; without `frames` where all are rendered, as in older plans."""
         plan = asdict(self) | {"frames": self.frame_selection}
-        absent = [name for name in ("frames", "row") if getattr(self, name) is None]
-        return {key: value for key, value in plan.items() if key not in absent}
+        for name in ("frames", "row"):
+            if plan[name] is None:
+                del plan[name]
+        return plan
 
     @property
     def frame_selection(self) -> dict[str, Any] | None:
@@ -159,8 +158,13 @@ class RecordingPlan:
     @property
     def places(self) -> list[Path]:
         """The dataset and the official files."""
-        official = dict.fromkeys(job.task for job in self.jobs) if self.hdf5 is not None else ()
-        return [*([] if self.dataset is None else [self.dataset]), *map(self._official, official)]
+        places: list[Path] = []
+        if self.dataset is not None:
+            places.append(self.dataset)
+        if self.hdf5 is not None:
+            for task in dict.fromkeys(job.task for job in self.jobs):
+                places.append(self._official(task))
+        return places
 
     def missing(self, options: "ConvertOptions") -> list[Path]:
         """The places that are still to be written; what is there holds exactly these episodes."""
@@ -169,8 +173,12 @@ class RecordingPlan:
             if not place.exists():
                 missing.append(place)
                 continue
+            if place == self.dataset:
+                is_same = self._is_dataset(options)
+            else:
+                is_same = self._is_official(place)
             require(
-                self._is_dataset(options) if place == self.dataset else self._is_official(place),
+                is_same,
                 f"{place} exists already, and is not what this command records; choose another"
                 " place, or remove it yourself.",
             )
@@ -231,12 +239,13 @@ class RecordingPlan:
             return False
         side = read_json(self.dataset / SIDE_FILE, "the facts of a recorded dataset")
         entries = side.get("episodes", [])
-        return (
-            side.get("plan", {}).get("options") == planned_options(options)
-            and [(e.get("task"), e.get("source_episode")) for e in entries]
-            == [(j.task, j.episode) for j in self.jobs]
-            and all(
-                job.made(e.get("seed"), e.get("difficulty"), e.get("frames"))
-                for job, e in zip(self.jobs, entries, strict=True)
-            )
-        )
+        if side.get("plan", {}).get("options") != planned_options(options):
+            return False
+        if len(entries) != len(self.jobs):
+            return False
+        for job, entry in zip(self.jobs, entries, strict=True):
+            if (entry.get("task"), entry.get("source_episode")) != (job.task, job.episode):
+                return False
+            if not job.made(entry.get("seed"), entry.get("difficulty"), entry.get("frames")):
+                return False
+        return True

@@ -42,7 +42,8 @@ def record_own(
     Returns:
         Frames, and the episodes that did not succeed.
     """
-    draft, episodes = work / DRAFT, {work / episode_file(spec): spec for spec in specs}
+    draft = work / DRAFT
+    episodes = {work / episode_file(spec): spec for spec in specs}
     shutil.rmtree(draft, ignore_errors=True)
     dataset: Any = None
     failures, frames = [], 0
@@ -60,14 +61,14 @@ def record_own(
             with np.load(path) as loaded:
                 columns = dict(loaded)
             goal = str(columns.pop("task"))
-            rows = [
-                dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
-            ]
-            dataset = dataset or _create(rows[0], draft, fps)
-            for row in rows:
+            length = len(columns[STATE])
+            for frame in range(length):
+                row = {name: column[frame] for name, column in columns.items()}
+                if dataset is None:
+                    dataset = _create(row, draft, fps)
                 dataset.add_frame({**row, "task": goal})
             dataset.save_episode()
-            frames += len(rows)
+            frames += length
         if dataset is None:
             raise UserError(
                 f"None of {len(specs)} demonstrations ended with info['success']: nothing was"
@@ -82,27 +83,22 @@ def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.n
     """The columns of an episode [frames, …] and its `task`; None where it did not succeed."""
     env = EpisodeEnv(environment, environment.make(spec), spec, environment.step_limit(spec.split))
     try:
-        rows = []
+        rows: list[dict[str, np.ndarray]] = []
         for observation, action, visible in env.demonstration():
-            images = {
-                f"{IMAGES}{name}": np.asarray(image)
-                for name, image in observation.items()
-                if name != "state"
-            }
-            state = np.asarray(observation["state"], np.float32)
-            rows.append(
-                {
-                    **images,
-                    STATE: state,
-                    ACTION: np.asarray(action, np.float32),
-                    "is_demo": np.array([visible]),
-                }
-            )
+            row = {}
+            for name, value in observation.items():
+                if name != "state":
+                    row[f"{IMAGES}{name}"] = np.asarray(value)
+            row[STATE] = np.asarray(observation["state"], np.float32)
+            row[ACTION] = np.asarray(action, np.float32)
+            row["is_demo"] = np.array([visible])
+            rows.append(row)
         if not env.success:
             return None
-        return {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {
-            "task": np.array(env.goal)
-        }
+        columns = {"task": np.array(env.goal)}
+        for name in rows[0]:
+            columns[name] = np.stack([row[name] for row in rows])
+        return columns
     finally:
         env.close()
 

@@ -46,8 +46,9 @@ def demonstrate(
             if ended or _ended(env):
                 break
             if env.recovery and env.failed_pick is not None and subtask in picks:
-                failing = picks.index(subtask) == env.failed_pick
-                demonstrator.fail_next_pick = env.recovery if failing else None
+                demonstrator.fail_next_pick = None
+                if picks.index(subtask) == env.failed_pick:
+                    demonstrator.fail_next_pick = env.recovery
             subtask.run(demonstrator)
             ended = _ended(env)
     return env.success() and not env.progress.failed
@@ -118,15 +119,17 @@ class Recorder:
         on_step: Callable[[RecordedStep], None] | None = None,
         render_request: RenderRequest | None = None,
     ) -> None:
-        self._task, self._render, self._on_step, self._render_request = (
-            task,
-            render,
-            on_step,
-            render_request,
+        self._task = task
+        self._render = render
+        self._on_step = on_step
+        self._render_request = render_request
+        include = Include(
+            front_depth=render,
+            wrist_depth=render,
+            front_camera_extrinsic=True,
+            wrist_camera_extrinsic=True,
         )
-        depth = {"include_front_depth": render, "include_wrist_depth": render}
-        poses = {"include_front_camera_extrinsic": True, "include_wrist_camera_extrinsic": True}
-        self._observer = Observer(task, Include.from_options(depth | poses), render)
+        self._observer = Observer(task, include, render)
 
     def record(self) -> Recording:
         """Reset the task and demonstrate it once."""
@@ -199,15 +202,14 @@ class Recorder:
         self._in_video = video
 
     def _observation(self, evaluated: dict[str, Any]) -> dict[str, Any]:
-        number, request = self._result.stored, self._render_request
-        cameras = CAMERAS if request is None else request.cameras(number, newest=False)
+        cameras: tuple[str, ...] = CAMERAS
+        if self._render_request is not None:
+            cameras = self._render_request.cameras(self._result.stored, newest=False)
         frame = self._observer.frame(evaluated, cameras)
         frame = {name: value for name, value in frame.items() if value is not None}
+        frame["eef_state"] = frame["eef_state"].astype(np.float32)
         closed = self._task.stick or bool((frame["gripper_state"] < GRIPPER_CLOSED).any())
-        return frame | {
-            "eef_state": frame["eef_state"].astype(np.float32),
-            "is_gripper_close": closed,
-        }
+        return frame | {"is_gripper_close": closed}
 
     def _actions(self, planned: "SubTask") -> dict[str, Any]:
         task, action = self._task, self._action
@@ -218,18 +220,17 @@ class Recorder:
             # a gripper begins straight down, which the official files have at +pi
             self._roll_shift = 2 * np.pi if abs(angles[0] + np.pi) < AT_REST else 0.0
         angles[0] += self._roll_shift
-        pixel = (
-            list(project(planned.targets[0].position)) if planned.choice and planned.targets else []
-        )
+        waypoint = self._waypoint
+        if waypoint is None:
+            waypoint = np.full(len(POSE) + 1, np.nan, np.float32)
+        point: list[int] = []
+        if planned.choice and planned.targets:
+            point = [round(float(v)) for v in project(planned.targets[0].position)]
         return {
             "joint_action": np.append(action[:ARM_JOINTS], gripper),
             "eef_action": np.concatenate([pose.p, angles, [gripper]]).astype(np.float64),
-            "waypoint_action": np.full(len(POSE) + 1, np.nan, np.float32)
-            if self._waypoint is None
-            else self._waypoint,
-            "choice_action": json.dumps(
-                {"choice": planned.choice.upper(), "point": [round(float(v)) for v in pixel]}
-            ),
+            "waypoint_action": waypoint,
+            "choice_action": json.dumps({"choice": planned.choice.upper(), "point": point}),
         }
 
     def _texts(self, planned: "SubTask") -> dict[str, Any]:
@@ -237,7 +238,8 @@ class Recorder:
         completed = progress.succeeded
         segmentation = self._observer.segmentation if self._render else None
         now = "completed" if completed else progress.planned
-        boundary, self._last_stored = now != self._last_stored, now
+        boundary = now != self._last_stored
+        self._last_stored = now
         return {
             "simple_subgoal": COMPLETED if completed else planned.text,
             "grounded_subgoal": self._planned.update(planned, segmentation),

@@ -66,11 +66,6 @@ class RobotControl:
         self._step = step
         self._on_waypoint = on_waypoint
 
-    @property
-    def stored_qpos(self) -> np.ndarray | None:
-        """Joint angles [7] where the first approach of a stick task ended; None before."""
-        return self.env.stored_qpos
-
     def move_to(self, pose: sapien.Pose, gripper: float | None = None) -> None:
         """Move the tool to a pose: straight if possible, else by a detour.
 
@@ -102,7 +97,7 @@ class RobotControl:
         self._move_gripper(OPEN)
 
     def close(self) -> None:
-        """Close the gripper, holding the arm; the stick has none, and nothing happens."""
+        """Likewise, close it."""
         self._move_gripper(CLOSE)
 
     def hold(self, n: int) -> None:
@@ -128,9 +123,10 @@ class RobotControl:
             qpos: joint angles to go to, [7]; by default those of the reset.
         """
         self.open()
-        target = self.env.reset_action[:ARM_JOINTS] if qpos is None else qpos[:ARM_JOINTS]
+        if qpos is None:
+            qpos = self.env.reset_action
         for _ in range(n):
-            self._command(target)
+            self._command(qpos)
             # Only now: tasks restore their objects after each step but the first.
             self.env.reset_in_progress = True
         self.env.reset_in_progress = False
@@ -138,7 +134,9 @@ class RobotControl:
 
     def at(self, position: Iterable[float], q: np.ndarray | None = None) -> sapien.Pose:
         """A pose of the tool at a place [3], by default with its present orientation."""
-        return sapien.Pose(list(position), self.env.tcp_pose.q if q is None else q)
+        if q is None:
+            q = self.env.tcp_pose.q
+        return sapien.Pose(list(position), q)
 
     def _plan(self, pose: sapien.Pose) -> np.ndarray:
         velocity, acceleration = LIMITS[self.env.stick]
@@ -154,7 +152,8 @@ class RobotControl:
             if plan is not None and len(plan) <= LONG_DETOUR:
                 break
         if plan is None:
-            place, orientation = ([round(float(x), 4) for x in part] for part in (pose.p, pose.q))
+            place = [round(float(x), 4) for x in pose.p]
+            orientation = [round(float(x), 4) for x in pose.q]
             raise PlanningError(
                 f"No way to {place}, orientation {orientation} (wxyz): out of the arm's reach or"
                 " blocked."

@@ -42,7 +42,8 @@ class PegPrimitives(RobotControl):
         way, z = _direction(cube, goal), cube.position[2]
         # The gripper never looks back to the robot: for a push towards it, it is turned by half a
         # turn.
-        q = pointing_down(way if goal.position[0] >= cube.position[0] else -way)
+        forward = way if goal.position[0] >= cube.position[0] else -way
+        q = pointing_down(forward)
         self.open()
         self.move_to(self.at([*(cube.position[:2] - BEHIND * way), z], q), CLOSE)
         self.close()
@@ -51,18 +52,18 @@ class PegPrimitives(RobotControl):
         self.announce(end, OPEN)
         self.open()
 
-    def hook(self, cube: Thing, goal: Thing, side: int | None = None) -> None:
+    def hook(self, cube: Thing, goal: Thing) -> None:
         """Draw a cube to a goal with a peg that is held by its tail, then let go.
 
-        Args:
-            side: +1 if the gripper passes the cube on the right of the way (the peg reaches to the
-                left), -1 for the other; by default by the sides of cube and goal.
+        Where the cube stands to the left of the goal, the gripper passes it on the right of the way
+        and the peg reaches to the left, otherwise the other way round.
         """
-        if side is None:
-            side = 1 if cube.position[1] > goal.position[1] else -1
+        side = 1 if cube.position[1] > goal.position[1] else -1
         way, z = _direction(cube, goal), cube.position[2]
         lateral = side * np.array([-way[1], way[0]])
-        q, aside = pointing_down(-lateral if self._reversed else lateral), HOOK_ASIDE * lateral
+        aside = HOOK_ASIDE * lateral
+        forward = -lateral if self._reversed else lateral
+        q = pointing_down(forward)
         start = self.at([*(cube.position[:2] - HOOK_BACK * way - aside), z], q)
         self.move_to(start, CLOSE)
         self.move_to(start)
@@ -72,15 +73,14 @@ class PegPrimitives(RobotControl):
         self.announce(end, OPEN)
         self.open()
 
-    def grasp_peg(self, peg: Peg, end: Thing | PegEnd, flip: bool = False) -> None:
+    def grasp_peg(self, peg: Peg, end: PegEnd, flip: bool = False) -> None:
         """Grasp a peg by one of its ends and lift it.
 
         Args:
-            end: `peg.head` or `peg.tail`, or its name.
             flip: hold the hand the other way round.
         """
         self.open()
-        grasp = _peg_grasp(getattr(peg, end) if isinstance(end, str) else end, flip)
+        grasp = _peg_grasp(getattr(peg, end), flip)
         self._reversed = bool(self.env.tier) and _looks_back(grasp)
         if self._reversed:
             grasp = sapien.Pose(grasp.p, turned(grasp.q, "z", np.pi))
@@ -90,7 +90,7 @@ class PegPrimitives(RobotControl):
         self.move_to(self.at([*grasp.p[:2], ABOVE_PEG], grasp.q), CLOSE)
         self.close()
 
-    def insert_peg(self, peg: Peg, grasped_end: Thing | PegEnd, side: int, box: Thing) -> None:
+    def insert_peg(self, peg: Peg, grasped_end: PegEnd, side: int, box: Thing) -> None:
         """Put the free end of a held peg into the hole of a box, as the benchmark's demonstrator
         does.
 
@@ -102,7 +102,7 @@ class PegPrimitives(RobotControl):
             side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
             box: its hole runs along its x axis, which points to the left.
         """
-        head_first = grasped_end in ("tail", peg.tail)
+        head_first = grasped_end == "tail"
         free = peg.head if head_first else peg.tail
         outward = -1 if head_first else 1
         flip = head_first != (side > 0)
@@ -114,9 +114,11 @@ class PegPrimitives(RobotControl):
             if flip:
                 # The tool is turned in place, which puts the peg's other end into the box ...
                 inserted = sapien.Pose(inserted.p, turned(inserted.q, "z", np.pi))
-                # ... and only in this case is that compensated.
-                along += grip.p[0] if head_first and along < 0 else 0.0
-            return inserted * sapien.Pose([-along if self._reversed else along, 0, -raised])
+                if head_first and along < 0:  # ... and only in this case is that compensated.
+                    along += grip.p[0]
+            if self._reversed:
+                along = -along
+            return inserted * sapien.Pose([along, 0, -raised])
 
         self.move_to(station(outward * INSERT_START, INSERT_RAISED), CLOSE)
         self.move_to(station(outward * INSERT_START), CLOSE)
@@ -124,29 +126,23 @@ class PegPrimitives(RobotControl):
         self.move_to(station(-INSERT_PAST), CLOSE)
 
     def insert_peg_fully(
-        self, peg: Peg, grasped_end: Thing | PegEnd, side: int, box: Thing, begun: bool = False
+        self, peg: Peg, grasped_end: PegEnd, side: int, box: Thing, begun: bool = False
     ) -> None:
         """Put the free end of a held peg into the middle of a box, whichever way the hand holds it.
 
         Args:
             begun: the peg is in the hole already; the other arguments are those of `insert_peg`.
         """
-        head_first = grasped_end in ("tail", peg.tail)
+        head_first = grasped_end == "tail"
         free = peg.head if head_first else peg.tail
-        hole = (
-            box.pose
-            if head_first == (side > 0)
-            else sapien.Pose(box.pose.p, turned(box.pose.q, "z", np.pi))
-        )
+        hole = box.pose
+        if head_first != (side > 0):
+            hole = sapien.Pose(hole.p, turned(hole.q, "z", np.pi))
         outward = -1 if head_first else 1
 
         def station(along: float, raised: float = 0.0) -> sapien.Pose:
-            return (
-                hole
-                * sapien.Pose([outward * along, 0, raised])
-                * free.pose.inv()
-                * self.env.tcp_pose
-            )
+            end = hole * sapien.Pose([outward * along, 0, raised])
+            return end * free.pose.inv() * self.env.tcp_pose
 
         if not begun:
             self.move_to(station(INSERT_START, INSERT_RAISED), CLOSE)
@@ -159,7 +155,8 @@ class PegPrimitives(RobotControl):
         metres.
         """
         self.open()
-        grasp = _peg_grasp(getattr(peg, end), flip, outward=TIP if end == "head" else -TIP)
+        outward = TIP if end == "head" else -TIP
+        grasp = _peg_grasp(getattr(peg, end), flip, outward)
         self.move_to(self.at([*grasp.p[:2], ABOVE_DRAG], grasp.q), OPEN)
         self.move_to(grasp, CLOSE)
         self.close()
@@ -183,8 +180,10 @@ class PegPrimitives(RobotControl):
 def _peg_grasp(end: Thing, flip: bool, outward: float = 0.0) -> sapien.Pose:
     """The tool's pose around one end of a peg, moved along the peg by `outward` metres."""
     q = turned(end.pose.q, "x", np.pi)
+    if flip:
+        q = turned(q, "z", np.pi)
     along = end.pose.to_transformation_matrix()[:3, 0]
-    return sapien.Pose(end.position + outward * along, turned(q, "z", np.pi) if flip else q)
+    return sapien.Pose(end.position + outward * along, q)
 
 
 def _looks_back(grasp: sapien.Pose) -> bool:
@@ -239,14 +238,13 @@ class StickPrimitives(RobotControl):
                 )
             targets.append(solution)
             joints = solution
-        middle = len(poses) // 2
         targets += [targets[-1]] * ARC_HOLD
-        self._half(poses[middle], targets[:middle])
-        self._half(poses[-1], targets[middle:])
-
-    def _half(self, waypoint: sapien.Pose, targets: list[np.ndarray]) -> None:
-        self.announce(waypoint, CLOSE)
-        self.follow(targets)
+        # The two halves of the arc are two waypoints.
+        middle = len(poses) // 2
+        self.announce(poses[middle], CLOSE)
+        self.follow(targets[:middle])
+        self.announce(poses[-1], CLOSE)
+        self.follow(targets[middle:])
 
 
 def arc(
@@ -263,8 +261,10 @@ def arc(
     """
     a, b = np.asarray(start, float)[:2], np.asarray(end, float)[:2]
     way = b - a
-    left = np.array([-way[1], way[0]]) / np.linalg.norm(way)
-    control = (a + b) / 2 + ARC_OFFSET * (left if direction == "clockwise" else -left)
+    aside = np.array([-way[1], way[0]]) / np.linalg.norm(way)
+    if direction == "counterclockwise":
+        aside = -aside
+    control = (a + b) / 2 + ARC_OFFSET * aside
     t = np.linspace(0, 1, ARC_SAMPLES)[:, None]
     points = (1 - t) ** 2 * a + 2 * t * (1 - t) * control + t**2 * b
     return np.column_stack([points, np.full(ARC_SAMPLES, STICK_Z)])

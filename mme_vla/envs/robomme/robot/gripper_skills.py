@@ -37,11 +37,12 @@ def grasp_orientation(thing: Thing, closing: np.ndarray) -> np.ndarray:
     first, second = np.argsort(np.abs(axes @ DOWN))[:2]
     if extents[second] < extents[first]:
         first, second = second, first
-    if extents[first] / extents[second] > 1 - SQUARE and abs(closing @ axes[second]) > abs(
-        closing @ axes[first]
-    ):
+    is_square = extents[first] / extents[second] > 1 - SQUARE
+    if is_square and abs(closing @ axes[second]) > abs(closing @ axes[first]):
         first = second
-    across = axes[first] * (1 if closing @ axes[first] >= 0 else -1)
+    across = axes[first]
+    if closing @ across < 0:
+        across = -across
     across = across - (across @ DOWN) * DOWN
     across /= np.linalg.norm(across)
     frame = np.eye(4)
@@ -55,19 +56,14 @@ def pointing_down(forward: np.ndarray) -> np.ndarray:
     """
     x = np.array([forward[0], forward[1], 0.0])
     x /= np.linalg.norm(x)
-    return wxyz(Rotation.from_matrix(np.stack([x, np.cross(DOWN, x), DOWN], axis=1)))
+    rotation = Rotation.from_matrix(np.stack([x, np.cross(DOWN, x), DOWN], axis=1))
+    return np.roll(rotation.as_quat(), 1)
 
 
 def turned(q: np.ndarray, axis: str, angle: float) -> np.ndarray:
     """An orientation wxyz turned about one of its own axes by an angle in radians."""
-    return (
-        sapien.Pose(q=q) * sapien.Pose(q=np.roll(Rotation.from_euler(axis, angle).as_quat(), 1))
-    ).q
-
-
-def wxyz(rotation: Rotation) -> np.ndarray:
-    """A rotation as a quaternion [4], scalar first."""
-    return np.roll(rotation.as_quat(), 1)
+    rotation = Rotation.from_euler(axis, angle)
+    return (sapien.Pose(q=q) * sapien.Pose(q=np.roll(rotation.as_quat(), 1))).q
 
 
 def failing_offset(mode: str, distance: float, seed: int) -> np.ndarray:
@@ -115,11 +111,11 @@ class GripperPrimitives(RobotControl):
         Args:
             z: height of the tool at the release, metres; by default the target's own.
         """
+        if z is None:
+            z = target.position[2]
         q = self.env.tcp_pose.q
-        above, below = (
-            self._over(target, ABOVE, q),
-            self._over(target, target.position[2] if z is None else z, q),
-        )
+        above = self._over(target, ABOVE, q)
+        below = self._over(target, z, q)
         self.move_to(above, CLOSE)
         self.move_to(below, OPEN)
         self.open()
@@ -169,8 +165,9 @@ class GripperPrimitives(RobotControl):
 
     def _grasp(self, thing: Thing, above: float, depth: float, miss: float) -> None:
         self.open()
-        mode, self.fail_next_pick = self.fail_next_pick, None
+        mode = self.fail_next_pick
         if mode is not None:
+            self.fail_next_pick = None
             self._fail_grasp(thing, above, depth, failing_offset(mode, miss, self.env.seed))
         grasp = self._grasp_pose(thing, depth)
         initial_height = thing.position[2]
@@ -202,9 +199,8 @@ class GripperPrimitives(RobotControl):
 
     def _grasp_pose(self, thing: Thing, depth: float) -> sapien.Pose:
         closing = self.env.tcp_pose.to_transformation_matrix()[:3, 1]
-        return sapien.Pose(
-            thing.position + np.array([0, 0, depth]), grasp_orientation(thing, closing)
-        )
+        place = thing.position + np.array([0, 0, depth])
+        return sapien.Pose(place, grasp_orientation(thing, closing))
 
     @staticmethod
     def _over(target: Thing, z: float, q: np.ndarray | Sequence[float]) -> sapien.Pose:

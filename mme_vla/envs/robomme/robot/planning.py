@@ -113,8 +113,12 @@ def plan_free(
     """
     start = np.asarray(qpos, np.float64)[:ARM_JOINTS]
     goal = arm.ik(target_pose, start)
-    path = None if goal is None else sample_path(arm, start, goal, seed)
-    return None if path is None else time_optimal(path, velocity_limit, acceleration_limit)
+    if goal is None:
+        return None
+    path = sample_path(arm, start, goal, seed)
+    if path is None:
+        return None
+    return time_optimal(path, velocity_limit, acceleration_limit)
 
 
 def time_optimal(
@@ -139,14 +143,12 @@ def time_optimal(
         constraint.JointVelocityConstraint(np.full(joints, velocity_limit)),
         constraint.JointAccelerationConstraint(np.full(joints, acceleration_limit)),
     ]
-    passage = algorithm.TOPPRA(
-        limits, spline, parametrizer="ParametrizeConstAccel"
-    ).compute_trajectory()
+    timing = algorithm.TOPPRA(limits, spline, parametrizer="ParametrizeConstAccel")
+    passage = timing.compute_trajectory()
     if passage is None:
         return None
-    return np.asarray(
-        passage(np.linspace(0, passage.duration, int(passage.duration / CONTROL_STEP)))
-    )
+    times = np.linspace(0, passage.duration, int(passage.duration / CONTROL_STEP))
+    return np.asarray(passage(times))
 
 
 def goal_in_base(
@@ -159,10 +161,8 @@ def goal_in_base(
     precision this length is off by up to 1e-7, and the goal is turned by up to 1e-9.
     """
     w, x, y, z = np.asarray(target_pose.q, precision)
-    summed, exact = (
-        (w * w + x * x + y * y + z * z),
-        np.square(target_pose.q, dtype=np.float64).sum(),
-    )
+    summed = w * w + x * x + y * y + z * z
+    exact = np.square(target_pose.q, dtype=np.float64).sum()
     goal = matrix_of(target_pose)
     goal[:3, :3] = np.eye(3) + exact / float(summed) * (goal[:3, :3] - np.eye(3))
     goal = np.linalg.inv(matrix_of(base_pose)) @ goal
@@ -181,13 +181,10 @@ def twist_of(transform: np.ndarray) -> np.ndarray | None:
     if abs(trace + 1) <= _PI_TOLERANCE:
         return None
     angle = np.arccos((trace - 1) / 2)
-    axis = np.array(
-        [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-    ) / (2 * np.sin(angle))
+    x = rotation[2, 1] - rotation[1, 2]
+    y = rotation[0, 2] - rotation[2, 0]
+    z = rotation[1, 0] - rotation[0, 1]
+    axis = np.array([x, y, z]) / (2 * np.sin(angle))
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     # Inverse of the left Jacobian of SO(3): from the displacement's translation to the twist's
@@ -218,19 +215,20 @@ class Obstacles:
 
     def __init__(self, arm: Arm, ends: list[np.ndarray]) -> None:
         self._arm = arm
-        self._floor = min([0.0, *(arm.heights(end)[0][2] + arm.base.p[2] for end in ends)]) - 1e-3
+        lowest = 0.0
+        for end in ends:
+            tool, _ = arm.heights(end)
+            lowest = min(lowest, tool[2] + arm.base.p[2])
+        self._floor = lowest - 1e-3
 
     def clear(self, joints: np.ndarray) -> bool:
         """Whether one configuration [7] is free."""
         tool, wrist = self._arm.heights(joints)
+        for place in (tool, wrist):
+            if np.linalg.norm(place[:2]) < COLUMN_RADIUS and place[2] < COLUMN_HEIGHT:
+                return False
         height = self._arm.base.p[2]
-        in_column = any(
-            np.linalg.norm(p[:2]) < COLUMN_RADIUS and p[2] < COLUMN_HEIGHT for p in (tool, wrist)
-        )
-        return (
-            bool(tool[2] + height >= self._floor and wrist[2] + height >= WRIST_CLEARANCE)
-            and not in_column
-        )
+        return bool(tool[2] + height >= self._floor and wrist[2] + height >= WRIST_CLEARANCE)
 
     def clear_between(self, a: np.ndarray, b: np.ndarray) -> bool:
         """Whether the straight joint path between two configurations is free, the first one not
@@ -274,8 +272,8 @@ def sample_path(arm: Arm, start: np.ndarray, goal: np.ndarray, seed: int) -> np.
     setup.solve(base.PlannerTerminationCondition(lambda: next(rounds, None) is None))
     if not setup.haveExactSolutionPath():
         return None
-    path = [start, *(_joints(state) for state in setup.getSolutionPath().getStates()[1:-1]), goal]
-    return np.array(_shortened(path, obstacles))
+    between = [_joints(state) for state in setup.getSolutionPath().getStates()[1:-1]]
+    return np.array(_shortened([start, *between, goal], obstacles))
 
 
 def _joints(state: Any) -> np.ndarray:
@@ -293,13 +291,15 @@ def _shortened(path: list[np.ndarray], obstacles: Obstacles) -> list[np.ndarray]
     """Leave out what a straight line can skip, then space the rest evenly, so that a spline stays
     near it.
     """
-    points, i = [path[0]], 0
+    points = [path[0]]
+    i = 0
     while i < len(path) - 1:
-        free = (
-            j for j in range(len(path) - 1, i + 1, -1) if obstacles.clear_between(path[i], path[j])
-        )
-        j = next(free, i + 1)
+        j = len(path) - 1
+        while j > i + 1 and not obstacles.clear_between(path[i], path[j]):
+            j -= 1
         steps = int(np.ceil(np.linalg.norm(path[j] - path[i]) / REACH))
-        points += [path[i] + (path[j] - path[i]) * k / steps for k in range(1, steps)] + [path[j]]
+        for k in range(1, steps):
+            points.append(path[i] + (path[j] - path[i]) * k / steps)
+        points.append(path[j])
         i = j
     return points

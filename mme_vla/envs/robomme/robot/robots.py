@@ -91,9 +91,10 @@ def description(stock: str, mount_from: str | None = None, visible: bool = True)
     robot = ElementTree.parse(source).getroot()
     if mount_from is not None:
         _add_mount(robot, ElementTree.parse(mount_from).getroot())
-    for link in robot.iter("link"):
-        for visual in [] if visible else link.findall("visual"):
-            link.remove(visual)
+    if not visible:
+        for link in robot.iter("link"):
+            for visual in link.findall("visual"):
+                link.remove(visual)
     caches = user_cache("robots")
     for mesh in robot.iter("mesh"):
         mesh.set("filename", str(source.parent / mesh.attrib["filename"]))
@@ -114,9 +115,10 @@ def _add_mount(robot: ElementTree.Element, donor: ElementTree.Element) -> None:
         if child is not None and child.attrib["link"] in MOUNT:
             joints.append(joint)
     links = [link for link in donor.findall("link") if link.attrib["name"] in MOUNT]
-    for visual in [visual for link in links for visual in link.findall("visual")]:
-        for material in visual.findall("material"):  # the camera is white in the official images
-            visual.remove(material)
+    for link in links:
+        for visual in link.iterfind("visual"):
+            for material in visual.findall("material"):
+                visual.remove(material)  # the camera is white in the official images
     robot.extend([*links, *joints])
 
 
@@ -151,9 +153,8 @@ def coarsen(corners: np.ndarray, cell: float = CELL) -> np.ndarray:
         np.floor(points / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
     cells = cells.reshape(-1)
-    means = (
-        np.stack([np.bincount(cells, points[:, axis]) for axis in range(3)], 1) / counts[:, None]
-    )
+    sums = [np.bincount(cells, points[:, axis]) for axis in range(3)]
+    means = np.stack(sums, 1) / counts[:, None]
     triangles = cells.reshape(-1, 3)
     different = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
     triangles = triangles[different]

@@ -7,7 +7,7 @@ Motions are functions of the number of control steps done, or of the state of th
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import sapien
@@ -42,18 +42,29 @@ def smoothstep(x: float) -> float:
     return x * x * (3 - 2 * x)
 
 
-def parked(group: int, i: int) -> Place:
-    """A place of its own for object `i` of a group, out of the scene: many at one place press
-    against each other.
+def parked(group: int | None, i: int) -> Place:
+    """Where object `i` of a group is out of the scene: at `AWAY`, or, in a group with a number, at
+    a place of its own, since many at one place press against each other.
     """
+    if group is None:
+        return AWAY
     return 20 + 0.5 * (i % PARKED_ROW), 20 + 0.5 * (4 * group + i // PARKED_ROW), 10.0
+
+
+class Motion(Protocol):
+    """What the script moves before the physics of a step."""
+
+    def apply(self, k: int) -> None:
+        """Move the objects for the step before which `k` steps were done."""
 
 
 class Appear:
     """An object is away for a number of steps, then appears at its place."""
 
     def __init__(self, thing: Thing, until: int, away: Place = AWAY) -> None:
-        self.thing, self.until, self.away = thing, until, away
+        self.thing = thing
+        self.until = until
+        self.away = away
         self.home = thing.pose
 
     def apply(self, k: int) -> None:
@@ -74,7 +85,7 @@ class Cover:
     def __init__(self, containers: Sequence[Thing], group: int | None = None) -> None:
         """`group`: park each container at a place of its own (`parked`); None: all at one."""
         self._parts = [
-            Appear(container, UNCOVERED_STEPS, AWAY if group is None else parked(group, i))
+            Appear(container, UNCOVERED_STEPS, parked(group, i))
             for i, container in enumerate(containers)
         ]
 
@@ -109,13 +120,11 @@ class Swap:
         partner: Thing | None = None,
         steps: int = SWAP_STEPS,
     ) -> None:
-        self.initiator, self.partner, self.start, self.lane, self.steps = (
-            initiator,
-            partner,
-            start,
-            lane,
-            steps,
-        )
+        self.initiator = initiator
+        self.partner = partner
+        self.start = start
+        self.lane = lane
+        self.steps = steps
         self._group = list(group)
         self._poses: dict[Thing, sapien.Pose] = {}
 
@@ -143,20 +152,22 @@ class Swap:
         arc = way * alpha + aside * self.lane * math.sin(math.pi * (k - self.start) / self.steps)
         if k == self.end:
             arc = way
-        for thing, pose in self._poses.items():
-            if thing is self.initiator:
-                thing.move_to(sapien.Pose([*(a.p[:2] + arc), a.p[2]], blend(a.q, b.q, alpha)))
-            elif thing is self.partner:
-                thing.move_to(sapien.Pose([*(b.p[:2] - arc), b.p[2]], blend(b.q, a.q, alpha)))
-            else:
-                thing.move_to(pose)
+        poses = dict(self._poses)
+        poses[self.initiator] = sapien.Pose([*(a.p[:2] + arc), a.p[2]], blend(a.q, b.q, alpha))
+        poses[self.partner] = sapien.Pose([*(b.p[:2] - arc), b.p[2]], blend(b.q, a.q, alpha))
+        for thing, pose in poses.items():
+            thing.move_to(pose)
 
 
-def sequential_swaps(initiators: Sequence[Thing], group: Sequence[Thing], start: int) -> list[Swap]:
+def sequential_swaps(
+    initiators: Sequence[Thing], group: Sequence[Thing], start: int, steps: int = SWAP_STEPS
+) -> list[Swap]:
     """One swap after another, the first at step `start`; the partner is the nearest object when a
     swap begins.
     """
-    return [Swap(thing, group, start + i * SWAP_STEPS) for i, thing in enumerate(initiators)]
+    return [
+        Swap(thing, group, start + i * steps, steps=steps) for i, thing in enumerate(initiators)
+    ]
 
 
 def blend(a: np.ndarray, b: np.ndarray, alpha: float) -> np.ndarray:
@@ -191,15 +202,16 @@ class Hide:
         self, hidden: Sequence[tuple[Thing, Thing]], start: int, end: int, group: int | None = None
     ) -> None:
         """`group`: park each object at a place of its own (`parked`); None: all at one."""
-        self._hidden, self._start, self._end = list(hidden), start, end
+        self._hidden = list(hidden)
+        self._start = start
+        self._end = end
         self._homes = [thing.pose for thing, _ in self._hidden]
-        self._away = [AWAY if group is None else parked(group, i) for i in range(len(self._hidden))]
+        self._away = [parked(group, i) for i in range(len(self._hidden))]
 
     def apply(self, k: int) -> None:
         """Move the hidden objects for the step before which `k` steps were done."""
-        for (thing, container), home, away in zip(
-            self._hidden, self._homes, self._away, strict=True
-        ):
+        rows = zip(self._hidden, self._homes, self._away, strict=True)
+        for (thing, container), home, away in rows:
             if self._start <= k < self._end:
                 thing.move_to(sapien.Pose(away, home.q))
             elif k == self._end:
@@ -216,16 +228,18 @@ class Highlight:
     """How far below the object's origin the disc lies, metres."""
 
     def __init__(self, disc: Thing, thing: Thing, start: int, end: int) -> None:
-        self._disc, self._thing, self._start, self._end = disc, thing, start, end
+        self._disc = disc
+        self._thing = thing
+        self._start = start
+        self._end = end
 
     def apply(self, k: int) -> None:
         """Move the disc for the step before which `k` steps were done."""
         self.active = self._start <= k <= self._end
+        place: Place = BELOW_TABLE
         if self.active:
-            below = self._thing.position - [0, 0, self.DEPTH]
-            self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
-        else:
-            self._disc.move_to(sapien.Pose(BELOW_TABLE, self._disc.pose.q))
+            place = self._thing.position - [0, 0, self.DEPTH]
+        self._disc.move_to(sapien.Pose(place, self._disc.pose.q))
 
 
 def build_mark(env: "Stage", name: str, radius: float, half_length: float) -> Disc:
@@ -243,7 +257,9 @@ class Mark:
     """
 
     def __init__(self, disc: Thing, place: np.ndarray, steps: int) -> None:
-        self._disc, self._place, self._steps = disc, place - [0, 0, Highlight.DEPTH], steps
+        self._disc = disc
+        self._place = place - [0, 0, Highlight.DEPTH]
+        self._steps = steps
         self._until = -1
         self._visible = False
         self._move(BELOW_TABLE)
@@ -277,7 +293,9 @@ class Trace:
     def update(self, k: int) -> None:
         """Place the dot of step `k`; it replaces that of 40 steps before."""
         x, y, z = self._env.tcp_pose.p
-        place = (x, y, self.HEIGHT) if z < self.BELOW else BELOW_TABLE
+        place = BELOW_TABLE
+        if z < self.BELOW:
+            place = (x, y, self.HEIGHT)
         self._dots[k % self.STEPS].move_to(sapien.Pose(place))
 
 

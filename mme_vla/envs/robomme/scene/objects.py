@@ -98,18 +98,16 @@ class Shapes:
         """Five cylinders one in the other, of the colour and white by turns; inner ones are a
         little longer.
         """
-        for k in range(5):
-            self.cylinder(
-                radius * (1 - 0.2 * k),
-                half_length + k * 1e-5,
-                colour if k % 2 == 0 else (1.0, 1.0, 1.0),
-            )
+        for k, ring_colour in enumerate((colour, WHITE, colour, WHITE, colour)):
+            self.cylinder(radius * (1 - 0.2 * k), half_length + k * 1e-5, ring_colour)
         return self
 
     def build(self, name: str, pose: sapien.Pose, kinematic: bool = False) -> Any:
         """The actor, at its pose; a kinematic one moves only when told to."""
         self._builder.set_initial_pose(pose)
-        return self._builder.build_kinematic(name) if kinematic else self._builder.build(name)
+        if kinematic:
+            return self._builder.build_kinematic(name)
+        return self._builder.build(name)
 
 
 def _material(colour: RGB | None, glossy: bool = False) -> sapien.render.RenderMaterial:
@@ -159,7 +157,8 @@ class Cube(Thing):
 
     def __init__(self, name: str, entity: Any, colour: str | RGB, half_size: float = H) -> None:
         super().__init__(name, entity)
-        self.colour, self.half_size = colour, half_size
+        self.colour = colour
+        self.half_size = half_size
 
 
 class Disc(Thing):
@@ -242,7 +241,9 @@ def build_disc(
     Args:
         z: height of the centre; by default the thickness.
     """
-    pose = sapien.Pose([float(xy[0]), float(xy[1]), thickness if z is None else z], UPRIGHT)
+    if z is None:
+        z = thickness
+    pose = sapien.Pose([float(xy[0]), float(xy[1]), z], UPRIGHT)
     rings = Shapes(env).rings(radius, thickness / 2, TARGET_COLOURS[colour])
     return Disc(name, rings.build(name, pose, kinematic=True), radius)
 
@@ -259,20 +260,17 @@ def build_highlight(
     a target.
     """
     shapes = Shapes(env)
-    shapes = (
+    if rings:
         shapes.rings(radius, half_length, colour)
-        if rings
-        else shapes.cylinder(radius, half_length, colour)
-    )
+    else:
+        shapes.cylinder(radius, half_length, colour)
     return Disc(name, shapes.build(name, sapien.Pose(BELOW_TABLE, UPRIGHT), kinematic=True), radius)
 
 
 def build_sphere(env: "Stage", name: str, radius: float, colour: RGB = WHITE) -> Thing:
     """A ball that nothing can touch; it waits below the table."""
-    return Thing(
-        name,
-        Shapes(env).sphere(radius, colour).build(name, sapien.Pose(BELOW_TABLE), kinematic=True),
-    )
+    shapes = Shapes(env).sphere(radius, colour)
+    return Thing(name, shapes.build(name, sapien.Pose(BELOW_TABLE), kinematic=True))
 
 
 def build_container(env: "Stage", name: str, xy: XY, yaw: float = 0.0) -> Container:
@@ -290,11 +288,8 @@ def build_container(env: "Stage", name: str, xy: XY, yaw: float = 0.0) -> Contai
     shapes.solid_box([middle, middle, lid], None, centre=[0, 0, lid])
     # Turned about its own vertical, which then points down: seen from above the turn goes the other
     # way.
-    pose = (
-        at(xy, CONTAINER_Z)
-        * sapien.Pose(q=euler2quat(np.pi, 0, 0))
-        * sapien.Pose(q=euler2quat(0, 0, yaw))
-    )
+    upside_down = sapien.Pose(q=euler2quat(np.pi, 0, 0))
+    pose = at(xy, CONTAINER_Z) * upside_down * sapien.Pose(q=euler2quat(0, 0, yaw))
     return Container(name, shapes.build(name, pose))
 
 
@@ -310,21 +305,10 @@ def build_board(env: "Stage", xy: XY, yaw: float = 0.0, name: str = "board") -> 
     return Board(name, shapes.build(name, at(xy, height, yaw), kinematic=True))
 
 
-def build_aperture_box(
-    env: "Stage",
-    xy: XY,
-    yaw: float,
-    inner: float = 0.017,
-    outer: float = 0.04,
-    half_depth: float = 0.05,
-    name: str = "box",
-) -> Thing:
-    """A box with a square hole along its x axis, standing on the table.
-
-    Args:
-        inner: half the width of the hole. outer: half the width of the box. half_depth: half its
-            length along the hole.
-    """
+def build_aperture_box(env: "Stage", xy: XY, yaw: float, name: str = "box") -> Thing:
+    """A box with a square hole along its x axis, standing on the table."""
+    inner, outer = 0.017, 0.04  # half the widths of the hole and of the box
+    half_depth = 0.05
     wall = (outer - inner) / 2
     shapes = Shapes(env)
     for sign in (-1, 1):
@@ -341,6 +325,5 @@ def build_aperture_box(
 def build_obstacle(env: "Stage", name: str, xy: XY, yaw: float, colour: RGB) -> Thing:
     """An upright block, thin along its y axis, to be circled around."""
     half = [0.03, 0.015, 0.05]
-    return Thing(
-        name, Shapes(env).solid_box(half, colour).build(name, at(xy, half[2], yaw), kinematic=True)
-    )
+    shapes = Shapes(env).solid_box(half, colour)
+    return Thing(name, shapes.build(name, at(xy, half[2], yaw), kinematic=True))

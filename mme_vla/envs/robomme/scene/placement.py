@@ -89,10 +89,15 @@ class Region:
 
     def place(self, draws: Draws, margin: float) -> np.ndarray:
         """Sample a point that keeps `margin` from the edges [2]; x comes first."""
-        half = self.half if isinstance(self.half, tuple) else (self.half, self.half)
-        low = [c - h + margin for c, h in zip(self.centre, half, strict=True)]
-        high = [c + h - margin for c, h in zip(self.centre, half, strict=True)]
-        return np.array([a + draws.uniform() * (b - a) for a, b in zip(low, high, strict=True)])
+        half = self.half
+        if not isinstance(half, tuple):
+            half = (half, half)
+        point = []
+        for centre, extent in zip(self.centre, half, strict=True):
+            low = centre - extent + margin
+            high = centre + extent - margin
+            point.append(low + draws.uniform() * (high - low))
+        return np.array(point)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +145,9 @@ class Box2D:
 
     def _reach(self, direction: np.ndarray) -> float:
         """How far the rectangle extends from its centre along a direction, metres."""
-        return self.half[0] * abs(_dot(self.axes[0], direction)) + self.half[1] * abs(
-            _dot(self.axes[1], direction)
-        )
+        along = self.half[0] * abs(_dot(self.axes[0], direction))
+        across = self.half[1] * abs(_dot(self.axes[1], direction))
+        return along + across
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> float:
@@ -166,17 +171,10 @@ def obstacle_box(thing: Thing) -> Box2D:
     Raises:
         SceneError: nothing of the object can be touched.
     """
-    bounds = _bounds(thing)
-    if bounds is None:
-        raise SceneError(f"{thing.name} has no collision shape; it cannot be an obstacle.")
-    return bounds
-
-
-def _bounds(thing: Thing) -> Box2D | None:
     body = thing.entity._objs[0].find_component_by_type(physx.PhysxRigidDynamicComponent)
     mesh = merge_meshes(get_component_meshes(body))
     if mesh is None:
-        return None
+        raise SceneError(f"{thing.name} has no collision shape; it cannot be an obstacle.")
     pose = body.pose.to_transformation_matrix().astype(np.float64)
     vertices = matrix_product(pose[:3, :3], np.asarray(mesh.vertices).T).T + pose[:3, 3]
     return Box2D(*shadow_of_smallest_box(vertices.tobytes(), mesh.faces.tobytes()))
@@ -190,8 +188,12 @@ def button_box(button: Button) -> Box2D:
 def board_boxes(board: Board) -> list[Box2D]:
     """What the board with a hole occupies: its four strips, as if it were not turned."""
     x, y = board.position[:2]
-    strips = [Box2D.aligned((x, y + side * 0.045), (0.05, 0.005)) for side in (1, -1)]
-    return strips + [Box2D.aligned((x + side * 0.045, y), (0.005, 0.04)) for side in (1, -1)]
+    return [
+        Box2D.aligned((x, y + 0.045), (0.05, 0.005)),
+        Box2D.aligned((x, y - 0.045), (0.05, 0.005)),
+        Box2D.aligned((x + 0.045, y), (0.005, 0.04)),
+        Box2D.aligned((x - 0.045, y), (0.005, 0.04)),
+    ]
 
 
 def draw_cube(
@@ -199,8 +201,6 @@ def draw_cube(
     region: Region,
     avoid: Sequence[Avoid] = (),
     gap: float = 0.005,
-    yaw: bool = True,
-    half: float = H,
 ) -> tuple[np.ndarray, float] | None:
     """Sample the position and the yaw of a cube; targets are no obstacles.
 
@@ -208,17 +208,15 @@ def draw_cube(
         region: the cube keeps inside it, as if it were not turned.
         avoid: what it keeps clear of.
         gap: metres.
-        yaw: sample a yaw too; otherwise the cube is aligned with the axes.
-        half: half its edge, metres.
 
     Returns:
         Centre [2] and yaw in radians; None when 256 trials have failed.
     """
-    obstacles = _obstacles([thing for thing in avoid if not isinstance(thing, Disc)], grow=0.0)
+    obstacles = _obstacles(avoid)
     for _ in range(TRIALS):
-        xy = region.place(draws, half)
-        angle = 2 * np.pi * draws.uniform() if yaw else 0.0
-        cube = Box2D.square(xy, half + gap, angle)
+        xy = region.place(draws, H)
+        angle = 2 * np.pi * draws.uniform()
+        cube = Box2D.square(xy, H + gap, angle)
         if not any(cube.intersects(obstacle) for obstacle in obstacles):
             return xy, angle
     return None
@@ -236,7 +234,7 @@ def draw_disc(
         gap: metres.
     """
     circles = [(disc.position[:2], disc.radius) for disc in avoid if isinstance(disc, Disc)]
-    obstacles = _obstacles([thing for thing in avoid if not isinstance(thing, Disc)], grow=0.0)
+    obstacles = _obstacles(avoid)
     for _ in range(TRIALS):
         xy = region.place(draws, radius)
         clear = all(obstacle.distance(xy) >= radius + gap for obstacle in obstacles)
@@ -246,11 +244,7 @@ def draw_disc(
 
 
 def draw_container(
-    draws: Draws,
-    region: Region,
-    avoid: Sequence[Avoid] = (),
-    gap: float = 0.005,
-    degrees: bool = False,
+    draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005
 ) -> tuple[np.ndarray, float] | None:
     """Sample the position of a container and then its yaw, 0 … 90°; the gap to other objects counts
     twice.
@@ -259,17 +253,15 @@ def draw_container(
         region: the container lies inside it.
         avoid: what it keeps clear of.
         gap: metres.
-        degrees: give the yaw in degrees, as rows do.
 
     Returns:
-        Centre [2] and yaw, in radians by default; None when 256 trials have failed.
+        Centre [2] and yaw in degrees, as rows have it; None when 256 trials have failed.
     """
-    obstacles = _obstacles([thing for thing in avoid if not isinstance(thing, Disc)], grow=gap)
+    obstacles = _obstacles(avoid, grow=gap)
     for _ in range(TRIALS):
         xy = region.place(draws, CONTAINER_HALF)
         if all(obstacle.distance(xy) >= CONTAINER_HALF + gap for obstacle in obstacles):
-            yaw = 90 * draws.uniform()
-            return xy, yaw if degrees else float(np.deg2rad(yaw))
+            return xy, 90 * draws.uniform()
     return None
 
 
@@ -281,9 +273,12 @@ def draw_button(
     return centre[0] + x * range[0], centre[1] + y * range[1]
 
 
-def _obstacles(avoid: Sequence[Avoid], grow: float) -> list[Box2D]:
+def _obstacles(avoid: Sequence[Avoid], grow: float = 0.0) -> list[Box2D]:
+    """What things other than targets occupy; objects without a rule of their own grow by `grow`."""
     boxes: list[Box2D] = []
     for item in avoid:
+        if isinstance(item, Disc):
+            continue
         if isinstance(item, Box2D):
             boxes.append(item)
         elif isinstance(item, Button):
@@ -314,7 +309,12 @@ def rotated_anchors(draws: Draws, count: int) -> list[Point]:
     triangle = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.0)]
     line = [(0.0, -0.15), (0.0, 0.15), (0.0, 0.0)]
     square = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.1), (0.1, -0.1)]
-    anchors = square if count == len(square) else line if on_line else triangle
+    if count == len(square):
+        anchors = square
+    elif on_line:
+        anchors = line
+    else:
+        anchors = triangle
     cos, sin = angle.cos(), angle.sin()  # in single precision, as the benchmark has it
     return [((cos * x - sin * y).item(), (sin * x + cos * y).item()) for x, y in anchors]
 
@@ -323,10 +323,14 @@ def shifted_anchors(draws: Draws, count: int) -> list[Point]:
     """Three anchors in a triangle or on a line, each shifted forward, or four of which pairs are
     shifted sideways.
     """
-    left, right = (draws.uniform() * SHIFT for _ in range(2))
-    a, b = ([draws.uniform() * SHIFT for _ in range(3)] for _ in range(2))
+    left = draws.uniform() * SHIFT
+    right = draws.uniform() * SHIFT
+    a = [draws.uniform() * SHIFT for _ in range(3)]
+    b = [draws.uniform() * SHIFT for _ in range(3)]
     on_line = draws.integer(0, 2)
     triangle = [(-0.05 + a[0], -0.15), (-0.05 + a[1], 0.15), (0.05 + a[2], 0.0)]
     line = [(-0.05 + b[0], -0.15), (-0.05 + b[1], 0.15), (-0.05 + b[2], 0.0)]
     square = [(0.0, -0.1 + left), (0.0, 0.1 + left), (0.1, 0.1 + right), (0.1, -0.1 + right)]
-    return square if count == len(square) else line if on_line else triangle
+    if count == len(square):
+        return square
+    return line if on_line else triangle

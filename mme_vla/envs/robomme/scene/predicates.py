@@ -50,9 +50,12 @@ def dropped(env: "Stage", thing: Thing) -> bool:
     """The object was let go: near the table. While recording it may still be falling, if the
     gripper is away.
     """
-    z = thing.position[2]
-    low = (z <= 0.2 and env.tcp_pose.p[2] > 0.05) if env.recording else z <= 0.035
-    return bool(low) and not env.is_grasping(thing)
+    highest = 0.2 if env.recording else 0.035
+    if thing.position[2] > highest:
+        return False
+    if env.recording and env.tcp_pose.p[2] <= 0.05:
+        return False
+    return not env.is_grasping(thing)
 
 
 def dropped_onto(env: "Stage", thing: Thing, target: Thing) -> bool:

@@ -100,7 +100,8 @@ class Stage(BaseEnv):
         lit_by_lamps = self.scene.sub_scenes[0].render_system.cubemap is None
         if not configs and lit_by_lamps and self._render_device.is_cpu():
             lean = lean_shaders()
-            self._custom_sensor_configs = {} if lean is None else {"shader_config": lean}
+            if lean is not None:
+                self._custom_sensor_configs = {"shader_config": lean}
         super()._setup_sensors(options)
         self._custom_sensor_configs = configs
 
@@ -112,17 +113,19 @@ class Stage(BaseEnv):
         bodies = [link.find_component_by_type(RenderBodyComponent) for link in links]
         return culled([body for body in bodies if body is not None], camera._render_cameras[0])
 
-    def set_up(self) -> None:
+    def _load_scene(self, options: dict) -> None:
         """Put up the table, with nothing on it."""
         self.table = TableSceneBuilder(self, robot_init_qpos_noise=0)
         self.table.build()
         self.things: list[Thing] = []
 
-    def tidy(self, env_idx: torch.Tensor) -> None:
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         """Bring table and robot back to their start."""
         self.table.initialize(env_idx)
-        fingers = [] if self.stick else [0.04, 0.04]
-        self.agent.reset(np.concatenate([RESET_QPOS, fingers]).astype(np.float32))
+        qpos = RESET_QPOS
+        if not self.stick:
+            qpos = np.concatenate([RESET_QPOS, [0.04, 0.04]])
+        self.agent.reset(qpos.astype(np.float32))
         self.agent.robot.set_pose(sapien.Pose(ROBOT_BASE))
         self.reset_in_progress = self.after_video = False
         self.stored_qpos = None
@@ -151,7 +154,9 @@ class Stage(BaseEnv):
         """Likewise, as a wait counts them: evaluated `as_recorded`, without those that a recording
         does not have.
         """
-        return self.steps_done - self.unrecorded_steps if self.recording else self.steps_done
+        if self.recording:
+            return self.steps_done - self.unrecorded_steps
+        return self.steps_done
 
     @property
     def reset_action(self) -> np.ndarray:

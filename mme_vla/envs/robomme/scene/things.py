@@ -51,28 +51,16 @@ class Thing:
     def move_to(self, pose: sapien.Pose) -> None:
         """Teleport the object, at rest."""
         self.entity.set_pose(pose)
-        self._draw(pose.p[2] > UNDER_THE_FLOOR)
+        if self._may_sink:
+            # Leave out of the images what the floor hides anyway: dozens of marks cost a third of
+            # the rendering.
+            visible = bool(pose.p[2] > UNDER_THE_FLOOR)
+            body = self.entity._objs[0].find_component_by_type(RenderBodyComponent)
+            if body is not None and bool(body.visibility) != visible:
+                body.visibility = float(visible)
         if self.entity.px_body_type == "dynamic":
             self.entity.set_linear_velocity(np.zeros((1, 3), np.float32))
             self.entity.set_angular_velocity(np.zeros((1, 3), np.float32))
-
-    def show(self) -> None:
-        """Draw the object, or leave it out, as its height says: due where its pose was set from
-        outside.
-        """
-        self._draw(bool(self.position[2] > UNDER_THE_FLOOR))
-
-    def _draw(self, visible: bool) -> None:
-        """Leave out of the images what the floor hides anyway: dozens of marks cost a third of the
-        rendering.
-        """
-        body = (
-            self.entity._objs[0].find_component_by_type(RenderBodyComponent)
-            if self._may_sink
-            else None
-        )
-        if body is not None and bool(body.visibility) != visible:
-            body.visibility = float(visible)
 
     def displace(self, pose: sapien.Pose) -> None:
         """Teleport the object in the midst of its motion: it keeps its velocity."""

@@ -12,7 +12,7 @@ import copy
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -57,22 +57,28 @@ class Values:
             value = sample()
             self.note(name, value)
             return value
-        match = self.find(name)
-        if match is None and default is None:
-            raise self.error(name, "is missing")
-        return default if match is None else match  # type: ignore[return-value]
+        value = self.find(name)
+        if value is None:
+            if default is None:
+                raise self.error(name, "is missing")
+            return default
+        return value
 
     def place(self, name: str, sample: Callable[[], Any], size: int = 2) -> list[float]:
         """`size` numbers, the first two of which are a place on the table."""
         value = self(name, lambda: [float(v) for v in sample()])
-        return value if not self.specified else self.check_place(name, value, size)
+        if self.specified:
+            return self.check_place(name, value, size)
+        return value
 
     def check_place(self, name: str, value: Any, size: int) -> list[float]:
         """A place that a row gives, if it is one."""
-        numbers = (
-            isinstance(value, list) and len(value) == size and all(_is_number(v) for v in value)
-        )
-        if not numbers or max(abs(value[0]), abs(value[1])) > BOUND:
+        is_list = isinstance(value, list) and len(value) == size
+        if (
+            not is_list
+            or not all(_is_number(v) for v in value)
+            or max(abs(value[0]), abs(value[1])) > BOUND
+        ):
             raise self.error(
                 name, f"is {brief(value)}; expected {size} numbers, x and y within {BOUND} m"
             )
@@ -82,11 +88,11 @@ class Values:
                 default: int | None = None) -> int:  # fmt: skip
         """A whole number from `least` to `most`, both included."""
         value = self(name, sample, default)
-        if self.specified and (
-            type(value) is not int or value < least or (most is not None and value > most)
-        ):
+        if self.specified:
             limit = f"at least {least}" if most is None else f"{least} to {most}"
-            raise self.error(name, f"is {brief(value)}; expected a whole number, {limit}")
+            too_large = type(value) is int and most is not None and value > most
+            if type(value) is not int or value < least or too_large:
+                raise self.error(name, f"is {brief(value)}; expected a whole number, {limit}")
         return value
 
     def number(self, name: str, sample: Callable[[], float]) -> float:
@@ -124,26 +130,28 @@ class Values:
         value = self.find(name)
         if value is None:
             return None
-        for pair in value if isinstance(value, list) else [value]:
-            two = (
-                isinstance(pair, list)
-                and len(pair) == 2
-                and all(type(i) is int and 0 <= i < count for i in pair)
-            )
-            if not two or pair[0] == pair[1]:
+        pairs = value if isinstance(value, list) else [value]
+        for pair in pairs:
+            are_two = isinstance(pair, list) and len(pair) == 2
+            if (
+                not are_two
+                or any(type(i) is not int or not 0 <= i < count for i in pair)
+                or pair[0] == pair[1]
+            ):
                 raise self.error(
                     name, f"has {brief(pair)}; expected two different numbers from 0 to {count - 1}"
                 )
-        return list(value)
+        return pairs
 
     def words(
         self, name: str, sample: Callable[[], list[str]], known: Mapping[str, Any]
     ) -> list[str]:
         """Names, each of those `known`, such as colours."""
         value = self(name, sample)
-        for word in value if isinstance(value, list) else [value]:
+        words = value if isinstance(value, list) else [value]
+        for word in words:
             self._check_word(name, word, known)
-        return value
+        return words
 
     def word(self, name: str, sample: Callable[[], str], known: Mapping[str, Any]) -> str:
         """One of the names `known`."""
@@ -167,15 +175,13 @@ class Values:
         """A value of the row, or None; `initializations` means its last entry."""
         value: Any = self.spec
         for part in name.split("."):
-            if isinstance(value, list):
-                index = int(part) if part.isdigit() else -1
-                value = value[index] if index < len(value) and value else None
-                if not part.isdigit() and isinstance(value, Mapping):
-                    value = value.get(part)
-            elif isinstance(value, Mapping):
-                value = value.get(part)
-            else:
-                return None
+            if isinstance(value, list) and part.isdigit():
+                index = int(part)
+                value = value[index] if index < len(value) else None
+                continue
+            if isinstance(value, list):  # initializations
+                value = value[-1] if value else None
+            value = value.get(part) if isinstance(value, Mapping) else None
         return value
 
     def names(self, name: str) -> list[str]:
@@ -226,10 +232,6 @@ class Values:
             if box.intersects(occupied):
                 raise self.error(name, f"overlaps spec.{other}")
         self._occupied.append((name, box))
-
-    def copy(self) -> Self:
-        """The same values, to be read."""
-        return type(self)(self.spec, self._where)
 
 
 def _is_number(value: Any) -> bool:

@@ -4,22 +4,16 @@ container.
 
 from mme_vla.envs.robomme.scene.placement import Draws
 from mme_vla.envs.robomme.tasks import register_task
-from mme_vla.envs.robomme.tasks.families.containers import (
-    Unmask,
-    container_choices,
-    container_picks,
-    hiding_goal,
-)
-from mme_vla.envs.robomme.tasks.families.stages import add_button, press
+from mme_vla.envs.robomme.tasks.families.containers import Unmask
+from mme_vla.envs.robomme.tasks.families.stages import add_button, press, press_choice
 from mme_vla.envs.subtasks import Choice, SubTask
-
-LETTERS = ("b", "c")
 
 
 @register_task
 class ButtonUnmask(Unmask):
     """Containers cover three cubes while the robot presses a button."""
 
+    letters = ("b", "c")
     dials = frozenset({"containers"})
 
     def build(self, draws: Draws) -> None:
@@ -33,14 +27,10 @@ class ButtonUnmask(Unmask):
         return local_draws.integer(0, picks)
 
     def subtasks(self) -> list[SubTask]:
-        picks = container_picks(self, self.targets, self.all_containers, LETTERS)
-        return [press(self.button, "press the button", "a"), *picks]
+        return [press(self.button, "press the button", "a"), *self.picks()]
 
     def choices(self) -> list[Choice]:
-        push = Choice("a", "press the button", lambda demo, _: demo.press(self.button))
-        return [push, *container_choices(self.containers, LETTERS)]
+        return [press_choice("a", "press the button", self.button), *super().choices()]
 
     def goals(self) -> list[str]:
-        return [
-            f"first press the button, then {hiding_goal([colour for colour, _ in self.targets])}"
-        ]
+        return [f"first press the button, then {self.hiding_goal()}"]

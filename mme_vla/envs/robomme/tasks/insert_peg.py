@@ -3,17 +3,17 @@ same with that peg.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from functools import partial
 
 import numpy as np
 import sapien
 
 from mme_vla.envs.robomme.robot.control import PlanningError
-from mme_vla.envs.robomme.robot.demonstrator import PegEnd
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator, PegEnd
 from mme_vla.envs.robomme.robot.robots import ROBOT_BASE
-from mme_vla.envs.robomme.scene.articulated import build_peg
+from mme_vla.envs.robomme.scene.articulated import Peg, build_peg
 from mme_vla.envs.robomme.scene.motions import Cue, Highlight, Mark, build_mark, on_table
 from mme_vla.envs.robomme.scene.objects import (
     APERTURE_COLOUR,
@@ -22,7 +22,7 @@ from mme_vla.envs.robomme.scene.objects import (
     build_aperture_box,
     build_highlight,
 )
-from mme_vla.envs.robomme.scene.placement import Draws, SceneError
+from mme_vla.envs.robomme.scene.placement import Draws, Point, SceneError
 from mme_vla.envs.robomme.scene.predicates import StaticFor, any_picked_up
 from mme_vla.envs.robomme.scene.things import Thing, distance_xy
 from mme_vla.envs.robomme.tasks import register_task
@@ -30,13 +30,12 @@ from mme_vla.envs.robomme.tasks.families.stages import end_video
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 
-if TYPE_CHECKING:
-    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
-
 PEGS, PEG_LENGTH, PEG_RADIUS = 3, 0.05, 0.01
 FROM_BOX, FROM_PEG = 0.06, 0.075
 TRIES = 256
 ENDS: tuple[PegEnd, PegEnd] = ("head", "tail")
+OTHER_END: dict[PegEnd, PegEnd] = {"head": "tail", "tail": "head"}
+SIDES = {1: "right", -1: "left"}
 LIFTED_Z = 0.1
 INSERTED = 0.05
 DISPLAY_STEPS = 20  # how long the box shows an insertion
@@ -63,21 +62,20 @@ class InsertPeg(Task):
             draws.uniform()  # part of the official stream, without effect
         head = self.values.colour("objects.head_rgb", lambda: draws.uniforms(3).tolist())
         tail = (1 - head[0], 1 - head[1], 1 - head[2])
-        draws.integer(0, 3)
+        draws.integer(0, 3)  # likewise
         self.box = self.add(build_aperture_box(self, (0, 0), math.pi / 2))
-        self.pegs = [
-            self.add(
-                build_peg(
-                    self, f"peg_{i}", PEG_LENGTH, PEG_RADIUS, head, tail, (0.2, 0.2 * (i - 1)), 0
-                )
-            )
-            for i in range(
-                self.values.count("initializations.pegs") if self.values.specified else PEGS
-            )
-        ]
+        count = PEGS
+        if self.values.specified:
+            count = self.values.count("initializations.pegs")
+        self.pegs: list[Peg] = []
+        for i in range(count):
+            xy = (0.2, 0.2 * (i - 1))
+            peg = build_peg(self, f"peg_{i}", PEG_LENGTH, PEG_RADIUS, head, tail, xy, 0)
+            self.pegs.append(self.add(peg))
         if not self.pegs:
             raise self.values.error("initializations.pegs", "is missing or empty")
         self.peg = self.pegs[0]
+        self.wrong_ends = [end for peg in self.pegs[1:] for end in (peg.head, peg.tail)]
         self._disc = build_highlight(self, "disc", *MARK, APERTURE_COLOUR)
         self._red_disc = build_mark(self, "disc_red", MARK[0] * 1.003, MARK[1] * 1.003)
 
@@ -90,57 +88,48 @@ class InsertPeg(Task):
             "initializations.box_yaw", lambda: math.radians(90 - 20 + 40 * draws.uniform())
         )
         self.box.set_home(at((x, y), APERTURE_Z, yaw))
-        for peg, (place, rotation) in zip(
-            self.pegs, self._read_pegs() or self._draw_pegs(draws, (x, y)), strict=True
-        ):
+        pegs = self._read_pegs() if values.specified else self._draw_pegs(draws, (x, y))
+        for peg, (place, rotation) in zip(self.pegs, pegs, strict=True):
             peg.set_home(at(place, 0, rotation))
-        self.end: PegEnd = ENDS[
-            values.integer("initializations.obj_sample", lambda: draws.integer(0, 2), most=1)
-        ]
-        self.side = (-1, 1)[
-            values.integer("initializations.dir_sample", lambda: draws.integer(0, 2), most=1)
-        ]
+        end = values.integer("initializations.obj_sample", lambda: draws.integer(0, 2), most=1)
+        side = values.integer("initializations.dir_sample", lambda: draws.integer(0, 2), most=1)
+        self.end = ENDS[end]
+        self.side = (-1, 1)[side]
         below = self.box.position - [0, 0, Highlight.DEPTH]
         self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
         self.mark = Mark(self._red_disc, self.box.position, DISPLAY_STEPS)
-        self._helpful, self._restoring = 0, False
+        self._helpful = 0
+        self._restoring = False
 
-    def _read_pegs(self) -> list[tuple[list[float], float]]:
-        """Place and yaw of each peg of the row; empty where there is none."""
+    def _read_pegs(self) -> list[tuple[Point, float]]:
+        """Place and yaw of each peg of the row."""
         values = self.values
-        pegs: list[tuple[list[float], float]] = []
-        for i in range(len(self.pegs) if values.specified else 0):
-            entry, name = values.find("initializations.pegs")[i], f"initializations.pegs.{i}"
+        pegs: list[tuple[Point, float]] = []
+        for i, entry in enumerate(values.find("initializations.pegs")):
+            name = f"initializations.pegs.{i}"
             if not isinstance(entry, list) or len(entry) != 2:
                 raise values.error(name, f"is {entry!r}; expected [[x, y], yaw]")
-            place = values.check_place(
-                name, [*entry[0], entry[1]] if isinstance(entry[0], list) else entry, 3
-            )
-            if any(math.dist(place[:2], other) < PEG_RADIUS for other, _ in pegs):
+            if isinstance(entry[0], list):
+                entry = [*entry[0], entry[1]]
+            x, y, yaw = values.check_place(name, entry, 3)
+            if any(math.dist((x, y), other) < PEG_RADIUS for other, _ in pegs):
                 raise values.error(name, "overlaps another peg")
-            pegs.append((place[:2], place[2]))
+            pegs.append(((x, y), yaw))
         return pegs
 
-    def _draw_pegs(
-        self, draws: Draws, box: tuple[float, float]
-    ) -> list[tuple[tuple[float, float], float]]:
-        places: list[tuple[float, float]] = []
-        yaws = []
+    def _draw_pegs(self, draws: Draws, box: Point) -> list[tuple[Point, float]]:
+        pegs: list[tuple[Point, float]] = []
         for _ in self.pegs:
-            places.append(self._draw_place(draws, box, places))
-            yaws.append(math.radians(-45 + 90 * draws.uniform()))
-        pegs = list(zip(places, yaws, strict=True))
+            place = self._draw_place(draws, box, [other for other, _ in pegs])
+            pegs.append((place, math.radians(-45 + 90 * draws.uniform())))
         self.values.note("initializations.pegs", pegs)
         return pegs
 
-    def _draw_place(
-        self, draws: Draws, box: tuple[float, float], others: list
-    ) -> tuple[float, float]:
+    def _draw_place(self, draws: Draws, box: Point, others: Sequence[Point]) -> Point:
         for _ in range(TRIES):
             place = (-0.2 + 0.4 * draws.uniform(), -0.3 + 0.6 * draws.uniform())
-            if math.dist(place, box) > FROM_BOX and all(
-                math.dist(place, other) > FROM_PEG for other in others
-            ):
+            clear = all(math.dist(place, other) > FROM_PEG for other in others)
+            if clear and math.dist(place, box) > FROM_BOX:
                 return place
         raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
 
@@ -167,11 +156,13 @@ class InsertPeg(Task):
 
     # Predicates -----------------------------------------------------------------------------------
 
-    def ends(self, end: str) -> tuple[Thing, Thing]:
+    def ends(self, end: PegEnd) -> tuple[Thing, Thing]:
         """The grasped end of the peg and the one that is inserted."""
-        return (self.peg.head, self.peg.tail) if end == "head" else (self.peg.tail, self.peg.head)
+        if end == "head":
+            return self.peg.head, self.peg.tail
+        return self.peg.tail, self.peg.head
 
-    def _lifted(self, end: str) -> bool:
+    def _lifted(self, end: PegEnd) -> bool:
         grasped, other = self.ends(end)
         tcp = self.tcp_pose.p
         nearer = np.linalg.norm(grasped.position - tcp) < np.linalg.norm(other.position - tcp)
@@ -183,13 +174,14 @@ class InsertPeg(Task):
         """
         if not self.tier:
             return bool(grasped.position[0] < free.position[0])
-        near = [distance_xy(thing.position, np.array(ROBOT_BASE)) for thing in (grasped, free)]
-        return near[0] < near[1] or (near[0] == near[1] and self.end == "head")
+        base = np.array(ROBOT_BASE)
+        distance, other = distance_xy(grasped.position, base), distance_xy(free.position, base)
+        return distance < other or (distance == other and self.end == "head")
 
     def _inside(self, thing: Thing) -> bool:
         return float(np.linalg.norm(thing.position - self.box.position)) <= INSERTED
 
-    def _inserted(self, end: str, side: int) -> bool:
+    def _inserted(self, end: PegEnd, side: int) -> bool:
         """The free end is in the box, the gripper on the given side of it."""
         grasped, free = self.ends(end)
         box = self.box.position
@@ -199,54 +191,51 @@ class InsertPeg(Task):
     # Sub-tasks ------------------------------------------------------------------------------------
 
     def subtasks(self) -> list[SubTask]:
-        between = [
-            end_video(self),
-            SubTask(
-                NO_RECORD,
-                StaticFor(self, HOLD_STEPS),
-                lambda demo: demo.hold(HOLD_STEPS),
-                video=True,
-            ),
-        ]
-        return [*self._both(video=True), *between, *self._both(video=False)]
+        hold = SubTask(
+            NO_RECORD, StaticFor(self, HOLD_STEPS), lambda demo: demo.hold(HOLD_STEPS), video=True
+        )
+        return [*self._both(video=True), end_video(self), hold, *self._both(video=False)]
+
+    def _wrong_peg(self) -> bool:
+        return any_picked_up(self, self.wrong_ends)
+
+    def _wrong_grasp(self) -> bool:
+        return self._lifted(OTHER_END[self.end]) or self._wrong_peg()
+
+    def _wrong_insertion(self) -> bool:
+        wrong_end = OTHER_END[self.end]
+        if self._inserted(wrong_end, 1) or self._inserted(wrong_end, -1):
+            return True
+        return self._inserted(self.end, -self.side) or self._wrong_peg()
 
     def _both(self, video: bool) -> list[SubTask]:
         grasped, free = self.ends(self.end)
-        side = "right" if self.side == 1 else "left"
         word = "near" if self._is_near(grasped, free) else "far"  # from the robot's base
-        wrong_end = "tail" if self.end == "head" else "head"
-        of_box = " of the box" if video else ""
-        others = [end for peg in self.pegs[1:] for end in (peg.head, peg.tail)]
-
-        def wrong_grasp() -> bool:
-            return self._lifted(wrong_end) or any_picked_up(self, others)
-
-        def wrong_insertion() -> bool:
-            wrong = self._inserted(wrong_end, 1) or self._inserted(wrong_end, -1)
-            return wrong or self._inserted(self.end, -self.side) or any_picked_up(self, others)
-
+        insertion = f"Insert the peg from the {SIDES[self.side]} side"
+        if video:
+            insertion += " of the box"
         return [
             SubTask(
                 f"Pick up the peg by grasping the {word} end",
                 done=lambda: self._lifted(self.end),
                 run=self._demonstrate_grasp,
                 grounded=f"Pick up the peg by grasping the {word} end at <>",
-                failed=None if video else wrong_grasp,
+                failed=None if video else self._wrong_grasp,
                 targets=[grasped],
                 choice="a",
                 video=video,
                 operation="which",
             ),
             SubTask(
-                f"Insert the peg from the {side} side{of_box}",
+                insertion,
                 done=lambda: self._inserted(self.end, self.side),
                 run=self._demonstrate_insertion,
-                grounded=f"Insert the peg from the {side} side{of_box} at <>",
-                failed=None if video else wrong_insertion,
+                grounded=f"{insertion} at <>",
+                failed=None if video else self._wrong_insertion,
                 targets=[self.box],
                 choice="b" if self.side == 1 else "c",
                 video=video,
-                operation=lambda: "which" if any_picked_up(self, others) else "how",
+                operation=lambda: "which" if self._wrong_peg() else "how",
             ),
         ]
 
@@ -255,28 +244,27 @@ class InsertPeg(Task):
     # Where the benchmark's demonstrator fails, other motions follow; where it does not, there are
     # none.
 
-    def _demonstrate_grasp(self, demo: "Demonstrator") -> None:
+    def _demonstrate_grasp(self, demo: Demonstrator) -> None:
         """Grasp as the benchmark does; where the box is in the hand's way, move the peg by its
         other end first.
         """
-        other: PegEnd = "tail" if self.end == "head" else "head"
-        plans: list[tuple[PegEnd, bool] | None] = [
-            None,
-            (other, False),
-            (other, True),
-            (self.end, True),
-        ]
         if not self.second_tries:
-            return demo.grasp_peg(self.peg, self.end)
+            demo.grasp_peg(self.peg, self.end)
+            return
+        other = OTHER_END[self.end]
+        # How the peg is dragged before the grasp: by which end, and whether with a flipped hand.
+        drags = [None, (other, False), (other, True), (self.end, True)]
         # What helped in the video is likely to help again.
-        for drag in plans[self._helpful :]:
+        for i in range(self._helpful, len(drags)):
+            drag = drags[i]
             if drag is not None:
+                end, flip = drag
                 with suppress(PlanningError):
-                    demo.drag_peg(self.peg, drag[0], self._way_out(), flip=drag[1])
+                    demo.drag_peg(self.peg, end, self._way_out(), flip)
             with suppress(PlanningError):  # out of reach, for instance
                 demo.grasp_peg(self.peg, self.end)
             if self._lifted(self.end):
-                self._helpful = plans.index(drag)
+                self._helpful = i
                 return
         raise PlanningError(
             f"{self.peg.name} cannot be grasped by its {self.end}: it is out of reach, or the box"
@@ -292,47 +280,41 @@ class InsertPeg(Task):
             near, farthest = WORKSPACE
             reached = near < np.linalg.norm(place - ROBOT_BASE[:2]) < farthest
             apart = np.linalg.norm(place - self.box.position[:2]) > OPEN_FROM_BOX
-            return bool(
-                reached
-                and apart
-                and all(np.linalg.norm(place - other) > OPEN_FROM_PEG for other in others)
-            )
+            if not (reached and apart):
+                return False
+            return all(np.linalg.norm(place - other) > OPEN_FROM_PEG for other in others)
 
-        angles, lengths = np.linspace(0, 2 * np.pi, 16, endpoint=False), np.arange(0.04, 0.4, 0.02)
-        ways = [
-            length * np.array([np.cos(angle), np.sin(angle)])
-            for length in lengths
-            for angle in angles
-        ]
         away = middle - self.box.position[:2]
         # A peg beside the box is not pulled through it; one that is only far away may come nearer.
         beside = np.linalg.norm(away) < OPEN_FROM_BOX
         most = SIDEWAYS * np.linalg.norm(away)
-        open_ways = (
-            w
-            for w in ways
-            if (not beside or w @ away >= most * np.linalg.norm(w)) and is_open(middle + w)
-        )
-        return next(open_ways, 0.1 * away / np.linalg.norm(away))
+        for length in np.arange(0.04, 0.4, 0.02):
+            for angle in np.linspace(0, 2 * np.pi, 16, endpoint=False):
+                way = length * np.array([np.cos(angle), np.sin(angle)])
+                passes_box = beside and way @ away < most * np.linalg.norm(way)
+                if not passes_box and is_open(middle + way):
+                    return way
+        return 0.1 * away / np.linalg.norm(away)
 
-    def _demonstrate_insertion(self, demo: "Demonstrator") -> None:
+    def _demonstrate_insertion(self, demo: Demonstrator) -> None:
         """Insert as the benchmark does; where that fails, push on, begin anew, and at last from
         another grasp.
         """
         task = (self.peg, self.end, self.side, self.box)
-        tries: list[Callable[[], None]] = [
-            lambda: demo.insert_peg(*task),
-            lambda: demo.insert_peg_fully(*task, begun=True),
-            lambda: demo.insert_peg_fully(*task),
-            lambda: self._insert_anew(demo, flip=True),
-            lambda: self._insert_anew(demo, flip=False),
-        ]
-        for attempt in tries if self.second_tries else tries[:1]:
+        tries: list[Callable[[], None]] = [partial(demo.insert_peg, *task)]
+        if self.second_tries:
+            tries += [
+                partial(demo.insert_peg_fully, *task, begun=True),
+                partial(demo.insert_peg_fully, *task),
+                partial(self._insert_anew, demo, flip=True),
+                partial(self._insert_anew, demo, flip=False),
+            ]
+        for attempt in tries:
             if not self._inserted(self.end, self.side):
                 with suppress(PlanningError):
                     attempt()
 
-    def _insert_anew(self, demo: "Demonstrator", flip: bool) -> None:
+    def _insert_anew(self, demo: Demonstrator, flip: bool) -> None:
         demo.withdraw()
         if any(self.is_grasping(end) for end in self.ends(self.end)):
             demo.lay_down_peg(self._way_out())
@@ -343,24 +325,20 @@ class InsertPeg(Task):
     # Choices --------------------------------------------------------------------------------------
 
     def choices(self) -> list[Choice]:
-        def every_end() -> list[Thing]:
-            return [end for peg in self.pegs for end in (peg.head, peg.tail)]
-
+        ends = [self.peg.head, self.peg.tail, *self.wrong_ends]
         return [
-            Choice("a", "pick up the peg by grasping one end", self._grasp, every_end),
-            Choice(
-                "b", "insert the peg from the right side", lambda demo, _: self._insert(demo, 1)
-            ),
-            Choice(
-                "c", "insert the peg from the left side", lambda demo, _: self._insert(demo, -1)
-            ),
+            Choice("a", "pick up the peg by grasping one end", self._grasp, ends),
+            Choice("b", "insert the peg from the right side", partial(self._insert, 1)),
+            Choice("c", "insert the peg from the left side", partial(self._insert, -1)),
         ]
 
-    def _grasp(self, demo: "Demonstrator", thing: Thing | None) -> None:
-        peg = next(peg for peg in self.pegs if thing in (peg.head, peg.tail))
-        demo.grasp_peg(peg, "head" if thing is peg.head else "tail")
+    def _grasp(self, demo: Demonstrator, thing: Thing) -> None:
+        for peg in self.pegs:
+            for end in ENDS:
+                if thing is getattr(peg, end):
+                    demo.grasp_peg(peg, end)
 
-    def _insert(self, demo: "Demonstrator", side: int) -> None:
+    def _insert(self, side: int, demo: Demonstrator, _: None) -> None:
         """Insert whichever peg the gripper is at, by whichever end it holds."""
         tcp = self.tcp_pose.p
         ends = [(peg, end) for peg in self.pegs for end in ENDS]
@@ -372,7 +350,7 @@ class InsertPeg(Task):
     def goals(self) -> list[str]:
         goal = "watch the video carefully, then grasp the same"
         if self.in_view:
-            side = "right" if self.side == 1 else "left"
+            side = SIDES[self.side]
             return [
                 f"grasp the marked end of the peg and insert it into the {side} side of the box"
             ]

@@ -3,22 +3,32 @@ same manner.
 """
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
 
 import numpy as np
 import sapien
 
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.articulated import PEG_COLOUR, build_peg
 from mme_vla.envs.robomme.scene.objects import H, at, build_cube, build_disc, cube_pose
-from mme_vla.envs.robomme.scene.placement import Draws, Region, SceneError, draw_cube, draw_disc
-from mme_vla.envs.robomme.scene.predicates import dropped_onto, gripper_open, picked_up, pushed_onto
+from mme_vla.envs.robomme.scene.placement import (
+    Avoid,
+    Draws,
+    Region,
+    SceneError,
+    draw_cube,
+    draw_disc,
+)
+from mme_vla.envs.robomme.scene.predicates import (
+    any_picked_up,
+    gripper_open,
+    picked_up,
+    pushed_onto,
+)
 from mme_vla.envs.robomme.tasks import register_task
-from mme_vla.envs.robomme.tasks.families.stages import delay, end_video, pick, wait
+from mme_vla.envs.robomme.tasks.families.stages import delay, end_video, pick, place, wait
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
-
-if TYPE_CHECKING:
-    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 
 MANNERS = ("hook", "push", "grasp")
 MANNER_TEXTS = {
@@ -31,7 +41,6 @@ TARGET_RADIUS = 0.04
 CUBE_FROM_TARGET = 5 * H
 CUBE_GAP = 0.005
 TRIES = 128
-PARTS = ("demo", "execution")
 HOLD_STEPS = {"hook": 30, "push": 60, "grasp": 60}
 MORE_TRIES = 2  # where the cube did not stay on the target
 
@@ -48,79 +57,67 @@ class MoveCube(Task):
     def build(self, draws: Draws) -> None:
         for _ in range(2):
             draws.uniform()  # part of the official stream, without effect
-        video_peg, peg = (self._place_peg(draws, part) for part in PARTS)
+        video_peg = self._place_peg(draws, "demo")
+        peg = self._place_peg(draws, "execution")
         for _ in range(2):
             draws.integer(0, 2)
         video_goal = self.values.place("layout.demo.goal_xy", lambda: self._draw_goal(draws, 0.15))
         goal = self.values.place("layout.execution.goal_xy", lambda: self._draw_goal(draws, 0.1))
+        x, y, yaw = video_peg
         self.peg = self.add(
-            build_peg(
-                self,
-                "peg",
-                PEG_LENGTH,
-                PEG_RADIUS,
-                PEG_COLOUR,
-                PEG_COLOUR,
-                video_peg[:2],
-                video_peg[2],
-            )
+            build_peg(self, "peg", PEG_LENGTH, PEG_RADIUS, PEG_COLOUR, PEG_COLOUR, (x, y), yaw)
         )
         self.target = self.add(
             build_disc(self, "target", TARGET_RADIUS, 0.005, "purple", video_goal)
         )
-        xy, yaw = self._place_cube(draws, PARTS[0], video_goal, [])
-        self.cube = self.add(build_cube(self, "cube", "red", xy, yaw))
-        xy, yaw = self._place_cube(draws, PARTS[1], goal, [self.cube])
+        x, y, yaw = self._place_cube(draws, "demo", video_goal, [])
+        self.cube = self.add(build_cube(self, "cube", "red", (x, y), yaw))
+        x, y, yaw = self._place_cube(draws, "execution", goal, [self.cube])
         self._execution_poses = {
             self.peg: at(peg[:2], 0, peg[2]),
             self.target: sapien.Pose([*goal, self.target.position[2]], self.target.pose.q),
-            self.cube: cube_pose(xy, yaw),
+            self.cube: cube_pose((x, y), yaw),
         }
 
     def _place_peg(self, draws: Draws, part: str) -> tuple[float, float, float]:
-        """Place and yaw of the peg in the video or in the execution."""
-        if not self.values.specified:
-            x, y, yaw = self._draw_peg(draws)
-            self.values.note(f"layout.{part}.peg_offsets", [0.0, x, y])
-            self.values.note(f"layout.{part}.peg_yaw", yaw)
-            return x, y, yaw
-        _, x, y = self.values.place(f"layout.{part}.peg_offsets", list, size=3)
-        return x, y, self.values.number(f"layout.{part}.peg_yaw", float)
-
-    def _place_cube(
-        self, draws: Draws, part: str, goal: Any, avoid: list
-    ) -> tuple[tuple[float, float], float]:
-        """Place and yaw of the cube in the video or in the execution."""
-
-        def sample() -> list[float]:
-            xy, yaw = self._draw_cube(draws, goal, avoid)
-            return [*xy, yaw]
-
-        name = f"layout.{part}.cube_pose"
-        x, y, yaw = self.values.place(name, sample, size=3)
-        if self.values.specified and math.dist((x, y), goal) <= H:
-            raise self.values.error(name, f"overlaps spec.layout.{part}.goal_xy")
-        return (x, y), yaw
-
-    @staticmethod
-    def _draw_peg(draws: Draws) -> tuple[float, float, float]:
+        """Place and yaw of the peg in the video (`demo`) or in the execution."""
+        values = self.values
+        if values.specified:
+            _, x, y = values.place(f"layout.{part}.peg_offsets", list, size=3)
+            return x, y, values.number(f"layout.{part}.peg_yaw", float)
         side = -0.2 if draws.coin() else 0.2
-        x, y = -0.05 + 0.1 * draws.uniform(), side - 0.05 + 0.1 * draws.uniform()
-        return x, y, math.radians(-45 + 90 * draws.uniform())
+        x = -0.05 + 0.1 * draws.uniform()
+        y = side - 0.05 + 0.1 * draws.uniform()
+        yaw = math.radians(-45 + 90 * draws.uniform())
+        values.note(f"layout.{part}.peg_offsets", [0.0, x, y])
+        values.note(f"layout.{part}.peg_yaw", yaw)
+        return x, y, yaw
 
     def _draw_goal(self, draws: Draws, half: float) -> np.ndarray:
         xy = draw_disc(draws, Region((0, 0), half), TARGET_RADIUS, [], gap=0)
         assert xy is not None
         return xy
 
-    def _draw_cube(self, draws: Draws, goal: Any, avoid: list) -> tuple[np.ndarray, float]:
+    def _place_cube(
+        self, draws: Draws, part: str, goal: Sequence[float], avoid: Sequence[Avoid]
+    ) -> list[float]:
+        """Place and yaw [3] of the cube in the video (`demo`) or in the execution."""
+        name = f"layout.{part}.cube_pose"
+        x, y, yaw = self.values.place(name, lambda: self._draw_cube(draws, goal, avoid), size=3)
+        if self.values.specified and math.dist((x, y), goal) <= H:
+            raise self.values.error(name, f"overlaps spec.layout.{part}.goal_xy")
+        return [x, y, yaw]
+
+    def _draw_cube(
+        self, draws: Draws, goal: Sequence[float], avoid: Sequence[Avoid]
+    ) -> list[float]:
         """A place near a point that is not near the goal."""
         for _ in range(TRIES):
             centre = (-0.1 + 0.2 * draws.uniform(), -0.1 + 0.2 * draws.uniform())
             if math.dist(centre, goal) > CUBE_FROM_TARGET:
                 place = draw_cube(draws, Region(centre, 0.05), avoid, gap=CUBE_GAP)
                 if place is not None:
-                    return place
+                    return [*place[0], place[1]]
                 break
         raise SceneError(
             f"MoveCube, seed {self.seed}: the cube finds no place away from the target."
@@ -137,24 +134,13 @@ class MoveCube(Task):
                 thing.displace(pose)
 
     def subtasks(self) -> list[SubTask]:
-        between = [wait(self, HOLD_STEPS[self.manner] + delay(self)), end_video(self)]
         moves = {"hook": self._hook, "push": self._push, "grasp": self._grasp}[self.manner]
-        return [*moves(video=True), *between, *moves(video=False)]
-
-    def _demonstrate_hook(self, demo: "Demonstrator") -> None:
-        demo.hook(self.cube, self.target, self._side())
-        for _ in range(MORE_TRIES if self.second_tries else 0):
-            if not self._pushed():
-                demo.withdraw()
-                demo.grasp_peg(self.peg, "tail")
-                demo.hook(self.cube, self.target, self._side())
-
-    def _demonstrate_push(self, demo: "Demonstrator") -> None:
-        demo.push(self.cube, self.target)
-        for _ in range(MORE_TRIES if self.second_tries else 0):
-            if not self._pushed():
-                demo.withdraw()
-                demo.push(self.cube, self.target)
+        return [
+            *moves(video=True),
+            wait(self, HOLD_STEPS[self.manner] + delay(self)),
+            end_video(self),
+            *moves(video=False),
+        ]
 
     def _on_target(self) -> bool:
         return pushed_onto(self.cube, self.target)
@@ -163,7 +149,7 @@ class MoveCube(Task):
         return self._on_target() and gripper_open(self)
 
     def _holds_peg(self) -> bool:
-        return any(picked_up(self, end) for end in (self.peg.head, self.peg.tail))
+        return any_picked_up(self, (self.peg.head, self.peg.tail))
 
     def _holds_cube(self) -> bool:
         return picked_up(self, self.cube)
@@ -192,48 +178,49 @@ class MoveCube(Task):
             ),
         ]
 
-    def _side(self) -> int:
-        """From which side the peg reaches around the cube."""
-        return 1 if self.cube.position[1] > self.target.position[1] else -1
+    def _demonstrate_hook(self, demo: Demonstrator) -> None:
+        demo.hook(self.cube, self.target)
+        tries = MORE_TRIES if self.second_tries else 0
+        for _ in range(tries):
+            if not self._pushed():
+                demo.withdraw()
+                demo.grasp_peg(self.peg, "tail")
+                demo.hook(self.cube, self.target)
 
     def _push(self, video: bool) -> list[SubTask]:
-        return [
-            SubTask(
-                "Close the gripper and push the cube to the target",
-                done=self._pushed,
-                run=self._demonstrate_push,
-                grounded="Close the gripper and push the cube at <> to the target at <>",
-                failed=lambda: self._holds_cube() or self._holds_peg(),
-                targets=[self.cube, self.target],
-                choice="c",
-                video=video,
-                operation="how",
-            )
-        ]
+        push = SubTask(
+            "Close the gripper and push the cube to the target",
+            done=self._pushed,
+            run=self._demonstrate_push,
+            grounded="Close the gripper and push the cube at <> to the target at <>",
+            failed=lambda: self._holds_cube() or self._holds_peg(),
+            targets=[self.cube, self.target],
+            choice="c",
+            video=video,
+            operation="how",
+        )
+        return [push]
+
+    def _demonstrate_push(self, demo: Demonstrator) -> None:
+        demo.push(self.cube, self.target)
+        tries = MORE_TRIES if self.second_tries else 0
+        for _ in range(tries):
+            if not self._pushed():
+                demo.withdraw()
+                demo.push(self.cube, self.target)
 
     def _grasp(self, video: bool) -> list[SubTask]:
-        def misplaced() -> bool:
-            return self._on_target() or self._holds_peg()
-
         return [
             pick(
                 self,
                 self.cube,
                 "Pick up the cube",
                 "d",
-                failed=misplaced,
+                failed=lambda: self._on_target() or self._holds_peg(),
                 video=video,
                 operation="how",
             ),
-            SubTask(
-                "place the cube onto the target",
-                done=lambda: dropped_onto(self, self.cube, self.target),
-                run=lambda demo: demo.place_on(self.target),
-                grounded="place the cube onto the target at <>",
-                targets=[self.target],
-                choice="e",
-                video=video,
-            ),
+            place(self, self.cube, self.target, "place the cube onto the target", "e", video=video),
         ]
 
     def choices(self) -> list[Choice]:
@@ -242,7 +229,7 @@ class MoveCube(Task):
             Choice(
                 "b",
                 "hook the cube to the target with the peg",
-                lambda demo, _: demo.hook(self.cube, self.target, self._side()),
+                lambda demo, _: demo.hook(self.cube, self.target),
             ),
             Choice(
                 "c",
@@ -257,5 +244,7 @@ class MoveCube(Task):
 
     def goals(self) -> list[str]:
         goal = "watch the video carefully, then move the cube to the target in the same manner"
-        manner = f": {MANNER_TEXTS[self.manner]}" if self.in_view else ""
+        manner = ""
+        if self.in_view:
+            manner = f": {MANNER_TEXTS[self.manner]}"
         return [f"{goal} as before{manner}", f"{goal} shown in the video{manner}"]

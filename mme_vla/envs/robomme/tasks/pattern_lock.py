@@ -3,11 +3,13 @@ again.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from functools import partial
 
 import numpy as np
 
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Mark, Trace, build_mark
 from mme_vla.envs.robomme.scene.objects import Disc, build_disc
 from mme_vla.envs.robomme.scene.placement import Draws, SceneError
@@ -17,9 +19,6 @@ from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import end_stick_video
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
-
-if TYPE_CHECKING:
-    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 
 GRID = {"easy": 3, "medium": 4, "hard": 5}
 PATH_LENGTH = {"easy": (2, 4), "medium": (3, 5), "hard": (4, 8)}
@@ -38,6 +37,7 @@ DIRECTIONS = {
     "backward-right": (-1, -1),
 }
 """Signs of the way in x and y, as the robot sees them."""
+LETTERS = dict(zip(DIRECTIONS, "abcdefgh", strict=True))
 REACH = 0.2  # how far away the disc a direction means may lie
 
 
@@ -51,14 +51,12 @@ class PatternLock(Task):
     def build(self, draws: Draws) -> None:
         n = GRID[self.difficulty]
         middle = (n - 1) / 2
-        places = [
-            (CENTRE[0] + (r - middle) * SPACING, CENTRE[1] + (c - middle) * SPACING)
-            for r, c in np.ndindex(n, n)
-        ]
-        self.discs = [
-            self.add(build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy))
-            for i, xy in enumerate(places)
-        ]
+        self.discs: list[Disc] = []
+        for row, column in np.ndindex(n, n):
+            x = CENTRE[0] + (row - middle) * SPACING
+            y = CENTRE[1] + (column - middle) * SPACING
+            name = f"disc_{len(self.discs)}"
+            self.discs.append(self.add(build_disc(self, name, 0.02, 0.01, "gray", (x, y))))
         nodes = self.values.indices("actions.path_nodes", lambda: self._draw_path(draws, n), n * n)
         steps = [np.subtract(divmod(a, n), divmod(b, n)) for a, b in itertools.pairwise(nodes)]
         if len(nodes) < 2 or any(np.abs(step).max() > 1 for step in steps):
@@ -72,7 +70,9 @@ class PatternLock(Task):
         self._trace = Trace(self)
 
     def _draw_path(self, draws: Draws, n: int) -> list[int]:
-        low, high = (length + self.turned("path") for length in PATH_LENGTH[self.difficulty])
+        low, high = PATH_LENGTH[self.difficulty]
+        low += self.turned("path")
+        high += self.turned("path")
         for _ in range(TRIES):
             start, goal = draws.permutation(n * n)[:2]
             path = search(draws, n, start, goal, {start})
@@ -97,15 +97,11 @@ class PatternLock(Task):
 
     def failure(self) -> bool:
         """Remembers which discs were visited; the rules belong to the moves."""
-        tcp = self.tcp_pose.p
-        if self._executing:
+        current = self.progress.current
+        if current is None or not current.video:
+            tcp = self.tcp_pose.p
             self.visited += [d for d in self.discs if over(tcp, d) and self.visited[-1:] != [d]]
         return False
-
-    @property
-    def _executing(self) -> bool:
-        current = self.progress.current
-        return current is None or not current.video
 
     def success(self) -> bool:
         return self.progress.succeeded and self.visited[-len(self.path) :] == self.path
@@ -118,15 +114,10 @@ class PatternLock(Task):
             run=lambda demo: demo.stick_to(first, store=True),
             video=True,
         )
-        return [
-            approach,
-            *self._moves(video=True),
-            *end_stick_video(self),
-            *self._moves(video=False),
-        ]
-
-    def _moves(self, video: bool) -> list[SubTask]:
-        return [self._move(a, b, video) for a, b in zip(self.path, self.path[1:], strict=False)]
+        legs = list(itertools.pairwise(self.path))
+        shown = [self._move(previous, goal, video=True) for previous, goal in legs]
+        moves = [self._move(previous, goal, video=False) for previous, goal in legs]
+        return [approach, *shown, *end_stick_video(self), *moves]
 
     def _move(self, previous: Disc, goal: Disc, video: bool) -> SubTask:
         others = [disc for disc in self.discs if disc is not previous and disc is not goal]
@@ -136,20 +127,18 @@ class PatternLock(Task):
             done=lambda: over(self.tcp_pose.p, goal),
             run=lambda demo: demo.stick_to(goal),
             failed=lambda: any(over(self.tcp_pose.p, disc) for disc in others),
-            choice="abcdefgh"[list(DIRECTIONS).index(word)],
+            choice=LETTERS[word],
             video=video,
             operation="order",
         )
 
     def choices(self) -> list[Choice]:
         return [
-            self._choice(letter, word) for letter, word in zip("abcdefgh", DIRECTIONS, strict=True)
+            Choice(letter, f"move {word}", partial(self._go, word))
+            for word, letter in LETTERS.items()
         ]
 
-    def _choice(self, letter: str, word: str) -> Choice:
-        return Choice(letter, f"move {word}", lambda demo, _: self._go(demo, word))
-
-    def _go(self, demo: "Demonstrator", word: str) -> None:
+    def _go(self, word: str, demo: Demonstrator, _: None) -> None:
         tcp = self.tcp_pose.p
         here = min(self.discs, key=lambda disc: distance_xy(disc.position, tcp))
         goal = self.disc_towards(here, word)
@@ -162,18 +151,18 @@ class PatternLock(Task):
         """
         signs = np.array(DIRECTIONS[word])
         way = signs / np.linalg.norm(signs)
-
-        def preference(disc: Disc) -> tuple[float, float]:
+        best: Disc | None = None
+        least = (math.inf, math.inf)
+        for disc in self.discs:
             step = disc.position[:2] - here.position[:2]
             length = float(np.linalg.norm(step))
-            return round(-float(step @ way) / length, 6), length
-
-        def fits(disc: Disc) -> bool:
-            step = disc.position[:2] - here.position[:2]
             on_side = all(s == 0 or s * d > 1e-6 for s, d in zip(signs, step, strict=True))
-            return disc is not here and on_side and float(np.linalg.norm(step)) <= REACH + 1e-6
-
-        return min(filter(fits, self.discs), key=preference, default=None)
+            if disc is here or not on_side or length > REACH + 1e-6:
+                continue
+            preference = (round(-float(step @ way) / length, 6), length)
+            if preference < least:
+                best, least = disc, preference
+        return best
 
     def goals(self) -> list[str]:
         goal = (
@@ -181,11 +170,9 @@ class PatternLock(Task):
             " same pattern"
         )
         if self.in_view:
-            moves = [
-                direction(b.position - a.position)
-                for a, b in zip(self.path, self.path[1:], strict=False)
-            ]
-            goal = f"{goal}: {', then '.join(f'move {word}' for word in moves)}"
+            legs = itertools.pairwise(self.path)
+            moves = [f"move {direction(b.position - a.position)}" for a, b in legs]
+            goal = f"{goal}: {', then '.join(moves)}"
         return [goal, f"{goal} shown in the video"]
 
 
@@ -194,11 +181,13 @@ def search(draws: Draws, n: int, node: int, goal: int, visited: set[int]) -> lis
     if node == goal:
         return [node]
     row, column = divmod(node, n)
-    places = [
-        (row + r, column + c) for r, c in NEIGHBOURS if 0 <= row + r < n and 0 <= column + c < n
+    neighbours = [
+        (row + r) * n + column + c
+        for r, c in NEIGHBOURS
+        if 0 <= row + r < n and 0 <= column + c < n
     ]
-    for i in draws.permutation(len(places)):
-        following = places[i][0] * n + places[i][1]
+    for i in draws.permutation(len(neighbours)):
+        following = neighbours[i]
         if following not in visited:
             visited.add(following)
             path = search(draws, n, following, goal, visited)

@@ -2,14 +2,23 @@
 pick up just those.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, Highlight, active_motions, under
 from mme_vla.envs.robomme.scene.objects import COLOURS, RGB, Cube, H, build_highlight
 from mme_vla.envs.robomme.scene.placement import Draws, Region
-from mme_vla.envs.robomme.scene.predicates import any_picked_up, dropped, picked_up
+from mme_vla.envs.robomme.scene.predicates import any_picked_up, picked_up
 from mme_vla.envs.robomme.tasks import register_task
-from mme_vla.envs.robomme.tasks.families.stages import add_button, add_cube, pick, press
+from mme_vla.envs.robomme.tasks.families.stages import (
+    add_button,
+    add_cube,
+    pick,
+    press,
+    press_choice,
+    put_down,
+    put_down_choice,
+)
 from mme_vla.envs.subtasks import Choice, SubTask, ordinal
 from mme_vla.envs.task import Task
 
@@ -41,18 +50,27 @@ class PickHighlight(Task):
             raise self.values.error("objects.highlight_ids", "is empty; expected at least one cube")
         self.goal_cubes = [self.cubes[i] for i in goals]
         self._discs = [
-            build_highlight(self, f"highlight_{i}", 0.05, 0.001)
-            for i in range(len(self.goal_cubes))
+            build_highlight(self, f"highlight_{i}", 0.05, 0.001) for i in range(len(goals))
         ]
         self._add_cubes(draws, "distractor", "layout.distractors", self.turned("distractors"))
+        self.other_cubes = [cube for cube in self.cubes if cube not in self.goal_cubes]
 
     def _add_cubes(self, draws: Draws, name: str, part: str, count: int) -> None:
-        for i in range(self.values.count(part) if self.values.specified else count):
-            colour, value = self._colour(draws, len(self.cubes)), f"{part}.{i}"
-            avoid = [self.button, *self.cubes]
-            self.cubes.append(
-                add_cube(self, draws, f"{name}_{i}", colour, TABLE, avoid, gap=2 * H, value=value)
+        if self.values.specified:
+            count = self.values.count(part)
+        for i in range(count):
+            colour = self._colour(draws, len(self.cubes))
+            cube = add_cube(
+                self,
+                draws,
+                f"{name}_{i}",
+                colour,
+                TABLE,
+                [self.button, *self.cubes],
+                gap=2 * H,
+                value=f"{part}.{i}",
             )
+            self.cubes.append(cube)
 
     def _colour(self, draws: Draws, i: int) -> str | RGB:
         """A name, or in rows of RoboMME-OOD any colour."""
@@ -68,63 +86,56 @@ class PickHighlight(Task):
     def start_episode(self, draws: Draws) -> None:
         pairs = zip(self._discs, self.goal_cubes, strict=True)
         self.highlights = [Highlight(disc, cube, *HIGHLIGHTED) for disc, cube in pairs]
+        self.motions = [*self.highlights]
         self.picked: set[Cube] = set()
 
-    def before_physics(self, k: int) -> None:
-        for highlight in self.highlights:
-            highlight.apply(k)
-
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
         return active_motions(self.highlights)
 
     def failure(self) -> bool:
         self.picked.update(cube for cube in self.goal_cubes if picked_up(self, cube))
-        others = [cube for cube in self.cubes if cube not in self.goal_cubes]
-        if self.tier and self.progress.index == 0:
-            return any_picked_up(self, self.cubes)
-        return self.progress.index > 0 and any_picked_up(self, others)
+        if self.progress.index > 0:
+            return any_picked_up(self, self.other_cubes)
+        # Before the button is pressed, rows of RoboMME-OOD allow no cube, the benchmark any.
+        return bool(self.tier) and any_picked_up(self, self.cubes)
 
     def success(self) -> bool:
         all_picked = len(self.picked) == len(self.goal_cubes)
-        return all_picked and (self.progress.succeeded or not self.tier)
+        if self.tier:
+            return all_picked and self.progress.succeeded
+        return all_picked
 
     def subtasks(self) -> list[SubTask]:
         steps = [press(self.button, "press the button", "a")]
         for i, cube in enumerate(self.goal_cubes):
-            steps += [self._pick(i, cube), self._place(cube)]
-        return [*steps, press(self.button, "press the button", "a")] if self.tier else steps[:-1]
+            steps.append(pick(self, cube, self._pick_text(i), "b", pick=True, operation="which"))
+            steps.append(
+                put_down(
+                    self,
+                    cube,
+                    "place the cube onto the table",
+                    "c",
+                    RELEASE_Z,
+                    operation="which",
+                )
+            )
+        if self.tier:
+            return [*steps, press(self.button, "press the button", "a")]
+        return steps[:-1]  # the last cube stays in the gripper
 
-    def _pick(self, i: int, cube: Cube) -> SubTask:
-        which = (
-            "highlighted cube"
-            if len(self.goal_cubes) == 1 and not self.tier
-            else f"{ordinal(i)} highlighted cube"
-        )
-        text = (
-            f"pick up the {which}" if self.tier else f"pick up the {which}, which is {cube.colour}"
-        )
-        return pick(self, cube, text, "b", pick=True, operation="which")
-
-    def _place(self, cube: Cube) -> SubTask:
-        return SubTask(
-            "place the cube onto the table",
-            done=lambda: dropped(self, cube),
-            run=lambda demo: demo.put_down(RELEASE_Z),
-            targets=[cube],
-            choice="c",
-            operation="which",
-        )
+    def _pick_text(self, i: int) -> str:
+        if self.tier:
+            return f"pick up the {ordinal(i)} highlighted cube"
+        which = "highlighted cube"
+        if len(self.goal_cubes) > 1:
+            which = f"{ordinal(i)} highlighted cube"
+        return f"pick up the {which}, which is {self.goal_cubes[i].colour}"
 
     def choices(self) -> list[Choice]:
         return [
-            Choice("a", "press button", lambda demo, _: demo.press(self.button)),
-            Choice(
-                "b",
-                "pick up the highlighted cube",
-                lambda demo, cube: demo.pick(cube),
-                lambda: self.cubes,
-            ),
-            Choice("c", "place the cube onto the table", lambda demo, _: demo.put_down(RELEASE_Z)),
+            press_choice("a", "press button", self.button),
+            Choice("b", "pick up the highlighted cube", Demonstrator.pick, self.cubes),
+            put_down_choice("c", "place the cube onto the table", RELEASE_Z),
         ]
 
     def goals(self) -> list[str]:

@@ -4,12 +4,12 @@ route.
 
 import itertools
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal
+from functools import partial
+from typing import Literal
 
 import numpy as np
 
-from mme_vla.envs.robomme.robot.demonstrator import arc
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator, arc
 from mme_vla.envs.robomme.scene.motions import Cue, Mark, Place, Trace, build_mark, on_table
 from mme_vla.envs.robomme.scene.objects import Disc, build_disc, build_obstacle
 from mme_vla.envs.robomme.scene.placement import Draws
@@ -20,9 +20,6 @@ from mme_vla.envs.robomme.tasks.families.stages import end_stick_video
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 
-if TYPE_CHECKING:
-    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
-
 PLACES, SPACING, CENTRE_X = 9, 0.07, -0.1
 MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}
 REACH_RADIUS, REACH_HEIGHT = 0.03, 0.15
@@ -30,6 +27,7 @@ MARK_RADIUS, MARK_STEPS = 0.02004, 40
 HOME_STEPS = 200
 CUE_RADIUS, DOT_RADIUS = 0.04, 0.01
 DOTS = range(8, 40, 7)  # of an arc's 45 points
+MOVE = "move to the nearest {} target by circling around the stick {}"
 Direction = Literal["clockwise", "counterclockwise"]
 TURNS = dict.fromkeys(("clockwise", "counterclockwise"))
 SIDES: tuple[tuple[str, Direction], ...] = (
@@ -52,14 +50,14 @@ class RouteStick(Task):
             self.values.number("layout.rotation_deg", lambda: -30 + 60 * draws.uniform())
         )
         cos, sin = math.cos(angle), math.sin(angle)
-        row = [(i - PLACES // 2) * SPACING for i in range(PLACES)]
-        places = [np.array([cos * CENTRE_X - sin * y, sin * CENTRE_X + cos * y]) for y in row]
-        self.all_discs = [
-            self.add(
-                build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy, z=-0.01 if i % 2 else 0.01)
-            )
-            for i, xy in enumerate(places)
-        ]
+        places: list[np.ndarray] = []
+        self.all_discs: list[Disc] = []
+        for i in range(PLACES):
+            y = (i - PLACES // 2) * SPACING
+            places.append(np.array([cos * CENTRE_X - sin * y, sin * CENTRE_X + cos * y]))
+            z = -0.01 if i % 2 else 0.01  # under an obstacle no disc is to be seen
+            disc = build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", places[i], z)
+            self.all_discs.append(self.add(disc))
         for i in range(1, PLACES, 2):
             colour = self.values.colour(
                 f"layout.obstacle_rgb.{i // 2}", lambda: draws.uniforms(3).tolist()
@@ -105,21 +103,18 @@ class RouteStick(Task):
 
     def cues(self) -> list[Cue]:
         """Of the next move: a disc under its target, and smaller ones along its arc."""
+        cues = [Cue("yellow", partial(self._arc_point, -1), CUE_RADIUS)]
+        for i in DOTS:
+            cues.append(Cue("yellow", partial(self._arc_point, i), DOT_RADIUS))
+        return cues
 
-        def point(i: int) -> Callable[[], Place | None]:
-            def place() -> Place | None:
-                move = len(self.directions) - len(self.progress.to_come)
-                if not 0 <= move < len(self.directions):  # in the video, or at the end
-                    return None
-                start, end = (disc.position for disc in self.route[move : move + 2])
-                return on_table(arc(start, end, self.directions[move])[i])
-
-            return place
-
-        return [
-            Cue("yellow", point(-1), CUE_RADIUS),
-            *(Cue("yellow", point(i), DOT_RADIUS) for i in DOTS),
-        ]
+    def _arc_point(self, i: int) -> Place | None:
+        """A point of the next move's arc."""
+        move = len(self.directions) - len(self.progress.to_come)
+        if not 0 <= move < len(self.directions):  # in the video, or at the end
+            return None
+        start, end = self.route[move].position, self.route[move + 1].position
+        return on_table(arc(start, end, self.directions[move])[i])
 
     def start_episode(self, draws: Draws) -> None:
         self.marks = [
@@ -138,7 +133,8 @@ class RouteStick(Task):
     def failure(self) -> bool:
         """Remembers the way of the tool since the last visit; the rules belong to the moves."""
         if self.progress.current is not self._way_of:
-            self._way_of, self._way = self.progress.current, []
+            self._way_of = self.progress.current
+            self._way = []
         self._way.append(np.asarray(self.tcp_pose.p[:2], np.float64))
         return False
 
@@ -158,16 +154,10 @@ class RouteStick(Task):
             run=lambda demo: demo.stick_to(first, store=True),
             video=True,
         )
-        return [
-            approach,
-            *self._moves(video=True),
-            *end_stick_video(self, HOME_STEPS),
-            *self._moves(video=False),
-        ]
-
-    def _moves(self, video: bool) -> list[SubTask]:
-        legs = zip(self.route, self.route[1:], self.directions, strict=False)
-        return [self._move(previous, goal, direction, video) for previous, goal, direction in legs]
+        legs = list(zip(self.route, self.route[1:], self.directions, strict=False))
+        shown = [self._move(*leg, video=True) for leg in legs]
+        moves = [self._move(*leg, video=False) for leg in legs]
+        return [approach, *shown, *end_stick_video(self, HOME_STEPS), *moves]
 
     def _move(self, previous: Disc, goal: Disc, direction: Direction, video: bool) -> SubTask:
         others = [disc for disc in self.all_discs if disc is not previous and disc is not goal]
@@ -181,7 +171,7 @@ class RouteStick(Task):
             return astray or (there() and self._turned(previous, goal) != direction)
 
         return SubTask(
-            self._text(side, direction),
+            MOVE.format(side, direction),
             done=there,
             run=lambda demo: demo.stick_arc(goal, direction),
             failed=failed,
@@ -190,25 +180,16 @@ class RouteStick(Task):
             operation=lambda: "how" if there() else "order",
         )
 
-    @staticmethod
-    def _text(side: str, direction: Direction) -> str:
-        return f"move to the nearest {side} target by circling around the stick {direction}"
-
     def choices(self) -> list[Choice]:
         return [
-            self._choice(letter, side, direction)
+            Choice(letter, MOVE.format(side, direction), partial(self._go, side, direction))
             for letter, (side, direction) in zip("abcd", SIDES, strict=True)
         ]
 
-    def _choice(self, letter: str, side: str, direction: Direction) -> Choice:
-        return Choice(
-            letter, self._text(side, direction), lambda demo, _: self._go(demo, side, direction)
-        )
-
-    def _go(self, demo: "Demonstrator", side: str, direction: Direction) -> None:
+    def _go(self, side: str, direction: Direction, demo: Demonstrator, _: None) -> None:
         tcp = self.tcp_pose.p
         here = min(range(len(self.discs)), key=lambda i: distance_xy(self.discs[i].position, tcp))
-        there = here + (1 if side == "left" else -1)
+        there = here + 1 if side == "left" else here - 1
         if 0 <= there < len(self.discs):
             demo.stick_arc(self.discs[there], direction)
 

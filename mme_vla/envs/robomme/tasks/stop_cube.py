@@ -3,12 +3,12 @@ right visit.
 """
 
 import math
-from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 import sapien
 
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, row, smoothstep, tally
 from mme_vla.envs.robomme.scene.objects import build_disc, build_moving_cube
 from mme_vla.envs.robomme.scene.placement import Draws
@@ -18,9 +18,6 @@ from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import add_button
 from mme_vla.envs.subtasks import Choice, SubTask, ordinal
 from mme_vla.envs.task import Task
-
-if TYPE_CHECKING:
-    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 
 INTERVALS = (60, 80, 120)  # steps of one pass
 PASSES = 5
@@ -51,8 +48,9 @@ class StopCube(Task):
         self.cube = self.add(build_moving_cube(self, "cube", colour, xy, z=0.01))
 
     def start_episode(self, draws: Draws) -> None:
-        draws, values = Draws(self.seed), self.values
-        draws.integer(27, 33)
+        values = self.values
+        draws = Draws(self.seed)
+        draws.integer(27, 33)  # part of the official stream, without effect
         self.interval = values.integer(
             "actions.move_interval", lambda: INTERVALS[draws.integer(0, 3)], least=2
         )
@@ -73,7 +71,9 @@ class StopCube(Task):
         if pass_index == self.passes:
             pass_index, steps = self.passes - 1, self.interval
         side = 2 * smoothstep(steps / self.interval) - 1
-        xy = self.target.position[:2] + self._reach * (side if pass_index % 2 == 0 else -side)
+        if pass_index % 2 == 1:  # on the way back
+            side = -side
+        xy = self.target.position[:2] + self._reach * side
         self.cube.move_to(sapien.Pose([*xy, self.cube.position[2]]))
 
     def cues(self) -> list[Cue]:
@@ -82,7 +82,9 @@ class StopCube(Task):
         """
 
         def left() -> int:
-            now = self.steps_done if self.stopped_at is None else self.stopped_at
+            now = self.stopped_at
+            if now is None:
+                now = self.steps_done
             return self.visit - now // self.interval
 
         return tally(row(self.passes), left)
@@ -101,10 +103,9 @@ class StopCube(Task):
         return self.interval * self.visit
 
     def _in_time(self) -> bool:
-        return (
-            self.stopped_at is not None
-            and self.deadline - self.interval <= self.stopped_at <= self.deadline
-        )
+        if self.stopped_at is None:
+            return False
+        return self.deadline - self.interval <= self.stopped_at <= self.deadline
 
     def _on_target(self) -> bool:
         return distance_xy(self.cube.position, self.target.position) <= STOPPED_AT
@@ -114,9 +115,10 @@ class StopCube(Task):
             return not (self._on_target() and self._in_time())
         return self.steps_done > self.deadline
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        over = self.stopped_at is None and self._on_target()
-        return {f"visit {self.steps_done // self.interval}"} if over else ()
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
+        if self.stopped_at is None and self._on_target():
+            return {f"visit {self.steps_done // self.interval}"}
+        return set()
 
     def checkpoints(self) -> list[int]:
         """Steps until which the arm waits: every 100th, then the one at which to press."""
@@ -133,6 +135,7 @@ class StopCube(Task):
             choice="a",
             operation=self._mistaken,
         )
+        waits = [self._wait(until) for until in self.checkpoints()]
         press = SubTask(
             "press the button to stop the cube on the target",
             done=lambda: self._in_time() and self._on_target(),
@@ -142,23 +145,20 @@ class StopCube(Task):
             choice="c",
             operation=self._mistaken,
         )
-        return [hover, *map(self._wait, self.checkpoints()), press]
+        return [hover, *waits, press]
 
     def _mistaken(self) -> str:
         """On the right visit the cube was only missed; on another one the count was forgotten."""
         return "" if self._in_time() else "how many"
 
-    def _press(self, demo: "Demonstrator") -> None:
+    def _press(self, demo: Demonstrator) -> None:
         """Press; if the wait before it ended so late that the cube would have passed, without
         closing the fingers.
         """
         crossing = self.deadline - self.interval // 2
         tolerated = self.interval // 15  # steps that the cube takes over half the target
-        demo.press(
-            self.button,
-            hold=False,
-            close=not self.second_tries or self.steps_done + PRESS_STEPS <= crossing + tolerated,
-        )
+        is_late = self.steps_done + PRESS_STEPS > crossing + tolerated
+        demo.press(self.button, hold=False, close=not (self.second_tries and is_late))
 
     def _wait(self, until: int) -> SubTask:
         return SubTask(
@@ -169,9 +169,10 @@ class StopCube(Task):
             operation=self._mistaken,
         )
 
-    def _next_checkpoint(self) -> int:
+    def _remain_static(self, demo: Demonstrator, _: None) -> None:
+        """Wait until the next step of `checkpoints`."""
         now = self.steps_done
-        return next((k for k in self.checkpoints() if k > now), now)
+        demo.hold_until(next((k for k in self.checkpoints() if k > now), now))
 
     def choices(self) -> list[Choice]:
         return [
@@ -180,7 +181,7 @@ class StopCube(Task):
                 "move to the top of the button to prepare",
                 lambda demo, _: demo.hover(self.button),
             ),
-            Choice("b", "remain static", lambda demo, _: demo.hold_until(self._next_checkpoint())),
+            Choice("b", "remain static", self._remain_static),
             Choice("c", "press button to stop the cube", lambda demo, _: self._press(demo)),
         ]
 

@@ -19,46 +19,46 @@ class VideoPlaceButton(VideoPlace):
     target_counts: ClassVar[dict[str, int]] = {"easy": 3, "medium": 4, "hard": 4}
 
     def draw_script(self, draws: Draws) -> None:
-        values, count = self.values, len(self.targets)
+        values = self.values
         self.before = values.flag("objects.task_flag", draws.coin)
-        self._extra = {
-            when: self._indices(f"objects.extra_place_target_ids.{when}", count)
-            for when in ("before", "after")
-        }
+        # A row may have the cube put on further targets beside the first two.
+        self._visited_before = [0, *self._further_visits("before")]
+        self._visited_after = [1, *self._further_visits("after")]
         goal = values.find("actions.target_target_id")
         if goal is not None and goal != self.targets.index(self.goal_target):
             raise values.error(
                 "actions.target_target_id", f"is {goal}; the other values give another target"
             )
 
-    def _indices(self, name: str, count: int) -> list[int]:
-        """Targets on which a row has the cube put beside the first two."""
-        return [] if self.values.find(name) is None else self.values.indices(name, list, count)
+    def _further_visits(self, when: str) -> list[int]:
+        name = f"objects.extra_place_target_ids.{when}"
+        if self.values.find(name) is None:
+            return []
+        return self.values.indices(name, list, len(self.targets))
 
     @property
     def goal_target(self) -> Disc:
-        before = [0, *self._extra["before"]]
-        return self.targets[before[-1] if self.before else 1]
+        if self.before:
+            return self.targets[self._visited_before[-1]]
+        return self.targets[self._visited_after[0]]
 
     def visits(self) -> list[SubTask]:
-        before = [0, *self._extra["before"]]
-        after = [1, *self._extra["after"]]
-        visible = [
-            [step for i in part for step in (self.show_pick(), self.show_drop(self.targets[i]))]
-            for part in (before, after)
-        ]
-        return [
-            *visible[0],
-            self.show_press(),
-            *visible[1],
-            *(self.put_back(self.cube) if self.tier else []),
-        ]
+        steps: list[SubTask] = []
+        for i in self._visited_before:
+            steps += [self.show_pick(self.cube), self.show_drop(self.cube, self.targets[i])]
+        steps.append(self.show_press())
+        for i in self._visited_after:
+            steps += [self.show_pick(self.cube), self.show_drop(self.cube, self.targets[i])]
+        if self.tier:
+            steps += self.put_back(self.cube)
+        return steps
 
     def goals(self) -> list[str]:
         place = f"place the {self.cube.colour} cube on the target"
         start = f"watch the video carefully, then {place}"
-        when = "before" if self.before else "after"
-        order = "last placed before" if self.before else "first placed after"
+        when, order = "after", "first placed after"
+        if self.before:
+            when, order = "before", "last placed before"
         if self.tier:
             return [f"{start} where it was {order} the button was pressed"]
         return [

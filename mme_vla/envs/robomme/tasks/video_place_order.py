@@ -4,7 +4,7 @@ video.
 
 from typing import ClassVar
 
-from mme_vla.envs.robomme.scene.objects import Disc
+from mme_vla.envs.robomme.scene.objects import Cube, Disc
 from mme_vla.envs.robomme.scene.placement import Draws
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.video_place import VideoPlace
@@ -24,29 +24,24 @@ class VideoPlaceOrder(VideoPlace):
     target_counts: ClassVar[dict[str, int]] = {"easy": 4, "medium": 4, "hard": 4}
 
     def draw_script(self, draws: Draws) -> None:
-        values, targets = self.values, len(self.targets)
+        values, targets = self.values, self.targets
 
         def sample() -> list[int]:
             count = draws.integer(2, 5)
             return draws.permutation(4)[:count]
 
-        rows = max(values.count("objects.visit_ids_by_object"), 1)
+        name = "objects.visit_ids_by_object"
+        rows = max(values.count(name), 1)
         if rows != len(self.demonstrated):
-            raise values.error(
-                "objects.visit_ids_by_object",
-                f"has {rows} lists for {len(self.demonstrated)} cubes",
-            )
-        visits = [
-            values.indices(f"objects.visit_ids_by_object.{i}", sample, targets) for i in range(rows)
-        ]
+            raise values.error(name, f"has {rows} lists for {len(self.demonstrated)} cubes")
+        self._visits: list[tuple[Cube, list[Disc]]] = []
+        total = 0
+        for i, cube in enumerate(self.demonstrated):
+            ids = values.indices(f"{name}.{i}", sample, len(targets))
+            self._visits.append((self.cubes[cube], [targets[j] for j in ids]))
+            total += len(ids)
         requested = values.integer("objects.answer_demo_index", lambda: 0, most=rows - 1)
-        total = sum(map(len, visits))
-        self.cube = self.cubes[self.demonstrated[requested]]
-        self._visits = [
-            (self.cubes[cube], [self.targets[i] for i in ids])
-            for cube, ids in zip(self.demonstrated, visits, strict=True)
-        ]
-        self.visited = self._visits[requested][1]
+        self.cube, self.visited = self._visits[requested]
         count = len(self.visited)
         self.rank = values.integer(
             "objects.which_in_subset", lambda: draws.integer(1, count + 1), least=1, most=count
@@ -60,10 +55,11 @@ class VideoPlaceOrder(VideoPlace):
         return self.visited[self.rank - 1]
 
     def visits(self) -> list[SubTask]:
-        steps, done = [], 0
+        steps: list[SubTask] = []
+        done = 0
         for cube, targets in self._visits:
             for target in targets:
-                steps += [self.show_pick(cube), self.show_drop(target, cube)]
+                steps += [self.show_pick(cube), self.show_drop(cube, target)]
                 if done == self.press_after:
                     steps.append(self.show_press())
                 done += 1
@@ -72,11 +68,8 @@ class VideoPlaceOrder(VideoPlace):
         return steps
 
     def goals(self) -> list[str]:
-        cube, which = (
-            f"place the {self.cube.colour} cube on the",
-            f"{ordinal(self.rank - 1)} target",
-        )
+        place = f"place the {self.cube.colour} cube on the {ordinal(self.rank - 1)} target"
         return [
-            f"watch the video carefully, then {cube} {which} it was previously placed on",
-            f"watch the video carefully and {cube} {which} where it was placed",
+            f"watch the video carefully, then {place} it was previously placed on",
+            f"watch the video carefully and {place} where it was placed",
         ]

@@ -2,9 +2,9 @@
 now.
 """
 
-from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import (
     SWAP_STEPS,
     Cue,
@@ -18,25 +18,25 @@ from mme_vla.envs.robomme.scene.motions import (
 )
 from mme_vla.envs.robomme.scene.objects import COLOURS, RGB, Cube
 from mme_vla.envs.robomme.scene.placement import ANCHOR_HALF, Draws, Region, rotated_anchors
-from mme_vla.envs.robomme.scene.predicates import StaticFor, any_picked_up, dropped, pressed
+from mme_vla.envs.robomme.scene.predicates import StaticFor, any_picked_up, pressed
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import (
     add_button,
     add_cube,
-    choices_made,
     delay,
     end_video,
     go_home,
     pick,
     press,
+    press_choice,
+    put_down,
+    put_down_choice,
     wait,
 )
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 
-if TYPE_CHECKING:
-    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
-
+SAMPLED_COLOURS = ("red", "blue", "green")
 SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
 ROUNDS = 5  # of the three colours, in hard episodes
 GO_HOME_STEPS = 20
@@ -53,6 +53,7 @@ class VideoRepick(Task):
     latch_failure = True
     recovery_sampled_per_episode = True
     dials = frozenset({"count", "delay"})
+    evidence_choices = "a"
 
     def plan(self, draws: Draws) -> None:
         self.repetitions = self.values.integer(
@@ -62,55 +63,67 @@ class VideoRepick(Task):
         self.swap_count = draws.integer(low, high + 1)
 
     def build(self, draws: Draws) -> None:
+        values = self.values
         self.button = add_button(self, draws, (-0.2, 0), (0.1, 0.1))
         self.cubes: list[Cube] = []
-        target, initiators = (
-            self._draw_cubes(draws) if not self.values.specified else self._read_cubes(draws)
-        )
+        target = 0
+        initiators: list[int] = []
+        if values.specified:
+            self._read_cubes(draws)
+        elif self.difficulty == "hard":
+            target = self._draw_many_cubes(draws)
+        else:
+            target, initiators = self._draw_equal_cubes(draws)
         count = len(self.cubes)
-        self.cube = self.cubes[
-            self.values.integer("objects.target", lambda: target, most=count - 1)
-        ]
-        self.pairs = self.values.pairs("actions.swap_pairs", count)
-        if self.pairs is None:
-            initiators = self.values.indices("actions.swap_initiators", lambda: initiators, count)
+        self.cube = self.cubes[values.integer("objects.target", lambda: target, most=count - 1)]
+        self.wrong_cubes = [cube for cube in self.cubes if cube is not self.cube]
+        self.pairs = values.pairs("actions.swap_pairs", count)
+        if self.pairs is not None:
+            swaps = len(self.pairs)
+        else:
+            initiators = values.indices("actions.swap_initiators", lambda: initiators, count)
+            swaps = len(initiators)
         self.initiators = [self.cubes[i] for i in initiators]
-        swaps = len(initiators if self.pairs is None else self.pairs)
-        self.swap_count = self.values.integer("objects.n_swaps", lambda: swaps)
+        self.swap_count = values.integer("objects.n_swaps", lambda: swaps)
         if self.swap_count != swaps:
-            raise self.values.error(
+            raise values.error(
                 "objects.n_swaps", f"is {self.swap_count}, and actions has {swaps} swaps"
             )
 
-    def _read_cubes(self, draws: Draws) -> tuple[int, list[int]]:
+    def _read_cubes(self, draws: Draws) -> None:
         """Add the row's cubes, all of one colour or each of its own."""
-        count = self.values.count("layout.cubes")
+        values = self.values
+        count = values.count("layout.cubes")
         if count < 1:
-            raise self.values.error("layout.cubes", "is missing or empty")
-        one_colour = self.values.find("objects.color_rgb") is not None
+            raise values.error("layout.cubes", "is missing or empty")
+        one_colour = values.find("objects.color_rgb") is not None
         for i in range(count):
-            colour: str | RGB = (
-                self.values.colour("objects.color_rgb", list)
-                if one_colour
-                else self.values.word(f"objects.colors.{i}", str, COLOURS)
-            )
+            colour: str | RGB
+            if one_colour:
+                colour = values.colour("objects.color_rgb", list)
+            else:
+                colour = values.word(f"objects.colors.{i}", str, COLOURS)
             self._add_cube(draws, colour, TABLE)
-        return 0, []
 
-    def _draw_cubes(self, draws: Draws) -> tuple[int, list[int]]:
-        """Add cubes at random places; indices of the target and of those that begin a swap."""
-        if self.difficulty == "hard":
-            for _ in range(ROUNDS):
-                for i in draws.permutation(3):
-                    self._add_cube(draws, ("red", "blue", "green")[i], TABLE)
-            return draws.integer(0, len(self.cubes)), []
-        colour = ("red", "blue", "green")[draws.integer(0, 3)]
+    def _draw_many_cubes(self, draws: Draws) -> int:
+        """Add cubes of three colours anywhere; the index of the target."""
+        for _ in range(ROUNDS):
+            for i in draws.permutation(3):
+                self._add_cube(draws, SAMPLED_COLOURS[i], TABLE)
+        return draws.integer(0, len(self.cubes))
+
+    def _draw_equal_cubes(self, draws: Draws) -> tuple[int, list[int]]:
+        """Add three cubes of one colour; indices of the target and of those that begin a swap."""
+        colour = SAMPLED_COLOURS[draws.integer(0, 3)]
         draws.permutation(4)  # part of the official stream, without effect
         for anchor in rotated_anchors(draws, 3):
             self._add_cube(draws, colour, Region(anchor, ANCHOR_HALF))
         target = draws.permutation(3)[0]
+        initiators = [target]
         others = [i for i in range(len(self.cubes)) if i != target]
-        return target, [target, *(others[i] for i in draws.permutation(2))][: self.swap_count]
+        for i in draws.permutation(2):
+            initiators.append(others[i])
+        return target, initiators[: self.swap_count]
 
     def _add_cube(self, draws: Draws, colour: str | RGB, region: Region) -> None:
         i, avoid = len(self.cubes), [self.button, *self.cubes]
@@ -127,13 +140,12 @@ class VideoRepick(Task):
 
     def before_physics(self, k: int) -> None:
         if self._swaps_due and not self.swaps:
-            self.swaps = (
-                planned_swaps(self.pairs, self.cubes, start=k)
-                if self.pairs is not None
-                else sequential_swaps(self.initiators, self.cubes, start=k)
-            )
-        for swap in self.swaps:
-            swap.apply(k)
+            if self.pairs is not None:
+                self.swaps = planned_swaps(self.pairs, self.cubes, start=k)
+            else:
+                self.swaps = sequential_swaps(self.initiators, self.cubes, start=k)
+            self.motions = [*self.swaps]
+        super().before_physics(k)
 
     def cues(self) -> list[Cue]:
         def left() -> int:
@@ -141,9 +153,12 @@ class VideoRepick(Task):
 
         return [under(self.cube), *tally(row(self.repetitions), left)]
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        ended_choices = choices_made(ended, "a", video=True) | choices_made(ended, "b", video=False)
-        return ended_choices | active_motions(self.swaps)
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
+        facts = super().evidence(ended) | active_motions(self.swaps)
+        for i, subtask in ended.items():
+            if subtask.choice == "b" and not subtask.video:  # one repetition is done
+                facts.add(f"{i} {subtask.text}")
+        return facts
 
     def failure(self) -> bool:
         """Notes whether the swaps may begin, one step after their stage is entered; the rules
@@ -152,35 +167,22 @@ class VideoRepick(Task):
         self._swaps_due = self._swap_stage is not None and self.progress.current is self._swap_stage
         return False
 
-    def _pressed_early(self, kind: str, i: int) -> bool:
-        """Whether the button is down in the window of a stage; in RoboMME-OOD each round has one of
-        its own.
-        """
-        first, last = PRESS_PUNISHED
-        if self.tier and i:
-            kind, first = f"{kind} {i}", 0
-        waited = self.steps_done - self._entered.setdefault(kind, self.steps_done)
-        return first <= waited <= last and pressed(self.button)
-
     def subtasks(self) -> list[SubTask]:
         return [*self._video(), *self._execution()]
 
     def _video(self) -> list[SubTask]:
-        cube = self.cube
-        drop = SubTask(
-            "drop the cube on the table",
-            done=lambda: dropped(self, cube),
-            run=lambda demo: demo.put_down(VIDEO_RELEASE_Z),
-            targets=[cube],
-            choice="b",
-            video=True,
-        )
         swaps = [self._swap_wait(i) for i in range(self.swap_count)]
         self._swap_stage = swaps[0] if swaps else None
-        first = pick(self, cube, "pick up the cube", grounded="", video=True)
+        steps = [
+            pick(self, self.cube, "pick up the cube", grounded="", video=True),
+            put_down(
+                self, self.cube, "drop the cube on the table", "b", VIDEO_RELEASE_Z, video=True
+            ),
+        ]
         longer = delay(self)
-        home = [go_home(self, GO_HOME_STEPS + longer)] if swaps or longer else []
-        return [first, drop, *home, *swaps, end_video(self)]
+        if swaps or longer:
+            steps.append(go_home(self, GO_HOME_STEPS + longer))
+        return [*steps, *swaps, end_video(self)]
 
     def _swap_wait(self, i: int) -> SubTask:
         """Hold still for a swap; in RoboMME-OOD until it ends."""
@@ -188,59 +190,78 @@ class VideoRepick(Task):
             return wait(self, SWAP_STEPS)
         still = StaticFor(self, 1)
 
-        def run(demo: "Demonstrator") -> None:
+        def run(demo: Demonstrator) -> None:
             if not self.swaps:
                 demo.hold(SWAP_STEPS)
             while self.swaps and self.steps_done < self.swaps[i].end:
                 demo.open()
 
         def done() -> bool:
-            at_rest = still()
+            at_rest = still()  # asked at every step, as it must be
             return at_rest and bool(self.swaps) and self.steps_done >= self.swaps[i].end
 
         return SubTask("static", done, run, video=True)
 
     def _execution(self) -> list[SubTask]:
-        stop = {"failed": lambda: any_picked_up(self, self.cubes), "operation": "how many"}
-        steps = [step for i in range(self.repetitions) for step in (self._pick(i), self._put(i))]
-        return [*steps, press(self.button, "press the button to finish", "c", **stop)]
-
-    def _pick(self, i: int) -> SubTask:
-        def strayed() -> bool:
-            return self._other_picked_up() or self._pressed_early("pick", i)
-
-        text = f"pick up the correct cube for the {ordinal(i)} time"
-        return pick(self, self.cube, text, failed=strayed, pick=True, operation=self._mistaken)
-
-    def _put(self, i: int) -> SubTask:
-        return SubTask(
-            "put it down",
-            done=lambda: dropped(self, self.cube),
-            run=lambda demo: demo.put_down(RELEASE_Z),
-            failed=lambda: self._other_picked_up() or self._pressed_early("put", i),
-            targets=[self.cube],
-            choice="b",
-            operation=self._mistaken,
+        steps: list[SubTask] = []
+        for i in range(self.repetitions):
+            steps += self._repetition(i)
+        stop = press(
+            self.button,
+            "press the button to finish",
+            "c",
+            failed=lambda: any_picked_up(self, self.cubes),
+            operation="how many",
         )
+        return [*steps, stop]
+
+    def _repetition(self, i: int) -> list[SubTask]:
+        return [
+            pick(
+                self,
+                self.cube,
+                f"pick up the correct cube for the {ordinal(i)} time",
+                failed=lambda: self._strayed("pick", i),
+                pick=True,
+                operation=self._mistaken,
+            ),
+            put_down(
+                self,
+                self.cube,
+                "put it down",
+                "b",
+                RELEASE_Z,
+                failed=lambda: self._strayed("put", i),
+                operation=self._mistaken,
+            ),
+        ]
+
+    def _strayed(self, kind: str, i: int) -> bool:
+        """Whether another cube is up, or the button is down in the window of a stage.
+
+        In RoboMME-OOD each round has a window of its own.
+        """
+        if any_picked_up(self, self.wrong_cubes):
+            return True
+        first, last = PRESS_PUNISHED
+        if self.tier and i:
+            kind, first = f"{kind} {i}", 0
+        entered = self._entered.setdefault(kind, self.steps_done)
+        return first <= self.steps_done - entered <= last and pressed(self.button)
 
     def _mistaken(self) -> str:
-        return "which" if self._other_picked_up() else "how many"
-
-    def _other_picked_up(self) -> bool:
-        return any_picked_up(self, [cube for cube in self.cubes if cube is not self.cube])
+        return "which" if any_picked_up(self, self.wrong_cubes) else "how many"
 
     def choices(self) -> list[Choice]:
         return [
-            Choice("a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
-            Choice("b", "put it down", lambda demo, _: demo.put_down(RELEASE_Z)),
-            Choice("c", "press the button to finish", lambda demo, _: demo.press(self.button)),
+            Choice("a", "pick up the cube", Demonstrator.pick, self.cubes),
+            put_down_choice("b", "put it down", RELEASE_Z),
+            press_choice("c", "press the button to finish", self.button),
         ]
 
     def goals(self) -> list[str]:
-        watch, same_cube = (
-            "watch the video carefully",
-            "pick up the same cube that was previously picked up",
-        )
+        watch = "watch the video carefully"
+        same_cube = "pick up the same cube that was previously picked up"
         same_block = "the same block that was previously picked up"
         if self.repetitions == 1:
             return [

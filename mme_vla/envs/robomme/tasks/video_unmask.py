@@ -5,14 +5,9 @@ right container.
 from mme_vla.envs.robomme.scene.motions import COVER_STEPS
 from mme_vla.envs.robomme.scene.placement import Draws
 from mme_vla.envs.robomme.tasks import register_task
-from mme_vla.envs.robomme.tasks.families.containers import (
-    Unmask,
-    container_choices,
-    container_picks,
-    hiding_goal,
-)
+from mme_vla.envs.robomme.tasks.families.containers import Unmask
 from mme_vla.envs.robomme.tasks.families.stages import delay, wait
-from mme_vla.envs.subtasks import Choice, SubTask
+from mme_vla.envs.subtasks import SubTask
 
 
 @register_task
@@ -25,13 +20,7 @@ class VideoUnmask(Unmask):
         self.build_containers(draws, [])
 
     def subtasks(self) -> list[SubTask]:
-        picks = container_picks(self, self.targets, self.all_containers)
-        return [wait(self, COVER_STEPS + delay(self)), *picks]
-
-    def choices(self) -> list[Choice]:
-        return container_choices(self.containers)
+        return [wait(self, COVER_STEPS + delay(self)), *self.picks()]
 
     def goals(self) -> list[str]:
-        return [
-            f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.targets])}"
-        ]
+        return [f"watch the video carefully, then {self.hiding_goal()}"]

@@ -4,15 +4,9 @@ up the right one.
 
 from mme_vla.envs.robomme.scene.placement import Draws, rotated_anchors
 from mme_vla.envs.robomme.tasks import register_task
-from mme_vla.envs.robomme.tasks.families.containers import (
-    CONTAINERS,
-    UnmaskSwap,
-    container_choices,
-    container_picks,
-    hiding_goal,
-)
+from mme_vla.envs.robomme.tasks.families.containers import CONTAINERS, UnmaskSwap
 from mme_vla.envs.robomme.tasks.families.stages import delay, wait
-from mme_vla.envs.subtasks import Choice, SubTask
+from mme_vla.envs.subtasks import SubTask
 
 
 @register_task
@@ -25,13 +19,7 @@ class VideoUnmaskSwap(UnmaskSwap):
         self.build_containers(draws, rotated_anchors(draws, CONTAINERS[self.difficulty]))
 
     def subtasks(self) -> list[SubTask]:
-        watch = wait(self, self.swapped_after + delay(self))
-        return [watch, *container_picks(self, self.targets, self.all_containers)]
-
-    def choices(self) -> list[Choice]:
-        return container_choices(self.containers)
+        return [wait(self, self.swapped_after + delay(self)), *self.picks()]
 
     def goals(self) -> list[str]:
-        return [
-            f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.targets])}"
-        ]
+        return [f"watch the video carefully, then {self.hiding_goal()}"]

@@ -2,10 +2,12 @@
 them down.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import (
     COVER_STEPS,
     SWAP_STEPS,
@@ -15,6 +17,7 @@ from mme_vla.envs.robomme.scene.motions import (
     Swap,
     active_motions,
     planned_swaps,
+    sequential_swaps,
     under,
 )
 from mme_vla.envs.robomme.scene.objects import (
@@ -42,69 +45,41 @@ from mme_vla.envs.task import Task
 
 UNMASK_COLOURS = ("red", "green", "blue")
 MOST_PICKS = len(UNMASK_COLOURS)
-PARKED: dict[str, int | None] = {"outer": 0, "outer cubes": 1, "inner": 2, "inner cubes": 3}
+PARKED = {"outer": 0, "outer cubes": 1, "inner": 2, "inner cubes": 3}
 """Groups of objects that are away at places of their own, in rows of RoboMME-OOD."""
-# half of the side of the square in which more containers than the benchmark's stand, metres
-WIDER = 0.25
-
-
-def add_containers(
-    env: Task,
-    draws: Draws,
-    count: int,
-    avoid: Sequence[Avoid] = (),
-    there: list[Container] | None = None,
-) -> list[Container]:
-    """Place containers in the middle of the table until there are `count` or one finds no place.
-
-    Args:
-        there: those that stand already, to which `count` more are added: closer together, and
-            further out.
-    """
-    containers = [] if there is None else there
-    half, gap = (0.2, 2 * H) if there is None else (WIDER, H)
-    stop = len(containers) + count
-    part = "layout.bins" if there is None else "layout.empty_bins"
-    if env.values.specified:
-        stop = len(containers) + env.values.count(part)
-    first = len(containers)
-    while len(containers) < stop:
-        container = add_container(
-            env,
-            draws,
-            f"{part}.{len(containers) - first}",
-            Region((0, 0), half),
-            [*avoid, *containers],
-            gap,
-            f"container_{len(containers)}",
-        )
-        if container is None:
-            break
-        containers.append(container)
-    return containers
 
 
 def add_container(
     env: Task,
     draws: Draws,
+    name: str,
     value: str,
     region: Region,
     avoid: Sequence[Avoid],
     gap: float,
-    name: str,
 ) -> Container | None:
     """Add a container at the row's place, or at a random one; None where it finds none."""
     if env.values.specified:
-        place = env.values.place(value, list, size=3)
-    else:
-        sample = draw_container(draws, region, avoid, gap=gap, degrees=True)
-        if sample is None:
-            return None
-        place = [*sample[0].tolist(), sample[1]]
-        env.values.note(value, place)
-    yaw = float(np.deg2rad(place[2]))
-    env.values.occupy(value, place[:2], CONTAINER_OUTER / 2, yaw)
-    return env.add(build_container(env, name, place[:2], yaw))
+        return read_container(env, name, value)
+    sample = draw_container(draws, region, avoid, gap=gap)
+    if sample is None:
+        return None
+    (x, y), degrees = sample
+    place = [float(x), float(y), degrees]
+    env.values.note(value, place)
+    return _put_container(env, name, value, place)
+
+
+def read_container(env: Task, name: str, value: str) -> Container:
+    """Add a container at the row's place."""
+    return _put_container(env, name, value, env.values.place(value, list, size=3))
+
+
+def _put_container(env: Task, name: str, value: str, place: Sequence[float]) -> Container:
+    x, y, degrees = place
+    yaw = float(np.deg2rad(degrees))
+    env.values.occupy(value, (x, y), CONTAINER_OUTER / 2, yaw)
+    return env.add(build_container(env, name, (x, y), yaw))
 
 
 class OuterContainers:
@@ -115,187 +90,192 @@ class OuterContainers:
     places.
     """
 
-    def __init__(self, env: Task, draws: Draws) -> None:
-        public = env.values.find("objects.distractors.public") is not None
-        part = "objects.distractors.public" if public else "objects.distractors"
-        count = env.values.count(f"{part}.bins")
+    def __init__(self, env: Task) -> None:
         self.containers: list[Container] = []
-        for i in range(count):
-            added = add_container(
-                env, draws, f"{part}.bins.{i}", Region((0, 0), 0), [], 0, f"distractor_bin_{i}"
+        self.hidden: list[tuple[Cube, Container]] = []
+        values = env.values
+        part = "objects.distractors"
+        if values.find(f"{part}.public") is not None:
+            part = f"{part}.public"
+        for i in range(values.count(f"{part}.bins")):
+            self.containers.append(read_container(env, f"distractor_bin_{i}", f"{part}.bins.{i}"))
+        if not self.containers:
+            return
+        indices = values.indices(f"{part}.cube_bins", list, len(self.containers))
+        colours = values.words(f"{part}.cube_colors", list, COLOURS)
+        if len(colours) != len(indices):
+            raise values.error(
+                f"{part}.cube_colors", f"has {len(colours)} colours for {len(indices)} cubes"
             )
-            assert added is not None
-            self.containers.append(added)
-        under = env.values.indices(f"{part}.cube_bins", list, count) if count else []
-        colours = env.values.words(f"{part}.cube_colors", list, COLOURS) if count else []
-        if len(colours) != len(under):
-            raise env.values.error(
-                f"{part}.cube_colors", f"has {len(colours)} colours for {len(under)} cubes"
+        for j, (i, colour) in enumerate(zip(indices, colours, strict=True)):
+            container = self.containers[i]
+            name = f"distractor_cube_{j}_{colour}"
+            cube = env.add(build_hidden_cube(env, name, colour, container.position[:2]))
+            self.hidden.append((cube, container))
+
+
+class ContainerTask(Task):
+    """Cubes under some of the containers, of which one or two are to be found."""
+
+    letters: ClassVar[tuple[str, str]] = ("a", "b")
+    """Options of multi-choice: picking a container up, and putting it down."""
+    pick_count: int
+    containers: list[Container]
+    outer: OuterContainers
+    colours: list[str]
+    over_cubes: list[Container]
+    """The container over the cube of each colour."""
+
+    def check_count(self) -> None:
+        """Refuse a row with fewer containers than hidden cubes."""
+        count = len(self.containers)
+        if count < MOST_PICKS:
+            raise self.values.error(
+                "layout.bins", f"has {count} containers; expected at least {MOST_PICKS}"
             )
-        self.hidden = []
-        for j, (i, colour) in enumerate(zip(under, colours, strict=True)):
-            place = self.containers[i].position[:2]
-            cube = env.add(build_hidden_cube(env, f"distractor_cube_{j}_{colour}", colour, place))
-            self.hidden.append((cube, self.containers[i]))
 
+    def hide_cubes(self) -> list[Cube]:
+        """Put a small cube of each colour under its container."""
+        cubes: list[Cube] = []
+        for colour, container in zip(self.colours, self.over_cubes, strict=False):
+            place = container.position[:2]
+            cubes.append(self.add(build_hidden_cube(self, f"cube_{colour}", colour, place)))
+        return cubes
 
-def add_hidden_cubes(
-    env: Task, colours: Sequence[str], containers: Sequence[Container]
-) -> list[Cube]:
-    """Put a small cube of each colour under the container of the same index."""
-    return [
-        env.add(build_hidden_cube(env, f"cube_{colour}", colour, container.position[:2]))
-        for colour, container in zip(colours, containers, strict=False)
-    ]
+    def parking_group(self, name: str) -> int | None:
+        """Which group of `PARKED` objects belong to while they are away; None: all at one place."""
+        return PARKED[name] if self.tier else None
 
-
-def container_picks(
-    env: Task,
-    targets: Sequence[tuple[str, Container]],
-    containers: Sequence[Container],
-    letters: tuple[str, str] = ("a", "b"),
-) -> list[SubTask]:
-    """Pick up the container over each colour in turn, putting one down before the next.
-
-    Args:
-        env: the task.
-        targets: colour and container, in order.
-        containers: all of them; lifting another one fails.
-        letters: multi-choice options of picking up and of putting down.
-    """
-    steps: list[SubTask] = []
-    for colour, container in targets:
-        if steps:
-            steps.append(
-                put_down_container(env, targets[len(steps) // 2][1], containers, letters[1])
-            )
-        steps.append(pick_up_container(colour, container, containers, letters[0]))
-    return steps
-
-
-def pick_up_container(
-    colour: str, container: Container, containers: Sequence[Container], choice: str
-) -> SubTask:
-    """The sub-task of lifting the container over the cube of a colour; lifting another
-    one fails.
-    """
-    return SubTask(
-        f"pick up the container that hides the {colour} cube",
-        done=lambda: container_picked_up(container),
-        run=lambda demo: demo.pick_container(container),
-        grounded=f"pick up the container at <> that hides the {colour} cube",
-        failed=lambda: others_lifted(container, containers),
-        targets=[container],
-        choice=choice,
-        pick=True,
-        operation="where",
-    )
-
-
-def put_down_container(
-    env: Task, container: Container, containers: Sequence[Container], choice: str
-) -> SubTask:
-    """The sub-task of putting a lifted container back; lifting another one fails."""
-    return SubTask(
-        "put down the container",
-        done=lambda: container_put_down(env, container),
-        run=lambda demo: demo.put_down(),
-        failed=lambda: others_lifted(container, containers),
-        targets=[container],
-        choice=choice,
-        operation="where",
-    )
-
-
-def others_lifted(container: Container, containers: Sequence[Container]) -> bool:
-    """Whether a container other than the right one is up."""
-    return any(container_picked_up(other) for other in containers if other is not container)
-
-
-def hiding_goal(colours: Sequence[str]) -> str:
-    """`pick up the container hiding the red cube`, and for a second colour another one."""
-    goal = f"pick up the container hiding the {colours[0]} cube"
-    for i, colour in enumerate(colours[1:], 2):
-        word = "finally" if i == len(colours) else "next"
-        goal += f", {word} pick up another container hiding the {colour} cube"
-    return goal
-
-
-def check_count(env: Task, count: int) -> None:
-    """Refuse a row with fewer containers than hidden cubes."""
-    if count < MOST_PICKS:
-        raise env.values.error(
-            "layout.bins", f"has {count} containers; expected at least {MOST_PICKS}"
-        )
-
-
-def container_choices(
-    containers: Sequence[Container], letters: tuple[str, str] = ("a", "b")
-) -> list[Choice]:
-    """Pick up a container (which one, a pixel says), or put the held one down."""
-    up, down = letters
-    return [
-        Choice(
-            up,
-            "pick up the container",
-            lambda demo, thing: demo.pick_container(thing),
-            lambda: containers,
-        ),
-        Choice(down, "put down the container", lambda demo, _: demo.put_down()),
-    ]
-
-
-STANDING = {"easy": 3, "medium": 5, "hard": 15}  # in hard episodes as many as fit
-STANDING_PICKS = {"easy": 1, "medium": 1, "hard": 2}
-
-
-class Unmask(Task):
-    """Containers that stay where they are; what comes before the picks is for the task to say."""
-
-    def build_containers(self, draws: Draws, avoid: Sequence[Avoid]) -> None:
-        """Place the containers, hide the cubes under the first three, and add what a dial or a row
-        adds.
-        """
-        self.containers = add_containers(self, draws, STANDING[self.difficulty], avoid)
-        if self.values.specified:
-            check_count(self, len(self.containers))
-        self.colours = sample_colours(self, draws, UNMASK_COLOURS)
-        self.pick_count = self.values.integer(
-            "objects.n_picks", lambda: STANDING_PICKS[self.difficulty], least=1, most=MOST_PICKS
-        )
-        add_hidden_cubes(self, self.colours, self.containers)
-        add_containers(self, draws, self.turned("containers"), avoid, self.containers)
-        self.outer = OuterContainers(self, draws)
+    @property
+    def targets(self) -> list[tuple[str, Container]]:
+        """Colours to be found, in order, each with the container over it."""
+        return list(zip(self.colours, self.over_cubes, strict=False))[: self.pick_count]
 
     @property
     def all_containers(self) -> list[Container]:
         """The inner ones and those around them: lifting a wrong one fails."""
         return [*self.containers, *self.outer.containers]
 
-    @property
-    def targets(self) -> list[tuple[str, Container]]:
-        """Colours to be found, in order, each with the container over it."""
-        return list(zip(self.colours, self.containers, strict=False))[: self.pick_count]
-
     def cues(self) -> list[Cue]:
+        pairs = zip(self.colours, self.over_cubes, strict=False)
+        return [under(container, colour) for colour, container in pairs]
+
+    def picks(self) -> list[SubTask]:
+        """Pick up the container over each colour in turn, putting one down before the next."""
+        steps: list[SubTask] = []
+        held: Container | None = None
+        for colour, container in self.targets:
+            if held is not None:
+                steps.append(self._put_down(held))
+            steps.append(self._pick_up(colour, container))
+            held = container
+        return steps
+
+    def _pick_up(self, colour: str, container: Container) -> SubTask:
+        return SubTask(
+            f"pick up the container that hides the {colour} cube",
+            done=lambda: container_picked_up(container),
+            run=lambda demo: demo.pick_container(container),
+            grounded=f"pick up the container at <> that hides the {colour} cube",
+            failed=lambda: self._another_lifted(container),
+            targets=[container],
+            choice=self.letters[0],
+            pick=True,
+            operation="where",
+        )
+
+    def _put_down(self, container: Container) -> SubTask:
+        return SubTask(
+            "put down the container",
+            done=lambda: container_put_down(self, container),
+            run=lambda demo: demo.put_down(),
+            failed=lambda: self._another_lifted(container),
+            targets=[container],
+            choice=self.letters[1],
+            operation="where",
+        )
+
+    def _another_lifted(self, container: Container) -> bool:
+        others = (other for other in self.all_containers if other is not container)
+        return any(container_picked_up(other) for other in others)
+
+    def choices(self) -> list[Choice]:
+        """Pick up a container (which one, a pixel says), or put the held one down."""
+        up, down = self.letters
         return [
-            under(container, colour)
-            for colour, container in zip(self.colours, self.containers, strict=False)
+            Choice(up, "pick up the container", Demonstrator.pick_container, self.containers),
+            Choice(down, "put down the container", lambda demo, _: demo.put_down()),
         ]
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        return active_motions(self.covers[:1])
+    def hiding_goal(self) -> str:
+        """`pick up the container hiding the red cube`, and for a second colour another one."""
+        (first, _), *others = self.targets
+        goal = f"pick up the container hiding the {first} cube"
+        for i, (colour, _) in enumerate(others, 1):
+            word = "finally" if i == len(others) else "next"
+            goal += f", {word} pick up another container hiding the {colour} cube"
+        return goal
+
+
+STANDING = {"easy": 3, "medium": 5, "hard": 15}  # in hard episodes as many as fit
+STANDING_PICKS = {"easy": 1, "medium": 1, "hard": 2}
+STANDING_HALF = 0.2
+"""Half the side of the square in which they stand, metres."""
+WIDER_HALF = 0.25
+"""Likewise for more containers than the benchmark's, which also stand closer together."""
+
+
+class Unmask(ContainerTask):
+    """Containers that stay where they are; what comes before the picks is for the task to say."""
+
+    def build_containers(self, draws: Draws, avoid: Sequence[Avoid]) -> None:
+        """Place the containers, hide the cubes under the first three, and add what a dial or a row
+        adds.
+        """
+        count = STANDING[self.difficulty]
+        self.containers = []
+        self._add_containers(draws, "layout.bins", count, avoid, STANDING_HALF, gap=2 * H)
+        if self.values.specified:
+            self.check_count()
+        self.colours = sample_colours(self, draws, UNMASK_COLOURS)
+        self.over_cubes = self.containers[: len(self.colours)]
+        self.pick_count = self.values.integer(
+            "objects.n_picks", lambda: STANDING_PICKS[self.difficulty], least=1, most=MOST_PICKS
+        )
+        self.hide_cubes()
+        more = self.turned("containers")
+        self._add_containers(draws, "layout.empty_bins", more, avoid, WIDER_HALF, gap=H)
+        self.outer = OuterContainers(self)
+
+    def _add_containers(
+        self, draws: Draws, part: str, count: int, avoid: Sequence[Avoid], half: float, gap: float
+    ) -> None:
+        """Place containers in the middle of the table until there are `count` more or one finds no
+        place.
+        """
+        if self.values.specified:
+            count = self.values.count(part)
+        for i in range(count):
+            container = add_container(
+                self,
+                draws,
+                f"container_{len(self.containers)}",
+                f"{part}.{i}",
+                Region((0, 0), half),
+                [*avoid, *self.containers],
+                gap,
+            )
+            if container is None:
+                return
+            self.containers.append(container)
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
+        return active_motions([self.cover])
 
     def start_episode(self, draws: Draws) -> None:
-        groups = PARKED if self.tier else dict.fromkeys(PARKED)
-        self.covers = [
-            Cover(self.containers, groups["inner"]),
-            Cover(self.outer.containers, groups["outer"]),
-        ]
-
-    def before_physics(self, k: int) -> None:
-        for cover in self.covers:
-            cover.apply(k)
+        self.cover = Cover(self.containers, self.parking_group("inner"))
+        outer = Cover(self.outer.containers, self.parking_group("outer"))
+        self.motions = [self.cover, outer]
 
 
 CONTAINERS = {"easy": 3, "medium": 4, "hard": 4}
@@ -303,7 +283,7 @@ SWAPS = {"easy": (1, 2), "medium": (1, 2), "hard": (2, 3)}  # fewest and most
 PICKS = {"easy": (1, 2), "medium": (1, 1), "hard": (2, 2)}
 
 
-class UnmaskSwap(Task):
+class UnmaskSwap(ContainerTask):
     """Where the containers stand, and what comes before the picks, is for the task to say."""
 
     dials = frozenset({"swaps"})
@@ -325,61 +305,61 @@ class UnmaskSwap(Task):
         Raises:
             SceneError: a container finds no place.
         """
-        self.containers: list[Container] = []
-        count = self.values.count("layout.bins") if self.values.specified else len(anchors)
+        values = self.values
+        self.containers = []
+        count = len(anchors)
+        if values.specified:
+            count = values.count("layout.bins")
         for i in range(count):
             region = Region(anchors[min(i, len(anchors) - 1)], ANCHOR_HALF)
+            taken = [*avoid, *self.containers]
             container = add_container(
-                self,
-                draws,
-                f"layout.bins.{i}",
-                region,
-                [*avoid, *self.containers],
-                H,
-                f"container_{i}",
+                self, draws, f"container_{i}", f"layout.bins.{i}", region, taken, H
             )
             if container is None:
                 raise SceneError(f"No place for container {i} with seed {self.seed}.")
             self.containers.append(container)
-        check_count(self, count)
+        self.check_count()
         self.colours = sample_colours(self, draws, UNMASK_COLOURS)
-        over = self.values.indices("objects.selected", lambda: draws.permutation(3), count)
+        over = values.indices("objects.selected", lambda: draws.permutation(3), count)
         if len(over) != len(self.colours):
-            raise self.values.error(
+            raise values.error(
                 "objects.selected", f"has {len(over)} containers for {len(self.colours)} cubes"
             )
         self.over_cubes = [self.containers[i] for i in over]
-        self.cubes = add_hidden_cubes(self, self.colours, self.over_cubes)
+        self.cubes = self.hide_cubes()
         self._plan_swaps(draws, count)
-        self.outer = OuterContainers(self, draws)
-        self.outer_pairs = (
-            self.values.pairs("actions.distractor_swap_pairs", len(self.outer.containers)) or []
-        )
+        self.outer = OuterContainers(self)
+        name = "actions.distractor_swap_pairs"
+        self.outer_pairs = values.pairs(name, len(self.outer.containers)) or []
         if len(self.outer_pairs) > self.swap_count:
             problem = f"has {len(self.outer_pairs)} swaps, more than objects.n_swaps"
-            raise self.values.error("actions.distractor_swap_pairs", problem)
+            raise values.error(name, problem)
 
     def _plan_swaps(self, draws: Draws, count: int) -> None:
         """Which containers change places: both of a row's pair, or an initiator and whichever is
         nearest then.
         """
-        self.swap_steps = self.values.integer(
+        values = self.values
+        self.swap_steps = values.integer(
             "actions.swap_window.duration_steps", lambda: SWAP_STEPS, least=1
         )
-        self.pairs = self.values.pairs("actions.swap_pairs", count)
-        initiators = []
-        if self.pairs is None:
-            sampled = [] if self.values.specified else self._draw_initiators(draws, count)
-            initiators = self.values.indices(
-                "actions.swap_initiators", lambda: sampled, count, distinct=False
+        name = "actions.swap_pairs"
+        self.pairs = values.pairs(name, count)
+        self.initiators: list[Container] = []
+        if self.pairs is not None:
+            swaps = len(self.pairs)
+        else:
+            name = "actions.swap_initiators"
+            initiators = values.indices(
+                name, lambda: self._draw_initiators(draws, count), count, distinct=False
             )
-        self.initiators = [self.containers[i] for i in initiators]
-        swaps = initiators if self.pairs is None else self.pairs
-        self.swap_count = self.values.integer("objects.n_swaps", lambda: len(swaps))
-        if self.swap_count != len(swaps):
-            name = "actions.swap_initiators" if self.pairs is None else "actions.swap_pairs"
-            raise self.values.error(
-                "objects.n_swaps", f"is {self.swap_count}, and {name} has {len(swaps)} swaps"
+            self.initiators = [self.containers[i] for i in initiators]
+            swaps = len(initiators)
+        self.swap_count = values.integer("objects.n_swaps", lambda: swaps)
+        if self.swap_count != swaps:
+            raise values.error(
+                "objects.n_swaps", f"is {self.swap_count}, and {name} has {swaps} swaps"
             )
 
     def _draw_initiators(self, draws: Draws, count: int) -> list[int]:
@@ -388,57 +368,33 @@ class UnmaskSwap(Task):
         others = [i for i in range(count) if i not in initiators]
         initiators.append(others[draws.integer(0, len(others))])
         initiators = initiators[: self.swap_count]
-        return initiators + [draws.integer(0, count) for _ in range(self.turned("swaps"))]
-
-    def cues(self) -> list[Cue]:
-        return [
-            under(container, colour)
-            for colour, container in zip(self.colours, self.over_cubes, strict=True)
-        ]
+        for _ in range(self.turned("swaps")):
+            initiators.append(draws.integer(0, count))
+        return initiators
 
     @property
     def swapped_after(self) -> int:
         """The step at which the last swap ends."""
         return COVER_STEPS + self.swap_steps * self.swap_count
 
-    @property
-    def targets(self) -> list[tuple[str, Container]]:
-        """Colours to be found, in order, each with the container over it."""
-        return list(zip(self.colours, self.over_cubes, strict=True))[: self.pick_count]
-
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
         return active_motions(self.visible_motions)
 
     def start_episode(self, draws: Draws) -> None:
         inner, outer = self.containers, self.outer.containers
         start, steps, end = COVER_STEPS, self.swap_steps, self.swapped_after
-        groups = PARKED if self.tier else dict.fromkeys(PARKED)
-        nearest = [
-            Swap(thing, inner, start + i * steps, steps=steps)
-            for i, thing in enumerate(self.initiators)
-        ]
-        swaps = nearest if self.pairs is None else planned_swaps(self.pairs, inner, start, steps)
-        cover = Cover(inner, groups["inner"])
+        if self.pairs is None:
+            swaps = sequential_swaps(self.initiators, inner, start, steps)
+        else:
+            swaps = planned_swaps(self.pairs, inner, start, steps)
+        cover = Cover(inner, self.parking_group("inner"))
+        pairs = list(zip(self.cubes, self.over_cubes, strict=True))
         self.visible_motions: list[Cover | Swap] = [cover, *swaps]
-        self.motions: list[Cover | Swap | Hide] = [
+        self.motions = [
             cover,
-            Cover(outer, groups["outer"]),
+            Cover(outer, self.parking_group("outer")),
             *swaps,
             *planned_swaps(self.outer_pairs, outer, start, steps),
-            Hide(
-                list(zip(self.cubes, self.over_cubes, strict=True)),
-                start,
-                end,
-                groups["inner cubes"],
-            ),
-            Hide(self.outer.hidden, start, end, groups["outer cubes"]),
+            Hide(pairs, start, end, self.parking_group("inner cubes")),
+            Hide(self.outer.hidden, start, end, self.parking_group("outer cubes")),
         ]
-
-    @property
-    def all_containers(self) -> list[Container]:
-        """The inner ones and those around them: lifting a wrong one fails."""
-        return [*self.containers, *self.outer.containers]
-
-    def before_physics(self, k: int) -> None:
-        for motion in self.motions:
-            motion.apply(k)

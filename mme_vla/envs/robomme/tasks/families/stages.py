@@ -1,10 +1,11 @@
-"""Sub-tasks and placements that several tasks share."""
+"""Sub-tasks, options and placements that several tasks share."""
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import TypedDict, Unpack
 
 import numpy as np
 
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.articulated import BUTTON_BASE, Button, build_button
 from mme_vla.envs.robomme.scene.objects import COLOURS, RGB, Cube, Disc, H, build_cube, build_disc
 from mme_vla.envs.robomme.scene.placement import (
@@ -16,15 +17,24 @@ from mme_vla.envs.robomme.scene.placement import (
     draw_cube,
     draw_disc,
 )
-from mme_vla.envs.robomme.scene.predicates import StaticFor, picked_up, pressed, reset_reached
+from mme_vla.envs.robomme.scene.predicates import (
+    StaticFor,
+    dropped,
+    dropped_onto,
+    picked_up,
+    pressed,
+    reset_reached,
+)
 from mme_vla.envs.robomme.scene.stage import RESET_QPOS
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.robomme.scene.things import Thing
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 
-if TYPE_CHECKING:
-    from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
-
 TARGET_THICKNESS = 0.005
+RELEASE_Z = 0.07
+"""Height of the tool where it lets a cube go, unless a task has its own, metres."""
+
+# Placements ---------------------------------------------------------------------------------------
 
 
 def add_cube(
@@ -37,8 +47,10 @@ def add_cube(
     gap: float = H,
     value: str = "",
 ) -> Cube:
-    """Add a cube at the place that the row gives as `value`, or at a random one; `SceneError` where
-    it finds none.
+    """Add a cube at the place that the row gives as `value`, or at a random one.
+
+    Raises:
+        SceneError: no place is free.
     """
 
     def sample() -> list[float]:
@@ -50,6 +62,56 @@ def add_cube(
     x, y, yaw = env.values.place(value, sample, size=3)
     env.values.occupy(value, (x, y), H, yaw)
     return env.add(build_cube(env, name, colour, (x, y), yaw))
+
+
+def add_cubes(
+    env: Task, draws: Draws, colours: Sequence[str], region: Region, avoid: Sequence[Avoid]
+) -> list[Cube]:
+    """Add the cubes of the row, or one of each of these colours; they keep clear of each other."""
+    names = [f"{colour}_0" for colour in colours]
+    if env.values.specified:
+        names = _cube_names(env, "layout.cubes")
+    cubes: list[Cube] = []
+    for name in names:
+        colour = name.split("_")[0]
+        value = f"layout.cubes.{name}"
+        taken = [*avoid, *cubes]
+        cubes.append(add_cube(env, draws, f"cube_{colour}", colour, region, taken, value=value))
+    return cubes
+
+
+def add_distractors(env: Task, draws: Draws, region: Region) -> list[Cube]:
+    """Add the cubes of other colours that a row has: each is a wrong cube."""
+    cubes: list[Cube] = []
+    if env.values.specified:
+        for name in _cube_names(env, "layout.distractors"):
+            colour = name.split("_")[0]
+            value = f"layout.distractors.{name}"
+            cubes.append(
+                add_cube(env, draws, f"distractor_{name}", colour, region, [], value=value)
+            )
+    return cubes
+
+
+def _cube_names(env: Task, part: str) -> list[str]:
+    """Names such as `red_0` of the cubes in a part of the row."""
+    names = env.values.names(part)
+    for name in names:
+        if name.split("_")[0] not in COLOURS:
+            raise env.values.error(
+                f"{part}.{name}", f"has an unknown colour; expected one of {', '.join(COLOURS)}"
+            )
+    return names
+
+
+def choose_cube(env: Task, draws: Draws, cubes: Sequence[Cube]) -> Cube:
+    """The cube that the goal is about: the row's, or a random one of these."""
+    count = len(cubes)
+    index = env.values.integer(
+        "objects.target_cube_idx", lambda: draws.integer(0, count), most=count - 1
+    )
+    check_colour(env, cubes[index].colour)
+    return cubes[index]
 
 
 def add_button(
@@ -79,8 +141,10 @@ def add_target(
     gap: float,
     colour: str = "purple",
 ) -> Disc:
-    """Add a target at the row's place, or at a random one; raises `SceneError` where
-    it finds none.
+    """Add a target at the row's place, or at a random one.
+
+    Raises:
+        SceneError: no place is free.
     """
 
     def sample() -> np.ndarray:
@@ -89,8 +153,22 @@ def add_target(
             raise SceneError(f"{type(env).__name__}, seed {env.seed}: {name} finds no place.")
         return xy
 
-    return env.add(
-        build_disc(env, name, radius, TARGET_THICKNESS, colour, env.values.place(value, sample))
+    xy = env.values.place(value, sample)
+    return env.add(build_disc(env, name, radius, TARGET_THICKNESS, colour, xy))
+
+
+# Values -------------------------------------------------------------------------------------------
+
+
+def sample_repetitions(env: Task, draws: Draws, bounds: tuple[int, int]) -> int:
+    """How often something is to be done: by the row, or at random from the fewest to the most, and
+    what the dial `count` adds.
+    """
+    fewest, most = bounds
+    return env.values.integer(
+        "objects.num_repeats",
+        lambda: draws.integer(fewest, most + 1) + env.turned("count"),
+        least=1,
     )
 
 
@@ -115,74 +193,91 @@ def check_colour(env: Task, colour: str | RGB) -> None:
         )
 
 
-def cube_names(env: Task, part: str, colours: Sequence[str]) -> list[str]:
-    """Names such as `red_0` of the cubes in a part of the row; without a row one of each of these
-    colours.
-    """
-    names = (
-        env.values.names(part) if env.values.specified else [f"{colour}_0" for colour in colours]
-    )
-    for name in names:
-        if name.split("_")[0] not in COLOURS:
-            raise env.values.error(
-                f"{part}.{name}", f"has an unknown colour; expected one of {', '.join(COLOURS)}"
-            )
-    return names
+def delay(env: Task) -> int:
+    """Steps more between what is shown and the execution: a dial, or a value of the row."""
+    turned = env.turned("delay")
+    if not turned and not env.values.specified:
+        return 0  # the values of such a scene do not name it
+    return env.values.integer("actions.delay", lambda: turned, default=0)
 
 
-def add_distractors(env: Task, draws: Draws, region: Region) -> list[Cube]:
-    """Add the cubes of other colours that a row has: each is a wrong cube."""
-    part = "layout.distractors"
-    return [
-        add_cube(
-            env, draws, f"distractor_{name}", name.split("_")[0], region, [], value=f"{part}.{name}"
-        )
-        for name in cube_names(env, part, [])
-    ]
+# Sub-tasks ----------------------------------------------------------------------------------------
 
 
-def press(button: Button, text: str, choice: str, **options: Any) -> SubTask:
+class Details(TypedDict, total=False):
+    """Fields of `SubTask` that the sub-tasks below leave to the task."""
+
+    grounded: str
+    failed: Callable[[], bool]
+    video: bool
+    pick: bool
+    operation: str | Callable[[], str]
+
+
+def press(button: Button, text: str, choice: str, **details: Unpack[Details]) -> SubTask:
     """Press a button; the pixel stands behind the word `button`."""
+    details.setdefault("grounded", text.replace("button", "button at <>", 1))
     return SubTask(
         text,
         done=lambda: pressed(button),
         run=lambda demo: demo.press(button),
         targets=[button],
         choice=choice,
-        **{"grounded": text.replace("button", "button at <>", 1), **options},
+        **details,
     )
 
 
-def pick(env: Task, cube: Cube, text: str, choice: str = "a", **options: Any) -> SubTask:
+def pick(
+    env: Task, cube: Cube, text: str, choice: str = "a", **details: Unpack[Details]
+) -> SubTask:
     """Pick up a cube; the pixel stands behind the word `cube`."""
+    details.setdefault("grounded", text.replace("cube", "cube at <>", 1))
     return SubTask(
         text,
         done=lambda: picked_up(env, cube),
         run=lambda demo: demo.pick(cube),
         targets=[cube],
         choice=choice,
-        **{"grounded": text.replace("cube", "cube at <>", 1), **options},
+        **details,
     )
 
 
-def choices_made(ended: Mapping[int, SubTask], letters: str, video: bool) -> set[str]:
-    """Of the sub-tasks that have ended, those of the video or of the execution that are one of some
-    options.
-    """
-    return {
-        f"{i} {s.text}"
-        for i, s in ended.items()
-        if s.choice and s.choice in letters and s.video == video
-    }
+def put_down(
+    env: Task,
+    cube: Cube,
+    text: str,
+    choice: str,
+    z: float = RELEASE_Z,
+    **details: Unpack[Details],
+) -> SubTask:
+    """Put the held cube down where it is, the tool at height `z` in metres."""
+    return SubTask(
+        text,
+        done=lambda: dropped(env, cube),
+        run=lambda demo: demo.put_down(z),
+        targets=[cube],
+        choice=choice,
+        **details,
+    )
 
 
-def delay(env: Task) -> int:
-    """Steps more between what is shown and the execution: a dial, or a value of the row."""
-    turned = env.turned("delay")
-    return (
-        turned
-        if not turned and not env.values.specified
-        else env.values.integer("actions.delay", lambda: turned, default=0)
+def place(
+    env: Task,
+    cube: Cube,
+    target: Thing,
+    text: str,
+    choice: str = "b",
+    **details: Unpack[Details],
+) -> SubTask:
+    """Place the held cube onto a target; the pixel stands behind the word `target`."""
+    details.setdefault("grounded", text.replace("target", "target at <>", 1))
+    return SubTask(
+        text,
+        done=lambda: dropped_onto(env, cube, target),
+        run=lambda demo: demo.place_on(target),
+        targets=[target],
+        choice=choice,
+        **details,
     )
 
 
@@ -194,7 +289,7 @@ def wait(env: Task, steps: int) -> SubTask:
 def go_home(env: Task, steps: int) -> SubTask:
     """Move above the middle of the table in the video, then hold still."""
 
-    def run(demo: "Demonstrator") -> None:
+    def run(demo: Demonstrator) -> None:
         demo.go_home()
         demo.hold(steps)
 
@@ -227,3 +322,16 @@ def end_stick_video(env: Task, steps: int = 30) -> list[SubTask]:
             video=True,
         ),
     ]
+
+
+# Options of multi-choice --------------------------------------------------------------------------
+
+
+def press_choice(label: str, text: str, button: Button) -> Choice:
+    """The option of pressing a button."""
+    return Choice(label, text, lambda demo, _: demo.press(button))
+
+
+def put_down_choice(label: str, text: str, z: float = RELEASE_Z) -> Choice:
+    """The option of putting down what is held, the tool at height `z` in metres."""
+    return Choice(label, text, lambda demo, _: demo.put_down(z))

@@ -3,11 +3,12 @@ of them again.
 """
 
 from abc import abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import ClassVar
 
 import sapien
 
+from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, Swap, active_motions, under
 from mme_vla.envs.robomme.scene.objects import Cube, Disc, H
 from mme_vla.envs.robomme.scene.placement import Avoid, Draws, Region
@@ -15,22 +16,23 @@ from mme_vla.envs.robomme.scene.predicates import any_picked_up, dropped, droppe
 from mme_vla.envs.robomme.scene.things import Thing
 from mme_vla.envs.robomme.tasks.families.stages import (
     add_button,
-    add_cube,
+    add_cubes,
     add_target,
     check_colour,
-    choices_made,
-    cube_names,
     delay,
     end_video,
     go_home,
     pick,
+    place,
     press,
+    press_choice,
     sample_colours,
     wait,
 )
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 
+COLOURS = ("red", "blue", "green")
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
 TARGET_RADIUS = 0.04
 TABLE_Z = 0.01
@@ -43,7 +45,8 @@ class Place(Thing):
     """Where an object stood at first: a place without a body."""
 
     def __init__(self, thing: Thing) -> None:
-        self.name, self._at = f"{thing.name}_home", thing.initial_pose
+        self.name = f"{thing.name}_home"
+        self._at = thing.initial_pose
 
     @property
     def pose(self) -> sapien.Pose:
@@ -56,6 +59,7 @@ class VideoPlace(Task):
     """
 
     dials = frozenset({"delay"})
+    evidence_choices = "bc"
     spot_radius: ClassVar[float]
     """How far the spot where the video puts the cube at its end stays from the edge of
     its region.
@@ -71,47 +75,50 @@ class VideoPlace(Task):
             self, draws, "spot", "layout.goal_xy", region, self.spot_radius, [], gap=H
         )
         self.button = add_button(self, draws, (0.1, 0), (0.05, 0.3))
-        colours = sample_colours(self, draws, ("red", "blue", "green"))[: CUBES[self.difficulty]]
-        avoid: list[Avoid] = [self.spot, self.button]
-        self.cubes: list[Cube] = []
-        for name in cube_names(self, "layout.cubes", colours):
-            colour, value = name.split("_")[0], f"layout.cubes.{name}"
-            self.cubes.append(
-                add_cube(self, draws, f"cube_{colour}", colour, table, avoid, value=value)
-            )
-            avoid.append(self.cubes[-1])
-        self.targets: list[Disc] = []
-        count = (
-            values.count("layout.targets")
-            if values.specified
-            else self.target_counts[self.difficulty]
-        )
-        for i in range(count):
-            value = f"layout.targets.{i}"
-            self.targets.append(
-                add_target(self, draws, f"target_{i}", value, table, TARGET_RADIUS, avoid, gap=H)
-            )
-            avoid.append(self.targets[-1])
-        if count < 2:
-            raise values.error("layout.targets", f"has {count} targets; expected at least 2")
-        spot = values.find("layout.goal_xy")
-        self.spot.set_home(sapien.Pose([*spot, SUNK_Z], self.spot.pose.q))
-        n_cubes = len(self.cubes)
+        colours = sample_colours(self, draws, COLOURS)[: CUBES[self.difficulty]]
+        self.cubes = add_cubes(self, draws, colours, table, [self.spot, self.button])
+        self.targets = self._add_targets(draws, table)
+        # The spot is not to be seen: a cube is put down where it would be.
+        self.spot.set_home(sapien.Pose([*values.find("layout.goal_xy"), SUNK_Z], self.spot.pose.q))
+        n_cubes, n_targets = len(self.cubes), len(self.targets)
         self.demonstrated = values.indices(
             "objects.demo_ids", lambda: [draws.integer(0, n_cubes)], n_cubes
         )
         if not self.demonstrated:
             raise values.error("objects.demo_ids", "is empty; expected the cubes of the video")
         self.cube = self.cubes[self.demonstrated[0]]
-        hard = self.difficulty == "hard"
-        swapped = values.indices(
-            "objects.swap_pair_ids", lambda: draws.permutation(count) if hard else [], count
-        )
+
+        def sample_swap() -> list[int]:
+            return draws.permutation(n_targets) if self.difficulty == "hard" else []
+
+        swapped = values.indices("objects.swap_pair_ids", sample_swap, n_targets)
         self._swapped = [self.targets[i] for i in swapped[:2]]
         if len(self._swapped) == 1:
             raise values.error("objects.swap_pair_ids", "has one target; expected two, or none")
         self.draw_script(draws)
         check_colour(self, self.cube.colour)
+
+    def _add_targets(self, draws: Draws, table: Region) -> list[Disc]:
+        count = self.target_counts[self.difficulty]
+        if self.values.specified:
+            count = self.values.count("layout.targets")
+        targets: list[Disc] = []
+        for i in range(count):
+            avoid: list[Avoid] = [self.spot, self.button, *self.cubes, *targets]
+            target = add_target(
+                self,
+                draws,
+                f"target_{i}",
+                f"layout.targets.{i}",
+                table,
+                TARGET_RADIUS,
+                avoid,
+                gap=H,
+            )
+            targets.append(target)
+        if count < 2:
+            raise self.values.error("layout.targets", f"has {count} targets; expected at least 2")
+        return targets
 
     @abstractmethod
     def draw_script(self, draws: Draws) -> None:
@@ -128,22 +135,22 @@ class VideoPlace(Task):
 
     def start_episode(self, draws: Draws) -> None:
         self._homes = {cube: Place(cube) for cube in self.cubes}
-        self._swap: Swap | None = None
+        self._swaps: list[Swap] = []
         self._swap_due = False
 
     def before_physics(self, k: int) -> None:
-        if self._swap_due and self._swap is None:
+        if self._swap_due and not self._swaps:
             first, second = self._swapped
-            self._swap = Swap(first, self.targets, start=k, lane=SWAP_LANE, partner=second)
-        if self._swap is not None:
-            self._swap.apply(k)
+            swap = Swap(first, self.targets, start=k, lane=SWAP_LANE, partner=second)
+            self._swaps = [swap]
+            self.motions = [swap]
+        super().before_physics(k)
 
     def cues(self) -> list[Cue]:
         return [under(self.goal_target)]
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        swap = [] if self._swap is None else [self._swap]
-        return choices_made(ended, "bc", video=True) | active_motions(swap)
+    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
+        return super().evidence(ended) | active_motions(self._swaps)
 
     def failure(self) -> bool:
         """Notes whether the swap may begin, one step after its stage is entered; the rules belong
@@ -154,15 +161,17 @@ class VideoPlace(Task):
 
     def subtasks(self) -> list[SubTask]:
         self._swap_stage = wait(self, SWAP_STAGE_STEPS)
-        drop = SubTask(
-            "drop the cube onto table",
-            done=lambda: dropped(self, self.cube),
-            run=lambda demo: demo.place_on(self.spot, TABLE_Z),
-            video=True,
-        )
-        leave = [] if self.tier else [self.show_pick(), drop]
-        after = [go_home(self, GO_HOME_STEPS + delay(self)), self._swap_stage, end_video(self)]
-        return [*self.visits(), *leave, *after, *self._execution()]
+        steps = self.visits()
+        if not self.tier:
+            drop = SubTask(
+                "drop the cube onto table",
+                done=lambda: dropped(self, self.cube),
+                run=lambda demo: demo.place_on(self.spot, TABLE_Z),
+                video=True,
+            )
+            steps += [self.show_pick(self.cube), drop]
+        home = go_home(self, GO_HOME_STEPS + delay(self))
+        return [*steps, home, self._swap_stage, end_video(self), *self._execution()]
 
     def put_back(self, cube: Cube) -> list[SubTask]:
         """Pick the cube up in the video and put it where it stood at first, as in RoboMME-OOD."""
@@ -175,21 +184,13 @@ class VideoPlace(Task):
         )
         return [self.show_pick(cube), put]
 
-    def show_pick(self, cube: Cube | None = None) -> SubTask:
-        """The video's picking up of a cube, by default the one to be placed."""
-        return pick(self, cube or self.cube, "pick up the cube", grounded="", video=True)
+    def show_pick(self, cube: Cube) -> SubTask:
+        """The video's picking up of a cube."""
+        return pick(self, cube, "pick up the cube", grounded="", video=True)
 
-    def show_drop(self, target: Disc, cube: Cube | None = None) -> SubTask:
+    def show_drop(self, cube: Cube, target: Disc) -> SubTask:
         """The video's dropping of a cube on a target."""
-        shifted = cube or self.cube
-        return SubTask(
-            "drop the cube onto target",
-            done=lambda: dropped_onto(self, shifted, target),
-            run=lambda demo: demo.place_on(target),
-            targets=[target],
-            choice="b",
-            video=True,
-        )
+        return place(self, cube, target, "drop the cube onto target", grounded="", video=True)
 
     def show_press(self) -> SubTask:
         """The video's press of the button."""
@@ -197,33 +198,29 @@ class VideoPlace(Task):
 
     def _execution(self) -> list[SubTask]:
         cube, target = self.cube, self.goal_target
-        other_cubes = [c for c in self.cubes if c is not cube]
-        other_targets = [t for t in self.targets if t is not target]
+        wrong_cubes = [other for other in self.cubes if other is not cube]
+        wrong_targets = [other for other in self.targets if other is not target]
         return [
             pick(
                 self,
                 cube,
                 "pick up the cube",
-                failed=lambda: any_picked_up(self, other_cubes),
+                failed=lambda: any_picked_up(self, wrong_cubes),
                 pick=True,
             ),
-            SubTask(
+            place(
+                self,
+                cube,
+                target,
                 "place the cube onto the correct target",
-                done=lambda: dropped_onto(self, cube, target),
-                run=lambda demo: demo.place_on(target),
-                grounded="place the cube onto the correct target at <>",
-                failed=lambda: any(dropped_onto(self, cube, other) for other in other_targets),
-                targets=[target],
-                choice="b",
+                failed=lambda: any(dropped_onto(self, cube, wrong) for wrong in wrong_targets),
                 operation=self.operation,
             ),
         ]
 
     def choices(self) -> list[Choice]:
         return [
-            Choice("a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
-            Choice(
-                "b", "drop onto", lambda demo, target: demo.place_on(target), lambda: self.targets
-            ),
-            Choice("c", "press the button", lambda demo, _: demo.press(self.button)),
+            Choice("a", "pick up the cube", Demonstrator.pick, self.cubes),
+            Choice("b", "drop onto", Demonstrator.place_on, self.targets),
+            press_choice("c", "press the button", self.button),
         ]

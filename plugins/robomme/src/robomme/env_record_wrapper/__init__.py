@@ -6,6 +6,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.interface import RoboMMEEnv
 from mme_vla.envs.make import check_names, make_env
 from mme_vla.envs.metadata import TASK_NAMES
+from mme_vla.envs.observations import Include
 from mme_vla.errors import UserError
 
 __all__ = ["BenchmarkEnvBuilder"]
@@ -82,8 +83,8 @@ class BenchmarkEnvBuilder:
         """Make an episode's environment; call `reset()` first.
 
         Args:
-            max_steps: by default the builder's. include: `include_front_depth` and the like, as
-                `mme_vla.envs.make_env` takes them.
+            max_steps: by default the builder's. include: `include_front_depth` and the like, the
+                fields of `mme_vla.envs.observations.Include`.
 
         Raises:
             UserError: no such episode, an unknown option, a missing package, or no Vulkan driver.
@@ -91,7 +92,8 @@ class BenchmarkEnvBuilder:
         seed, difficulty = self.resolve_episode(episode_idx)
         env = make_env(
             self.env_id, action_space=self.action_space, seed=seed, difficulty=difficulty,
-            max_steps=self.max_steps if max_steps is None else max_steps, **include,
+            max_steps=self.max_steps if max_steps is None else max_steps,
+            include=Include.from_options(include),
         )  # fmt: skip
         assert isinstance(env, RoboMMEEnv)
         return env
