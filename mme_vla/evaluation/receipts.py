@@ -294,33 +294,28 @@ def _compare_records(
     subgoal = settings.get("subgoal")
     if isinstance(subgoal, Mapping):
         subgoal = subgoal.get("name")
-    expected = {"event": settings.get("event"), "subgoal": subgoal}
+    expected = {"event": settings.get("event"), "subgoal": subgoal, "env": settings.get("env")}
     for key, field in _IDENTITY.items():
         if key in settings:
             expected[field] = settings[key]
         else:
             result.not_compared.append(f"settings.{key}: the receipt does not name it.")
-    for record in records:
-        values = vars(record)
-        # A run has one policy and one robot.
-        for field in ("composition", "action_space"):
-            expected.setdefault(field, values[field])
-        for field, value in expected.items():
-            result.compare(f"records.{field}", str(value), str(values[field]))
-        if record.env is not None:
-            result.compare("records.env", settings.get("env"), record.env)
-        if "training" in content:
-            training = record.training and asdict(record.training)
-            result.compare("records.training", str(content["training"]), str(training))
-
+    if "training" in content:
+        expected["training"] = content["training"]
+    limit = float("inf")
     try:
         # The time for which events hold the robot counts as well.
         hold_steps = sum(event.perturbation.hold for event in read_events(settings.get("event")))
         limit = int(settings["max_steps"]) + _MARGIN + hold_steps
     except (KeyError, TypeError, ValueError) as error:  # UserError is a ValueError
         result.not_compared.append(f"steps: the settings name no limit of them ({error}).")
-        return
     for record in records:
+        values = asdict(record)
+        values["env"] = record.env or expected["env"]  # not every record names its own
+        for field in ("composition", "action_space"):  # a run has one policy and one robot
+            expected.setdefault(field, values[field])
+        for field, value in expected.items():
+            result.compare(f"records.{field}", str(value), str(values[field]))
         # A motion of RoboMME may end beyond the limit.
         is_motion = settings.get("env") == ROBOMME and record.action_space in MOTIONS
         if record.steps < 0 or (record.steps > limit and not is_motion):

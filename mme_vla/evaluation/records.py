@@ -178,7 +178,8 @@ class EpisodeRecord:
     def to_json(self) -> str:
         """One line, without its end; a checksum in it tells damage."""
         values = asdict(self)
-        for name, default in {"extra": {}, **_OF_ROLLOUTS}.items():
+        absent: dict[str, Any] = {"extra": {}, **_OF_ROLLOUTS}
+        for name, default in absent.items():
             if values[name] == default:
                 del values[name]
         return to_line(values)

@@ -313,8 +313,8 @@ def build_perturbation(section: Mapping[str, Any], option: str, key: str) -> Per
         return built
     options = {key: value for key, value in section.items() if key != "name"}
     where = f"{key}: {name}" if "=" in key else f"{key}.{name}"
-    read: Any = read_section(kind, options, where)  # type: ignore[arg-type]
-    return read  # type: ignore[no-any-return]
+    read: Perturbation = read_section(kind, options, where)
+    return read
 
 
 def build_word(word: Word, option: str, key: str) -> Perturbation:
@@ -324,7 +324,7 @@ def build_word(word: Word, option: str, key: str) -> Perturbation:
         check_choice(f"{key}: name", word.name, PERTURBATIONS)
         dial = getattr(PERTURBATIONS[word.name], "dial", None)
         require(dial is not None, f"{key}: {word.name} takes no number.")
-        section[dial] = word.value
+        section[str(dial)] = word.value
     return build_perturbation(section, option, key)
 
 
