@@ -308,7 +308,8 @@ def build_perturbation(section: Mapping[str, Any], option: str, key: str) -> Per
         f"{option}=…" in serving or not serving,
         f"{key}: {name} changes nothing here; it belongs in {' or '.join(serving)}.",
     )
-    if not is_dataclass(kind):
+    has_checked_options = is_dataclass(kind)
+    if not has_checked_options:
         built: Perturbation = PERTURBATIONS.build(section)
         return built
     options = {key: value for key, value in section.items() if key != "name"}

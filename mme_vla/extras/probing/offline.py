@@ -231,7 +231,7 @@ class _Moments:
 
     def _required_frames(self, arms: Sequence[ProbedPolicy]) -> np.ndarray | None:
         """Frames that any of these arms reads; None for all."""
-        required = np.zeros(0, np.int64)
+        required: np.ndarray = np.zeros(0, np.int64)
         for probed in arms:
             frames = probed.frames_read(np.array(self._steps), self._recording.exec_start)
             if frames is None:

@@ -91,7 +91,7 @@ class Recording:
             return stored_views, dict.fromkeys(stored_views, here - start)
         views, rendered = {}, {}
         for name in robot.camera_names:
-            frames = np.arange(start, stop)
+            frames: np.ndarray = np.arange(start, stop)
             if required is not None:
                 frames = np.array([stop - 1])
                 if name == robot.memory_camera:

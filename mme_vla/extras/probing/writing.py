@@ -271,10 +271,12 @@ def memory_selection(
 
     # Their tokens, for memories that read them.
     stored = memory.storage.stored_frames(episode.length)
-    kind, tokens = TokenlessHistory, np.zeros(0)
+    kind: type[CachedHistory] = TokenlessHistory
+    tokens = np.zeros(0)
     if policy is not None:
         images = np.stack([episode.images[frame] for frame in stored.tolist()])
-        kind, tokens = CachedHistory, policy.encode_frames(images).float().cpu().numpy()
+        kind = CachedHistory
+        tokens = policy.encode_frames(images).float().cpu().numpy()
     history = kind(memory.storage, tokens, stored, episode.length, scores, episode.exec_start)
     history.motion = states.__getitem__
     history.state_width = states.shape[1]
