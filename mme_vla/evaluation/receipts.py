@@ -380,19 +380,29 @@ def _conditions(on_gpu: bool, renders: bool, folders: Iterable[str]) -> dict[str
 def _code(folders: frozenset[str]) -> dict[str, str]:
     """The names that git has for the source of each folder, in a clone; no source is read for them.
 
-    A folder with changes that are not committed has no name. Of an installed package the version
-    names the code.
+    Changes that are not committed are part of the name. Of an installed package the version names
+    the code.
     """
-    git = ["git", "-C", str(Path(__file__).parents[1])]
-    how: dict[str, Any] = {"capture_output": True, "text": True, "check": True}
+    names = {}
     try:
-        listed = subprocess.run([*git, "ls-tree", "-rd", "HEAD", "."], **how).stdout
-        changes = subprocess.run([*git, "status", "--porcelain", "."], **how).stdout
+        status = _git("status", "--porcelain", ".")
+        for line in _git("ls-tree", "-rd", "HEAD", "."):
+            tree, _, folder = line.partition("\t")
+            if folder not in folders:
+                continue
+            names[f"git {folder}"] = tree.split()[2]
+            changes = [change for change in status if f"mme_vla/{folder}/" in change]
+            if changes:
+                changes += _git("diff", "HEAD", "--", folder)
+                names[f"git {folder}"] += f"+{digest({'changes': changes}, 12)}"
     except (OSError, subprocess.CalledProcessError):  # no clone, or no git
         return {}
-    trees = {line.partition("\t")[2]: line.split()[2] for line in listed.splitlines()}
-    unchanged = [name for name in folders & set(trees) if f"mme_vla/{name}/" not in changes]
-    return {f"git {name}": trees[name] for name in unchanged}
+    return names
+
+
+def _git(*words: str) -> list[str]:
+    command = ["git", "-C", str(Path(__file__).parents[1]), *words]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
 
 
 def _extras_of(policy: Policy) -> set[str]:
