@@ -126,7 +126,6 @@ def test_the_recipe_holds_what_changes_an_update() -> None:
         ("policy", "stage"),
         ("policy", "subtask_weight"),
         ("data", "weights"),
-        ("data", "texts"),
     ):
         other = {**CONFIG, section: {**CONFIG.get(section, {}), key: "x"}}
         assert identify(other, ["abc"])["recipe"] != base["recipe"], key
