@@ -141,9 +141,7 @@ def episodes(models: list[str], task: str, steps: int) -> None:
             "the episode ended before its limit"
         )
         assert full.record.outcome == needed.record.outcome
-        assert full.record.extra["actions_sha256"] == needed.record.extra["actions_sha256"], (
-            "other actions"
-        )
+        assert full.record.actions_sha256 == needed.record.actions_sha256, "other actions"
         cells = [name, *(f"{m.images['front']} + {m.images['wrist']}" for m in (full, needed))]
         for a, b in ((full.env_s, needed.env_s), (full.cpu_s, needed.cpu_s)):
             cells += [f"{a:.1f} s", f"{b:.1f} s", f"{a / b:.1f}x"]

@@ -55,7 +55,7 @@ class Measured:
             f"{render:.1f} s",
             f"{policy:.1f} s",
             f"{100 * policy / (sim + render):.0f} %",
-            f"{1000 * policy / sum(r.extra['chunks'] for r in self.records):.0f} ms",
+            f"{1000 * policy / sum(r.chunks or 0 for r in self.records):.0f} ms",
             f"{self.mean_batch:.1f}",
             f"{self.wall_s:.1f} s",
         ]

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from mme_vla.integration.base import Integration
     from mme_vla.memory.base import Memory, PerceptualMemory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
+    from mme_vla.memory.perturbation import HistoryTransform as HistoryTransform
+    from mme_vla.memory.perturbation import Perturbation
     from mme_vla.memory.recurrent import RecurrentMemory
-    from mme_vla.memory.transforms import HistoryTransform
     from mme_vla.policy.base import Policy
     from mme_vla.policy.build import build_policy
     from mme_vla.policy.episode import Episode
@@ -49,7 +50,7 @@ _MODULES = {
     "memory.base": ["Memory", "PerceptualMemory"],
     "memory.history": ["CachedHistory", "History", "OnlineHistory", "StorageSpec"],
     "memory.recurrent": ["RecurrentMemory"],
-    "memory.transforms": ["HistoryTransform"],
+    "memory.perturbation": ["HistoryTransform", "Perturbation"],
     "policy.base": ["Policy"],
     "policy.build": ["build_policy"],
     "policy.episode": ["Episode"],
@@ -76,13 +77,13 @@ __all__ = [
     "Episode",
     "History",
     "HistoryTokens",
-    "HistoryTransform",
     "Integration",
     "MMEPolicy",
     "Memory",
     "MemoryTokens",
     "OnlineHistory",
     "PerceptualMemory",
+    "Perturbation",
     "Policy",
     "RecurrentMemory",
     "StorageSpec",

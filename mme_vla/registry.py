@@ -346,18 +346,15 @@ PROMPTS: Registry[Any] = Registry(
 TASKS: Registry[Any] = Registry("task")
 ENVS: Registry[Any] = Registry("environment", {"mme_vla": "mme_vla.envs.benchmark"}, key="env")
 PLAYERS: Registry[Any] = Registry("player")
-INTERVENTIONS: Registry[Any] = Registry("intervention")
 REWARDS: Registry[Any] = Registry(
     "reward", dict.fromkeys(("none", "sparse", "subtask"), "mme_vla.envs.subtasks")
 )
-HISTORY_TRANSFORMS: Registry[Any] = Registry(
-    "history transform",
-    dict.fromkeys(("repeat_frame", "speed", "drop_frames", "noise"), "mme_vla.memory.transforms"),
-    key="history_transform",
-)
-EVENTS: Registry[Any] = Registry(
-    "event",
-    dict.fromkeys(("pause", "gap", "speed", "restart"), "mme_vla.evaluation.rollout.events"),
+PERTURBATIONS: Registry[Any] = Registry(
+    "perturbation",
+    dict.fromkeys(
+        ("pause", "repeat_frame", "gap", "speed", "drop_frames", "noise", "restart"),
+        "mme_vla.memory.perturbation",
+    ),
 )
 TRAINING_SETS: Registry[Any] = Registry("kind of training samples", key="training_set")
 """`SampleSpec.kind` → a dataset of such samples, for policies that do not learn from steps.
@@ -384,11 +381,13 @@ REGISTRIES = {
     "task": TASKS,
     "env": ENVS,
     "player": PLAYERS,
-    "intervention": INTERVENTIONS,
     "reward": REWARDS,
-    "history_transform": HISTORY_TRANSFORMS,
     "prompt": PROMPTS,
-    "event": EVENTS,
+    "perturbation": PERTURBATIONS,
+    # The same by the option that takes it
+    "history_transform": PERTURBATIONS,
+    "event": PERTURBATIONS,
+    "intervention": PERTURBATIONS,
     "training_set": TRAINING_SETS,
     "side_file": SIDE_FILES,
     "split_policy": SPLIT_POLICIES,
@@ -401,9 +400,9 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
 
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`,
-            `processor`, `subgoal` (a predictor), `task`, `env`, `player`, `intervention` (of a
-            probe), `reward`, `history_transform`, `prompt` (a prompt format) or `event` (of a
-            rollout).
+            `processor`, `subgoal` (a predictor), `task`, `env`, `player`, `reward`, `prompt` (a
+            prompt format) or `perturbation` (of training, rollouts or probes; also called
+            `history_transform`, `event` and `intervention`).
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mme_vla import HistoryTransform, register
+from mme_vla import Perturbation, register
 
 
-@register("history_transform", "hesitate")
+@register("perturbation", "hesitate")
 @dataclass(frozen=True)
-class Hesitate(HistoryTransform):
+class Hesitate(Perturbation):
     """Each frame of the execution is repeated `times` times with probability `p`; in a probe every
     1/p-th frame.
     """

@@ -147,7 +147,7 @@ def run(args: argparse.Namespace) -> None:
         show_ood(records, args)
         return
     results = aggregate(records, protocol, args.split, args.conflicts)
-    if any(record.extra.get("made_up") for record in records):
+    if any(record.made_up for record in records):
         results.notes.insert(
             0, "Made-up records, sampled from the paper's rates: not a result of anything."
         )
@@ -180,11 +180,7 @@ def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
     """Episodes of a task in the split that the records are of; of other environments as many as
     there are records.
     """
-    custom = [
-        record.episode
-        for record in records
-        if split in (None, record.split) and record.extra.get("suite")
-    ]
+    custom = [r.episode for r in records if split in (None, r.split) and r.suite]
     if custom and not any(record.task in TASK_FACTS for record in records):
         return 1 + max(custom)
     splits = {record.split for record in records if split in (None, record.split)}

@@ -16,7 +16,8 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import History
-from mme_vla.memory.transforms import FrameMap, HistoryTransform, TransformedHistory, map_frames
+from mme_vla.memory.perturbation import Perturbation
+from mme_vla.memory.transforms import FrameMap, TransformedHistory, map_frames
 from mme_vla.processing.base import PolicyProcessor, Sample, motion_rows
 from mme_vla.processing.base import collate as collate
 from mme_vla.processing.images import past_views
@@ -110,7 +111,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         labels: Sequence[str] = (),
         weights: str | None = None,
         seed: int = 42,
-        transforms: Sequence[HistoryTransform] = (),
+        transforms: Sequence[Perturbation] = (),
     ) -> None:
         """Arrange the samples; nothing is read yet.
 
@@ -289,7 +290,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     def __getitem__(self, index: int) -> dict[str, Any]:
         return self._item(index, self.transforms)
 
-    def _item(self, index: int, transforms: Sequence[HistoryTransform]) -> dict[str, Any]:
+    def _item(self, index: int, transforms: Sequence[Perturbation]) -> dict[str, Any]:
         step = self.step(index)
         rng = np.random.default_rng([self.seed, self.epoch, index])
         frames = self._frame_map(
@@ -307,7 +308,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         episode: int,
         frames: np.ndarray,
         index: int,
-        transforms: Sequence[HistoryTransform],
+        transforms: Sequence[Perturbation],
     ) -> FrameMap | None:
         """How transforms show an item's episode up to the last of its `frames`; None without
         transforms.

@@ -71,28 +71,32 @@ def evaluate(
     >>> result.success_rate  # doctest: +SKIP
     0.4
     """
-    run_settings, arms = (
-        read_section(RolloutSettings, {**settings, "seed": seed}),
-        event_arms(event),
-    )
+    run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
+    arms = event_arms(event)
     jobs = choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
     if base is make_env:
         environment(run_settings.env).check_installed()
     loaded, source = load(policy)
     predictor = predictor_of(loaded, subgoal)
-    subgoal_label = (
-        subgoal if isinstance(subgoal, str) else None if subgoal is None else type(subgoal).__name__
-    )
+    if subgoal is None or isinstance(subgoal, str):
+        subgoal_label = subgoal
+    else:
+        subgoal_label = type(subgoal).__name__
     facts = facts_of(loaded, name, source, run_settings, subgoal_label)
     folder = default_output(facts) if output is None else Path(output).expanduser()
     wrapped = policy_of_split(loaded.eval(), run_settings.split, recordings)
-    options: dict[str, Any] = {
-        "subgoals": predictor,
-        "source": source,
-        "base": base,
-        "show_progress": show_progress,
-    }
-    return evaluate_events(wrapped, jobs, folder, facts, run_settings, arms, **options)
+    return evaluate_events(
+        wrapped,
+        jobs,
+        folder,
+        facts,
+        run_settings,
+        arms,
+        subgoals=predictor,
+        source=source,
+        base=base,
+        show_progress=show_progress,
+    )
 
 
 def policy_of_split(policy: Policy, split: str, recordings: Any = None) -> Policy:

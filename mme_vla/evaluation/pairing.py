@@ -69,20 +69,26 @@ def pair[Key: Hashable](sides: Sequence[Mapping[Key, Collection[EpisodeRecord]]]
     Args:
         sides: of each run, its records by what makes an episode the same, such as task and number.
     """
-    first, *others = sides
-    keys, unnamed, other, mixed = list[Key](), 0, Counter[str](), Counter[str]()
-    for key, records in first.items():
-        if not all(key in side for side in others):
+    keys: list[Key] = []
+    unnamed = 0
+    other: Counter[str] = Counter()
+    mixed: Counter[str] = Counter()
+    for key in sides[0]:
+        if not all(key in side for side in sides):
             continue
-        every = [*records, *(record for side in others for record in side[key])]
-        scenes, task = {record.named_scene for record in every}, every[0].task
-        if len(scenes - {None}) > 1 or len({record.seed for record in every}) > 1:
-            other[task] += 1
+        records: list[EpisodeRecord] = []
+        for side in sides:
+            records += side[key]
+        scenes = {record.named_scene for record in records}
+        seeds = {record.seed for record in records}
+        if len(scenes - {None}) > 1 or len(seeds) > 1:
+            other[records[0].task] += 1
         elif len(scenes) > 1:
-            mixed[task] += 1
+            mixed[records[0].task] += 1
         else:
             keys.append(key)
-            unnamed += scenes == {None}
+            if scenes == {None}:
+                unnamed += 1
     return Pairing(tuple(keys), unnamed, dict(other), dict(mixed))
 
 

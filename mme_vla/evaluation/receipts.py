@@ -3,13 +3,14 @@
 import hashlib
 import platform
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 from mme_vla.config.naming import digest, flat
 from mme_vla.envs.base import environment
@@ -17,12 +18,11 @@ from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, brief, require
 from mme_vla.evaluation.records import EpisodeRecord, count_outcomes
+from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.store import RUN_FILE, read_records, read_run
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE
 from mme_vla.policy.training_identity import identity_of
-from mme_vla.processing.base import STATS_FILE
-from mme_vla.processing.normalise import NormStats
 from mme_vla.utils import (
     SUMS,
     Sums,
@@ -35,14 +35,13 @@ from mme_vla.utils import (
     with_checksum,
     write_json,
 )
+from mme_vla.utils.validation import validated
 
 CODE = (
     "backbone",
     "embodiment",
     "envs",
     "evaluation/rollout",
-    "extras/methods",
-    "extras/nano",
     "integration",
     "memory",
     "policy",
@@ -50,9 +49,7 @@ CODE = (
     "speed",
     "subgoal",
 )
-"""Packages of this library that can change a result: policies, scenes, rollouts. Their source is
-digested.
-"""
+"""Folders of this library that can change a result, beside the extras that the policy is of."""
 SIMULATOR = (
     "mani_skill",
     "sapien",
@@ -75,6 +72,7 @@ _MARGIN = 2  # steps beyond its limit that the benchmark counts
 # Files of a checkpoint that no policy is loaded from, and endings of those that one may be
 _OF_TRAINING = ("raw.", "raw-", "optimizer", "shards/", STATE, SUMS)
 _LOADED = (".safetensors", ".json", ".model", ".pt", ".pth", ".bin")
+# Setting of `run.json` → field of its records
 _IDENTITY = {
     "model": "model",
     "checkpoint": "checkpoint",
@@ -82,22 +80,47 @@ _IDENTITY = {
     "split": "split",
     "max_steps": "max_steps",
 }
-"""Setting of `run.json` → field of its records."""
-_CONDITIONS = (
-    "code",
-    "simulator",
-    "renderer",
-    "libraries",
-    "hardware",
-    "checkpoint",
-    "statistics",
-)
-# Part of every receipt, and of its conditions → kind
-_PARTS = {"settings": dict, "conditions": list, "records": dict, "scenes": str, "score": dict}
-_PARTS_OF_CONDITIONS = dict.fromkeys(
-    ("code", "simulator", "libraries", "hardware", "checkpoint"), dict
-)
+# Scene of a record → why it is not compared
+_UNNAMED_SCENES = {
+    None: "scenes: records do not name them, as those of earlier versions.",
+    NO_VALUES: "scenes: the environment gave no values of some.",
+    NOT_BUILT: "scenes: some episodes ended before theirs was built.",
+}
 _FEW = 5  # differences of one kind that are listed
+
+
+# What a receipt must be, as far as the code trusts it
+_Section = dict[str, Any] | None
+
+
+class _Settings(TypedDict, total=False):
+    env: str | None
+    event: str | None
+
+
+class _Records(TypedDict, total=False):
+    file: str | None
+
+
+class _Files(TypedDict, total=False):
+    folder: str | None
+    files: _Section
+
+
+class _Conditions(TypedDict, total=False):
+    code: _Section
+    simulator: _Section
+    libraries: _Section
+    hardware: _Section
+    checkpoint: _Files | None
+
+
+class _Receipt(TypedDict):
+    settings: _Settings
+    conditions: list[_Conditions]
+    records: _Records
+    scenes: str
+    score: dict[str, Any]
 
 
 class Verification(NamedTuple):
@@ -121,9 +144,27 @@ class Verification(NamedTuple):
             return "differs"
         return "not compared" if self.not_compared else "agrees"
 
-    def compare(self, what: str, then: Any, here: Any) -> None:
-        """Compare a value of a receipt with the same here."""
-        self.differences.extend(_differences(what, then, here))
+    def compare(self, what: str, then: Any, here: Any, absent_differs: bool = True) -> None:
+        """Compare a value of a receipt with the same here, part by part.
+
+        absent_differs: whether a part that only one of them has is a difference; else it is not
+        compared.
+        """
+        old, new = flat({what: then}), flat({what: here})
+        differences = []
+        for key in sorted({*old, *new}):
+            name = brief(key, 200, quote=False)
+            if absent_differs or (key in old and key in new):
+                if old.get(key) != new.get(key):
+                    values = brief(old.get(key), 20), brief(new.get(key), 20)
+                    differences.append(f"{name}: {values[0]} in the receipt, {values[1]} here")
+            elif key in old:
+                self.not_compared.append(f"{name}: there is nothing here to compare.")
+            elif new[key] is not None:
+                self.not_compared.append(f"{name}: the receipt does not name it.")
+        self.differences.extend(differences[:_FEW])
+        if len(differences) > _FEW:
+            self.differences.append(f"{what}: {len(differences) - _FEW} more")
 
 
 def receipt_file(records: Path) -> Path:
@@ -148,13 +189,10 @@ def receipt(
             whether the simulator of this library renders.
     """
     path = receipt_file(records)
-    conditions: list[Any] = []
-    if path.exists():
-        conditions = read_receipt(path)["conditions"]
-    here = to_json(
-        {**_conditions(policy.device.type == "cuda", renders), **_checkpoint(policy, source)}
-    )
-    if here not in conditions:
+    here = _conditions(policy.device.type == "cuda", renders, _extras_of(policy))
+    here["checkpoint"] = _checkpoint(source)
+    conditions = read_receipt(path)["conditions"] if path.exists() else []
+    if to_json(here) not in conditions:
         conditions.append(here)
     trained = identity_of(policy.config)
     facts = {
@@ -162,15 +200,12 @@ def receipt(
         "training": None if trained is None else asdict(trained),
         "conditions": conditions,
     }
-
-    def write() -> None:
-        write_json(path, with_checksum(to_json({**facts, **_score(records, run["settings"])})))
-
-    write()  # a process that is killed has named its conditions
+    # Before as well: a process that is killed has named its conditions.
+    write_json(path, with_checksum(to_json({**facts, **_score(records, run["settings"])})))
     try:
         yield
     finally:
-        write()
+        write_json(path, with_checksum(to_json({**facts, **_score(records, run["settings"])})))
 
 
 def read_receipt(path: Path) -> dict[str, Any]:
@@ -180,29 +215,15 @@ def read_receipt(path: Path) -> dict[str, Any]:
         UserError: it is damaged, lacks a part, or a part is of another kind.
     """
     content: dict[str, Any] = verified(read_json(path, "a receipt"), str(path))
-    fault = f"{path} is no receipt of an evaluation"
-    missing = [key for key in _PARTS if content.get(key) is None]
-    require(not missing, f"{fault}: it has no {', '.join(missing)}.")
-    _check_kinds(fault, content, _PARTS)
-    _check_kinds(fault, content["settings"], {"env": str, "event": str})
-    _check_kinds(fault, content["records"], {"file": str})
-    for part in content["conditions"]:
-        _check_kinds(fault, part, _PARTS_OF_CONDITIONS)
-        _check_kinds(fault, part.get("checkpoint") or {}, {"files": dict, "folder": str})
+    try:
+        validated(_Receipt, content, "The file")
+    except UserError as error:
+        raise UserError(f"{path} is no receipt of an evaluation: {error}") from None
     return content
 
 
-def _check_kinds(fault: str, section: Any, kinds: Mapping[str, type]) -> None:
-    require(isinstance(section, dict), f"{fault}: {brief(section)} is no object.")
-    for key, kind in kinds.items():
-        value = section.get(key)
-        is_of_kind = value is None or isinstance(value, kind)
-        require(is_of_kind, f"{fault}: {key} is {brief(value)}, and must be a {kind.__name__}.")
-
-
 def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Verification:
-    """Check a receipt offline: recompute the digests of the files that are here, compare versions
-    of what is installed.
+    """Check a receipt offline: compare it with the files and the versions that are here.
 
     Args:
         path: of the receipt; its records, or these as `.xz`, and `run.json` are beside it.
@@ -214,37 +235,34 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
             of.
     """
     content = read_receipt(path)
-    settings, name, folder = content["settings"], content["records"].get("file"), path.parent
     result = Verification([], [], [])
-    if (folder / RUN_FILE).is_file():
-        result.compare("settings", settings, read_run(folder)["settings"])
+    if path.with_name(RUN_FILE).is_file():
+        result.compare("settings", content["settings"], read_run(path.parent)["settings"])
     else:
         result.not_compared.append(f"settings: {RUN_FILE} is not beside the receipt.")
 
-    # The records may have been compressed since.
-    files = []
-    if isinstance(name, str):
-        files = [inside(folder, name, "records"), inside(folder, f"{name}.xz", "records")]
-    here = [file for file in files if file.is_file()]
-    if here:
-        records = read_records(here[0])
-        for key, value in to_json(_score(here[0], settings)).items():
-            if key in content or value:
-                result.compare(key, content.get(key), value)
-        _compare_identity(result, records, content)
-        _compare_steps(result, records, settings)
-        _compare_scenes(result, records, settings, build)
-    elif files:
-        result.differences.append(f"records: neither {name} nor {name}.xz is beside the receipt.")
-    else:
+    name = content["records"].get("file")
+    if name is None:
         result.not_compared.append("records: the receipt names no file of them.")
+    else:
+        # The records may have been compressed since.
+        files = [inside(path.parent, end, "records") for end in (name, f"{name}.xz")]
+        present = [file for file in files if file.is_file()]
+        if not present:
+            missing = f"records: neither {name} nor {name}.xz is beside the receipt."
+            result.differences.append(missing)
+        for file in present[:1]:
+            for key, value in to_json(_score(file, content["settings"])).items():
+                result.compare(key, content.get(key, {}), value)
+            _compare_records(result, read_records(file), content)
+            _compare_scenes(result, read_records(file), content, build)
 
     for part in content["conditions"] or [{}]:
         _compare_conditions(result, part, checkpoint)
     return Verification(*(list(dict.fromkeys(lines)) for lines in result))
 
 
-# The records and their settings -------------------------------------------------------------------
+# The records --------------------------------------------------------------------------------------
 
 
 def _score(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -268,17 +286,15 @@ def _score(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _compare_identity(
-    result: Verification, records: Sequence[EpisodeRecord], content: Mapping[str, Any]
+def _compare_records(
+    result: Verification, records: list[EpisodeRecord], content: Mapping[str, Any]
 ) -> None:
-    """Whether every record is of the settings and of the training."""
+    """Whether every record is of the settings and of the training, and no longer than its limit."""
     settings = content["settings"]
     subgoal = settings.get("subgoal")
-    expected = {
-        "event": settings.get("event"),
-        "subgoal": subgoal.get("name") if isinstance(subgoal, Mapping) else subgoal,
-        "env": settings.get("env"),
-    }
+    if isinstance(subgoal, Mapping):
+        subgoal = subgoal.get("name")
+    expected = {"event": settings.get("event"), "subgoal": subgoal, "env": settings.get("env")}
     for key, field in _IDENTITY.items():
         if key in settings:
             expected[field] = settings[key]
@@ -286,35 +302,20 @@ def _compare_identity(
             result.not_compared.append(f"settings.{key}: the receipt does not name it.")
     if "training" in content:
         expected["training"] = content["training"]
-    for record in records[:1]:  # a run has one policy and one robot
-        expected |= {"composition": record.composition, "action_space": record.action_space}
-    values_of: dict[str, set[str]] = {field: set() for field in expected}
-    for record in records:
-        training = record.training and asdict(record.training)
-        env = record.extra.get("env", expected["env"])  # not every record names its own
-        values = {**vars(record), "training": training, "env": env}
-        for field in expected:
-            values_of[field].add(str(values[field]))
-    for field, value in expected.items():
-        for here in sorted(values_of[field]):
-            result.compare(f"records.{field}", str(value), here)
-
-
-def _compare_steps(
-    result: Verification, records: Sequence[EpisodeRecord], settings: Mapping[str, Any]
-) -> None:
-    """Whether no episode is longer than its limit, by which the time that events hold the robot
-    counts as well.
-    """
-    from mme_vla.evaluation.rollout.events import read_events
-
+    limit = float("inf")
     try:
-        hold_steps = sum(placed.event.hold for placed in read_events(settings.get("event")))
+        # The time for which events hold the robot counts as well.
+        hold_steps = sum(event.perturbation.hold for event in read_events(settings.get("event")))
         limit = int(settings["max_steps"]) + _MARGIN + hold_steps
     except (KeyError, TypeError, ValueError) as error:  # UserError is a ValueError
         result.not_compared.append(f"steps: the settings name no limit of them ({error}).")
-        return
     for record in records:
+        values = asdict(record)
+        values["env"] = record.env or expected["env"]  # not every record names its own
+        for field in ("composition", "action_space"):  # a run has one policy and one robot
+            expected.setdefault(field, values[field])
+        for field, value in expected.items():
+            result.compare(f"records.{field}", str(value), str(values[field]))
         # A motion of RoboMME may end beyond the limit.
         is_motion = settings.get("env") == ROBOMME and record.action_space in MOTIONS
         if record.steps < 0 or (record.steps > limit and not is_motion):
@@ -322,45 +323,36 @@ def _compare_steps(
 
 
 def _compare_scenes(
-    result: Verification,
-    records: Sequence[EpisodeRecord],
-    settings: Mapping[str, Any],
-    build: bool,
+    result: Verification, records: list[EpisodeRecord], content: Mapping[str, Any], build: bool
 ) -> None:
     """Seeds and difficulties of the episodes, and the scenes' digests, for which they are built."""
-    not_compared = result.not_compared
     try:
         require(records, "there is no record.")
-        env = environment(str(settings.get("env")))
+        env = environment(str(content["settings"].get("env")))
         for record in records:
             env.check_task(record.task)
             spec = env.episode(record.task, record.split, record.episode)
             name = f"scene {record.task} {record.episode}"
             then, here = f"{record.seed}, {record.difficulty}", f"{spec.seed}, {spec.difficulty}"
             result.compare(name, then, here)
-            if record.scene is None:
-                not_compared.append(
-                    "scenes: records do not name them, as those of earlier versions."
-                )
-            elif record.scene == NO_VALUES:
-                not_compared.append("scenes: the environment gave no values of some.")
-            elif not build:
-                not_compared.append("scenes: they were not built here, as was asked.")
-            elif record.scene == NOT_BUILT:
-                not_compared.append("scenes: some episodes ended before theirs was built.")
-            elif (built := env.scene_digest(spec)) == NO_VALUES:
-                not_compared.append("scenes: the environment gives no values of some here.")
+            if record.scene in _UNNAMED_SCENES:
+                result.not_compared.append(_UNNAMED_SCENES[record.scene])
+            elif build:
+                result.compare(name, record.scene, env.scene_digest(spec))
             else:
-                result.compare(name, record.scene, built)
+                result.not_compared.append("scenes: they were not built here, as was asked.")
     except UserError as error:  # of a plugin that is not loaded, or without the simulator
-        not_compared.append(f"scenes: {error}")
+        result.not_compared.append(f"scenes: {error}")
 
 
 # The conditions -----------------------------------------------------------------------------------
 
 
-def _conditions(on_gpu: bool, renders: bool) -> dict[str, Any]:
-    """Code, simulator, renderer, libraries and hardware of this process."""
+def _conditions(on_gpu: bool, renders: bool, folders: Iterable[str]) -> dict[str, Any]:
+    """Code, simulator, renderer, libraries and hardware of this process.
+
+    folders: of this library, beside those of `CODE`.
+    """
     import torch
 
     cpu, renderer = platform.processor() or platform.machine(), None
@@ -376,7 +368,7 @@ def _conditions(on_gpu: bool, renders: bool) -> dict[str, Any]:
         renderer = f"{render_backend()}: {', '.join(devices)}"
     gpu = torch.cuda.get_device_name() if on_gpu and torch.cuda.is_available() else None
     return {
-        "code": {"mme-vla": version("mme-vla"), **{name: _code(name) for name in CODE}},
+        "code": {"mme-vla": version("mme-vla"), **_code(frozenset({*CODE, *folders}))},
         "simulator": {name: _version(name) for name in SIMULATOR},
         "renderer": renderer,
         "libraries": {name: _version(name) for name in LIBRARIES},
@@ -385,11 +377,39 @@ def _conditions(on_gpu: bool, renders: bool) -> dict[str, Any]:
 
 
 @cache
-def _code(package: str) -> str:
-    """Digest of the source files of a package of this library, read once in a process."""
-    root = Path(__file__).resolve().parents[1]
-    files = sorted((root / package).rglob("*.py"))
-    return digest({path.relative_to(root).as_posix(): file_sum(path) for path in files}, 64)
+def _code(folders: frozenset[str]) -> dict[str, str]:
+    """The names that git has for the source of each folder, in a clone; no source is read for them.
+
+    Changes that are not committed are part of the name. Of an installed package the version names
+    the code.
+    """
+    names = {}
+    try:
+        status = _git("status", "--porcelain", ".")
+        for line in _git("ls-tree", "-rd", "HEAD", "."):
+            tree, _, folder = line.partition("\t")
+            if folder not in folders:
+                continue
+            names[f"git {folder}"] = tree.split()[2]
+            changes = [change for change in status if f"mme_vla/{folder}/" in change]
+            if changes:
+                changes += _git("diff", "HEAD", "--", folder)
+                names[f"git {folder}"] += f"+{digest({'changes': changes}, 12)}"
+    except (OSError, subprocess.CalledProcessError):  # no clone, or no git
+        return {}
+    return names
+
+
+def _git(*words: str) -> list[str]:
+    command = ["git", "-C", str(Path(__file__).parents[1]), *words]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+
+
+def _extras_of(policy: Policy) -> set[str]:
+    """The extras that the policy's classes are from, such as `extras/nano`."""
+    kinds = [*map(type, policy.modules()), type(policy.processor)]
+    names = [kind.__module__.split(".") for kind in kinds]
+    return {"/".join(name[1:3]) for name in names if name[:2] == ["mme_vla", "extras"]}
 
 
 def _version(package: str) -> str | None:
@@ -399,24 +419,48 @@ def _version(package: str) -> str | None:
         return None
 
 
+def _compare_conditions(
+    result: Verification, part: Mapping[str, Any], checkpoint: Path | None
+) -> None:
+    """Compare what both the receipt and this machine name of code, packages, checkpoint, …."""
+    folders = [name.partition(" ")[2] for name in part.get("code") or {} if " " in name]
+    on_gpu = (part.get("hardware") or {}).get("gpu") is not None
+    renders = part.get("renderer", "not named") is not None
+    for what, here in _conditions(on_gpu, renders, folders).items():
+        then = part.get(what, {})
+        if what == "hardware":  # another type of CPU or GPU has no weight
+            result._replace(differences=result.notes).compare(what, then, here, False)
+        else:
+            result.compare(what, then, here, False)
+
+    named = part.get("checkpoint") or {}
+    files = named.get("files")
+    folder = checkpoint or Path(named.get("folder") or "no folder")
+    if not files:
+        result.not_compared.append("checkpoint: the receipt does not name it.")
+    elif (folder / "config.json").is_file():
+        loaded = _loaded(folder)  # a file beside those of the receipt is a difference
+        then = {**dict.fromkeys(loaded), **files}
+        result.compare("checkpoint", then, _sums(folder, then))
+    else:
+        hint = f"{brief(str(folder), 200, quote=False)}: name its folder with --checkpoint"
+        result.not_compared.append(f"checkpoint: there is no checkpoint in {hint}.")
+
+
 # The checkpoint -----------------------------------------------------------------------------------
 
 
-def _checkpoint(policy: Policy, source: str | None) -> dict[str, Any]:
-    """Digests of the files that the weights are from, and of the statistics in use."""
-    folder, files = str(source), dict[str, str | None]()
-    if source is not None and Path(source).is_dir():
-        place = Path(source).resolve()
-        folder = str(place)
-        # Those of the table were compared with the files when they were loaded; a file beside it
-        # may be loaded too.
-        table = Sums(place).table
-        files = _sums(place, [name for name in _loaded(place) if name not in table])
-        files |= {name: table[name] for name in table if not name.startswith(_OF_TRAINING)}
-    return {
-        "checkpoint": {"folder": folder, "files": files},
-        "statistics": digest(policy.require_processor().require_stats().to_dict(), 64),
-    }
+def _checkpoint(source: str | None) -> dict[str, Any]:
+    """Digests of the files that the weights are from."""
+    if source is None or not Path(source).is_dir():
+        return {"folder": str(source), "files": {}}
+    folder = Path(source).resolve()
+    # Those of the table were compared with the files when they were loaded; a file beside it may be
+    # loaded too.
+    table = Sums(folder).table
+    files = _sums(folder, [name for name in _loaded(folder) if name not in table])
+    files |= {name: table[name] for name in table if not name.startswith(_OF_TRAINING)}
+    return {"folder": str(folder), "files": files}
 
 
 def _loaded(folder: Path) -> list[str]:
@@ -433,56 +477,3 @@ def _sums(folder: Path, names: Iterable[str]) -> dict[str, str | None]:
     """
     paths = {name: inside(folder, name) for name in names}
     return {name: file_sum(path) if path.is_file() else None for name, path in paths.items()}
-
-
-def _compare_conditions(
-    result: Verification, part: Mapping[str, Any], checkpoint: Path | None
-) -> None:
-    """Compare what both the receipt and this machine name of code, packages, checkpoint, …."""
-    named = part.get("checkpoint") or {}
-    files, place = named.get("files") or {}, checkpoint or Path(named.get("folder") or "no folder")
-    on_gpu = (part.get("hardware") or {}).get("gpu") is not None
-    then = {**part, "checkpoint": files}
-    here = _conditions(on_gpu, renders=part.get("renderer") is not None)
-    if (place / "config.json").is_file():
-        here["checkpoint"] = _sums(place, {*files, *_loaded(place)})
-        if files:  # a file beside those that were loaded is a difference
-            then["checkpoint"] = {**dict.fromkeys(_loaded(place)), **files}
-        if (place / STATS_FILE).is_file():
-            here["statistics"] = digest(NormStats.load(place / STATS_FILE).to_dict(), 64)
-
-    for what in _CONDITIONS:
-        old, new = then.get(what, {}), here.get(what)
-        # Another type of CPU or GPU has no weight.
-        sink = result._replace(differences=result.notes) if what == "hardware" else result
-        if what == "renderer" and old is None:
-            continue  # nothing was rendered
-        if not old:
-            result.not_compared.append(f"{what}: the receipt does not name it.")
-        elif new is None:
-            hint = f"{brief(str(place), 200, quote=False)}: name its folder with --checkpoint"
-            result.not_compared.append(f"{what}: there is no checkpoint in {hint}.")
-        elif not isinstance(new, dict):
-            sink.compare(what, old, new)
-        else:
-            for name in sorted({*old, *new}):
-                key = f"{what}.{brief(name, quote=False)}"
-                if name in old and name in new:
-                    sink.compare(key, old[name], new[name])
-                elif name in old:
-                    result.not_compared.append(f"{key}: there is nothing here to compare.")
-                elif new[name] is not None:
-                    result.not_compared.append(f"{key}: the receipt does not name it.")
-
-
-def _differences(what: str, then: Any, now: Any) -> list[str]:
-    """What differs between a value of a receipt and the same here, in a line each."""
-    old, new = flat({what: then}), flat({what: now})
-    lines = []
-    for key in sorted({*old, *new}):
-        if old.get(key) != new.get(key):
-            values = brief(old.get(key), 20), brief(new.get(key), 20)
-            lines.append(f"{key}: {values[0]} in the receipt, {values[1]} here")
-    if len(lines) > _FEW:
-        lines[_FEW:] = [f"{what}: {len(lines) - _FEW} more"]
-    return lines

@@ -1,7 +1,7 @@
 """What is kept of an evaluated episode, and how records come together into runs."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from dataclasses import KW_ONLY, asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from typing import Annotated, Any, NamedTuple, Self
 
@@ -33,17 +33,20 @@ class RunKey(NamedTuple):
     event: str | None = None
 
     def __str__(self) -> str:
-        name = self.model if self.subgoal is None else f"{self.model}+{self.subgoal}"
-        name = name if self.memory_budget is None else f"{name}, {self.memory_budget} memory tokens"
-        trained = ""
+        text = self.model
+        if self.subgoal is not None:
+            text += f"+{self.subgoal}"
+        if self.memory_budget is not None:
+            text += f", {self.memory_budget} memory tokens"
         if self.training is not None:
-            seed = "" if self.training.seed is None else f"training seed {self.training.seed} of "
-            trained = f", {seed}recipe {str(self.training.recipe)[:6]}"
-        happens = f", event {self.event}" if self.event else ""
-        return (
-            f"{name}{trained}, checkpoint {self.checkpoint}, seed {self.model_seed},"
-            f" {self.split}{happens}"
-        )
+            recipe = f"recipe {str(self.training.recipe)[:6]}"
+            if self.training.seed is not None:
+                recipe = f"training seed {self.training.seed} of {recipe}"
+            text += f", {recipe}"
+        text += f", checkpoint {self.checkpoint}, seed {self.model_seed}, {self.split}"
+        if self.event:
+            text += f", event {self.event}"
+        return text
 
 
 class EpisodeKey(NamedTuple):
@@ -69,35 +72,6 @@ class Seconds:
 
 
 @dataclass(frozen=True)
-class RolloutDetails:
-    """What a rollout keeps in `EpisodeRecord.extra`; what is None or empty is not written.
-
-    env: the environment's name. goal: the instruction. chunks: how often the policy acted.
-    video_frames: observed frames of the conditioning video. actions_sha256: digest of the executed
-    actions. suite: the task's, where its environment has suites. refused: what the environment says
-    of an episode that failed. video: name of the file. process: where the chain of sub-tasks broke.
-    events: what happened, and when. subgoals: their score.
-    """
-
-    env: str
-    goal: str
-    chunks: int
-    video_frames: int
-    actions_sha256: str
-    suite: str | None = None
-    refused: str | None = None
-    video: str | None = None
-    process: Mapping[str, Any] | None = None
-    events: Sequence[Mapping[str, Any]] = ()
-    subgoals: Mapping[str, Any] | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values by name, for records."""
-        optional = {f.name for f in fields(self) if f.default is not MISSING}
-        return {name: value for name, value in vars(self).items() if value or name not in optional}
-
-
-@dataclass(frozen=True)
 class EpisodeRecord:
     """One evaluated episode.
 
@@ -120,8 +94,17 @@ class EpisodeRecord:
     records written before
         checkpoints named it, and of what was not trained.
     event: what happened in the rollout (`pause:100@subtask:2`); None in the matched arm, which is
-    the plain run. extra: whatever else a runner keeps.
+    the plain run.
     when: UTC time of the end, ISO 8601.
+    extra: whatever else a runner of one's own keeps.
+
+    What follows is of rollouts, and is not written where it is None or empty. env: the
+    environment's name. goal: the instruction. chunks: how often the policy acted. video_frames:
+    observed frames of the conditioning video. actions_sha256: digest of the executed actions.
+    suite: the task's, where its environment has suites. refused: what the environment says of an
+    episode that failed. video: name of the file. process: where the chain of sub-tasks broke
+    (`ProcessScore`). events: what happened, and at which control step. subgoals: their score
+    (`SubgoalScore`). made_up: whether the record is synthetic.
     """
 
     model: str
@@ -144,8 +127,21 @@ class EpisodeRecord:
     training: TrainingIdentity | None = None
     event: str | None = None
     when: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
-    extra: dict[str, Any] = field(default_factory=dict)
+    extra: Mapping[str, Any] = field(default_factory=dict)
     scene: str | None = None
+    _: KW_ONLY
+    env: str | None = None
+    goal: str | None = None
+    chunks: Integer | None = None
+    video_frames: Integer | None = None
+    actions_sha256: str | None = None
+    suite: str | None = None
+    refused: str | None = None
+    video: str | None = None
+    process: Mapping[str, Any] | None = None
+    events: tuple[Mapping[str, Any], ...] = ()
+    subgoals: Mapping[str, Any] | None = None
+    made_up: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():
@@ -181,12 +177,17 @@ class EpisodeRecord:
 
     def to_json(self) -> str:
         """One line, without its end; a checksum in it tells damage."""
-        return to_line(asdict(self))
+        values = asdict(self)
+        absent: dict[str, Any] = {"extra": {}, **_OF_ROLLOUTS}
+        for name, default in absent.items():
+            if values[name] == default:
+                del values[name]
+        return to_line(values)
 
     @classmethod
     def from_json(cls, line: str | bytes) -> Self:
         """Read a line."""
-        # Not only finite numbers: a score that does not exist is kept as NaN in `extra`.
+        # Not only finite numbers: a score that does not exist is kept as NaN.
         return cls.from_dict(
             verified(parse_json(line, "an episode record", finite=False), "an episode record")
         )
@@ -194,9 +195,19 @@ class EpisodeRecord:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Read the object of a line, without its checksum."""
-        record = read_section(cls, {**values, "seconds": values.get("seconds") or {}}, "record")
+        values = {**values, "seconds": values.get("seconds") or {}}
+        extra = values.get("extra")
+        if isinstance(extra, Mapping):  # where earlier versions kept what is of rollouts
+            known = {name: extra[name] for name in _OF_ROLLOUTS if name in extra}
+            other = {name: value for name, value in extra.items() if name not in known}
+            values = {**values, **known, "extra": other}
+        record = read_section(cls, values, "record")
         check_choice("record.outcome", record.outcome, OUTCOMES)
         return record
+
+
+_OF_ROLLOUTS = {spec.name: spec.default for spec in fields(EpisodeRecord) if spec.kw_only}
+"""Field that is not written at its default → that."""
 
 
 def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[EpisodeRecord]:
@@ -257,10 +268,13 @@ def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecor
     for record in records:
         if record.composition is not None:
             digests.setdefault(record.run._replace(composition=None), set()).add(record.composition)
-    only = {run: next(iter(of_run)) for run, of_run in digests.items() if len(of_run) == 1}
-    return [
-        replace(r, composition=only.get(r.run)) if r.composition is None else r for r in records
-    ]
+    completed = []
+    for record in records:
+        of_run = digests.get(record.run, set())
+        if record.composition is None and len(of_run) == 1:
+            record = replace(record, composition=next(iter(of_run)))
+        completed.append(record)
+    return completed
 
 
 def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]]:

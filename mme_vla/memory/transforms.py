@@ -1,172 +1,19 @@
-"""Transforms of a history: which frames a policy learns from, and which times they have.
+"""Recorded episodes as perturbations show them: which frames, at which times.
 
-A transform sets how often each frame of an episode is observed. In training a dataset applies it to
-everything that a sample reads of the past (`data.history_transforms`), and a probe applies the same
-object to a running episode.
+A perturbation sets how often each frame of an episode is observed (`memory/perturbation.py`). In
+training a dataset applies it to everything that a sample reads of the past
+(`data.history_transforms`), and a probe applies the same object to a running episode.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
-from typing import Annotated, Any, ClassVar, cast
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from mme_vla.config.sections import NonNegative, NonNegativeInt, Range, read_section
 from mme_vla.errors import require
 from mme_vla.memory.history import FrameScores, History
-from mme_vla.registry import HISTORY_TRANSFORMS
-
-Share = Annotated[float, Range(0.0, 1.0)]
-
-
-class HistoryTransform:
-    """Changes nothing. A subclass overrides what it changes; a dataclass, so that its options are
-    its fields.
-
-    dial: the option that a probe sets by `name:value`. drops: whether it may leave frames out.
-    """
-
-    dial: ClassVar[str | None] = None
-    drops: ClassVar[bool] = False
-
-    def repeats(
-        self, length: int, exec_start: int, rng: np.random.Generator | None = None
-    ) -> np.ndarray:
-        """How often each of the first `length` frames is observed, int64 [length]; 0 leaves one
-        out.
-
-        Args:
-            exec_start: the first execution frame, video included.
-            rng: randomness for training; None for the reproducible choice that a probe makes, in
-                which a frame's number depends on no later frame.
-        """
-        return np.ones(length, np.int64)
-
-    def perturb(self, rows: Tensor, rng: np.random.Generator | None = None) -> Tensor:
-        """Change tokens [n, d] of past frames, or their proprioception and actions, as they are
-        read.
-        """
-        return rows
-
-
-@HISTORY_TRANSFORMS.register("repeat_frame")
-@dataclass(frozen=True)
-class RepeatFrame(HistoryTransform):
-    """One frame is repeated `frames` times more, as if the robot had paused.
-
-    at: which, from the first execution frame on; None: any frame in training, the first of the
-    execution in a probe. p: share of the samples that have a pause. In training it has any length
-    from one frame to `frames`.
-    """
-
-    frames: NonNegativeInt = 64
-    at: NonNegativeInt | None = None
-    p: Share = 1.0
-    dial: ClassVar = "frames"
-
-    def repeats(
-        self, length: int, exec_start: int, rng: np.random.Generator | None = None
-    ) -> np.ndarray:
-        count = self.frames
-        frame = exec_start + (self.at or 0)
-        if rng is not None:
-            has_pause = rng.random() < self.p
-            if self.frames:
-                count = int(rng.integers(1, self.frames + 1))
-            if self.at is None:
-                frame = int(rng.integers(length))
-            if not has_pause:
-                count = 0
-        counts = np.ones(length, np.int64)
-        if frame < length:
-            counts[frame] += count
-        return counts
-
-
-@HISTORY_TRANSFORMS.register("speed")
-@dataclass(frozen=True)
-class Speed(HistoryTransform):
-    """The past seems to be `factor` times as fast; below 1 it is slower. In training by any factor
-    between it and 1.
-    """
-
-    factor: Annotated[float, Range(1 / 16, 16.0)] = 2.0
-    dial: ClassVar = "factor"
-    drops: ClassVar = True
-
-    def repeats(
-        self, length: int, exec_start: int, rng: np.random.Generator | None = None
-    ) -> np.ndarray:
-        factor = self.factor if rng is None else self.factor ** rng.random()
-        edges = np.floor(np.arange(length + 1) / factor).astype(np.int64)
-        return np.diff(edges)
-
-
-@HISTORY_TRANSFORMS.register("drop_frames")
-@dataclass(frozen=True)
-class DropFrames(HistoryTransform):
-    """A `share` of the frames is lost: at random in training, evenly spaced in a probe."""
-
-    share: Share = 0.25
-    dial: ClassVar = "share"
-    drops: ClassVar = True
-
-    def repeats(
-        self, length: int, exec_start: int, rng: np.random.Generator | None = None
-    ) -> np.ndarray:
-        if rng is not None:
-            return (rng.random(length) >= self.share).astype(np.int64)
-        n_dropped = np.floor(np.arange(length + 1) * self.share)  # of the frames before each
-        return 1 - np.diff(n_dropped).astype(np.int64)
-
-
-@HISTORY_TRANSFORMS.register("noise")
-@dataclass(frozen=True)
-class Noise(HistoryTransform):
-    """Gaussian noise on what is read of the past; `std` is in standard deviations of the numbers
-    that are read.
-    """
-
-    std: NonNegative = 0.1
-    dial: ClassVar = "std"
-
-    def perturb(self, rows: Tensor, rng: np.random.Generator | None = None) -> Tensor:
-        if rows.numel() < 2:
-            return rows
-        if rng is None:
-            rng = np.random.default_rng(0)
-        noise = torch.from_numpy(rng.standard_normal(tuple(rows.shape), np.float32)).to(rows.device)
-        return (rows + self.std * rows.float().std() * noise).to(rows.dtype)
-
-
-def build_transform(entry: Any) -> HistoryTransform:
-    """A transform from its name, or from a mapping with `name` and its options."""
-    section: Mapping[str, Any] = {"name": entry} if isinstance(entry, str) else entry
-    kind: Any = HISTORY_TRANSFORMS[section["name"]]
-    if not is_dataclass(kind):
-        return cast(HistoryTransform, HISTORY_TRANSFORMS.build(section))
-    options = {key: value for key, value in section.items() if key != "name"}
-    read: Any = read_section(kind, options, f"history_transforms.{section['name']}")  # type: ignore[arg-type]
-    return cast(HistoryTransform, read)
-
-
-def build_transforms(entries: Any) -> tuple[HistoryTransform, ...]:
-    """The transforms that a configuration lists, in the order in which they act."""
-    if entries is None:
-        return ()
-    is_list = isinstance(entries, Sequence) and not isinstance(entries, str)
-    require(
-        is_list and all(_names_transform(entry) for entry in entries),
-        f"history_transforms={entries}: write a list of names or of mappings with a name, such as"
-        " [repeat_frame] or [{name: speed, factor: 2}].",
-    )
-    return tuple(build_transform(entry) for entry in entries)
-
-
-def _names_transform(entry: Any) -> bool:
-    return isinstance(entry, str) or (isinstance(entry, Mapping) and "name" in entry)
+from mme_vla.memory.perturbation import Perturbation
 
 
 @dataclass(frozen=True)
@@ -180,7 +27,7 @@ class FrameMap:
 
     real: np.ndarray
     exec_start: int
-    transforms: Sequence[HistoryTransform] = ()
+    transforms: Sequence[Perturbation] = ()
     rng: np.random.Generator | None = None
 
     def transformed(self, frames: np.ndarray) -> np.ndarray:
@@ -198,7 +45,7 @@ class FrameMap:
 
 
 def map_frames(
-    transforms: Sequence[HistoryTransform],
+    transforms: Sequence[Perturbation],
     length: int,
     exec_start: int,
     rng: np.random.Generator | None = None,
@@ -207,7 +54,7 @@ def map_frames(
     """Apply transforms one after the other to the first `length` frames of an episode.
 
     Args:
-        rng: see `HistoryTransform.repeats`. keep: frames that stay whatever the transforms leave
+        rng: see `Perturbation.repeats`. keep: frames that stay whatever the transforms leave
             out: those at which the policy decides.
     """
     real = np.arange(length)

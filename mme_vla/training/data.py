@@ -13,7 +13,7 @@ from mme_vla.data.dataset import GroupDataset, TrainingDataset
 from mme_vla.data.sources import default_val_episodes, open_sources, split_episodes
 from mme_vla.data.statistics import NARROW, check_ranges, compute_norm_stats
 from mme_vla.errors import UserError, check_choice, require
-from mme_vla.memory.transforms import build_transforms
+from mme_vla.memory.perturbation import build_transforms
 from mme_vla.policy.base import Policy
 from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats

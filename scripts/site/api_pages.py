@@ -18,7 +18,7 @@ GROUPS = {
         "Memory",
         "PerceptualMemory",
         "RecurrentMemory",
-        "HistoryTransform",
+        "Perturbation",
         "Integration",
         "Backbone",
         "Task",

@@ -74,9 +74,7 @@ def test_an_environment_of_ones_own_works_in_every_command(
     loop = (*BLINK, *trained, "tasks=all", "workers=1")
     run(tmp_path, "blink", "evaluate", *loop, "episodes=2", "output=evaluated", "video=all")
     records = read_folders(find_records([tmp_path / "evaluated"]))
-    assert [
-        (r.task, r.episode, r.seed, r.extra["env"], r.extra["video_frames"]) for r in records
-    ] == [
+    assert [(r.task, r.episode, r.seed, r.env, r.video_frames) for r in records] == [
         ("Blink", 0, 500_000, "blink", 4),
         ("Blink", 1, 500_001, "blink", 4),
     ]
@@ -172,4 +170,4 @@ def test_maniskills_pick_cube_is_recorded_trained_and_evaluated(tmp_path: Path) 
         "output=evaluated",
     )
     (record,) = read_folders(find_records([tmp_path / "evaluated"]))
-    assert (record.task, record.extra["env"], record.steps) == ("PickCube-v1", "pick_cube", 4)
+    assert (record.task, record.env, record.steps) == ("PickCube-v1", "pick_cube", 4)

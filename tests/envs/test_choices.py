@@ -263,7 +263,7 @@ def test_a_rollout_asks_after_each_choice_and_takes_what_is_offered_only() -> No
     envs = Offering(robot=CHOOSER)
     (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=9)
     assert record.outcome in ("success", "timeout") and record.action_space == "multi_choice"
-    assert record.extra["chunks"] == len(envs.taken) == record.steps // 3
+    assert record.chunks == len(envs.taken) == record.steps // 3
     assert {action["choice"] for action in envs.taken} <= {"A", "B"}
     assert all(0 <= share <= 256 for action in envs.taken for share in action["point"])
 
@@ -276,7 +276,7 @@ def test_choices_that_move_nothing_come_to_an_end() -> None:
     (record,) = roll(
         policy, [Job("PickXtimes", "test", 0)], Idle(robot=CHOOSER, max_steps=5), max_steps=5
     )
-    assert (record.outcome, record.extra["chunks"], record.steps) == ("timeout", 6, 0)
+    assert (record.outcome, record.chunks, record.steps) == ("timeout", 6, 0)
 
 
 def test_an_environment_without_options_is_no_place_for_a_policy_that_chooses() -> None:

@@ -146,14 +146,14 @@ def test_a_rollout_of_motions_remembers_every_frame_and_asks_after_each_motion()
     assert (
         record.outcome == "timeout" and record.steps % 3 == 0 and record.action_space == "waypoint"
     )
-    assert record.extra["chunks"] == record.steps // 3, (
+    assert record.chunks == record.steps // 3, (
         "one motion of a chunk is executed, then the policy is asked"
     )
     assert {action[6] for action in envs.made[job].actions} <= {-1.0, 1.0}, (
         "the gripper is opened or closed, no less"
     )
     (result,) = roll(policy, [job], MotionEnvs(robot=policy.embodiment), max_steps=9, draw="all")
-    assert result.extra["actions_sha256"] == record.extra["actions_sha256"]
+    assert result.actions_sha256 == record.actions_sha256
 
 
 def test_a_pose_out_of_reach_is_the_policys_failure() -> None:
@@ -167,7 +167,7 @@ def test_a_pose_out_of_reach_is_the_policys_failure() -> None:
     (record,) = roll(
         policy, [Job("PickXtimes", "test", 0)], OutOfReach(robot=policy.embodiment), retries=1
     )
-    assert (record.outcome, record.steps, record.extra["refused"]) == ("fail", 0, "IK failed")
+    assert (record.outcome, record.steps, record.refused) == ("fail", 0, "IK failed")
 
 
 def test_a_policy_of_motions_is_served_a_motion_at_a_time() -> None:

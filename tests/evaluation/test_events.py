@@ -22,7 +22,7 @@ from helpers.rollout_fakes import (
     use_inline_envs,
 )
 from helpers.scripted_env import VIDEO, make_moving_env, make_slow_env
-from mme_vla import MMEPolicy, UserError, build_policy, register
+from mme_vla import MMEPolicy, Perturbation, UserError, build_policy, register
 from mme_vla.cli.results import main as results
 from mme_vla.config.composition import compose
 from mme_vla.envs.base import Environment, EpisodeEnv, Hold
@@ -40,11 +40,11 @@ from mme_vla.evaluation.results.events import (
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import Interval, wilson
 from mme_vla.evaluation.rollout.evaluation import evaluate_events
-from mme_vla.evaluation.rollout.events import Event, EventCourse, event_arms, read_events
+from mme_vla.evaluation.rollout.events import EventCourse, event_arms, read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.processing.normalise import NormStats
-from mme_vla.registry import EVENTS
+from mme_vla.registry import PERTURBATIONS
 from mme_vla.testing.small import cached_history
 
 UNMASK, START = Job("VideoUnmask", "test", 0), VIDEO["VideoUnmask"]
@@ -84,18 +84,18 @@ class Observed:
 
 
 def facts(record: EpisodeRecord) -> tuple[Any, ...]:
-    return record.outcome, record.steps, record.extra["chunks"], record.extra["actions_sha256"]
+    return record.outcome, record.steps, record.chunks, record.actions_sha256
 
 
 def test_events_are_read_from_one_word() -> None:
     first, second = read_events("pause:100@subtask:2+gap:32@step:64")
-    assert (first.event.hold, first.event.observed, first.unit, first.number) == (
+    assert (first.perturbation.hold, first.perturbation.observed, first.unit, first.number) == (
         100,
         100,
         "subtask",
         2,
     )
-    assert (second.event.hold, second.event.observed, second.unit, second.number) == (
+    assert (second.perturbation.hold, second.perturbation.observed, second.unit, second.number) == (
         33,
         1,
         "step",
@@ -112,8 +112,8 @@ def test_events_are_read_from_one_word() -> None:
 @pytest.mark.parametrize(
     ("arm", "words"),
     [
-        ("pause:-5", "event=pause:-5: pause.steps=-5 must be a whole number, 0 or more"),
-        ("pause:1.5", "event=pause:1.5: pause.steps=1.5"),
+        ("pause:-5", "event=pause:-5: pause.frames=-5 must be a whole number, 0 or more"),
+        ("pause:1.5", "event=pause:1.5: pause.frames=1.5"),
         ("gap:-1", "event=gap:-1: gap.frames=-1"),
         ("paus:5", "event=paus:5: name='paus'. Did you mean 'pause'"),
         ("pause:5@subtsk:2", "event=pause:5@subtsk:2: place='subtsk'.*subtask"),
@@ -126,6 +126,8 @@ def test_events_are_read_from_one_word() -> None:
         ("5", "event=5: write pause:100"),
         (["pause:5", "pause:5"], "each once"),
         (7, "event=7"),
+        ("shuffle", "event=shuffle: shuffle changes nothing here; it belongs in with=…"),
+        ("noise:1", "it belongs in data.history_transforms=… or with=…"),
     ],
 )
 def test_what_is_no_event_is_refused_with_its_key(arm: Any, words: str) -> None:
@@ -158,7 +160,7 @@ def test_a_pause_holds_the_robot_and_memory_receives_its_frames(
     env = envs.made[UNMASK]
     assert env.hold_steps == 10 and len(env.actions) == 41, "the limit grows by the pause"
     assert (record.outcome, record.steps) == ("timeout", 51) and facts(again) == facts(record)
-    assert record.extra["events"] == [{"event": "pause:10@step:16", "step": 16}]
+    assert record.events == ({"event": "pause:10@step:16", "step": 16},)
     frames = np.stack(env.frames)
     for count, selection in zip(observed.frames[:3], observed.selections, strict=False):
         offline = policy.require_memory().gather_selection(
@@ -203,10 +205,10 @@ def test_a_video_can_be_faster_or_slower(
     for event, length in (("speed:2", 10), ("speed:0.5", 42)):
         observed = Observed(policy, monkeypatch)
         (record,) = roll(policy, [UNMASK], InlineEnvs(), event=event)
-        assert observed.frames[0] == length + 1 and record.extra["video_frames"] == length
+        assert observed.frames[0] == length + 1 and record.video_frames == length
         monkeypatch.undo()
     (no_video,) = roll(policy, [Job("PickXtimes", "test", 0)], InlineEnvs(), event="speed:2")
-    assert no_video.extra["events"] == [{"event": "speed:2", "step": None}]
+    assert no_video.events == ({"event": "speed:2", "step": None},)
 
 
 @pytest.mark.parametrize("name", ["framesamp_modul", "ttt_modul", "framesamp_ttt_modul"])
@@ -216,7 +218,7 @@ def test_a_restart_begins_the_frame_index_anew_and_keeps_what_is_remembered(
     policy = quick_policy(name, 8, policy={"history_dtype": "float32"})
     observed = Observed(policy, monkeypatch)
     (record,) = roll(policy, [UNMASK], InlineEnvs(), event="restart@step:16")
-    assert record.extra["events"] == [{"event": "restart@step:16", "step": 16}]
+    assert record.events == ({"event": "restart@step:16", "step": 16},)
     assert [int(selection.step) for selection in observed.selections] == [START, 0, 16]
     last = observed.selections[2]
     times = last.positions[last.mask][:, 0]
@@ -240,7 +242,7 @@ def test_events_act_by_sub_task_and_episode_by_episode(memoryless: MMEPolicy) ->
     made = roll(memoryless, JOBS, envs, event="pause:7@subtask:20+pause:3@subtask:20")
     assert {env.hold_steps for env in envs.made.values()} == {10}
     # the first decision in it
-    assert [entry["step"] for r in made for entry in r.extra["events"]] == [32] * 12
+    assert [entry["step"] for r in made for entry in r.events] == [32] * 12
     alone = roll(
         memoryless, JOBS, InlineEnvs(1), event="pause:7@subtask:20+pause:3@subtask:20", max_batch=1
     )
@@ -248,10 +250,7 @@ def test_events_act_by_sub_task_and_episode_by_episode(memoryless: MMEPolicy) ->
         (r.key, r.outcome, r.steps) for r in made
     }
     (never,) = roll(memoryless, [UNMASK], InlineEnvs(), event="pause:7@subtask:99")
-    assert (
-        never.extra["events"] == [{"event": "pause:7@subtask:99", "step": None}]
-        and never.steps == 41
-    )
+    assert never.events == ({"event": "pause:7@subtask:99", "step": None},) and never.steps == 41
 
 
 def test_a_place_that_the_environment_does_not_tell_is_refused() -> None:
@@ -263,18 +262,18 @@ def test_a_place_that_the_environment_does_not_tell_is_refused() -> None:
 
 def test_a_custom_event_is_registered_by_name(policy: MMEPolicy) -> None:
     @register("event", "rename")
-    class Rename(Event):
+    class Rename(Perturbation):
         hold, observed = 8, 5
 
         def act(self, episode: Any) -> None:
             episode.goal = "do something else"
 
-    assert EVENTS["rename"] is Rename
+    assert PERTURBATIONS["rename"] is Rename
     few, every = (
         roll(policy, [UNMASK], InlineEnvs(), event="rename@step:10", draw=d)[0]
         for d in ("needed", "all")
     )
-    assert few.extra["goal"] == "do something else" and few.extra["events"][0]["step"] == 16
+    assert few.goal == "do something else" and few.events[0]["step"] == 16
     assert facts(few) == facts(every) and few.steps == 49
 
 
@@ -355,7 +354,7 @@ def test_every_event_run_has_its_matched_arm(
 
 
 def under(event: str | None, won: list[int], log: Any = ()) -> list[EpisodeRecord]:
-    return [replace(r, event=event, extra={"events": list(log)}) for r in records("test", won)]
+    return [replace(r, event=event, events=tuple(log)) for r in records("test", won)]
 
 
 def test_results_pair_events_with_their_matched_arms(

@@ -132,7 +132,7 @@ def test_a_video_shows_everything_and_changes_nothing(tmp_path: Path) -> None:
     assert {job: env.rendered for job, env in envs.made.items()} == {
         job: {"front": n, "wrist": n} for job, n in zip(JOBS, FRAMES, strict=True)
     }
-    assert all((tmp_path / record.extra["video"]).stat().st_size for record in recorded)
+    assert all((tmp_path / record.video).stat().st_size for record in recorded)
 
 
 def test_an_environment_that_does_not_repeat_its_video_is_refused() -> None:

@@ -113,9 +113,7 @@ def test_records_tables_and_the_report_tell_it() -> None:
     ]
     outcomes = ["fail", "timeout", "success"]
     rows = [
-        EpisodeRecord(
-            "m", 1, 7, "PickXtimes", i, i, "easy", outcome, 9, extra={"process": score.to_dict()}
-        )
+        EpisodeRecord("m", 1, 7, "PickXtimes", i, i, "easy", outcome, 9, process=score.to_dict())
         for i, (outcome, score) in enumerate(zip(outcomes, scores, strict=True))
     ]
     results = aggregate(

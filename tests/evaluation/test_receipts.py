@@ -2,8 +2,9 @@
 
 import json
 import lzma
+import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="scenes are built, which needs the extra 'sim'")
 
+from helpers.nano_policies import nano
 from helpers.rollout_fakes import quick_policy
 from mme_vla import UserError
 from mme_vla.cli.results import main
@@ -31,6 +33,15 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("policy") / "step_000003"
     quick_policy("framesamp_modul").save_pretrained(folder)
     return folder
+
+
+NAMES_OF_CODE = receipts._code.__wrapped__
+
+
+@pytest.fixture(autouse=True)
+def committed_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every folder has a name, whether this checkout is a clone and without changes or not."""
+    monkeypatch.setattr(receipts, "_code", lambda names: {f"git {name}": "0" for name in names})
 
 
 def run(
@@ -141,7 +152,7 @@ def test_changed_records_scenes_and_receipts_are_named(checkpoint: Path, tmp_pat
     other = tmp_path / "receipt-of-something-else.json"
     other.write_text(json.dumps({"settings": {}}))
     with pytest.raises(
-        UserError, match="is no receipt of an evaluation: it has no conditions, records"
+        UserError, match="is no receipt of an evaluation: The file lacks conditions"
     ):
         receipts.verify(other)
     path.write_text(path.read_text().replace('"success": 1', '"success": 3'))
@@ -206,32 +217,39 @@ def first(content: dict[str, Any]) -> dict[str, Any]:
     return content["conditions"][0]
 
 
+def named(part: str, names: Iterable[str]) -> set[str]:
+    """The lines on the parts of a condition that are here."""
+    return {f"{part}.{name}" for name in names if part == "code" or receipts._version(name)}
+
+
+CODE = named("code", [f"git {folder}" for folder in receipts.CODE])
+SIMULATOR = named("simulator", receipts.SIMULATOR)
+LIBRARIES = named("libraries", receipts.LIBRARIES)
 ABSENCES: dict[str, tuple[Callable[[dict[str, Any]], object], set[str]]] = {
     "no condition": (
         lambda c: c.update(conditions=[]),
-        {"code", "simulator", "renderer", "libraries", "hardware", "checkpoint", "statistics"},
+        {"code.mme-vla", "renderer", "hardware.cpu", "checkpoint", *CODE, *SIMULATOR, *LIBRARIES},
     ),
     "no files of the checkpoint": (
         lambda c: first(c)["checkpoint"].update(files={}),
         {"checkpoint"},
     ),
-    "no checkpoint": (lambda c: first(c).pop("checkpoint"), {"checkpoint", "statistics"}),
+    "no checkpoint": (lambda c: first(c).pop("checkpoint"), {"checkpoint"}),
     "another folder": (
         lambda c: first(c)["checkpoint"].update(folder="nowhere"),
-        {"checkpoint", "statistics"},
+        {"checkpoint"},
     ),
-    "no folder": (lambda c: first(c)["checkpoint"].update(folder=""), {"checkpoint", "statistics"}),
-    "no statistics": (lambda c: first(c).pop("statistics"), {"statistics"}),
-    "no code": (lambda c: first(c).pop("code"), {"code"}),
+    "no folder": (lambda c: first(c)["checkpoint"].update(folder=""), {"checkpoint"}),
+    "no code": (lambda c: first(c).pop("code"), {"code.mme-vla", *CODE}),
     "code of nothing": (
         lambda c: first(c).update(code={"mme-vla": first(c)["code"]["mme-vla"]}),
-        {f"code.{name}" for name in receipts.CODE},
+        CODE,
     ),
     "no version of the library": (lambda c: first(c)["code"].pop("mme-vla"), {"code.mme-vla"}),
-    "no simulator": (lambda c: first(c).update(simulator={}), {"simulator"}),
+    "no simulator": (lambda c: first(c).update(simulator={}), SIMULATOR),
     "no PyTorch": (lambda c: first(c)["libraries"].pop("torch"), {"libraries.torch"}),
     "no renderer": (lambda c: first(c).pop("renderer"), {"renderer"}),
-    "no hardware": (lambda c: first(c).pop("hardware"), {"hardware"}),
+    "no hardware": (lambda c: first(c).update(hardware={}), {"hardware.cpu"}),
     "no file of records": (lambda c: c.update(records={}), {"records"}),
 }
 
@@ -311,7 +329,7 @@ def test_another_scene_of_the_same_seed_is_noticed(finished: Path) -> None:
         ({"checkpoint": 7}, "checkpoint"),
         ({"event": "pause:64"}, "event"),
         ({"subgoal": "oracle"}, "subgoal"),
-        ({"extra": {"env": "another"}}, "env"),
+        ({"env": "another"}, "env"),
         ({"training": TrainingIdentity(1, "r", "d", "w")}, "training"),
     ],
     ids=str,
@@ -426,39 +444,26 @@ def test_records_of_several_streams_are_read_whole(checkpoint: Path, tmp_path: P
     assert receipts.verify(path) == ([], [], [])
 
 
-# The digest of the code ---------------------------------------------------------------------------
+# The code -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name, counts", [
-    ("memory/base.py", True), ("envs/task.py", True), ("evaluation/rollout/runner.py", True),
-    ("cli/results.py", False), ("evaluation/results/plots.py", False), ("play/page.py", False),
-])  # fmt: skip
-def test_the_digest_of_the_code_covers_what_can_change_a_result(name: str, counts: bool) -> None:
+def test_the_code_that_can_change_a_result_is_named_by_git_and_no_source_is_read(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receipts, "file_sum", lambda path: pytest.fail(f"{path} was read"))
     root = Path(receipts.__file__).parents[1]
-    covered = {
-        path.relative_to(root).as_posix()
-        for part in receipts.CODE
-        for path in (root / part).rglob("*.py")
-    }
-    assert (name in covered) is counts
-    assert all(list((root / part).rglob("*.py")) for part in receipts.CODE), "a package was moved"
+    assert all((root / part).is_dir() for part in receipts.CODE), "a package was moved"
+    names = NAMES_OF_CODE(frozenset({*receipts.CODE, "extras/nano"}))
+    assert set(names) <= {f"git {folder}" for folder in (*receipts.CODE, "extras/nano")}
+    assert all(re.fullmatch(r"[0-9a-f]{40}(\+[0-9a-f]{12})?", name) for name in names.values())
+    assert receipts._extras_of(quick_policy("framesamp_modul")) == set()
+    assert receipts._extras_of(nano()) == {"extras/nano"}
 
 
 def test_digests_of_the_code_that_earlier_versions_wrote_are_not_compared(finished: Path) -> None:
     earlier = {"mme-vla": first(receipts.read_receipt(finished))["code"]["mme-vla"]}
-    for code in ({"files": "0" * 64}, {"covers": list(receipts.CODE), "sha256": "0" * 64}):
+    for code in ({"files": "0" * 64}, {"memory": "0" * 64}):
         rewrite(finished, lambda content, code=code: first(content).update(code=earlier | code))
         result = receipts.verify(finished)
         assert result.word == "not compared"
-        assert any(line.startswith("code.memory: ") for line in result.not_compared)
-
-
-def test_the_code_is_read_once_in_a_process(
-    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run(tmp_path / "first", checkpoint, range(1))
-    read: list[Path] = []
-    file_sum = receipts.file_sum
-    monkeypatch.setattr(receipts, "file_sum", lambda path: (read.append(path), file_sum(path))[1])
-    run(tmp_path / "second", checkpoint, range(1))
-    assert not [path for path in read if path.suffix == ".py"]
+        assert any(line.startswith("code.git memory: ") for line in result.not_compared)

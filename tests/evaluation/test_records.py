@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from mme_vla import UserError
-from mme_vla.evaluation.records import EpisodeRecord, RolloutDetails, Seconds, by_run, merge
+from mme_vla.evaluation.records import EpisodeRecord, Seconds, by_run, merge
 from mme_vla.evaluation.store import RecordLog, claim_run, find_records, read_records, read_run
 
 
@@ -33,7 +33,11 @@ def record(**changes: Any) -> EpisodeRecord:
 
 def test_a_record_survives_its_line() -> None:
     made = record(
-        error="IK failed\nat step 3", outcome="error", subgoal="qwenvl", extra={"video": "a/b.mp4"}
+        error="IK failed\nat step 3",
+        outcome="error",
+        subgoal="qwenvl",
+        video="a/b.mp4",
+        extra={"mine": 1},
     )
     line = made.to_json()
     assert "\n" not in line
@@ -181,9 +185,17 @@ def test_processes_of_one_number_on_two_machines_do_not_share_a_file(
     assert len(set(linked)) == 2
 
 
-def test_details_of_a_rollout_that_are_absent_are_not_written() -> None:
-    bare = RolloutDetails("mme_vla", "", 0, 0, "0123")
-    names = ["env", "goal", "chunks", "video_frames", "actions_sha256"]
-    assert list(bare.to_dict()) == names, "in the order in which records have them"
-    full = replace(bare, suite="Counting", video="a.mp4", events=[{"event": "restart", "step": 0}])
-    assert list(full.to_dict()) == [*names, "suite", "video", "events"]
+def test_what_is_absent_of_a_rollout_is_not_written() -> None:
+    bare = json.loads(record().to_json())
+    assert not {"env", "chunks", "events", "made_up", "extra"} & set(bare)
+    full = record(suite="Counting", chunks=0, events=({"event": "restart", "step": 0},))
+    written = json.loads(full.to_json())
+    assert (written["suite"], written["chunks"]) == ("Counting", 0)
+    assert EpisodeRecord.from_json(full.to_json()) == full
+
+
+def test_records_whose_rollout_was_kept_in_extra_are_read() -> None:
+    extra = {"env": "mme_vla", "chunks": 3, "events": [{"event": "restart", "step": 0}], "mine": 1}
+    earlier = EpisodeRecord.from_dict({**asdict(record()), "extra": extra})
+    assert (earlier.env, earlier.chunks, earlier.extra) == ("mme_vla", 3, {"mine": 1})
+    assert earlier.events == ({"event": "restart", "step": 0},)

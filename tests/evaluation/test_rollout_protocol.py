@@ -51,7 +51,7 @@ def test_sixteen_of_twenty_actions_are_executed_and_then_the_policy_is_queried_a
     assert [len(chunk) for chunk in watched.chunks] == [20, 20, 20]
     sent = np.concatenate([chunk[:16] for chunk in watched.chunks])
     assert np.array_equal(np.stack(envs.made[UNMASK].actions), sent[:41])
-    assert (record.outcome, record.steps, record.extra["chunks"]) == ("timeout", 41, 3)
+    assert (record.outcome, record.steps, record.chunks) == ("timeout", 41, 3)
 
 
 def test_an_episode_that_ends_inside_a_chunk_ends_there(memoryless):
@@ -155,7 +155,7 @@ def test_one_at_a_time_results_are_equal_to_the_last_bit_in_any_order():
         records = roll(
             policy, jobs, InlineEnvs(workers, base=make_moving_env, max_steps=24), max_batch=1
         )
-        return {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records}
+        return {r.key: (r.outcome, r.steps, r.actions_sha256) for r in records}
 
     forward = digests(JOBS, 1)
     assert digests(JOBS[::-1], 4) == forward

@@ -31,11 +31,7 @@ from mme_vla.policy.mme import MMEPolicy
 def outcomes(folder: Path) -> dict:
     """What must not depend on how a run came about; the last is exact to the last bit."""
     records = [record for path in find_records([folder]) for record in read_records(path)]
-    return {
-        r.key: (r.outcome, r.steps, r.extra["actions_sha256"])
-        for r in records
-        if r.outcome != "error"
-    }
+    return {r.key: (r.outcome, r.steps, r.actions_sha256) for r in records if r.outcome != "error"}
 
 
 @pytest.mark.slow
@@ -200,9 +196,7 @@ def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(
     options = {"base": make_moving_env, "videos": (str(tmp_path), "all")}
     records = roll(quick_policy("pi05"), [Job("VideoUnmask", "test", 0)], InlineEnvs(**options))
     (path,) = tmp_path.iterdir()
-    assert (
-        path.name == "VideoUnmask_ep0_success_pick_up_the_red_cube.mp4" == records[0].extra["video"]
-    )
+    assert path.name == "VideoUnmask_ep0_success_pick_up_the_red_cube.mp4" == records[0].video
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert stream.average_rate == 30

@@ -43,10 +43,7 @@ def make_watched_env(task: str, split: str, episode: int, max_steps: int) -> Wat
 
 def outcomes(records: list[EpisodeRecord]) -> list[tuple[Any, ...]]:
     assert all(record.error is None for record in records)
-    return [
-        (r.key, r.outcome, r.steps, r.extra["actions_sha256"], r.extra.get("subgoals"))
-        for r in records
-    ]
+    return [(r.key, r.outcome, r.steps, r.actions_sha256, r.subgoals) for r in records]
 
 
 def both_ways(

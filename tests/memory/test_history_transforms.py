@@ -11,7 +11,7 @@ import torch
 from helpers.memory_fakes import LastFrames, encode, same
 from helpers.nano_policies import demonstration, nano
 from helpers.probe_fakes import probed, reader
-from mme_vla import UserError, register
+from mme_vla import Perturbation, UserError, register
 from mme_vla.data.cache import VisionCache
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.dataset import GroupDataset, TrainingDataset
@@ -22,25 +22,17 @@ from mme_vla.extras.probing.arms import options_of, read_arm
 from mme_vla.extras.probing.feed import Feed
 from mme_vla.extras.probing.lines import MomentLine
 from mme_vla.memory.history import CachedHistory, StorageSpec
-from mme_vla.memory.transforms import (
-    DropFrames,
-    HistoryTransform,
-    Noise,
-    RepeatFrame,
-    Speed,
-    TransformedHistory,
-    build_transforms,
-    map_frames,
-)
+from mme_vla.memory.perturbation import DropFrames, Noise, Pause, Speed, build_transforms
+from mme_vla.memory.transforms import TransformedHistory, map_frames
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
-from mme_vla.registry import HISTORY_TRANSFORMS
+from mme_vla.registry import PERTURBATIONS
 
-EVERY = [RepeatFrame(16), Speed(2.0), DropFrames(0.5)]
+EVERY = [Pause(16), Speed(2.0), DropFrames(0.5)]
 
 
 @pytest.mark.parametrize("transform", EVERY)
-def test_a_map_is_ascending_and_ends_at_the_current_frame(transform: HistoryTransform) -> None:
+def test_a_map_is_ascending_and_ends_at_the_current_frame(transform: Perturbation) -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
         visible = map_frames([transform], 40, 10, rng, keep=[39])
@@ -53,7 +45,7 @@ def test_a_map_is_ascending_and_ends_at_the_current_frame(transform: HistoryTran
 
 
 @pytest.mark.parametrize("transform", [*EVERY, Speed(0.5)])
-def test_in_a_probe_no_frame_depends_on_a_later_one(transform: HistoryTransform) -> None:
+def test_in_a_probe_no_frame_depends_on_a_later_one(transform: Perturbation) -> None:
     full = map_frames([transform], 60, 10).real
     for length in (12, 33, 59):
         part = map_frames([transform], length, 10).real
@@ -61,19 +53,19 @@ def test_in_a_probe_no_frame_depends_on_a_later_one(transform: HistoryTransform)
 
 
 def test_transforms_have_the_lengths_they_say() -> None:
-    assert len(map_frames([RepeatFrame(16)], 40, 10).real) == 56
+    assert len(map_frames([Pause(16)], 40, 10).real) == 56
     assert (
         len(map_frames([Speed(2.0)], 40, 0).real) == 20
         and len(map_frames([Speed(0.5)], 40, 0).real) == 80
     )
     assert len(map_frames([DropFrames(0.25)], 40, 0).real) == 30
-    assert len(map_frames([Speed(2.0), RepeatFrame(16)], 40, 0).real) == 36
-    assert len(map_frames([RepeatFrame(16, p=0.0)], 40, 10, np.random.default_rng(0)).real) == 40
+    assert len(map_frames([Speed(2.0), Pause(16)], 40, 0).real) == 36
+    assert len(map_frames([Pause(16, p=0.0)], 40, 10, np.random.default_rng(0)).real) == 40
 
 
 def test_a_feed_shows_frames_as_the_map_does() -> None:
-    feed = Feed(transforms=(RepeatFrame(8, 2), Speed(2.0)))
-    real = map_frames(feed.transforms, 50, 5).real
+    feed = Feed((Pause(8, 2), Speed(2.0)))
+    real = map_frames(feed.perturbations, 50, 5).real
     assert np.array_equal(np.repeat(np.arange(50), feed.repeats(np.arange(50), 5)), real)
     last = feed.displayed(np.arange(50), 5)
     assert all(real[n] == frame for frame, n in enumerate(last) if n >= 0) and (
@@ -101,7 +93,7 @@ def test_noise_perturbs_by_its_share_of_the_deviation() -> None:
 
 def test_entries_that_are_no_transforms_are_reported() -> None:
     assert build_transforms(["repeat_frame", {"name": "speed", "factor": 4}]) == (
-        RepeatFrame(),
+        Pause(),
         Speed(4),
     )
     for entries, words in (
@@ -115,7 +107,7 @@ def test_entries_that_are_no_transforms_are_reported() -> None:
 
 
 def test_a_transform_that_returns_too_few_numbers_is_reported() -> None:
-    class Short(HistoryTransform):
+    class Short(Perturbation):
         def repeats(
             self, length: int, exec_start: int, rng: np.random.Generator | None = None
         ) -> np.ndarray:
@@ -143,7 +135,7 @@ def test_samples_are_transformed_by_seed_epoch_and_index(sample: Any) -> None:
     sources, processor, caches = sample
     base = TrainingDataset(sources, processor, LastFrames(), caches)
     changed = TrainingDataset(
-        sources, processor, LastFrames(), caches, transforms=[RepeatFrame(32, p=1.0)]
+        sources, processor, LastFrames(), caches, transforms=[Pause(32, p=1.0)]
     )
     items = [changed[60], changed[60]]
     assert same(*items) and not same(items[0]["history"], base[60]["history"])
@@ -156,7 +148,7 @@ def test_samples_are_transformed_by_seed_epoch_and_index(sample: Any) -> None:
     assert same(changed.observation(60), base.observation(60)), (
         "what a policy meets when acting is not transformed"
     )
-    nothing = TrainingDataset(sources, processor, LastFrames(), caches, transforms=[RepeatFrame(0)])
+    nothing = TrainingDataset(sources, processor, LastFrames(), caches, transforms=[Pause(0)])
     assert same(nothing[60]["history"], base[60]["history"])
 
 
@@ -171,7 +163,7 @@ def test_past_actions_go_through_the_map(sample: Any, monkeypatch: pytest.Monkey
     )
     exec_start = int(sources[0].exec_starts[step.episode])
     visible = map_frames(
-        [RepeatFrame(5, step.index - exec_start - 1)], step.index + 1, exec_start, keep=[step.index]
+        [Pause(5, step.index - exec_start - 1)], step.index + 1, exec_start, keep=[step.index]
     )
     monkeypatch.setattr(Processor, "prompt_spec", replace(processor.prompt_spec, past_actions=4))
     past = data.past_actions(step, visible)
@@ -197,9 +189,7 @@ def test_nano_redraws_histories_each_epoch() -> None:
     policy, made = nano().eval(), demonstration()
     policy.require_processor().stats = statistics([made], policy)
     base = Decisions.of(policy, [made])
-    first, again = (
-        Decisions.of(policy, [made], transforms=[RepeatFrame(32)], seed=1) for _ in range(2)
-    )
+    first, again = (Decisions.of(policy, [made], transforms=[Pause(32)], seed=1) for _ in range(2))
     rows = [0, 1, 2]
     one = first.collate(rows).history
     assert (
@@ -209,7 +199,7 @@ def test_nano_redraws_histories_each_epoch() -> None:
     )
     first.set_epoch(1)
     assert not same(first.collate(rows).history, one)
-    still = Decisions.of(policy, [made], transforms=[RepeatFrame(0)], seed=1)
+    still = Decisions.of(policy, [made], transforms=[Pause(0)], seed=1)
     assert same(still.collate(rows).history, base.collate(rows).history)
 
 
@@ -217,8 +207,13 @@ def test_a_probe_applies_the_same_objects(tmp_path: Path) -> None:
     arms = [
         read_arm(word) for word in ("repeat_frame:8", "speed:2", "drop_frames:0.5", "noise:0.5")
     ]
-    feeds = [arm.feed.transforms for arm in arms]
-    assert feeds == [(RepeatFrame(8),), (Speed(2),), (DropFrames(0.5),), (Noise(0.5),)]
+    assert [arm.parts for arm in arms] == [
+        (Pause(8),),
+        (Speed(2),),
+        (DropFrames(0.5),),
+        (Noise(0.5),),
+    ]
+    assert [arm.feed.perturbations for arm in arms[2:]] == [(DropFrames(0.5),), ()]
     assert (
         read_arm("pause:8").feed.repeats(np.arange(9), 3).tolist()
         == arms[0].feed.repeats(np.arange(9), 3).tolist()
@@ -242,10 +237,10 @@ def test_a_probe_applies_the_same_objects(tmp_path: Path) -> None:
 
 def test_a_transform_of_ones_own_is_registered() -> None:
     @register("history_transform", "still_for_a_test")
-    class Still(HistoryTransform):
+    class Still(Perturbation):
         pass
 
-    assert HISTORY_TRANSFORMS["still_for_a_test"] is Still
+    assert PERTURBATIONS["still_for_a_test"] is Still
     assert np.array_equal(
         map_frames(build_transforms(["still_for_a_test"]), 5, 0).real, np.arange(5)
     )

@@ -12,7 +12,8 @@ from omegaconf import OmegaConf
 from mme_vla.config.trees import config_dir
 from mme_vla.errors import UserError
 from mme_vla.memory.base import FeatureEncoder, Memory, stack_history
-from mme_vla.memory.transforms import RepeatFrame, TransformedHistory, map_frames
+from mme_vla.memory.perturbation import Pause
+from mme_vla.memory.transforms import TransformedHistory, map_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.testing.check_memory import D_VISION, WIDTH, Episode
 from mme_vla.types import HistoryTokens
@@ -101,7 +102,7 @@ def test_without_positions_there_is_no_position_layer_and_a_narrower_encoder() -
 @pytest.mark.parametrize("name", WITH_POSITIONS | OTHERS)
 def test_every_memory_learns_from_a_repeated_frame(name: str) -> None:
     memory, run = build(name), 16
-    frames = map_frames([RepeatFrame(run, 4)], 48, Episode.exec_start, keep=[47])
+    frames = map_frames([Pause(run, 4)], 48, Episode.exec_start, keep=[47])
     base = Episode(memory, 48).cached()
     paused = TransformedHistory(base, frames)
     tokens = memory.gather_selection(paused, len(paused) - 1)

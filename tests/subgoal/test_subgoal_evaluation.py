@@ -85,7 +85,7 @@ def test_every_subgoal_is_recorded_with_its_time_and_image(tmp_path: Path) -> No
         frame = envs.made[UNMASK].frames[21 + line["step"]]  # 21 frames of video come before
         assert np.abs(image - frame).mean() < 2
     assert len(list((tmp_path / "VideoUnmask_ep0").iterdir())) == 3
-    assert record.extra["subgoals"] == {
+    assert record.subgoals == {
         "chunks": 3,
         "judged": 3,
         "right": 2,
@@ -129,19 +129,17 @@ def test_what_the_environment_does_not_name_is_not_judged() -> None:
 
 def test_results_tell_right_subgoals_and_distances_by_task() -> None:
     def record(task: str, right: int, problems: dict | None = None) -> EpisodeRecord:
-        extra = {
-            "subgoals": {
-                "chunks": 4,
-                "judged": 4,
-                "right": right,
-                "points": right,
-                "distance": 3.0 * right,
-                "asked": 4,
-                "problems": problems or {},
-            }
+        score = {
+            "chunks": 4,
+            "judged": 4,
+            "right": right,
+            "points": right,
+            "distance": 3.0 * right,
+            "asked": 4,
+            "problems": problems or {},
         }
         place = ("groundsg", 1, 7, task, 0, 1, "easy", "success", 9)
-        return EpisodeRecord(*place, subgoal="qwenvl", extra=extra)
+        return EpisodeRecord(*place, subgoal="qwenvl", subgoals=score)
 
     protocol = Protocol(("PickXtimes", "VideoUnmask"), 1)
     results = aggregate([record("PickXtimes", 4), record("VideoUnmask", 1, {"empty": 2})], protocol)
@@ -154,7 +152,7 @@ def test_results_tell_right_subgoals_and_distances_by_task() -> None:
     assert [row[-1] for row in table.rows] == ["0", "2 empty", "2 empty"]
     assert "subgoals beside the environment" in html_report(results, [], "t")
     broken = EpisodeRecord(
-        "groundsg", 1, 7, "PickXtimes", 0, 1, "easy", "success", 9, extra={"subgoals": {"right": 1}}
+        "groundsg", 1, 7, "PickXtimes", 0, 1, "easy", "success", 9, subgoals={"right": 1}
     )
     with pytest.raises(UserError, match="not a score"):
         total_score([broken])
@@ -265,7 +263,7 @@ def test_a_rollout_with_a_predictor_in_the_background_ends_like_any_other(tmp_pa
     jobs = [Job("PickXtimes", "test", episode) for episode in range(3)]
     records = roll(quick_policy("groundsg"), jobs, InlineEnvs(2), oracle, subgoal_folder=tmp_path)
     assert [record.outcome for record in records] == ["timeout"] * 3
-    assert {record.extra["subgoals"]["chunks"] for record in records} == {3}
+    assert {record.subgoals["chunks"] for record in records} == {3}
     with pytest.raises(UserError, match="subgoal_mode='behind'"):
         choose_subgoals(quick_policy("groundsg"), {"name": "oracle"}, "behind")
 
@@ -326,7 +324,7 @@ def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(
             line["oracle"] for line in entries
         )
         assert Image.open(tmp_path / "subgoals" / entries[0]["image"]).size == (256, 256)
-        assert (tmp_path / "videos" / record.extra["video"]).stat().st_size > 1000
+        assert (tmp_path / "videos" / record.video).stat().st_size > 1000
     if words[0] == "subgoal=oracle":
         assert score.accuracy == 100
         pick = next(line for line in lines(tmp_path / "subgoals" / "PickXtimes_ep0.jsonl"))

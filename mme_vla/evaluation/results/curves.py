@@ -213,7 +213,6 @@ def distinct_parts(runs: Sequence[str]) -> list[str]:
     return [", ".join(part for part in parts if part not in shared) for parts in names]
 
 
-EXTRA = "process"  # Where a record keeps it
 CAPTION = (
     "Progress: sub-tasks done, of those there are. Then how many episodes ended by a wrong choice"
     " that is a mistake of memory (which one, where, how many, in what order, how), by another"
@@ -223,14 +222,13 @@ CAPTION = (
 
 def process_of(record: EpisodeRecord) -> ProcessScore | None:
     """The score in a record; None for episodes whose environment reports none."""
-    value = record.extra.get(EXTRA)
-    return None if value is None else ProcessScore.from_dict(value)
+    return None if record.process is None else ProcessScore.from_dict(record.process)
 
 
 def process_tables(results: Results) -> list[Table]:
     """Where the chains broke, a table of every method that has scores, over all its runs."""
     columns = ["", "episodes", "progress (%)", "success", *OPERATIONS, MOTION, "stuck"]
-    return task_tables(results, EXTRA, "where the chain broke", columns, _row)
+    return task_tables(results, "process", "where the chain broke", columns, _row)
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:

@@ -18,9 +18,9 @@ from mme_vla.evaluation.results.compare import show_p
 from mme_vla.evaluation.results.curves import Curves, Place, curves_of
 from mme_vla.evaluation.results.statistics import sign_test
 from mme_vla.evaluation.results.tables import Table
-from mme_vla.evaluation.rollout.events import split_words
+from mme_vla.memory.perturbation import split_word
 from mme_vla.policy.training_identity import TrainingIdentity
-from mme_vla.registry import EVENTS
+from mme_vla.registry import PERTURBATIONS
 
 Pair = tuple[EpisodeRecord, EpisodeRecord]
 """An episode's record under an event, and the plain one."""
@@ -70,7 +70,7 @@ def did_not_act(record: EpisodeRecord) -> list[str]:
     """The events of a record whose place never came: a sub-task that did not begin, a step beyond
     the end.
     """
-    return [entry["event"] for entry in record.extra.get("events", ()) if entry["step"] is None]
+    return [entry["event"] for entry in record.events if entry["step"] is None]
 
 
 def idle_events(records: Sequence[EpisodeRecord]) -> list[str]:
@@ -167,9 +167,13 @@ def event_curves(
 
 
 def _place(record: EpisodeRecord) -> Place | None:
-    words = None if record.event is None else split_words(record.event)
-    if words is None or words.value is None:
+    word = None if record.event is None else split_word(record.event)
+    if word is None or word.value is None:
         return None
-    neutral = EVENTS[words.name].neutral if words.name in EVENTS else 0
-    dial = words.name if words.unit is None else f"{words.name}@{words.unit}:{words.number}"
-    return Place(record.run._replace(event=None), dial, words.value, neutral)
+    neutral = 0.0
+    if word.name in PERTURBATIONS:
+        neutral = PERTURBATIONS[word.name].neutral
+    dial = word.name
+    if word.unit is not None:
+        dial += f"@{word.unit}:{word.number}"
+    return Place(record.run._replace(event=None), dial, word.value, neutral)

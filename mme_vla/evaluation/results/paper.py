@@ -205,9 +205,7 @@ def demo_records(
                         ended = ("success" if won else "timeout", steps)
                         time = Seconds(0.02 * steps, 0.01 * steps, 0.03 * steps)
                         records.append(
-                            EpisodeRecord(
-                                *place, *ended, time, subgoal=subgoal, extra={"made_up": True}
-                            )
+                            EpisodeRecord(*place, *ended, time, subgoal=subgoal, made_up=True)
                         )
     return records
 

@@ -152,11 +152,7 @@ class Protocol:
 
 def suites_of(records: Iterable[EpisodeRecord]) -> dict[str, str]:
     """Task → suite, as the records of other environments than RoboMME name it."""
-    return {
-        r.task: str(r.extra["suite"])
-        for r in records
-        if r.extra.get("suite") and r.task not in TASK_FACTS
-    }
+    return {r.task: r.suite for r in records if r.suite and r.task not in TASK_FACTS}
 
 
 def tasks_of(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:

@@ -34,18 +34,18 @@ class Table:
 
 def task_tables(
     results: Results,
-    key: str,
+    name: str,
     title: str,
     columns: Sequence[str],
     row: Callable[[str, Sequence[EpisodeRecord]], list[str]],
 ) -> list[Table]:
-    """A table of every method whose records have `extra[key]`: a row for each task that has any,
-    and one for all.
+    """A table of every method whose records have a score in the field `name`: a row for each task
+    that has any, and one for all.
     """
     tables = []
     for method in results.methods:
-        has_extra = [key in record.extra for record in method.table["record"]]
-        table = method.table[has_extra]
+        has_score = [getattr(record, name) is not None for record in method.table["record"]]
+        table = method.table[has_score]
         if table.empty:
             continue
         by_task = table.groupby("task")["record"]

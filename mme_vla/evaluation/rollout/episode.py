@@ -14,8 +14,9 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds
 from mme_vla.evaluation.rollout.environment import Observation
-from mme_vla.evaluation.rollout.events import Event, EventCourse, PlacedEvent
+from mme_vla.evaluation.rollout.events import Event, EventCourse
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
+from mme_vla.memory.perturbation import Perturbation
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import Subgoal, SubgoalPredictor
 
@@ -48,7 +49,7 @@ class RunningEpisode:
         subgoals: SubgoalPredictor | None = None,
         piece: int = 32,
         trace: SubgoalTrace | None = None,
-        events: Sequence[PlacedEvent] = (),
+        events: Sequence[Event] = (),
     ) -> None:
         self._policy, self._subgoals, self._piece = policy, subgoals, piece
         self.job, self.trace = job, trace
@@ -127,7 +128,7 @@ class RunningEpisode:
         self._observed(frames, length)
         self._expect(frames, np.zeros(n_frames, bool), self._sent[:executed])
 
-    def next_event(self) -> Event | None:
+    def next_event(self) -> Perturbation | None:
         """Let the events take place that are due; the one that holds the robot before the policy
         acts, if there is.
         """

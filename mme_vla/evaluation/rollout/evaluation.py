@@ -132,7 +132,7 @@ def evaluate_events(
     """
     for event in events:
         for placed in read_events(event):
-            placed.event.check(policy)
+            placed.perturbation.check(policy)
     matched = evaluate(policy, jobs, output, facts, settings, **how)
     if not events:
         return matched

@@ -40,9 +40,9 @@ class RenderPlan:
         self._grounded = subgoals is not None and subgoals.kind == "grounded"
         self._sees_video = subgoals is not None and subgoals.sees_video
         self._sees_passing = subgoals is not None and subgoals.sees_passing
-        events = [placed.event for placed in read_events(settings.event)]
-        self._hold_steps = sum(event.hold for event in events)
-        self._resampled = any(not event.placed for event in events)
+        events = read_events(settings.event)
+        self._hold_steps = sum(event.perturbation.hold for event in events)
+        self._resampled = any(event.resamples_video for event in events)
         memory = policy.memory
         every = memory is not None and memory.past_view_spec is not None
         self._cameras = self._robot.camera_names if every else (self._robot.memory_camera,)

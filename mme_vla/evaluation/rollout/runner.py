@@ -20,7 +20,7 @@ from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.messages import Command
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError
-from mme_vla.evaluation.records import EpisodeRecord, RolloutDetails
+from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.progress import RolloutProgress
@@ -345,19 +345,6 @@ class Rollout:
         source = environment(self.settings.env)
         spec = source.episode(job.task, job.split, job.episode)
         failed = ending.outcome == "error"
-        details = RolloutDetails(
-            env=self.settings.env,
-            goal=running.episode.goal,
-            chunks=running.chunks,
-            video_frames=running.video_frames,
-            actions_sha256=running.actions_sha256,
-            suite=source.suite_of(job.task),
-            refused=None if failed else ending.error,
-            video=running.video,
-            process=running.process,
-            events=running.events.log,
-            subgoals=None if running.trace is None else running.trace.score.to_dict(),
-        )
         return EpisodeRecord(
             **vars(self.facts),
             action_space=robot.action.answers or robot.name,
@@ -370,5 +357,15 @@ class Rollout:
             steps=running.steps,
             seconds=running.seconds,
             error=ending.error if failed else None,
-            extra=details.to_dict(),
+            env=self.settings.env,
+            goal=running.episode.goal,
+            chunks=running.chunks,
+            video_frames=running.video_frames,
+            actions_sha256=running.actions_sha256,
+            suite=source.suite_of(job.task),
+            refused=None if failed else ending.error,
+            video=running.video,
+            process=running.process,
+            events=tuple(running.events.log),
+            subgoals=None if running.trace is None else running.trace.score.to_dict(),
         )

@@ -27,8 +27,8 @@ class RolloutSettings:
     without it. timeout_s: seconds after which an environment that does not respond is replaced.
     draw: `needed`: images that the policy and its subgoals read; `all`: of every frame. Outcomes
     are the same. subgoal_log: whether every predicted subgoal is logged with its image.
-    event: what happens in every episode (`rollout.events`), such as `pause:100@subtask:2`; None for
-    nothing.
+    event: what happens in every episode (`rollout/events.py`), such as `pause:100@subtask:2`; None
+    for nothing.
     """
 
     seed: NonNegativeInt = 42
@@ -53,7 +53,7 @@ class RolloutSettings:
     def __post_init__(self) -> None:
         source = environment(self.env)
         source.check_split(self.split)
-        if any(placed.event.hold for placed in read_events(self.event)):
+        if any(event.perturbation.hold for event in read_events(self.event)):
             source.check_hold()
         if not self.max_steps:
             object.__setattr__(self, "max_steps", source.step_limit(self.split))

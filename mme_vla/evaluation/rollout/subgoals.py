@@ -22,8 +22,6 @@ from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.oracle import online_subgoal
 from mme_vla.subgoal.text import mark_points
 
-EXTRA = "subgoals"  # Where a record keeps its score, in `EpisodeRecord.extra`
-
 
 @dataclass
 class SubgoalScore:
@@ -104,15 +102,12 @@ class SubgoalScore:
         try:
             return cls(**{**values, "problems": Counter(values["problems"])})
         except (TypeError, KeyError) as error:
-            raise UserError(
-                f"extra.{EXTRA} of a record is not a score of subgoals: {error}"
-            ) from None
+            raise UserError(f"subgoals of a record is not a score of subgoals: {error}") from None
 
 
 def score_of(record: EpisodeRecord) -> SubgoalScore | None:
     """The score of a record's subgoals; None for an episode without a predictor."""
-    values = record.extra.get(EXTRA)
-    return None if values is None else SubgoalScore.from_dict(values)
+    return None if record.subgoals is None else SubgoalScore.from_dict(record.subgoals)
 
 
 def total_score(records: Iterable[EpisodeRecord]) -> SubgoalScore | None:
@@ -152,7 +147,7 @@ def subgoal_tables(results: Results) -> list[Table]:
         "asked",
         "unusable answers",
     ]
-    return task_tables(results, EXTRA, "subgoals beside the environment's own", columns, _row)
+    return task_tables(results, "subgoals", "subgoals beside the environment's own", columns, _row)
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:

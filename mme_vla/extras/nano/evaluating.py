@@ -143,9 +143,7 @@ def play_episode(job: Play) -> EpisodeRecord:
     finally:
         session.close()
     outcome = "fail" if record.outcome == "error" else record.outcome
-    return replace(
-        record, outcome=outcome, error=None, extra={"refused": record.error} if record.error else {}
-    )
+    return replace(record, outcome=outcome, error=None, extra={}, refused=record.error)
 
 
 def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
@@ -169,12 +167,12 @@ def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
     finally:
         env.close()
     extra: dict[str, Any] = {"status": status, "demonstrated": motions is not None}
-    if reason:
-        extra["refused"] = str(reason)  # as a policy's record says why a motion was not carried out
+    refused = str(reason) if reason else None  # why a motion was not carried out
     return EpisodeRecord(
         PLANNER, "none", 0, spec.task, spec.episode, spec.seed, spec.difficulty,
         status if status in ("success", "fail", "timeout") else "fail", steps, split=spec.split,
         max_steps=max_steps, action_space="waypoint", extra=extra, scene=scene,
+        refused=refused,
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.extras.nano.learning import Decisions, choice_errors, position_error, statistics
 from mme_vla.extras.nano.rows import CONFIG, TRAINED
 from mme_vla.extras.nano.tokens import FrameTokens, TokenStore
-from mme_vla.memory.transforms import build_transforms
+from mme_vla.memory.perturbation import build_transforms
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning, copy_tower
 from mme_vla.policy.mme import MMEPolicy, mme_of

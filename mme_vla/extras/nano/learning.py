@@ -25,7 +25,8 @@ from mme_vla.extras.nano.tokens import FrameTokens, tokenize
 from mme_vla.extras.nano.tower import reflect, reflect_points
 from mme_vla.memory.base import Memory, stack_history
 from mme_vla.memory.history import CachedHistory, History
-from mme_vla.memory.transforms import HistoryTransform, TransformedHistory, map_frames
+from mme_vla.memory.perturbation import Perturbation
+from mme_vla.memory.transforms import TransformedHistory, map_frames
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats
@@ -58,7 +59,7 @@ class Replay:
 
     memory: Memory
     rows: Sequence[tuple[History, int, FrameLabels]]
-    transforms: Sequence[HistoryTransform]
+    transforms: Sequence[Perturbation]
     seed: int
 
     def select(self, rows: Sequence[int], epoch: int) -> HistoryTokens:
@@ -201,7 +202,7 @@ class Decisions(Dataset[int]):
         policy: MMEPolicy,
         demonstrations: Iterable[tuple[Demonstration, FrameTokens]] | Iterable[Demonstration],
         min_distance: float = MIN_DISTANCE,
-        transforms: Sequence[HistoryTransform] = (),
+        transforms: Sequence[Perturbation] = (),
         seed: int = 0,
         reflect_p: float = 0.0,
         sides: Sequence[str] = (),

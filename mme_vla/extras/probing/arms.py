@@ -1,23 +1,27 @@
-"""Arms of a probe: interventions alone or together (`drop:2`, `nodemo+shuffle`)."""
+"""Arms of a probe: perturbations alone or together (`drop:2`, `nodemo+shuffle`)."""
 
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
 import numpy as np
 
-from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, brief, require
 from mme_vla.extras.probing.channels import Channel, Remembered
 from mme_vla.extras.probing.feed import Feed
-from mme_vla.extras.probing.interventions import NEEDS, Intervention, Moment, Transform
-from mme_vla.memory.transforms import build_transform
+from mme_vla.extras.probing.interventions import NEEDS, Moment, perturb_store
+from mme_vla.memory.perturbation import (
+    PROBE,
+    Pause,
+    Perturbation,
+    build_perturbation,
+    build_word,
+    overrides,
+    split_word,
+)
 from mme_vla.policy.base import Policy
-from mme_vla.registry import HISTORY_TRANSFORMS, INTERVENTIONS
 
-_NUMBER = re.compile(r"\d+(\.\d+)?")
 DEFAULT_ARMS = (
     "drop:all",
     "nodemo",
@@ -40,19 +44,27 @@ DEFAULT_ARMS = (
 
 @dataclass(frozen=True)
 class Arm:
-    """Interventions that act together, in this order, under one name."""
+    """Perturbations that act together, in this order, under one name."""
 
     name: str
-    parts: tuple[Intervention, ...] = ()
+    parts: tuple[Perturbation, ...] = ()
 
     @property
     def feed(self) -> Feed:
         """What the policy observes."""
-        return reduce(lambda feed, part: part.feed(feed), self.parts, Feed())
+        return Feed.of(self.parts)
 
     @property
     def needs(self) -> frozenset[str]:
-        return frozenset().union(*(part.needs for part in self.parts))
+        """What a probe must have for them, of `NEEDS`."""
+        needs: set[str] = set()
+        for part in self.parts:
+            needs |= part.needs
+            if overrides(type(part), "perturb"):
+                needs.add("entries")
+            elif overrides(type(part), "repeats"):
+                needs.add("pauses")
+        return frozenset(needs)
 
     @property
     def edits(self) -> bool:
@@ -60,34 +72,37 @@ class Arm:
         return "entries" in self.needs
 
     def only(self, moment: Moment) -> np.ndarray | None:
-        """The frames that may be remembered; of several such interventions those that all of them
+        """The frames that may be remembered; of several such perturbations those that all of them
         allow.
         """
-        allowed = [frames for part in self.parts if (frames := part.only(moment)) is not None]
-        if not allowed:
-            return None
-        both: np.ndarray = reduce(np.intersect1d, allowed)
+        allowed: np.ndarray | None = None
+        for part in self.parts:
+            frames = part.only(moment)
+            if frames is not None:
+                allowed = frames if allowed is None else np.intersect1d(allowed, frames)
         require(
-            len(both), f"{self.name} leaves no frame to remember: its parts allow different ones."
+            allowed is None or len(allowed),
+            f"{self.name} leaves no frame to remember: its parts allow different ones.",
         )
-        return both
+        return allowed
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         """What is remembered instead."""
-        return reduce(lambda edited, part: part.edit(edited, moment), self.parts, store)
+        for part in self.parts:
+            store = part.edit(store, moment)
+            if overrides(type(part), "perturb"):
+                store = perturb_store(store, part, moment.rng)
+        return store
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         """The subgoal that the policy reads instead."""
-        return reduce(
-            lambda subgoal_text, part: part.say(subgoal_text, moment), self.parts, subgoal
-        )
+        return reduce(lambda text, part: part.say(text, moment), self.parts, subgoal)
 
     def dial(self) -> float | None:
-        """Where the arm stands on its dial, if it is one intervention with a number for one."""
+        """Where the arm stands on its dial, if it is one perturbation with a number for one."""
         if len(self.parts) != 1 or self.parts[0].dial is None:
             return None
-        part = self.parts[0]
-        value = getattr(part.transform if isinstance(part, Transform) else part, self.parts[0].dial)
+        value = getattr(self.parts[0], self.parts[0].dial)
         return float(value) if isinstance(value, int | float) else None
 
 
@@ -95,52 +110,27 @@ UNPROBED = Arm("unprobed")
 
 
 def read_arm(spec: Any) -> Arm:
-    """An arm from a word such as `drop:2` or `nodemo+shuffle`, or from
+    """An arm from words such as `drop:2` or `nodemo+shuffle`, or from
     `{name: drop, count: 2, which: oldest}`.
     """
-    if isinstance(spec, Mapping):
+    if isinstance(spec, Mapping) and "name" in spec:
+        name = str(spec["name"])
         options = ",".join(f"{key}={value}" for key, value in spec.items() if key != "name")
-        return Arm(
-            f"{spec.get('name')}({options})" if options else str(spec.get("name")), (_build(spec),)
-        )
+        if options:
+            name += f"({options})"
+        return Arm(name, (build_perturbation(spec, PROBE, "with"),))
     if not isinstance(spec, str) or not spec:
         raise UserError(
             f"with={brief(spec)}: write words such as drop:2 or nodemo+shuffle, or {{name: drop,"
             " …}."
         )
-    return Arm(spec, tuple(_read_part(word) for word in spec.split("+")))
-
-
-def _read_part(word: str) -> Intervention:
-    name, _, value = word.partition(":")
-    dial = _kind(name).dial
-    if not value:
-        return _build({"name": name})
-    if name in HISTORY_TRANSFORMS and dial is not None and _NUMBER.fullmatch(value):
-        return _build({"name": name, dial: float(value) if "." in value else int(value)})
-    if dial is None or (value != "all" and not value.removeprefix("-").isdecimal()):
-        allowed = (
-            f"{name}:<{dial}>, a whole number, or all where it counts"
-            if dial
-            else f"{name}, which has no dial"
-        )
-        raise UserError(f"{word!r}: write {allowed}.")
-    return _build({"name": name, dial: None if value == "all" else int(value)})
-
-
-def _kind(name: Any) -> Any:
-    """The class of an intervention, or of a history transform, which a probe applies as well."""
-    return (HISTORY_TRANSFORMS if name in HISTORY_TRANSFORMS else INTERVENTIONS)[name]
-
-
-def _build(section: Mapping[str, Any]) -> Intervention:
-    entry: Any = _kind(section.get("name"))
-    if section.get("name") in HISTORY_TRANSFORMS:
-        return Transform(build_transform(dict(section)))
-    options = {key: value for key, value in section.items() if key != "name"}
-    if not is_dataclass(entry):
-        return INTERVENTIONS.build(section)
-    return read_section(entry, options, section["name"])  # type: ignore[arg-type, return-value]
+    parts = []
+    for text in spec.split("+"):
+        word = split_word(text)
+        if word is None or word.unit is not None:
+            raise UserError(f"with={text}: write a name, as drop, or a name and a number, drop:2.")
+        parts.append(build_word(word, PROBE, f"with={text}"))
+    return Arm(spec, tuple(parts))
 
 
 def read_arms(specs: Any) -> list[Arm]:
@@ -173,8 +163,9 @@ def lacking(
     for need in sorted(arm.needs):
         if not there.get(need, False):
             return NEEDS.get(need, need)
-    if arm.feed.sessions > recordings:
-        return f"{arm.feed.sessions} recorded episodes to take from, and there are {recordings}"
+    n_sessions = arm.feed.n_sessions
+    if n_sessions > recordings:
+        return f"{n_sessions} recorded episodes to take from, and there are {recordings}"
     return None
 
 
@@ -201,8 +192,13 @@ def choose_arms(
 
 def options_of(arm: Arm) -> list[dict[str, Any]]:
     """The options of an arm's parts, as plain values."""
-    parts = [part.transform if isinstance(part, Transform) else part for part in arm.parts]
-    return [{"intervention": type(part).__name__, **vars(part)} for part in parts]
+    options = []
+    for part in arm.parts:
+        values = {"intervention": type(part).__name__, **vars(part)}
+        if isinstance(part, Pause):  # as earlier versions named it, so that their probes continue
+            values = {"intervention": "Pause", "frames": part.frames, "at": part.at or 0}
+        options.append(values)
+    return options
 
 
 def slug(name: str) -> str:

@@ -1,5 +1,5 @@
-"""The report card of a checkpoint: is its memory more than a clock, and how does it recover from a
-wrong one?
+"""The report card of a checkpoint: measures how far a memory is used as a clock, and how a policy
+recovers from a wrong one.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,7 +16,7 @@ from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.results.statistics import resampled_means
+from mme_vla.evaluation.results.statistics import percentiles, resampled_means
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.rollout.evaluation import evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -47,7 +47,7 @@ of 0.
 """
 AGAIN, PAGE, FIGURES = "again", "card.html", "card.json"
 MARK = "Report card of"  # stands in the heading of each page
-_SAMPLES, _TAILS = 10_000, (0.025, 0.975)
+_SAMPLES = 10_000  # of the bootstrap
 _HOW = (
     (
         "Every arm runs the scenes of the matched run with its noise. A loss is the matched success"
@@ -164,45 +164,43 @@ def run_card(
     """
     for name, mark in ((PAGE, MARK), (FIGURES, "memory_or_clock")):
         require_earlier(folder / name, mark)
-    channel, in_simulation = channel_of(policy), base is make_env and settings.env == "mme_vla"
+    channel = channel_of(policy)
+    in_simulation = base is make_env and settings.env == "mme_vla"
     arms = {label: read_arm(word) for label, word in ARMS.items()}
-    reasons = {label: lacking(arm, policy, channel, len(plan.lend), boundaries=in_simulation)
-               for label, arm in arms.items()}  # fmt: skip
-    notes = [
-        f"{label} ({ARMS[label]}) was left out: it needs {why}."
-        for label, why in reasons.items()
-        if why
-    ]
+    possible, notes = [], []
+    for label, arm in arms.items():
+        why = lacking(arm, policy, channel, len(plan.lend), boundaries=in_simulation)
+        if why is None:
+            possible.append(label)
+        else:
+            notes.append(f"{label} ({ARMS[label]}) was left out: it needs {why}.")
     others = {name: _reference(name, place, plan) for name, place in (references or {}).items()}
-    possible = [label for label, why in reasons.items() if why is None]
+
+    # In closed loop: every arm, then the matched run again with other noise.
     how: dict[str, Any] = {"subgoals": subgoals, "base": base, "show_progress": show_progress}
     plan = replace(plan, arms=[ARMS[label] for label in possible], events=())
     run_probe(policy, replace(plan, recordings=()), folder, facts, settings, **how)
     again = replace(settings, seed=settings.seed + 1)
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
-    evaluate(
-        policy,
-        plan.jobs,
-        folder / AGAIN,
-        renamed,
-        again,
-        shard=plan.shard,
-        source=plan.source,
-        **how,
-    )
+    how |= {"shard": plan.shard, "source": plan.source}
+    evaluate(policy, plan.jobs, folder / AGAIN, renamed, again, **how)
+
+    # On recorded episodes: how long a wrong scene has an effect.
     recovered = None
     if plan.recordings and len(plan.lend) > 1 and WRONG_SCENE in possible:
         offline = replace(plan.offline, moments=None, scan=False)
         wrong = replace(plan, arms=[ARMS[WRONG_SCENE]], jobs=(), offline=offline)
         run_probe(policy, wrong, folder, facts, settings, show_progress=show_progress)
         recovered = recovery(Findings.of(lines.read_all(folder / OFFLINE)).moments)
-    writing = _writing(policy, plan) if in_simulation and channel.chooses else None
+    writing = None
+    if in_simulation and channel.chooses:
+        writing = _writing(policy, plan)
     if isinstance(writing, str):
         notes.append(writing)
-    unprobed, equal = (
-        _scenes(folder / ONLINE / slug(UNPROBED.name), plan),
-        _scenes(folder / AGAIN, plan),
-    )
+
+    # The scenes that are the same in every run.
+    unprobed = _scenes(folder / ONLINE / slug(UNPROBED.name), plan)
+    equal = _scenes(folder / AGAIN, plan)
     probed = {label: _scenes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
     same = pair([unprobed, equal, *probed.values()])
     notes += same.gaps("The arms")
@@ -249,23 +247,22 @@ def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> C
         " them again.",
     )
     noise = _mean({key: abs(matched[key] - again[key]) for key in keys})
-    table = {
-        label: {key: matched[key] - outcomes[key] for key in keys}
-        for label, outcomes in arms.items()
-    }
+    table = {}
+    for label, outcomes in arms.items():
+        table[label] = {key: matched[key] - outcomes[key] for key in keys}
     sampled = dict(zip(table, _bootstrap(list(table.values())), strict=True))
     losses = {}
     for label, differences in table.items():
-        loss, (low, high) = _mean(differences), np.quantile(sampled[label], _TAILS)
+        loss, interval = _mean(differences), percentiles(sampled[label])
         signs = np.sign(list(differences.values()))
         losses[label] = Loss(
-            _mean({key: arms[label][key] for key in keys}),
-            loss,
-            float(low),
-            float(high),
-            int((signs > 0).sum()),
-            int((signs < 0).sum()),
-            bool(low > 0 and loss > noise),
+            success=_mean({key: arms[label][key] for key in keys}),
+            loss=loss,
+            low=interval.low,
+            high=interval.high,
+            lost=int((signs > 0).sum()),
+            gained=int((signs < 0).sum()),
+            beyond_noise=interval.low > 0 and loss > noise,
         )
     score = clock_score(losses, sampled)
     return Card("", "", len(keys), _mean({key: matched[key] for key in keys}), noise, losses, score)
@@ -285,9 +282,9 @@ def clock_score(losses: Mapping[str, Loss], sampled: Mapping[str, np.ndarray]) -
         known = time + content > 0
         return time[known] / (time + content)[known]
 
-    low, high = np.quantile(share(sampled[TIME], sampled[CONTENT]), _TAILS)
+    interval = percentiles(share(sampled[TIME], sampled[CONTENT]))
     score = share(np.array([losses[TIME].loss]), np.array([losses[CONTENT].loss]))
-    return ClockScore(float(score[0]), float(low), float(high))
+    return ClockScore(float(score[0]), interval.low, interval.high)
 
 
 def clock_scores(
@@ -309,14 +306,12 @@ def clock_scores(
     suites = {suite: protocol.choose("suite", suite) for suite in protocol.suites}
     if len(suites) < 2:
         return {}
-    return {
-        suite: grade(
-            select(matched, tasks),
-            {label: select(arm, tasks) for label, arm in arms.items()},
-            select(again, tasks),
-        ).memory_or_clock
-        for suite, tasks in suites.items()
-    }
+    scores = {}
+    for suite, tasks in suites.items():
+        arms_of_suite = {label: select(arm, tasks) for label, arm in arms.items()}
+        card = grade(select(matched, tasks), arms_of_suite, select(again, tasks))
+        scores[suite] = card.memory_or_clock
+    return scores
 
 
 def recovery(moments: Sequence[MomentLine]) -> Recovery | None:
@@ -328,15 +323,16 @@ def recovery(moments: Sequence[MomentLine]) -> Recovery | None:
         misled.setdefault(line.recording, []).append(line.change > max(line.spread, NEGLIGIBLE))
     if not misled:
         return None
-    last = [max(np.flatnonzero(flags), default=-1) for flags in misled.values()]
-    lengths = [len(flags) for flags in misled.values()]
-    after = [i + 1 if i + 1 < n else np.inf for i, n in zip(last, lengths, strict=True)]
+    after = []  # decisions until a recording has recovered
+    for flags in misled.values():
+        recovered_at = 1 + max(np.flatnonzero(flags), default=-1)
+        after.append(recovered_at if recovered_at < len(flags) else np.inf)
     median = float(np.median(after))
     return Recovery(
-        median if np.isfinite(median) else None,
-        int(np.isfinite(after).sum()),
-        len(after),
-        float(np.mean(lengths)),
+        median=median if np.isfinite(median) else None,
+        recovered=int(np.isfinite(after).sum()),
+        recordings=len(after),
+        decisions=float(np.mean([len(flags) for flags in misled.values()])),
     )
 
 
@@ -384,11 +380,7 @@ def _reference(name: str, place: str, plan: ProbePlan) -> Scenes:
 
 def _mean(values: Outcomes) -> float:
     """Mean over tasks of the means over their scenes."""
-    tasks = dict.fromkeys(key.task for key in values)
-    means = [
-        np.mean([value for key, value in values.items() if key.task == task]) for task in tasks
-    ]
-    return float(np.mean(means))
+    return float(np.mean([of_task.mean() for of_task in _by_task(values).values()]))
 
 
 def _by_task(values: Outcomes) -> dict[str, np.ndarray]:
@@ -415,19 +407,18 @@ def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any] | str:
     memory, env = policy.require_memory(), environment("mme_vla")
     try:
         frames = required_frames(memory)
-        specs = (env.episode(job.task, job.split, job.episode) for job in plan.jobs)
-        episodes = [
-            episode for spec in specs if (episode := record_evidence(spec, frames)) is not None
-        ]
+        episodes = []
+        for job in plan.jobs:
+            episode = record_evidence(env.episode(job.task, job.split, job.episode), frames)
+            if episode is not None:
+                episodes.append(episode)
         encoder = policy if isinstance(policy, MMEPolicy) else None
         scores: dict[str, Any] = score_writing(memory, episodes, encoder).to_dict()
     except UserError as error:
         return f"No score of writing: {error}"
-    return (
-        scores
-        if scores["tasks"]
-        else "No score of writing: no scene has a fact that a frame shows."
-    )
+    if not scores["tasks"]:
+        return "No score of writing: no scene has a fact that a frame shows."
+    return scores
 
 
 def tables_of(card: Card) -> list[Table]:

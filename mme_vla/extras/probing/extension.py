@@ -5,7 +5,25 @@ from pathlib import Path
 from mme_vla.registry import Command, Extension
 
 EXTENSION = Extension(
-    parts={"split_policy": {"sessions": "mme_vla.extras.probing.feed"}},
+    parts={
+        "split_policy": {"sessions": "mme_vla.extras.probing.probed"},
+        "perturbation": dict.fromkeys(
+            (
+                "shuffle",
+                "drop",
+                "swap",
+                "delay",
+                "recent",
+                "oracle",
+                "distract",
+                "nodemo",
+                "subgoal_swap",
+                "subgoal_delay",
+                "subgoal_count",
+            ),
+            "mme_vla.extras.probing.interventions",
+        ),
+    },
     commands={
         "analyse": Command(
             "mme_vla.extras.probing.cli.analyse",

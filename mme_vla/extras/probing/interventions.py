@@ -1,11 +1,10 @@
-"""What a probe changes in a policy's frames, memory or subgoal: each a small class with a dial.
+"""The perturbations of what a policy remembers, of its subgoal, and of which episodes it is shown.
 
-One of your own is a class registered with `register("intervention", name)` in a module that
-`plugins` names.
+Each is a small class with a dial; the base class and the others are in `memory/perturbation.py`.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
@@ -15,10 +14,9 @@ from torch import Tensor
 from mme_vla.config.sections import NonNegativeInt, PositiveInt
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.channels import Remembered, same_progress
-from mme_vla.extras.probing.feed import Feed
 from mme_vla.memory.history import History
-from mme_vla.memory.transforms import HistoryTransform, RepeatFrame
-from mme_vla.registry import INTERVENTIONS
+from mme_vla.memory.perturbation import Perturbation
+from mme_vla.registry import PERTURBATIONS
 
 NEEDS = {
     "entries": "something remembered that the probe can reach",
@@ -60,36 +58,9 @@ class Moment:
     weigh: Callable[[Remembered], np.ndarray] | None = None
 
 
-class Intervention:
-    """Changes nothing. A subclass overrides what it changes; a dataclass, so that its options are
-    its fields.
-
-    dial: the option that `name:value` sets. needs: of `NEEDS`, without which it is refused.
-    """
-
-    dial: ClassVar[str | None] = None
-    needs: ClassVar[frozenset[str]] = frozenset()
-
-    def feed(self, feed: Feed) -> Feed:
-        """What the policy observes."""
-        return feed
-
-    def only(self, moment: Moment) -> np.ndarray | None:
-        """The stored frames that may be remembered, ascending, at least one; None for all."""
-        return None
-
-    def edit(self, store: Remembered, moment: Moment) -> Remembered:
-        """What is remembered instead."""
-        return store
-
-    def say(self, subgoal: str | None, moment: Moment) -> str | None:
-        """The subgoal that the policy reads instead."""
-        return subgoal
-
-
-@INTERVENTIONS.register("shuffle")
+@PERTURBATIONS.register("shuffle")
 @dataclass(frozen=True)
-class Shuffle(Intervention):
+class Shuffle(Perturbation):
     """The contents of all entries change places; their times and slots stay where they are."""
 
     needs: ClassVar = frozenset({"entries"})
@@ -100,9 +71,9 @@ class Shuffle(Intervention):
         return store.rearranged(slots, [_content(store, int(slot)) for slot in order])
 
 
-@INTERVENTIONS.register("drop")
+@PERTURBATIONS.register("drop")
 @dataclass(frozen=True)
-class Drop(Intervention):
+class Drop(Perturbation):
     """Some entries are taken away; the others keep slot and time.
 
     count: how many; None takes all. which: the `oldest`, the `newest`, at `random`, or the most
@@ -116,13 +87,23 @@ class Drop(Intervention):
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         slots = store.occupied
-        most = len(slots) if self.count is None else min(self.count, len(slots))
-        return store.without(_ranked(store, self.which, moment)[:most])
+        if self.which == "oldest":
+            slots = sorted(slots, key=lambda slot: -store.age(slot))
+        elif self.which == "newest":
+            slots = sorted(slots, key=store.age)
+        elif self.which == "random":
+            slots = moment.rng.permutation(slots).tolist()
+        elif moment.weigh is None:
+            raise UserError("drop.which=used needs a policy to ask, and here is none.")
+        else:
+            weights = moment.weigh(store)
+            slots = sorted(slots, key=lambda slot: -weights[slot])
+        return store.without(slots[: self.count])
 
 
-@INTERVENTIONS.register("swap")
+@PERTURBATIONS.register("swap")
 @dataclass(frozen=True)
-class Swap(Intervention):
+class Swap(Perturbation):
     """Entries hold what an entry of another recorded episode holds that is as far along; times
     stay.
 
@@ -134,25 +115,21 @@ class Swap(Intervention):
     needs: ClassVar = frozenset({"entries", "recordings"})
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
-        occupied, donor = store.occupied, moment.donor(store.name)
+        occupied = store.occupied
+        donor = moment.donor(store.name)
         if not donor.occupied or not occupied:
             return store
         # Paired over all entries, so that a part of them is swapped as it would be among all.
-        their = dict(
-            zip(
-                occupied,
-                np.array(donor.occupied)[same_progress(occupied, len(donor.occupied))].tolist(),
-                strict=True,
-            )
-        )
-        count = len(occupied) if self.count is None else min(self.count, len(occupied))
-        slots = sorted(moment.rng.permutation(occupied)[:count].tolist())
-        return store.rearranged(slots, [_content(donor, their[slot]) for slot in slots])
+        pairs = same_progress(occupied, len(donor.occupied)).tolist()
+        slot_of_donor = {slot: donor.occupied[at] for slot, at in zip(occupied, pairs, strict=True)}
+        slots = sorted(moment.rng.permutation(occupied)[: self.count].tolist())
+        contents = [_content(donor, slot_of_donor[slot]) for slot in slots]
+        return store.rearranged(slots, contents)
 
 
-@INTERVENTIONS.register("delay")
+@PERTURBATIONS.register("delay")
 @dataclass(frozen=True)
-class Delay(Intervention):
+class Delay(Perturbation):
     """All entries seem to be from `frames` later, the current one too: a clock that runs ahead.
     Negative: behind.
 
@@ -164,15 +141,17 @@ class Delay(Intervention):
     needs: ClassVar = frozenset({"entries", "clock"})
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
-        shifted = [
-            None if e is None else replace(e, time=e.time + self.frames) for e in store.entries
-        ]
+        shifted = list(store.entries)
+        for slot in store.occupied:
+            entry = shifted[slot]
+            assert entry is not None
+            shifted[slot] = replace(entry, time=entry.time + self.frames)
         return replace(store, entries=tuple(shifted))
 
 
-@INTERVENTIONS.register("recent")
+@PERTURBATIONS.register("recent")
 @dataclass(frozen=True)
-class Recent(Intervention):
+class Recent(Perturbation):
     """The memory chooses among the last `frames` frames alone, at the times at which they were."""
 
     frames: PositiveInt = 64
@@ -184,9 +163,9 @@ class Recent(Intervention):
         return inside if len(inside) else moment.stored[-1:]
 
 
-@INTERVENTIONS.register("oracle")
+@PERTURBATIONS.register("oracle")
 @dataclass(frozen=True)
-class Oracle(Intervention):
+class Oracle(Perturbation):
     """The memory chooses among the frames at which a sub-task began, the last of the video and the
     newest.
     """
@@ -199,124 +178,68 @@ class Oracle(Intervention):
         return moment.stored[np.unique(np.append(np.maximum(at, 0), len(moment.stored) - 1))]
 
 
-@INTERVENTIONS.register("pause")
+@PERTURBATIONS.register("distract")
 @dataclass(frozen=True)
-class Pause(Intervention):
-    """One frame is repeated `frames` times more: `repeat_frame`. `at`: which, from the first
-    execution frame on.
-    """
-
-    frames: NonNegativeInt = 64
-    at: NonNegativeInt = 0
-    dial: ClassVar = "frames"
-    needs: ClassVar = frozenset({"pauses"})
-
-    def feed(self, feed: Feed) -> Feed:
-        return replace(feed, transforms=(*feed.transforms, RepeatFrame(self.frames, self.at)))
-
-
-@dataclass(frozen=True)
-class Transform(Intervention):
-    """A history transform (`mme_vla.memory.transforms`), as training applies it, on the frames of a
-    running episode.
-    """
-
-    transform: HistoryTransform
-
-    @property
-    def dial(self) -> str | None:  # type: ignore[override]
-        return self.transform.dial
-
-    @property
-    def needs(self) -> frozenset[str]:  # type: ignore[override]
-        changes = type(self.transform).perturb is not HistoryTransform.perturb
-        return frozenset({"entries"} if changes else {"pauses"})
-
-    def feed(self, feed: Feed) -> Feed:
-        return replace(feed, transforms=(*feed.transforms, self.transform))
-
-    def edit(self, store: Remembered, moment: Moment) -> Remembered:
-        if "entries" not in self.needs:
-            return store
-        slots = store.occupied
-        views: dict[int, _Perturbed] = {}
-        contents: list[Any] = []
-        for content in (_content(store, slot) for slot in slots):
-            if isinstance(content, Tensor):
-                rows = self.transform.perturb(content.reshape(-1, content.shape[-1]), moment.rng)
-                contents.append(rows.reshape(content.shape))
-            else:  # a frame of a history
-                view, frame = content
-                contents.append(
-                    (
-                        views.setdefault(id(view), _Perturbed(view, self.transform, moment.rng)),
-                        frame,
-                    )
-                )
-        return store.rearranged(slots, contents)
-
-
-class _Perturbed(History):
-    """A history whose tokens a transform perturbs as they are gathered."""
-
-    def __init__(
-        self, source: History, transform: HistoryTransform, rng: np.random.Generator
-    ) -> None:
-        super().__init__(source.spec, source.exec_start)
-        self._source, self._transform, self._rng = source, transform, rng
-
-    def __len__(self) -> int:
-        return len(self._source)
-
-    def gather(self, indices: np.ndarray) -> Tensor:
-        return self._transform.perturb(self._source.gather(indices), self._rng)
-
-
-@INTERVENTIONS.register("distract")
-@dataclass(frozen=True)
-class Distract(Intervention):
+class Distract(Perturbation):
     """So many unrelated recorded episodes are seen first, as if they were part of the video."""
 
     sessions: NonNegativeInt = 1
     dial: ClassVar = "sessions"
     needs: ClassVar = frozenset({"recordings"})
 
-    def feed(self, feed: Feed) -> Feed:
-        return replace(feed, sessions=feed.sessions + self.sessions)
+    @property
+    def n_sessions(self) -> int:
+        return self.sessions
 
 
-@INTERVENTIONS.register("nodemo")
+@PERTURBATIONS.register("nodemo")
 @dataclass(frozen=True)
-class NoDemo(Intervention):
+class NoDemo(Perturbation):
     """The conditioning video is not shown."""
 
-    def feed(self, feed: Feed) -> Feed:
-        return replace(feed, video=False)
+    shows_video: ClassVar = False
+
+
+class _Perturbed(History):
+    """A history whose tokens are perturbed as they are gathered."""
+
+    def __init__(
+        self, source: History, perturbation: Perturbation, rng: np.random.Generator
+    ) -> None:
+        super().__init__(source.spec, source.exec_start)
+        self._source, self._perturbation, self._rng = source, perturbation, rng
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        return self._perturbation.perturb(self._source.gather(indices), self._rng)
+
+
+def perturb_store(
+    store: Remembered, perturbation: Perturbation, rng: np.random.Generator
+) -> Remembered:
+    """The store with the contents of all entries perturbed (`Perturbation.perturb`)."""
+    slots = store.occupied
+    views: dict[int, _Perturbed] = {}
+    contents: list[Any] = []
+    for slot in slots:
+        content = _content(store, slot)
+        if isinstance(content, Tensor):
+            rows = perturbation.perturb(content.reshape(-1, content.shape[-1]), rng)
+            contents.append(rows.reshape(content.shape))
+        else:
+            view, frame = content  # a frame of a history
+            if id(view) not in views:
+                views[id(view)] = _Perturbed(view, perturbation, rng)
+            contents.append((views[id(view)], frame))
+    return store.rearranged(slots, contents)
 
 
 def _content(store: Remembered, slot: int) -> Any:
     entry = store.entries[slot]
     assert entry is not None
     return entry.content
-
-
-def _ranked(store: Remembered, which: str, moment: Moment) -> list[int]:
-    """Slots that hold something, those to be taken first at the beginning."""
-    slots = store.occupied
-
-    def used() -> list[int]:
-        if moment.weigh is None:
-            raise UserError("drop.which=used needs a policy to ask, and here is none.")
-        weights = moment.weigh(store)
-        return sorted(slots, key=lambda slot: -weights[slot])
-
-    orders: Mapping[str, Callable[[], list[int]]] = {
-        "oldest": lambda: sorted(slots, key=lambda slot: -store.age(slot)),
-        "newest": lambda: sorted(slots, key=store.age),
-        "random": lambda: moment.rng.permutation(slots).tolist(),
-        "used": used,
-    }
-    return orders[which]()
 
 
 _ORDINALS = (
@@ -336,9 +259,9 @@ _NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nin
 _COUNT = re.compile(rf"<[^>]*>|\b(?:{'|'.join((*_ORDINALS, *_NUMBERS))}|\d+)\b")
 
 
-@INTERVENTIONS.register("subgoal_swap")
+@PERTURBATIONS.register("subgoal_swap")
 @dataclass(frozen=True)
-class SubgoalSwap(Intervention):
+class SubgoalSwap(Perturbation):
     """The subgoal of another recorded episode that is as far along."""
 
     needs: ClassVar = frozenset({"subgoal", "recordings"})
@@ -347,9 +270,9 @@ class SubgoalSwap(Intervention):
         return subgoal if moment.donor_subgoal is None else moment.donor_subgoal
 
 
-@INTERVENTIONS.register("subgoal_delay")
+@PERTURBATIONS.register("subgoal_delay")
 @dataclass(frozen=True)
-class SubgoalDelay(Intervention):
+class SubgoalDelay(Perturbation):
     """The subgoal of `decisions` chunks ago; the first one until then."""
 
     decisions: PositiveInt = 2
@@ -357,16 +280,14 @@ class SubgoalDelay(Intervention):
     needs: ClassVar = frozenset({"subgoal"})
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
-        return (
-            moment.subgoals[max(len(moment.subgoals) - 1 - self.decisions, 0)]
-            if moment.subgoals
-            else subgoal
-        )
+        if not moment.subgoals:
+            return subgoal
+        return moment.subgoals[max(len(moment.subgoals) - 1 - self.decisions, 0)]
 
 
-@INTERVENTIONS.register("subgoal_count")
+@PERTURBATIONS.register("subgoal_count")
 @dataclass(frozen=True)
-class SubgoalCount(Intervention):
+class SubgoalCount(Perturbation):
     """Every count in the subgoal is wrong by `by`: `for the first time` becomes
     `for the second time`.
     """

@@ -43,13 +43,11 @@ class Change:
 
 def compare_chunks(before: Tensor, after: Tensor) -> Change:
     """Compare chunks [n, h, w] before and after an intervention, row by row of the same noise."""
-    first, second = (x.double().flatten(1).numpy() for x in (before, after))
-    across, within, inside = (
-        _distances(first, second),
-        _distances(first, first),
-        _distances(second, second),
-    )
-    energy = 2 * across.mean() - within.mean() - inside.mean()
+    first = before.double().flatten(1).numpy()
+    second = after.double().flatten(1).numpy()
+    across = _distances(first, second)
+    within = _distances(first, first)
+    energy = 2 * across.mean() - within.mean() - _distances(second, second).mean()
     return Change(float(np.diagonal(across).mean()), std_of(within), float(max(energy, 0.0)))
 
 
@@ -134,11 +132,11 @@ class _Moments:
 
     def _shared_noise(self) -> dict[int, list[Noise]]:
         generator = torch.Generator().manual_seed(self._seed)
-        count = self._settings.draws
-        return {
-            step: [self._policy.sampling_noise(generator) for _ in range(count)]
-            for step in self._steps
-        }
+        draws: dict[int, list[Noise]] = {step: [] for step in self._steps}
+        for noise_of_step in draws.values():
+            for _ in range(self._settings.draws):
+                noise_of_step.append(self._policy.sampling_noise(generator))
+        return draws
 
     def _watch(self, arms: list[ProbedPolicy]) -> list[Line]:
         """Run the episode once for arms with the same feed."""
@@ -152,9 +150,8 @@ class _Moments:
             recording.show(episode, n_observed, step + 1, required)
             n_observed = step + 1
             episode.boundaries = episode.numbers(np.array(sorted(self._boundaries), np.int64))
-            episode.subgoal = (
-                None if self._subgoal_kind is None else recording.subgoal(step, self._subgoal_kind)
-            )
+            if self._subgoal_kind is not None:
+                episode.subgoal = recording.subgoal(step, self._subgoal_kind)
             episode.subgoals.append(episode.subgoal)
             for probed in arms:
                 result += self._probe(probed, episode, step)
@@ -171,11 +168,11 @@ class _Moments:
         if arm is UNPROBED:
             self._baseline[step] = probed.ask(episode, snapshot, [edited], draws, steps)[0]
             return self._scan(probed, episode, snapshot, step) if self._settings.scan else []
-        change = compare_chunks(
-            self._baseline[step], probed.ask(episode, snapshot, [edited], draws, steps)[0]
-        )
-        stores = snapshot.stores
-        touched = [age for old, new in zip(stores, edited, strict=True) for age in old.changed(new)]
+        chunks = probed.ask(episode, snapshot, [edited], draws, steps)[0]
+        change = compare_chunks(self._baseline[step], chunks)
+        touched: list[int] = []
+        for old, new in zip(snapshot.stores, edited, strict=True):
+            touched += old.changed(new)
         return [
             MomentLine(
                 self._recording.name,
@@ -185,7 +182,7 @@ class _Moments:
                 self._recording.subgoal(step) or "",
                 arm.name,
                 arm.dial(),
-                sum(map(len, stores)),
+                sum(map(len, snapshot.stores)),
                 touched,
                 **asdict(change),
             )
@@ -195,14 +192,15 @@ class _Moments:
         self, probed: ProbedPolicy, episode: ProbedEpisode, snapshot: MemorySnapshot, step: int
     ) -> list[Line]:
         """The change that each entry's absence makes, one at a time."""
-        stores, places = snapshot.stores, []
+        stores = snapshot.stores
+        places = []
+        variants = []
         for i, store in enumerate(stores):
-            places += [(i, slot) for slot in store.occupied]
+            for slot in store.occupied:
+                places.append((i, slot))
+                variants.append([*stores[:i], store.without([slot]), *stores[i + 1 :]])
         if not places:
             return []
-        variants = [
-            [*stores[:i], stores[i].without([slot]), *stores[i + 1 :]] for i, slot in places
-        ]
         chunks = probed.ask(
             episode, snapshot, variants, self._draws[step], self._settings.flow_steps
         )
@@ -233,8 +231,10 @@ class _Moments:
 
     def _required_frames(self, arms: Sequence[ProbedPolicy]) -> np.ndarray | None:
         """Frames that any of these arms reads; None for all."""
-        parts = [
-            probed.frames_read(np.array(self._steps), self._recording.exec_start) for probed in arms
-        ]
-        known = [part for part in parts if part is not None]
-        return np.unique(np.concatenate(known)) if len(known) == len(parts) else None
+        required: np.ndarray = np.zeros(0, np.int64)
+        for probed in arms:
+            frames = probed.frames_read(np.array(self._steps), self._recording.exec_start)
+            if frames is None:
+                return None
+            required = np.union1d(required, frames)
+        return required

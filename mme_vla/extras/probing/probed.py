@@ -11,29 +11,129 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.extras.probing.arms import UNPROBED, Arm, options_of
+from mme_vla.data.sources import open_sources
+from mme_vla.envs.metadata import SESSIONS, read_variant
+from mme_vla.errors import UserError
+from mme_vla.extras.probing.arms import UNPROBED, Arm, options_of, read_arm
 from mme_vla.extras.probing.channels import Channel, MemorySnapshot, Remembered, channel_of
-from mme_vla.extras.probing.feed import FedEpisode, FedPolicy
 from mme_vla.extras.probing.interventions import Moment
-from mme_vla.extras.probing.recordings import SUBGOAL, Recording, stored_frames
+from mme_vla.extras.probing.recordings import SUBGOAL, Recording, all_recordings, stored_frames
+from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.processing.prompt import subgoal_kind
+from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.types import Noise, stack_noise
 
 
-class ProbedEpisode(FedEpisode):
-    """A fed episode that a probe follows.
+class ProbedEpisode(Episode):
+    """Passes frames on to `inner`, the policy's own episode, as an arm's feed shows them.
 
-    recording: the recorded episode, if it is one. subgoals: those that were set at each chunk so
-    far.
+    exec_start: the first execution frame, once it is observed. boundaries: observed frames at which
+    sub-tasks began, where the environment reports them. recording: the recorded episode, if it is
+    one. subgoals: those that were set at each chunk so far.
     """
 
     recording: Recording | None = None
 
     def __init__(self, policy: "ProbedPolicy", goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
+        self._probed = policy
+        self.seed = seed
+        self.inner = policy.inner.start_episode(goal, seed)
+        self.exec_start: int | None = None
+        self._counts: np.ndarray = np.zeros(0, np.int64)
+        self._starts: np.ndarray = np.zeros(0, np.int64)
+        self.boundaries: Sequence[int] = ()
         self.subgoals: list[str | None] = []
+
+    def observe(
+        self,
+        frames: Mapping[str, np.ndarray],
+        states: np.ndarray,
+        is_demo: bool | np.ndarray = False,
+        actions: np.ndarray | None = None,
+        rendered: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Take frames as `Episode.observe` does."""
+        self.inner.goal = self.goal
+        self.inner.options = self.options
+        states = np.asarray(states)
+        length = len(states)
+        demo = np.broadcast_to(np.asarray(is_demo, bool), (length,))
+        video = int(demo.sum())
+        numbers = self.n_observed_frames + np.arange(length)
+        if not self.n_observed_frames:
+            _show_all(self._probed.sessions, self.inner, self._probed.inner)
+        if self.exec_start is None and video < length:
+            self.exec_start = self.n_observed_frames + video
+        self.n_observed_frames += length
+
+        # How often each frame is observed; the one at which the policy decides always is.
+        exec_start = self.n_observed_frames if self.exec_start is None else self.exec_start
+        repeats = self._probed.feed.repeats(numbers, exec_start)
+        if self._probed.feed.drops and video < length:
+            repeats[-1] = max(repeats[-1], 1)
+        self._counts = np.concatenate([self._counts, repeats])
+        order = np.repeat(np.arange(length), repeats)
+
+        # The actions that led to those of the execution.
+        executed = order[order >= video]
+        if actions is not None and self._robot.action.frames is not None:
+            actions = np.asarray(actions)[executed - video]
+        elif not len(executed):
+            actions = None
+
+        # Of each camera, the observed frames that have an image, and these.
+        views = {}
+        places = {}
+        for name, view in frames.items():
+            with_images = np.arange(length)
+            if rendered is not None and name in rendered:
+                with_images = np.asarray(rendered[name])
+            places[name] = np.flatnonzero(np.isin(order, with_images))
+            views[name] = view
+            if (repeats != 1).any():
+                views[name] = view[np.searchsorted(with_images, order[places[name]])]
+        if rendered is None:
+            self.inner.observe(views, states[order], demo[order], actions)
+        else:
+            visible = {name: places[name] for name in rendered}
+            self.inner.observe(views, states[order], demo[order], actions, rendered=visible)
+        if len(self._starts):
+            self.boundaries = self.numbers(self._starts)
+
+    def restart_clock(self) -> None:
+        self.inner.restart_clock()
+
+    def begun(self, frames: Sequence[int], exec_start: int) -> None:
+        """Note where sub-tasks began, the execution among them, as numbers of observed frames."""
+        self._starts = np.array(sorted({0, exec_start, *frames}), np.int64)
+        self.boundaries = self.numbers(self._starts)
+
+    def numbers(self, frames: np.ndarray) -> list[int]:
+        """The episode's frames [n] as numbers of observed frames, without those that are not
+        observed.
+        """
+        frames = frames[frames < len(self._counts)]
+        last = self._probed.n_before + np.cumsum(self._counts)[frames] - 1
+        numbers: list[int] = last[self._counts[frames] > 0].tolist()
+        return numbers
+
+    @property
+    def state(self) -> Tensor:
+        return self.inner.state
+
+    def acted(self, chunk: np.ndarray) -> None:
+        self.inner.acted(chunk)
+
+    def add_frames(self, *_: Any, **__: Any) -> None:
+        """Not offered: a feed decides on whole observations."""
+        raise UserError(
+            "A probed episode takes whole observations: observe(), not add_frames() and set_view()."
+        )
+
+    set_view = add_frames
 
 
 ALIKE = 3  # episodes with the most similar goals among which a donor is chosen
@@ -55,10 +155,8 @@ class DonorEpisode:
 
         def store(name: str) -> Remembered:
             step = self._step(episode) if self._channel.chooses else None
-            stores = {
-                store.name: store for store in self._channel.read(self._observed(), step).stores
-            }
-            return stores[name]
+            stores = self._channel.read(self._observed(), step).stores
+            return next(store for store in stores if store.name == name)
 
         return store
 
@@ -73,26 +171,24 @@ class DonorEpisode:
         return min(self.recording.exec_start + max(executed, 0), self.recording.length - 1)
 
     def _observed(self) -> Episode:
-        if self._episode is None:
-            recording, policy = self.recording, self._policy
-            running, observed = policy.start_episode(recording.goal), 0
-            # A bank is written where chunks are chosen; stored frames can be read at any step
-            # afterwards.
-            stops = (
-                []
-                if self._channel.chooses
-                else recording.decisions(policy.embodiment.action.execute, None)
-            )
-            for stop in stops:
-                recording.show(running, observed, stop + 1)
-                observed = stop + 1
+        """The episode, once it has run."""
+        if self._episode is not None:
+            return self._episode
+        recording, policy = self.recording, self._policy
+        running = policy.start_episode(recording.goal)
+        n_observed = 0
+        # A bank is written where chunks are chosen; stored frames can be read at any step
+        # afterwards.
+        if not self._channel.chooses:
+            for stop in recording.decisions(policy.embodiment.action.execute, None):
+                recording.show(running, n_observed, stop + 1)
+                n_observed = stop + 1
                 running.subgoal = recording.subgoal(stop, self._subgoal_kind)
                 policy.act([running])
-            recording.show(
-                running, observed, recording.length, stored_frames(policy, recording.length)
-            )
-            self._episode = running
-        return self._episode
+        required = stored_frames(policy, recording.length)
+        recording.show(running, n_observed, recording.length, required)
+        self._episode = running
+        return running
 
 
 class DonorEpisodes:
@@ -124,8 +220,13 @@ def others(
     return sorted((recording for recording in recordings if recording != exclude), key=unlike)
 
 
-class ProbedPolicy(FedPolicy):
-    """`inner` under an arm."""
+class ProbedPolicy(Policy):
+    """`inner` under an arm. It evaluates and rolls out as any policy does, with the same noise."""
+
+    n_distractor_episodes: int = 0
+    """Episodes of a stress split's sessions, which a run names; those of a probe's arm do not
+    count.
+    """
 
     def __init__(
         self,
@@ -136,29 +237,63 @@ class ProbedPolicy(FedPolicy):
     ) -> None:
         """Wrap a policy.
 
-        sessions: recorded episodes to observe before each, as many as the arm needs. donors: to
-        take contents from.
+        sessions: recorded episodes, of which as many as the arm needs are observed before each
+        episode. donors: to take contents from.
         """
-        super().__init__(inner, arm.feed, sessions)
-        self.arm, self.channel, self.donors = arm, channel_of(inner), donors
+        super().__init__()
+        self.inner, self.arm, self.donors = inner, arm, donors
+        self.channel = channel_of(inner)
+        self.feed = arm.feed
+        self.sessions = list(sessions)[: self.feed.n_sessions]
+        self.n_before = sum(recording.length for recording in self.sessions)
+        """Frames of the sessions."""
+        self.memory, self.processor, self.config = inner.memory, inner.processor, dict(inner.config)
+        self.horizon, self.action_dim = inner.horizon, inner.action_dim
+        self.history_dtype = inner.history_dtype
+        self.sample_steps = inner.sample_steps
+        self.max_actions = inner.max_actions
         if arm.parts:
             self.config["probe"] = [arm.name, options_of(arm)]
 
     def start_episode(self, goal: str, seed: int = 0) -> ProbedEpisode:
         return ProbedEpisode(self, goal, seed)
 
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        return self.inner.sampling_noise(generator)
+
+    def sample_actions(
+        self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
+    ) -> Tensor:
+        return self.inner.sample_actions(batch, draws, steps)
+
+    def require_memory(self) -> MemoryModule:
+        return self.inner.require_memory()
+
+    def vision_fingerprint(self) -> str:
+        return self.inner.vision_fingerprint()
+
+    def encode_frames(self, frames: np.ndarray) -> Tensor:
+        return self.inner.encode_frames(frames)
+
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
-        reads = super().frames_read(steps, exec_start)
-        if reads is None or not len(steps) or "choice" not in self.arm.needs:
-            return reads
-        # Which frames are left to choose from is known only then.
-        displayed = self.feed.displayed(steps, exec_start, self.before)
-        stored = stored_frames(self.inner, int(displayed.max()) + 1)
-        return (
-            reads
-            if stored is None
-            else np.union1d(reads, self.feed.source_frames(stored, exec_start, self.before))
-        )
+        """The episode's frames that the policy reads through the feed; None for all, where the feed
+        leaves some out.
+        """
+        feed, n_before = self.feed, self.n_before
+        if feed.drops:
+            return None
+        displayed = feed.displayed(steps, exec_start, n_before)
+        reads = self.inner.frames_read(displayed, feed.first_executed(exec_start, n_before))
+        if reads is None:
+            return None
+        if len(steps) and "choice" in self.arm.needs:
+            # Which frames are left to choose from is known only then.
+            stored = stored_frames(self.inner, int(displayed.max()) + 1)
+            if stored is not None:
+                reads = np.union1d(reads, stored)
+        length = int(max(steps, default=-1)) + 1
+        paused = np.flatnonzero(feed.repeats(np.arange(length), exec_start) > 1)
+        return np.union1d(feed.source_frames(reads, exec_start, n_before), paused)
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         for episode in map(_probed, episodes):
@@ -173,17 +308,18 @@ class ProbedPolicy(FedPolicy):
         draws: Mapping[str, Tensor],
         steps: int | None = None,
     ) -> Tensor:
+        probed = [_probed(episode) for episode in episodes]
         if not self.arm.edits:
-            return super().predict_chunk(batch, episodes, draws, steps)
-        mine, remembering = [_probed(episode) for episode in episodes], []
-        for i, episode in enumerate(mine):
-            snapshot, stores = self.snapshot(
-                episode, {name: value[i] for name, value in draws.items()}
-            )
+            inner = [episode.inner for episode in probed]
+            return self.inner.predict_chunk(batch, inner, draws, steps)
+        remembering = []
+        for i, episode in enumerate(probed):
+            sampled = {name: value[i] for name, value in draws.items()}
+            snapshot, stores = self.snapshot(episode, sampled)
             remembering.append(self.channel.counterfactual(episode.inner, snapshot, stores))
         chunk = self.channel.predict_chunk(batch, remembering, draws, steps)
-        for episode, its in zip(mine, remembering, strict=True):
-            self.channel.commit(episode.inner, its)
+        for episode, memory in zip(probed, remembering, strict=True):
+            self.channel.commit(episode.inner, memory)
         return chunk
 
     def snapshot(
@@ -194,21 +330,19 @@ class ProbedPolicy(FedPolicy):
         snapshot = self.channel.read(episode.inner, only=self.arm.only(moment))
         edited = []
         for place, store in enumerate(snapshot.stores):
-            weigh = (
-                None if sampled is None else partial(self._weigh, episode, snapshot, place, sampled)
-            )
-            # the same chance for each store
+            weigh = None
+            if sampled is not None:
+                weigh = partial(self._weigh, episode, snapshot, place, sampled)
+            # A moment of its own: the same chance for each store.
             edited.append(self.arm.edit(store, self.moment(episode, weigh)))
         return snapshot, edited
 
     def moment(self, episode: ProbedEpisode, weigh: Any = None) -> Moment:
         """What the arm may know now."""
         now = max(episode.inner.n_observed_frames - 1, 0)
-        stored = (
-            np.zeros(0, np.int64)
-            if self.memory is None
-            else self.memory.storage.stored_frames(now + 1)
-        )
+        stored = np.zeros(0, np.int64)
+        if self.memory is not None:
+            stored = self.memory.storage.stored_frames(now + 1)
         rng = np.random.default_rng([episode.seed, now, zlib.crc32(self.arm.name.encode())])
         known: dict[str, Any] = {}
         if self.donors is not None:
@@ -258,14 +392,10 @@ class ProbedPolicy(FedPolicy):
         for start in range(0, len(pairs), batch):
             part = pairs[start : start + batch]
             observation = self.inner.observation([episode.inner] * len(part))
+            memories = [ready[id(variant)] for variant, _ in part]
             stacked = stack_noise([sampled for _, sampled in part])
-            chunks.append(
-                self.channel.predict_chunk(
-                    observation, [ready[id(v)] for v, _ in part], stacked, steps
-                )
-                .float()
-                .cpu()
-            )
+            chunk = self.channel.predict_chunk(observation, memories, stacked, steps)
+            chunks.append(chunk.float().cpu())
         action = self.embodiment.action
         stacked_chunks = torch.cat(chunks).unflatten(0, (len(variants), len(draws)))
         first = self.inner.require_processor().samples.window - 1
@@ -276,3 +406,51 @@ def _probed(episode: Episode) -> ProbedEpisode:
     """An episode of a probed policy."""
     assert isinstance(episode, ProbedEpisode)
     return episode
+
+
+def _show_all(recordings: Sequence[Recording], running: Episode, policy: Policy) -> None:
+    """Show recorded episodes as if they were part of an episode's conditioning video."""
+    before = sum(recording.length for recording in recordings)
+    stored = stored_frames(policy, before)
+    start = 0
+    for recording in recordings:
+        of_recording = None
+        if stored is not None:
+            of_recording = stored[stored >= start] - start
+        recording.show(running, 0, recording.length, of_recording, video=True)
+        start += recording.length
+
+
+@SPLIT_POLICIES.register(SESSIONS)
+def with_sessions(policy: Policy, split: str, recordings: Any) -> Policy:
+    """The policy as a split with sessions evaluates it: it observes them before each episode.
+
+    They are the first of the recorded episodes, the same before every episode, and count as part of
+    its video.
+
+    Args:
+        recordings: datasets, as `data.sources` names them; recorded episodes; or None.
+    """
+    variant = read_variant(split)
+    count = 0 if variant is None else variant.sessions
+    if not count:
+        return policy
+    episodes = _recorded_episodes(policy, recordings)
+    if policy.embodiment.readings or count > len(episodes):
+        raise UserError(
+            f"split={split} needs {count} recorded episodes to take from, and there are"
+            f" {len(episodes)}: name them with recordings=…."
+        )
+    probed = ProbedPolicy(policy, read_arm(f"distract:{count}"), episodes).eval()
+    probed.n_distractor_episodes = count
+    probed.config["sessions"] = [recording.name for recording in probed.sessions]
+    return probed
+
+
+def _recorded_episodes(policy: Policy, recordings: Any) -> list[Recording]:
+    """The recorded episodes of datasets; recorded episodes as they are, and none for None."""
+    if recordings is None:
+        return []
+    if isinstance(recordings, Sequence) and all(isinstance(one, Recording) for one in recordings):
+        return list(recordings)
+    return all_recordings(open_sources(recordings, policy.embodiment))

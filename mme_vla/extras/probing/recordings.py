@@ -89,20 +89,17 @@ class Recording:
             here = keyframes.frames[(keyframes.frames >= start) & (keyframes.frames < stop)]
             stored_views = keyframes.views(here, robot)
             return stored_views, dict.fromkeys(stored_views, here - start)
-        if required is None:
-            indices = np.arange(start, stop)
-            return {
-                name: self.source.frames(self.episode, indices, name) for name in robot.camera_names
-            }, None
-        here = np.union1d(required[(required >= start) & (required < stop)], [stop - 1])
-        camera_frames = {
-            name: here if name == robot.memory_camera else here[-1:] for name in robot.camera_names
-        }
-        views = {
-            name: self.source.frames(self.episode, frames, name)
-            for name, frames in camera_frames.items()
-        }
-        return views, {name: frames - start for name, frames in camera_frames.items()}
+        views, rendered = {}, {}
+        for name in robot.camera_names:
+            frames: np.ndarray = np.arange(start, stop)
+            if required is not None:
+                frames = np.array([stop - 1])
+                if name == robot.memory_camera:
+                    inside = (required >= start) & (required < stop)
+                    frames = np.union1d(required[inside], frames)
+            views[name] = self.source.frames(self.episode, frames, name)
+            rendered[name] = frames - start
+        return views, None if required is None else rendered
 
     def show(
         self,
@@ -134,9 +131,10 @@ class Recording:
             actions = self.source.actions(self.episode)[np.maximum(executed - 1, 0)]
         demo = np.ones(len(frames), bool) if video else frames < self.exec_start
         states = self.source.states(self.episode, start, stop)
-        running.observe(
-            views, states, demo, actions, **({} if rendered is None else {"rendered": rendered})
-        )
+        if rendered is None:
+            running.observe(views, states, demo, actions)
+        else:
+            running.observe(views, states, demo, actions, rendered=rendered)
 
 
 def all_recordings(sources: Sequence[EpisodeSource]) -> list[Recording]:
@@ -149,11 +147,9 @@ def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
     all.
     """
     memory = policy.memory
-    if (
-        memory is None
-        or memory.past_view_spec is not None
-        or policy.frames_read(np.zeros(1, np.int64), 0) is None
-    ):
+    if memory is None or memory.past_view_spec is not None:
+        return None
+    if policy.frames_read(np.zeros(1, np.int64), 0) is None:
         return None
     frames = [memory.storage.stored_frames(length)]
     scorer = memory.make_scorer()

@@ -2,7 +2,7 @@
 
 import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,14 +57,15 @@ class Effect:
 
 def effect(lines: Sequence[MomentLine] | Sequence[EntryLine]) -> Effect:
     """The effect over some lines, at least one."""
-    changes, spreads = np.array([x.change for x in lines]), np.array([x.spread for x in lines])
-    distances = [x.distance for x in lines if isinstance(x, MomentLine)]
+    changes = np.array([line.change for line in lines])
+    spreads = np.array([line.spread for line in lines])
+    distances = np.array([getattr(line, "distance", 0.0) for line in lines])
     return Effect(
-        len(lines),
-        float(changes.mean()),
-        float(spreads.mean()),
-        float(np.mean(distances)) if distances else 0.0,
-        float((changes > spreads).mean()),
+        moments=len(lines),
+        change=float(changes.mean()),
+        spread=float(spreads.mean()),
+        distance=float(distances.mean()),
+        beyond=float((changes > spreads).mean()),
     )
 
 
@@ -86,72 +87,64 @@ class Findings:
 
     def arms(self) -> dict[str, Effect]:
         """The effect of every arm, in the order in which they came."""
-        return {
-            name: effect(lines)
-            for name, lines in _grouped(self.moments, lambda line: line.arm).items()
-        }
+        lines_of_arms = _grouped(self.moments, lambda line: line.arm)
+        return {name: effect(lines) for name, lines in lines_of_arms.items()}
 
     def families(self) -> dict[str, list[tuple[float, Effect]]]:
         """Interventions of which several places of the dial were probed: dial and effect,
         ascending.
         """
-        dials: dict[str, dict[float, list[MomentLine]]] = {}
-        for line in self.moments:
-            if line.dial is not None:
-                dials.setdefault(line.arm.partition(":")[0], {}).setdefault(line.dial, []).append(
-                    line
-                )
-        return {
-            name: [(dial, effect(lines)) for dial, lines in sorted(dial_lines.items())]
-            for name, dial_lines in dials.items()
-            if len(dial_lines) > 1
-        }
+        turned = [line for line in self.moments if line.dial is not None]
+        families = {}
+        for name, members in _grouped(turned, lambda line: line.arm.partition(":")[0]).items():
+            places = _grouped(members, lambda line: line.dial or 0.0)
+            if len(places) > 1:
+                families[name] = [(dial, effect(places[dial])) for dial in sorted(places)]
+        return families
 
     def decay(self, video: bool) -> list[tuple[float, Effect]]:
         """Mean age and effect of the entries of each bin of age, those of the video or of the
         execution.
         """
-        mine = [entry for entry in self.entries if entry.video == video]
-        bins = _grouped(mine, lambda entry: int(np.searchsorted(AGES, entry.age, "right")))
-        return [
-            (float(np.mean([e.age for e in lines])), effect(lines))
-            for _, lines in sorted(bins.items())
-        ]
+        entries = [entry for entry in self.entries if entry.video == video]
+        bins = _grouped(entries, lambda entry: int(np.searchsorted(AGES, entry.age, "right")))
+        points = []
+        for _, lines in sorted(bins.items()):
+            mean_age = float(np.mean([line.age for line in lines]))
+            points.append((mean_age, effect(lines)))
+        return points
 
     def reach(self) -> float | None:
         """How far back what matters lies: mean age of the entries, weighted by their change; None
         without entries.
         """
         weights = np.array([entry.change for entry in self.entries])
-        return (
-            float(np.average([e.age for e in self.entries], weights=weights))
-            if weights.sum() > 0
-            else None
-        )
+        if weights.sum() <= 0:
+            return None
+        return float(np.average([entry.age for entry in self.entries], weights=weights))
 
     def from_video(self) -> float | None:
         """The share of all entries' changes that those of the conditioning video make; None without
         entries.
         """
         total = sum(entry.change for entry in self.entries)
-        return (
-            sum(entry.change for entry in self.entries if entry.video) / total
-            if total > 0
-            else None
-        )
+        if total <= 0:
+            return None
+        return sum(entry.change for entry in self.entries if entry.video) / total
 
     def matters_most(self) -> dict[str, list[EntryLine]]:
         """For each task the step at which a single entry mattered most: all entries of
         that step.
         """
-        strongest: dict[str, list[EntryLine]] = {}
-        moments = _grouped(self.entries, lambda e: (e.task, e.recording, e.step))
+        strongest: dict[str, float] = {}
+        entries: dict[str, list[EntryLine]] = {}
+        moments = _grouped(self.entries, lambda entry: (entry.task, entry.recording, entry.step))
         for (task, *_), lines in moments.items():
-            if task not in strongest or max(e.change for e in lines) > max(
-                e.change for e in strongest[task]
-            ):
-                strongest[task] = lines
-        return strongest
+            change = max(line.change for line in lines)
+            if task not in strongest or change > strongest[task]:
+                strongest[task] = change
+                entries[task] = lines
+        return entries
 
 
 def _grouped[K, L](lines: Iterable[L], key: Callable[[L], K]) -> dict[K, list[L]]:
@@ -165,9 +158,10 @@ def show(effect_of: Effect | None) -> str:
     """A change as a table has it: the change, and how many of the policy's own spread that is."""
     if effect_of is None:
         return "–"
-    return f"{effect_of.change:.3f}" + (
-        "" if effect_of.times is None else f" ({effect_of.times:.1f}×)"
-    )
+    text = f"{effect_of.change:.3f}"
+    if effect_of.times is not None:
+        text += f" ({effect_of.times:.1f}×)"
+    return text
 
 
 def arms_table(findings: Findings) -> Table:
@@ -205,17 +199,14 @@ def arms_table(findings: Findings) -> Table:
 
 def phases_table(findings: Findings) -> Table:
     """Every arm by task and sub-task."""
-    places = sorted({(line.task, line.phase) for line in findings.moments})
-    named = [f"{task or 'task'} · {phase + 1}" for task, phase in places]
+    groups = _grouped(findings.moments, lambda line: (line.arm, line.task, line.phase))
+    phases = sorted({(task, phase) for _, task, phase in groups})
+    named = [f"{task or 'task'} · {phase + 1}" for task, phase in phases]
     rows = []
     for name in findings.arms():
         cells = []
-        for place in places:
-            lines = [
-                line
-                for line in findings.moments
-                if line.arm == name and (line.task, line.phase) == place
-            ]
+        for task, phase in phases:
+            lines = groups.get((name, task, phase))
             cells.append(show(effect(lines) if lines else None))
         rows.append([name, *cells])
     return Table("By task and sub-task", ("arm", *named), rows)
@@ -225,10 +216,12 @@ def checkpoints_table(findings: dict[str, Findings]) -> Table:
     """One row a checkpoint: what it takes from its memory."""
     rows = []
     for name, checkpoint in findings.items():
-        arms, reach, video = checkpoint.arms(), checkpoint.reach(), checkpoint.from_video()
+        arms = checkpoint.arms()
         cells = [show(arms.get(arm)) for arm, _ in MEASURES.values()]
-        rows.append([name, *cells, "–" if reach is None else f"{reach:.0f}",
-                     "–" if video is None else f"{100 * video:.0f} %"])  # fmt: skip
+        reach, video = checkpoint.reach(), checkpoint.from_video()
+        cells.append("–" if reach is None else f"{reach:.0f}")
+        cells.append("–" if video is None else f"{100 * video:.0f} %")
+        rows.append([name, *cells])
     return Table(
         "What is taken from memory",
         ("checkpoint", *MEASURES, "reach (frames)", "from the video"),
@@ -395,20 +388,21 @@ def write_page(
     sections, tables = [], []
     if findings.moments:
         tables = [checkpoints_table({name: findings}), arms_table(findings), phases_table(findings)]
-        curves = [(f"Over the dial: {dial}", curve, "Dashed: the policy's own spread.")
-                  for dial, curve in dials(findings).items()]  # fmt: skip
+        sections.append(Section("In short", tables=tables[:1], caption=UNITS))
+        sections.append(Section("Interventions", effects(findings)))
+        curves = []
         if findings.entries:
-            curves.insert(
-                0, ("Decay with distance", decay(findings), "Each entry left out by itself.")
-            )
-        sections += [
-            Section("In short", tables=tables[:1], caption=UNITS),
-            Section("Interventions", effects(findings)),
-        ]
-        sections += [Section(title, curve, caption=caption, half=i < len(curves) - len(curves) % 2)
-                     for i, (title, curve, caption) in enumerate(curves)]  # fmt: skip
+            caption = "Each entry left out by itself."
+            curves.append(Section("Decay with distance", decay(findings), caption=caption))
+        for dial, curve in dials(findings).items():
+            caption = "Dashed: the policy's own spread."
+            curves.append(Section(f"Over the dial: {dial}", curve, caption=caption))
+        in_pairs = len(curves) - len(curves) % 2
+        sections += [replace(curve, half=True) for curve in curves[:in_pairs]]
+        sections += curves[in_pairs:]
         sections += [Section(table.title, tables=[table]) for table in tables[1:]]
-    if images := [(path.stem, _encoded(path)) for path in sorted((folder / IMAGES).glob("*.png"))]:
+    images = [(path.stem, _encoded(path)) for path in sorted((folder / IMAGES).glob("*.png"))]
+    if images:
         caption = "The step of each task at which a single entry mattered most."
         sections.append(Section("What was remembered", images=images, caption=caption))
     verdicts = [comparison.verdict for comparison in comparisons]

@@ -98,12 +98,14 @@ def run_probe(
 ) -> Probe:
     """Run the parts of the plan that the folder lacks, and write the page."""
     check_outputs(folder, claimed=(folder / OFFLINE / RUN_FILE).is_file())
-    channel, notes = channel_of(policy), list[str]()
+    channel = channel_of(policy)
+    notes: list[str] = []
     if plan.recordings:
         has_boundaries = all(recording.tells_subtasks for recording in plan.recordings)
-        names = {recording.name for recording in plan.lend}
-        # never the probed one
-        n_donors = len(names) - any(recording.name in names for recording in plan.recordings)
+        donor_names = {recording.name for recording in plan.lend}
+        n_donors = len(donor_names)
+        if any(recording.name in donor_names for recording in plan.recordings):
+            n_donors -= 1  # never the probed one
         arms, notes = choose_arms(plan.arms, policy, channel, n_donors, boundaries=has_boundaries)
         _on_recordings(policy, arms, plan, folder / OFFLINE, facts, show_progress)
     if plan.jobs:
@@ -113,47 +115,34 @@ def run_probe(
         )
         notes += [f"In closed loop {note}" for note in left_out if note not in notes]
         donors = DonorEpisodes(policy, channel, plan.lend) if plan.lend else None
-        for arm in [UNPROBED, *arms]:
-            probed = (
-                policy if arm is UNPROBED else ProbedPolicy(policy, arm, plan.lend, donors).eval()
-            )
-            evaluate(
-                probed,
-                plan.jobs,
-                folder / ONLINE / slug(arm.name),
-                replace(facts, model=named(facts.model, arm)),
-                settings,
-                subgoals=subgoals,
-                shard=plan.shard,
-                source=plan.source,
-                base=base,
-                notes={"arm": arm.name},
-                show_progress=show_progress,
-            )
-        if plan.events:
-            evaluate_events(
-                policy,
-                plan.jobs,
-                folder / ONLINE / slug(UNPROBED.name),
-                facts,
-                settings,
-                plan.events,
-                subgoals=subgoals,
-                shard=plan.shard,
-                source=plan.source,
-                base=base,
-                notes={"arm": UNPROBED.name},
-                show_progress=show_progress,
-            )
+        how: dict[str, Any] = {
+            "subgoals": subgoals,
+            "shard": plan.shard,
+            "source": plan.source,
+            "base": base,
+            "show_progress": show_progress,
+        }
+        # The unprobed run, with its events; then every arm on the same scenes.
+        output, how["notes"] = folder / ONLINE / slug(UNPROBED.name), {"arm": UNPROBED.name}
+        evaluate_events(policy, plan.jobs, output, facts, settings, plan.events, **how)
+        for arm in arms:
+            probed = ProbedPolicy(policy, arm, plan.lend, donors).eval()
+            output, how["notes"] = folder / ONLINE / slug(arm.name), {"arm": arm.name}
+            named_facts = replace(facts, model=named(facts.model, arm))
+            evaluate(probed, plan.jobs, output, named_facts, settings, **how)
+
+    # The page on all that the folder holds.
     findings = Findings.of(lines.read_all(folder / OFFLINE))
-    records = read_folders(find_records([folder / ONLINE])) if (folder / ONLINE).is_dir() else []
+    records: list[EpisodeRecord] = []
+    if (folder / ONLINE).is_dir():
+        records = read_folders(find_records([folder / ONLINE]))
     comparisons = _paired(records, facts.split, facts.model)
     notes += idle_events(records)
-    notes += [note for comparison in comparisons for note in comparison.gaps]
+    for comparison in comparisons:
+        notes += comparison.gaps
     write_images(findings, plan.recordings, folder)
-    return Probe(
-        findings, comparisons, notes, write_page(folder, facts.model, findings, comparisons, notes)
-    )
+    page = write_page(folder, facts.model, findings, comparisons, notes)
+    return Probe(findings, comparisons, notes, page)
 
 
 def _on_recordings(
@@ -168,9 +157,9 @@ def _on_recordings(
     claim_run(folder, _settings(policy, plan, facts, arms))
     shard = plan.shard
     local = list(plan.recordings)[shard.index :: shard.count]
-    path = folder / (
-        "offline.jsonl" if shard.count == 1 else f"offline-{shard.index}of{shard.count}.jsonl"
-    )
+    path = folder / "offline.jsonl"
+    if shard.count > 1:
+        path = folder / f"offline-{shard.index}of{shard.count}.jsonl"
     with (
         progress("probe", len(local), unit="episodes")
         if show_progress
@@ -254,14 +243,12 @@ def probe(
     arms_of_events = event_arms(event)
     require(tasks is not None or not arms_of_events, IN_CLOSED_LOOP)
     loaded, source = load(policy)
-    recorded = (
-        [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
-    )
-    jobs = (
-        []
-        if tasks is None
-        else choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
-    )
+    recorded: list[Recording] = []
+    if recordings is not None:
+        recorded = all_recordings(open_sources(recordings, loaded.embodiment))
+    jobs: list[Job] = []
+    if tasks is not None:
+        jobs = choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
     if jobs and base is make_env:
         environment(run_settings.env).check_installed()
     predictor = predictor_of(loaded, subgoal)
@@ -299,12 +286,10 @@ def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Co
         return []
     protocol = Protocol(tasks, episodes=1 + max(record.episode for record in records))
     methods = aggregate(records, protocol, split).methods
-    baseline = next(
-        (method for method in methods if method.model == model and method.event is None), None
-    )
-    if baseline is None:
-        return []
-    return compare_all(
-        [(m, baseline) for m in methods if m is not baseline and common_episodes(m, baseline)],
-        protocol,
-    )
+    unprobed = [method for method in methods if method.model == model and method.event is None]
+    pairs = []
+    for baseline in unprobed[:1]:
+        for method in methods:
+            if method is not baseline and common_episodes(method, baseline):
+                pairs.append((method, baseline))
+    return compare_all(pairs, protocol)

@@ -98,19 +98,20 @@ def score_episode(
         begun = first <= step
         if not begun.any():
             continue
-        frames, past = selection(step), visible[:, : step + 1]
+        frames = selection(step)
+        past = visible[:, : step + 1]
         selected = past[:, frames]
         retained[(retained < 0) & selected.any(1)] = step
-        if step >= exec_start:
-            count = len(frames)
-            shows = float(selected.any(0).mean()) if count else 0.0
-            missed = [
-                comb(step + 1 - int(row.sum()), count) / comb(step + 1, count)
-                for row in past[begun]
-            ]
-            rows.append(
-                (shows, selected[begun].any(1).mean(), past.any(0).mean(), 1 - np.mean(missed))
-            )
+        if step < exec_start:
+            continue
+        count = len(frames)
+        shows = float(selected.any(0).mean()) if count else 0.0
+        recall = selected[begun].any(1).mean()
+        # Of so many frames at random, none shows a fact with the hypergeometric probability of 0.
+        missed = []
+        for row in past[begun]:
+            missed.append(comb(step + 1 - int(row.sum()), count) / comb(step + 1, count))
+        rows.append((shows, recall, past.any(0).mean(), 1 - np.mean(missed)))
     if not rows:
         return None
     lags = (retained - first)[retained >= 0].tolist()
@@ -135,33 +136,25 @@ class Writing:
         mean: dict[str, Any] = {}
         for name in next(iter(rows.values()), {}):
             values = [row[name] for row in rows.values() if row[name] is not None]
-            total = (
-                sum(values)
-                if name in ("facts", "episodes")
-                else float(np.mean(values))
-                if values
-                else None
-            )
-            mean[name] = total
+            mean[name] = None
+            if name in ("facts", "episodes"):
+                mean[name] = sum(values)
+            elif values:
+                mean[name] = float(np.mean(values))
         return {"tasks": rows, "mean": mean}
 
 
 def _row(episodes: Sequence[EpisodeWriting]) -> dict[str, Any]:
-    names = ("precision", "recall", "score", "chance")
-    means = {
-        name: float(np.mean([getattr(episode, name) for episode in episodes])) for name in names
-    }
-    lags, facts = (
-        [lag for episode in episodes for lag in episode.lags],
-        sum(episode.facts for episode in episodes),
-    )
-    lag = float(np.mean(lags)) if lags else None
-    return means | {
-        "lag": lag,
-        "held": len(lags) / facts,
-        "facts": facts,
-        "episodes": len(episodes),
-    }
+    row: dict[str, Any] = {}
+    for name in ("precision", "recall", "score", "chance"):
+        row[name] = float(np.mean([getattr(episode, name) for episode in episodes]))
+    lags = np.concatenate([episode.lags for episode in episodes])
+    facts = sum(episode.facts for episode in episodes)
+    row["lag"] = float(lags.mean()) if len(lags) else None
+    row["held"] = len(lags) / facts
+    row["facts"] = facts
+    row["episodes"] = len(episodes)
+    return row
 
 
 # Selections ---------------------------------------------------------------------------------------
@@ -265,24 +258,28 @@ def memory_selection(
         states: of the robot, normalised [t, s]. policy: makes the tokens; None where the memory
             reads none to choose.
     """
-    stored, scorer = memory.storage.stored_frames(episode.length), memory.make_scorer()
-    rows = (
-        {} if scorer is None else {t: scorer(t, episode.images[t]) for t in sorted(episode.images)}
-    )
-    values = {t: row for t, row in rows.items() if row is not None}
-    scores = (
-        FrameScores(np.array(list(values)), np.stack(list(values.values()))) if values else None
-    )
-    context = memory.storage, stored, episode.length, scores, episode.exec_start
-    history: CachedHistory
-    if policy is None:
-        history = TokenlessHistory(context[0], np.zeros(0), *context[1:])
-    else:
-        tokens = policy.encode_frames(
-            np.stack([episode.images[t] for t in stored.tolist()])
-        ).float()
-        history = CachedHistory(context[0], tokens.cpu().numpy(), *context[1:])
-    history.motion, history.state_width = states.__getitem__, states.shape[1]
+    # The scores of frames, for memories that choose by them.
+    scorer = memory.make_scorer()
+    values = {}
+    for frame in sorted(episode.images):
+        row = None if scorer is None else scorer(frame, episode.images[frame])
+        if row is not None:
+            values[frame] = row
+    scores = None
+    if values:
+        scores = FrameScores(np.array(list(values)), np.stack(list(values.values())))
+
+    # Their tokens, for memories that read them.
+    stored = memory.storage.stored_frames(episode.length)
+    kind: type[CachedHistory] = TokenlessHistory
+    tokens = np.zeros(0)
+    if policy is not None:
+        images = np.stack([episode.images[frame] for frame in stored.tolist()])
+        kind = CachedHistory
+        tokens = policy.encode_frames(images).float().cpu().numpy()
+    history = kind(memory.storage, tokens, stored, episode.length, scores, episode.exec_start)
+    history.motion = states.__getitem__
+    history.state_width = states.shape[1]
     return lambda step: selected_frames(memory, history, step)
 
 
@@ -313,9 +310,8 @@ def score_writing(
     if policy is None:
         normalised = normalised_states(raw)
     else:
-        normalised = normalize(
-            torch.from_numpy(raw), policy.require_processor().require_stats().state
-        )
+        stats = policy.require_processor().require_stats().state
+        normalised = normalize(torch.from_numpy(raw), stats)
     states = normalised.split([episode.length for episode in episodes])
     tower = policy if isinstance(selector, MemoryModule) and reads_tokens(selector) else None
     for episode, motion in zip(episodes, states, strict=True):
@@ -342,21 +338,19 @@ def writing_table(results: Mapping[str, Writing]) -> str:
     ]
     for name, row in rows.items():
         mean = row["mean"]
-        shares = " | ".join(
-            f"{mean[key]:.2f}" for key in ("score", "chance", "precision", "recall")
-        )
+        keys = ("score", "chance", "precision", "recall")
+        shares = " | ".join(f"{mean[key]:.2f}" for key in keys)
         lag = "" if mean["lag"] is None else f"{mean['lag']:.0f}"
         lines.append(f"| `{name}` | {shares} | {lag} | {mean['held']:.2f} |")
-    tasks = list(dict.fromkeys(task for row in rows.values() for task in row["tasks"]))
-    lines += [
-        "",
-        f"| task | {' | '.join(f'`{name}`' for name in rows)} |",
-        "|---|" + "---:|" * len(rows),
-    ]
+    names = [f"`{name}`" for name in rows]
+    lines += ["", f"| task | {' | '.join(names)} |", "|---|" + "---:|" * len(rows)]
+    tasks: dict[str, None] = {}
+    for row in rows.values():
+        tasks |= dict.fromkeys(row["tasks"])
     for task in tasks:
-        cells = [row["tasks"].get(task) for row in rows.values()]
-        texts = (
-            "" if cell is None else f"{cell['score']:.2f} ({cell['chance']:.2f})" for cell in cells
-        )
+        texts = []
+        for row in rows.values():
+            cell = row["tasks"].get(task)
+            texts.append("" if cell is None else f"{cell['score']:.2f} ({cell['chance']:.2f})")
         lines.append(f"| {task} | {' | '.join(texts)} |")
     return "\n".join(lines) + "\n"

@@ -175,9 +175,7 @@ def test_it_is_evaluated(model: str, loaded: Callable[[str], Policy]) -> None:
     )
     (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=20)
     assert (
-        record.outcome in ("success", "fail", "timeout")
-        and record.steps > 0
-        and record.extra["chunks"] > 0
+        record.outcome in ("success", "fail", "timeout") and record.steps > 0 and record.chunks > 0
     )
     assert record.action_space == policy.embodiment.action.space
 

@@ -19,7 +19,7 @@ from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.extras.nano.learning import Decisions, statistics
 from mme_vla.extras.nano.runs import counts_of
 from mme_vla.extras.nano.tower import CLASSES, by_class, summarise
-from mme_vla.memory.transforms import RepeatFrame
+from mme_vla.memory.perturbation import Pause
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.run_folders import resolve_checkpoint, shipped_checkpoints
 from mme_vla.testing import check_backbone
@@ -87,7 +87,7 @@ def test_a_memory_learns_from_the_sub_tasks_of_demonstrations(
 
     learned, naive = labels(Decisions.of(policy, [made]).collate([2]))
     assert learned == naive and set(learned) == {1, 2, 3, 4}
-    batch = Decisions.of(policy, [made], transforms=[RepeatFrame(400)]).collate([2])
+    batch = Decisions.of(policy, [made], transforms=[Pause(400)]).collate([2])
     learned, naive = labels(batch)
     assert learned != naive and learned == sorted(learned) and learned[-1] == 4, (
         "of the recorded frames"

@@ -69,4 +69,4 @@ def test_the_planners_record_says_why_a_motion_was_not_carried_out(
     monkeypatch.setattr(evaluating, "make_env", lambda *_, **__: Refusing())
     record = replay(metadata.episode("VideoUnmask", "val", 0), max_steps=500)
     assert record.outcome == "fail" and record.extra["status"] == "error"
-    assert record.extra["refused"] == "no path to the pose"
+    assert record.refused == "no path to the pose"

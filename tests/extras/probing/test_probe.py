@@ -14,11 +14,12 @@ from helpers.rollout_fakes import quick_policy
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.extras.probing.channels import channel_of
+from mme_vla.extras.probing.interventions import NoDemo
 from mme_vla.extras.probing.lines import EntryLine, MomentLine, append, read
 from mme_vla.extras.probing.offline import compare_chunks
 from mme_vla.extras.probing.probed import ProbedPolicy
 from mme_vla.extras.probing.report import Findings
-from mme_vla.memory.transforms import RepeatFrame
+from mme_vla.memory.perturbation import Pause
 
 NEURAL_ARMS = [
     "drop:all",
@@ -103,12 +104,14 @@ def test_interventions_on_entries_are_refused_where_there_are_none() -> None:
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("shufle", "Unknown intervention 'shufle'. Did you mean 'shuffle'?"),
-        ("nodemo:3", "nodemo, which has no dial"),
-        ("drop:x", "write drop:<count>, a whole number"),
+        ("shufle", "with=shufle: name='shufle'. Did you mean 'shuffle'?"),
+        ("nodemo:3", "with=nodemo:3: nodemo takes no number"),
+        ("drop:x", "with=drop:x: write a name, as drop, or a name and a number, drop:2"),
         ("drop:0", "drop.count=0 must be a whole number, 1 or more"),
         ({"name": "drop", "which": "old"}, "drop.which='old'. Did you mean 'oldest'?"),
         (7, "with=7"),
+        ("gap:3", "with=gap:3: gap changes nothing here; it belongs in event=…."),
+        ("pause:3@step:2", "with=pause:3@step:2: write a name"),
     ],
 )
 def test_words_that_are_no_arms_are_reported(word: Any, message: str) -> None:
@@ -119,7 +122,7 @@ def test_words_that_are_no_arms_are_reported(word: Any, message: str) -> None:
 
 def test_arms_compose_in_their_order(tmp_path: Path) -> None:
     arm = read_arm("nodemo+pause:8+drop:2")
-    assert (arm.feed.video, arm.feed.transforms) == (False, (RepeatFrame(8, 0),)) and arm.edits
+    assert not arm.feed.shows_video and arm.feed.perturbations == (NoDemo(), Pause(8)) and arm.edits
     lines = probed(reader(0), ["nodemo", "nodemo+drop:all", "drop:all"], tmp_path)
     moments = [line for line in lines if isinstance(line, MomentLine)]
     assert {len(line.touched) for line in moments if line.arm == "nodemo"} == {0}

@@ -30,7 +30,7 @@ def test_every_waypoint_is_requested_once_and_counts_its_frames(policy: SAM2ActP
     assert [record.outcome for record in records] == ["success", "success"]
     for record in records:
         assert record.steps == 3 * MOTION
-        assert record.extra["chunks"] == 3
+        assert record.chunks == 3
     for env in envs.made.values():
         assert [action.shape for action in env.actions] == [(7,)] * 3
 
@@ -39,7 +39,7 @@ def test_an_episode_ends_after_its_waypoints(policy: SAM2ActPolicy) -> None:
     assert policy.info.max_actions == policy.require_processor().waypoints == 40
     envs = InlineEnvs(base=make_depth_env, robot=policy.embodiment, max_steps=10_000, max_actions=2)
     (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=10_000)
-    assert (record.outcome, record.extra["chunks"], record.steps) == ("timeout", 2, 2 * MOTION)
+    assert (record.outcome, record.chunks, record.steps) == ("timeout", 2, 2 * MOTION)
 
 
 def test_the_last_frame_of_a_motion_is_the_keyframe(policy: SAM2ActPolicy) -> None:
