@@ -4,12 +4,17 @@
 
 import os
 import sys
+from collections.abc import Callable
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.errors import require
 from mme_vla.registry import Command, extensions
 from mme_vla.utils.processes import started_processes
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 COMMANDS = {
     "train": Command(
@@ -102,24 +107,45 @@ def commands() -> dict[str, Command]:
     return all_commands
 
 
-_WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}  # Options that only print
+_PRINTING = {"-h", "--help", "--hydra-help", "-c", "--cfg"}  # Options that only print
 
 
 def run(name: str) -> None:
-    """Run a command, importing its module first: Ctrl-C ends the import with a message, too.
+    """Run a command: check its words, import its module, and call its `main`.
 
-    A terminal gets a line at once, since imports take seconds. Logs and pipes stay as they are.
+    A command with a configuration is imported once that is composed, so that help and mistakes do
+    not wait for PyTorch. Ctrl-C ends an import with a message, too.
     """
     # Threads that wait for each other asleep leave their cores to data workers and environments:
     # busy waiting slows a step tenfold. It counts only when set before PyTorch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with print_user_errors():
-        if _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
+        command = commands()[name]
+        if _PRINTING.isdisjoint(sys.argv[1:]):
             check_launcher(name)
-        first = os.environ.get("LOCAL_RANK", "0") == "0"
-        if first and sys.stderr.isatty() and _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
-            print("Loading PyTorch and LeRobot …", file=sys.stderr, flush=True)
-        import_module(commands()[name].module).main()
+        if command.reads_words or not command.config:
+            load_main(command)()
+            return
+        from mme_vla.cli.command import run_configured  # Hydra, which other commands do without
+
+        def main(cfg: "DictConfig") -> object:
+            return load_main(command)(cfg)
+
+        main.__module__ = command.module
+        run_configured(command.config, main)
+
+
+def load_main(command: Command) -> Callable[..., object]:
+    """Import a command's module.
+
+    A terminal gets a line at once, since imports take seconds. Logs and pipes stay as they are.
+    """
+    is_first = os.environ.get("LOCAL_RANK", "0") == "0"
+    is_printing = not _PRINTING.isdisjoint(sys.argv[1:])
+    if is_first and not is_printing and command.module not in sys.modules and sys.stderr.isatty():
+        print("Loading PyTorch and LeRobot …", file=sys.stderr, flush=True)
+    main: Callable[..., object] = import_module(command.module).main
+    return main
 
 
 def check_launcher(name: str) -> None:

@@ -5,13 +5,11 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from mme_vla.cli.command import cli
 from mme_vla.config.devices import process_device
 from mme_vla.errors import UserError
 from mme_vla.utils import FolderLock
 
 
-@cli("cache")
 def main(cfg: DictConfig) -> None:
     """Build, or with dry_run only estimate, the caches that configs/cache.yaml and the command line
     describe.

@@ -78,7 +78,7 @@ def strip(snapshots: Sequence[Snapshot], tiles: int) -> "Image":
     return contact_sheet(images, COLUMNS)
 
 
-def run(cfg: "DictConfig") -> None:
+def main(cfg: "DictConfig") -> None:
     """Draw the gallery as configs/show.yaml and the command line say."""
     from mme_vla.data.console import progress
 
@@ -128,10 +128,3 @@ def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
     raise UserError(
         f"{spec.task}: no demonstration succeeded for seeds {spec.seed} … {spec.seed + 99}."
     )
-
-
-def main() -> None:
-    """Run `mme-vla gallery`."""
-    from mme_vla.cli.command import cli
-
-    cli("show")(run)()

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.cli.command import cli
 from mme_vla.errors import UserError, printable
 
 if TYPE_CHECKING:
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from mme_vla.memory.base import Memory
 
 
-@cli("inspect")
 def main(cfg: DictConfig) -> None:
     """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw
     its memory.

@@ -190,7 +190,7 @@ def plan(cfg: "DictConfig") -> list[Job]:
     ]
 
 
-def run(cfg: "DictConfig") -> None:
+def main(cfg: "DictConfig") -> None:
     """Record as configs/record.yaml and the command line say; what the same words have recorded
     stays as it is.
     """
@@ -299,10 +299,3 @@ def _claim(work: Path, plan: list[dict[str, Any]]) -> None:
         f"{work} holds an interrupted recording of other episodes. Repeat that command to finish"
         " it, choose another output, or remove that folder yourself.",
     )
-
-
-def main() -> None:
-    """Run `mme-vla record`."""
-    from mme_vla.cli.command import cli
-
-    cli("record")(run)()

@@ -29,7 +29,7 @@ from mme_vla.config.sections import section_keys
 from mme_vla.errors import UserError, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
-from mme_vla.policy.saving import save_settings
+from mme_vla.policy.saving import save_policy, save_settings
 from mme_vla.policy.tensor_files import (
     assign_tensors,
     cast,
@@ -74,16 +74,21 @@ def save_checkpoint(
     optimizer: torch.optim.Optimizer,
     config: Mapping[str, Any],
     keep: KeepRule,
+    facts: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write `folder`/step_…; it appears whole or not at all. Then remove what `keep` does not hold
     on to.
+
+    Args:
+        config: of the training, for `training_state.json`.
+        facts: sections that join the policy's own configuration.
     """
     from safetensors.torch import save_file
 
     target, draft = _places(folder, step)
     shutil.rmtree(draft, ignore_errors=True)
     with ema.applied():
-        policy.save_pretrained(draft)
+        save_policy(policy, draft, facts=facts)
     parameters = trainable(policy)
     save_file({name: _on_cpu(p) for name, p in parameters.items()}, draft / RAW)
     moments = {
@@ -109,6 +114,7 @@ def save_shards(
     optimizer: torch.optim.Optimizer,
     config: Mapping[str, Any],
     keep: KeepRule,
+    facts: Mapping[str, Any] | None = None,
     hurry: bool = False,
 ) -> Path:
     """Begin to write `folder`/step_… of a sharded run; all processes call it and wait for the
@@ -126,7 +132,7 @@ def save_shards(
     about: list[str] = []
     if first:
         fresh_folder(draft)
-        about = [*save_settings(policy, draft), STATE]
+        about = [*save_settings(policy, draft, facts), STATE]
 
     def finish() -> None:
         place, notes = draft, shard_notes(draft)

@@ -78,6 +78,7 @@ class Trainer:
         run: Run,
         config: Mapping[str, Any],
         accelerator: Accelerator,
+        facts: Mapping[str, Any] | None = None,
     ) -> None:
         """Put the policy on its device, and back to where `run.checkpoint` left it.
 
@@ -85,9 +86,15 @@ class Trainer:
             policy: with the parameters frozen that shall not learn. samples: the training split.
             validation: held-out samples, if any.
             config: the plain configuration, saved with every checkpoint.
+            facts: sections that join the policy's own configuration in checkpoints: its training
+                and its card.
         """
-        self.settings, self.run_info, self.config = settings, run, config
-        self.accelerator, self.validation = accelerator, validation
+        self.settings = settings
+        self.run_info = run
+        self.config = config
+        self.accelerator = accelerator
+        self.validation = validation
+        self.facts = dict(facts or {})
         self.order = BatchOrder(
             len(samples),
             settings.batch_size,
@@ -262,10 +269,8 @@ class Trainer:
         with self.ema.applied():
             loss = self.validation.loss(self.policy, *processes, self.accelerator.reduce)
         loggers.write(step, {"val/loss": loss})
-        self.policy.config.setdefault("card", {})["results"] = {
-            "validation loss": round(loss, 4),
-            "at step": step,
-        }
+        results = {"validation loss": round(loss, 4), "at step": step}
+        self.facts["card"] = {**self.facts.get("card", {}), "results": results}
         line.say(f"step {step}/{self.settings.steps} · validation loss {loss:.4f}")
         return loss
 
@@ -277,7 +282,7 @@ class Trainer:
             stopping: the process may be killed before long: what resuming needs comes first.
         """
         folder, keep = self.run_info.checkpoints, self.settings.keep
-        saved = (self.policy, self.ema, self.optimizer, self.config, keep)
+        saved = (self.policy, self.ema, self.optimizer, self.config, keep, self.facts)
         if self._shard_writer is not None:
             save_shards(self._shard_writer, folder, step, *saved, hurry=stopping)
         else:

@@ -164,11 +164,11 @@ def test_a_gallery_replaces_no_readme_but_its_own(
     page = tmp_path / "README.md"
     page.write_text("# My project\n")
     with pytest.raises(UserError, match=r"README\.md exists"):
-        gallery.run(cfg)  # type: ignore[arg-type]
+        gallery.main(cfg)  # type: ignore[arg-type]
     assert page.read_text() == "# My project\n"
     page.write_text(gallery.render("gallery.md", entries=[("StopCube", "press", "StopCube.jpg")]))
     with pytest.raises(RuntimeError, match="reached"):
-        gallery.run(cfg)  # type: ignore[arg-type]
+        gallery.main(cfg)  # type: ignore[arg-type]
 
 
 def test_a_checkpoint_that_is_written_again_leaves_a_copy_beside_it_alone(tmp_path: Path) -> None:

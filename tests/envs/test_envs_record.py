@@ -70,7 +70,7 @@ def test_the_command_saves_both_layouts_and_only_what_is_missing(
     monkeypatch.setattr(
         record, "record_episode", lambda *_: pytest.fail("a finished episode was recorded again")
     )
-    record.run(cfg)
+    record.main(cfg)
     assert not work.exists()
     assert "1 episodes" in capsys.readouterr().out
     source = EpisodeSource(output)
@@ -78,11 +78,11 @@ def test_the_command_saves_both_layouts_and_only_what_is_missing(
     with open_episode(ref) as episode:
         assert len(source) == 1
         assert len(source.states(0)) == episode.length
-    record.run(cfg)
+    record.main(cfg)
     assert "all there already" in capsys.readouterr().out
     jobs.append(record.Job("PatternLock", 1, seed=1, difficulty="easy", recovery=None, retries=3))
     with pytest.raises(UserError, match="exists already"):
-        record.run(cfg)
+        record.main(cfg)
 
 
 def test_a_folder_of_another_recording_is_refused(tmp_path: Path) -> None:

@@ -18,7 +18,8 @@ from mme_vla.config.composition import compose
 from mme_vla.envs.grounding import project
 from mme_vla.envs.robomme.scene.placement import SceneError
 from mme_vla.extras.nano import pretraining, scenes
-from mme_vla.extras.nano.cli.vision_pretrain import run
+from mme_vla.extras.nano.cli import vision_pretrain
+from mme_vla.extras.nano.cli.vision_pretrain import PretrainRun, run
 from mme_vla.extras.nano.pretraining import (
     PretrainSettings,
     Scenes,
@@ -173,27 +174,17 @@ def record(
             raise SceneError(f"{task}, seed {seed}: target 3 finds no place.")
         return folder / f"{task}-{seed}-{arrangements}.npz"
 
-    monkeypatch.setattr(scenes, "record_scene", take)
+    monkeypatch.setattr(vision_pretrain, "record_scene", take)
 
     def names(
         tower: object, files: list[Path], held_out: list[Path], *_: object
     ) -> list[list[str]]:
         return [[file.name for file in group] for group in (files, held_out)]
 
-    monkeypatch.setattr(pretraining, "pretrain", names)
-    return run(
-        compose(
-            "vision_pretrain",
-            [
-                "tasks=[StopCube]",
-                "scenes=4",
-                "held_out=1",
-                "workers=1",
-                f"output={tmp_path}",
-                *words,
-            ],
-        )
-    )
+    monkeypatch.setattr(vision_pretrain, "pretrain", names)
+    words = ("tasks=[StopCube]", "scenes=4", "held_out=1", "workers=1", *words)
+    config = resolved(compose("vision_pretrain", [*words, f"output={tmp_path}"]))
+    return run(read_section(PretrainRun, config, others=True))
 
 
 def test_the_last_scenes_of_a_task_are_held_out_and_only_demonstrated(
