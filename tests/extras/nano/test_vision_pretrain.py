@@ -14,7 +14,8 @@ from torch import Tensor, nn
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
 from mme_vla import UserError
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, resolved
+from mme_vla.config.sections import read_section
 from mme_vla.envs.grounding import project
 from mme_vla.envs.robomme.scene.placement import SceneError
 from mme_vla.extras.nano import pretraining, scenes
@@ -174,7 +175,7 @@ def record(
             raise SceneError(f"{task}, seed {seed}: target 3 finds no place.")
         return folder / f"{task}-{seed}-{arrangements}.npz"
 
-    monkeypatch.setattr(vision_pretrain, "record_scene", take)
+    monkeypatch.setattr(scenes, "record_scene", take)
 
     def names(
         tower: object, files: list[Path], held_out: list[Path], *_: object
