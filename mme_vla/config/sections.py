@@ -86,13 +86,14 @@ def read_section[T](
     # Read as JSON, whose lists and maps may become tuples and dataclasses in strict mode.
     text = to_json(section, inf_nan_mode="constants", fallback=brief)
     try:
-        return _adapter(kind).validate_json(text, strict=True, extra="forbid")
+        read: T = _adapter(kind).validate_json(text, strict=True, extra="forbid")
     except ValidationError as error:
         raise _mistake(error, kind, json.loads(text), where) from None
+    return read
 
 
 @cache
-def _adapter[T](kind: type[T]) -> TypeAdapter[T]:
+def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 

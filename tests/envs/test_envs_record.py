@@ -12,7 +12,7 @@ pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact
 
 from mme_vla.cli import gallery as show
 from mme_vla.cli import record
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, resolved
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.envs.make import make_task
@@ -104,7 +104,8 @@ def test_a_folder_of_another_recording_is_refused(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_recorded_is_refused_by_name(words: list[str], message: str) -> None:
     with pytest.raises(UserError, match=message):
-        record.plan(compose("record", [*words, "output=somewhere"]))
+        config = resolved(compose("record", [*words, "output=somewhere"]))
+        record.plan(record.RecordRun.from_config(config))
 
 
 @pytest.mark.parametrize("task", ["VideoUnmask", "PickHighlight"])
