@@ -5,7 +5,7 @@ remembers of it.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -49,12 +49,17 @@ class Inspection:
     backbone: Mapping[str, Any]
     memory: Mapping[str, Any] | None
 
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Read a composed configuration, plain and resolved."""
+        return read_section(cls, config, others=True)
+
 
 def main(cfg: DictConfig) -> None:
     """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw its
     memory.
     """
-    wanted = read_section(Inspection, resolved(cfg), others=True)
+    wanted = Inspection.from_config(resolved(cfg))
     console = Console(markup=False)
     if (wanted.checkpoint is None) == (wanted.dataset is None):
         raise UserError(
@@ -74,7 +79,7 @@ def main(cfg: DictConfig) -> None:
     show_episode(source, episode, step, console)
     if wanted.memory is None:
         return
-    memory = build_memory(wanted.memory, wanted.backbone)
+    memory = build_memory(wanted)
     name = str(wanted.memory["name"])
     image = draw_memory(source, episode, step, memory, name, Path(wanted.output), console)
     console.print(f"image: {image}", highlight=False, soft_wrap=True)
@@ -202,10 +207,12 @@ def check_place(source: EpisodeSource, episode: int, step: int | None) -> tuple[
     return episode, step
 
 
-def build_memory(section: Mapping[str, Any], backbone: Mapping[str, Any]) -> Memory:
-    """The memory of a section, of any width: it is only asked to select."""
-    shape = shape_of(backbone)
-    return mme.build_memory(section, shape.vision_width, shape.grid, shape.vision_width)
+def build_memory(wanted: Inspection) -> Memory:
+    """The memory that is named, of any width: it is only asked to select."""
+    if wanted.memory is None:
+        raise UserError("memory=none: name a memory, such as memory=tokendrop.")
+    shape = shape_of(wanted.backbone)
+    return mme.build_memory(wanted.memory, shape.vision_width, shape.grid, shape.vision_width)
 
 
 def draw_memory(

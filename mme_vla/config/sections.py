@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -85,16 +84,17 @@ def read_section[T](
     section = {**section_keys(values, where, known), **fixed}
     # Read as JSON, whose lists and maps may become tuples and dataclasses in strict mode.
     text = to_json(section, inf_nan_mode="constants", fallback=brief)
+    if kind not in _ADAPTERS:
+        _ADAPTERS[kind] = TypeAdapter(kind)
     try:
-        read: T = _adapter(kind).validate_json(text, strict=True, extra="forbid")
+        read: T = _ADAPTERS[kind].validate_json(text, strict=True, extra="forbid")
     except ValidationError as error:
         raise _mistake(error, kind, json.loads(text), where) from None
     return read
 
 
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
+_ADAPTERS: dict[Any, TypeAdapter[Any]] = {}
+"""pydantic's readers of the dataclasses that were read before."""
 
 
 def section_keys(

@@ -116,7 +116,7 @@ def compute_statistics(
     """The statistics of the training split that the policy's processor normalises with."""
     processor = policy.require_processor()
     spec = processor.stats_spec
-    narrow = data.narrow_ranges or "refuse"
+    narrow: str = data.narrow_ranges or "refuse"
     if spec.bounds == "extremes":
         narrow = "ignore"  # nothing lies beyond them
     return compute_norm_stats(
@@ -150,7 +150,7 @@ def read_statistics(
     processor = policy.require_processor()
     spec = processor.stats_spec
     stats = NormStats.load(checked_file(folder, STATS_FILE))
-    narrow = "warn" if data.narrow_ranges == "warn" else "refuse"
+    narrow: str = "warn" if data.narrow_ranges == "warn" else "refuse"
     if spec.bounds == "extremes":
         narrow = "ignore"
     try:

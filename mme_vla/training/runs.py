@@ -59,6 +59,13 @@ are open (`check_content`). A run's statistics stay what they are: `data.narrow_
 whether it continues with narrow ones.
 """
 
+ONLY_CHOICES = {
+    "backbone.head.name": "flow",
+    "data.history_transforms": [],
+    "learning.history_transforms": [],
+}
+"""Keys that checkpoints do not name where there was no other choice yet, and that choice."""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -122,14 +129,16 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
             f"continue it with resume={folder}, or choose another output.",
         )
         return Run(folder)
-    checkpoint = (
-        _newest_unfinished(folder) if resume == "auto" else resolve_checkpoint(Path(resume))
-    )
-    if checkpoint is None:
-        return Run(folder)
+    if resume == "auto":
+        newest = _newest_unfinished(folder)
+        if newest is None:
+            return Run(folder)
+        checkpoint = newest
+    else:
+        checkpoint = resolve_checkpoint(Path(resume))
     state = read_state(checkpoint)
     check_settings(checkpoint, state["config"], config)
-    steps = config["train"]["steps"]
+    steps: int = config["train"]["steps"]
     require(
         state["step"] <= steps,
         f"{checkpoint} has done {state['step']} steps already, more than train.steps={steps}: give"
@@ -190,6 +199,9 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
     """Dotted keys that a run may not change, with their values in two plain configurations."""
     before = flat(to_json(old))
     after = flat(to_json(new))
+    for key, value in ONLY_CHOICES.items():
+        if key in after:
+            before.setdefault(key, value)
     differing: dict[str, tuple[Any, Any]] = {}
     for key in sorted(before.keys() | after.keys()):
         may_differ = any(f"{key}.".startswith(f"{free}.") for free in MAY_DIFFER)
@@ -207,14 +219,14 @@ def _newest_unfinished(folder: Path) -> Path | None:
     is finished.
     """
     beside = [path for path in folder.parent.glob("*") if (path / CHECKPOINTS).is_dir()]
-    runs = [
-        folder,
-        *sorted(beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True),
-    ]
-    for run in runs:
+    beside.sort(key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True)
+    for run in [folder, *beside]:
         checkpoints = checkpoints_in(run / CHECKPOINTS)
-        if checkpoints:
-            return None if (run / SUMMARY).is_file() and run != folder else checkpoints[-1]
+        if not checkpoints:
+            continue
+        if run != folder and (run / SUMMARY).is_file():
+            return None
+        return checkpoints[-1]
     return None
 
 
@@ -267,5 +279,6 @@ def start_from(policy: Policy, source: str) -> str:
         A sentence that says what was taken, what is new and what was left behind.
     """
     newest = newest_checkpoint(Path(source))
-    source = source if newest == Path(source) else str(newest)
+    if newest != Path(source):
+        source = str(newest)
     return f"weights from {source}: {transfer(policy, source)}"

@@ -103,7 +103,9 @@ class TrainSettings:
     @property
     def recomputation(self) -> Recompute:
         """What the backward pass computes again."""
-        return self.gradient_checkpointing and (SELECTIVE if self.recompute == SELECTIVE else True)
+        if not self.gradient_checkpointing:
+            return False
+        return SELECTIVE if self.recompute == SELECTIVE else True
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from mme_vla import UserError, build_policy
 from mme_vla.cli.inspect import (
+    Inspection,
     build_memory,
     check_place,
     draw_memory,
@@ -48,7 +49,7 @@ def test_a_memory_is_rendered_as_it_selects(
     sample: EpisodeSource, console: Console, tmp_path: Path
 ) -> None:
     config = resolved(compose("inspect", ["memory=tokendrop"]))
-    memory = build_memory(config["memory"], config["backbone"])
+    memory = build_memory(Inspection.from_config(config))
     path = draw_memory(sample, 3, 120, memory, "tokendrop", tmp_path, console)
     with Image.open(path) as image:
         assert image.width > 800

@@ -50,7 +50,7 @@ class NanoRun:
     episodes: Any
     replace: bool
     policy_seed: int
-    max_steps: NonNegativeInt | None
+    max_steps: NonNegativeInt
     max_choices: PositiveInt | None
     only_possible: bool
     workers: PositiveInt
