@@ -28,7 +28,8 @@ class Command:
     module: its `main` runs the command. text: one line of help. config: the YAML file of the tree's
     top level that configures it; empty for commands with options. usage: how it is typed; by
     default `mme-vla NAME`. processes: what it does where a launcher starts several: `one` is
-    refused, `shared` divides the work, `any` only reads.
+    refused, `shared` divides the work, `any` only reads. reads_words: its `main` reads the command
+    line itself, and takes no configuration.
     """
 
     module: str
@@ -36,6 +37,7 @@ class Command:
     config: str = ""
     usage: str = ""
     processes: Literal["one", "shared", "any"] = "one"
+    reads_words: bool = False
 
 
 @dataclass(frozen=True)

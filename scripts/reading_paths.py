@@ -1,8 +1,8 @@
-"""Files and lines that a reader needs for five questions about the library
+"""Files and lines that a reader needs for six questions about the library
 (docs/extend/architecture.md).
 
-(a) and (e) follow imports from a starting point; (b) to (d) list the files on the way. Every file
-is checked to exist, and every call of (d) to be defined where it is listed.
+(a) and (e) follow imports from a starting point; (b) to (d) and (f) list the files on the way.
+Every file is checked to exist, and every call of (d) and (f) to be defined where it is listed.
 
     python scripts/reading_paths.py
 """
@@ -33,6 +33,15 @@ SAMPLING = [
     ("policy/mme.py", "predict_chunk"), ("policy/mme.py", "sample_actions"),
     ("model.py", "sample"), ("backbone/pi05.py", "sample"),
 ]  # fmt: skip
+TRAINING = [
+    ("cli/train.py", "main"), ("training/settings.py", "from_config"),
+    ("training/runs.py", "claim_run"), ("training/data.py", "prepare_data"),
+    ("training/loop.py", "update"), ("training/order.py", "batch"),
+    ("training/optim.py", "make_optimizer"), ("training/checkpoint.py", "save_checkpoint"),
+]  # fmt: skip
+"""From the command line to the last checkpoint of one process; `training/parallel.py` and
+`training/shards.py` are for several.
+"""
 ALONE = "README.md"
 QUESTIONS = (
     "How does FrameSamp + Modulator work, image to loss?",
@@ -40,8 +49,9 @@ QUESTIONS = (
     "Another flow head (noise schedule, time distribution, sampler)",
     "Where is an action chunk sampled?",
     "Backbone, memory and integration alone in your own training loop",
+    "What does `mme_vla.train` do, from the command line to a checkpoint?",
 )
-"""(a) to (e), as docs/extend/layout.md has them."""
+"""(a) to (f), as docs/extend/layout.md has them."""
 
 
 def path_of(module: str) -> Path | None:
@@ -81,10 +91,10 @@ def check(files: list[Path]) -> list[Path]:
     return files
 
 
-def sampling() -> list[Path]:
-    """The files of (d), each of which must define its call."""
-    files = check([PACKAGE / name for name, _ in SAMPLING])
-    for file, (_, call) in zip(files, SAMPLING, strict=True):
+def defining(calls: list[tuple[str, str]]) -> list[Path]:
+    """The files of (d) or (f), each of which must define its call."""
+    files = check([PACKAGE / name for name, _ in calls])
+    for file, (_, call) in zip(files, calls, strict=True):
         functions = {
             node.name
             for node in ast.walk(ast.parse(file.read_text()))
@@ -123,14 +133,16 @@ def count(files: list[Path]) -> str:
 
 
 def answers() -> list[tuple[str, list[Path]]]:
-    """What (a) to (e) take, and the files."""
+    """What (a) to (f) take, and the files."""
     lines, modules = example()
-    sampled = sampling()
+    sampled = defining(SAMPLING)
+    trained = defining(TRAINING)
     read = [closure(MODEL), *(check([PACKAGE / n for n in names]) for names in (SELECTION, HEAD))]
     return [
         *((count(files), files) for files in read),
         (f"{len(SAMPLING)} calls, {count(sampled)}", sampled),
         (f"{lines} lines, {modules} modules imported", [ROOT / ALONE]),
+        (count(trained), trained),
     ]
 
 

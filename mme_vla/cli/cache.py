@@ -1,48 +1,62 @@
 """`mme-vla cache model=… data=…`: build vision caches; `torchrun` shares the episodes out."""
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 from omegaconf import DictConfig
 
-from mme_vla.cli.command import cli
+from mme_vla.config.composition import resolved
 from mme_vla.config.devices import process_device
+from mme_vla.config.sections import read_section
+from mme_vla.data.cache import cache_folder, default_cache_root, fingerprint
+from mme_vla.data.cache_building import build_cache, clear_cache, estimate, process_rank
+from mme_vla.data.sources import open_sources
 from mme_vla.errors import UserError
+from mme_vla.policy.build import build_from_config
+from mme_vla.training.runs import start_from, weights_to_start_from
+from mme_vla.training.settings import TrainRun
 from mme_vla.utils import FolderLock
 
 
-@cli("cache")
+@dataclass(frozen=True)
+class CacheRun:
+    """The keys of `configs/cache.yaml` beside those of a training."""
+
+    device: str
+    dry_run: bool
+    rebuild: bool
+
+
 def main(cfg: DictConfig) -> None:
     """Build, or with dry_run only estimate, the caches that configs/cache.yaml and the command line
     describe.
     """
-    from mme_vla.data.cache import cache_folder, default_cache_root, fingerprint
-    from mme_vla.data.cache_building import build_cache, clear_cache, estimate, process_rank
-    from mme_vla.data.sources import open_sources
-    from mme_vla.policy.build import build_from_config
-    from mme_vla.training.runs import start_from, weights_to_start_from
-
-    if cfg.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+    config = resolved(cfg)
+    command = read_section(CacheRun, config, others=True)
+    training = TrainRun.from_config(config)
+    settings = training.data.cache
+    if command.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise UserError(
             "rebuild=true removes files that other processes write: run it once without torchrun"
             " first."
         )
-    init_from = weights_to_start_from(cfg.init_from)
+    init_from = weights_to_start_from(training.init_from)
     policy = build_from_config(cfg, fresh_backbone=init_from is None)
     if init_from is not None:
         print(start_from(policy, init_from))
-    device = process_device(cfg.device)
+    device = process_device(command.device)
     memory = policy.to(device).memory
     if memory is None:
-        raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
+        raise UserError(f"model={training.name} has no memory: there is nothing to cache.")
     tower = policy.vision_fingerprint()
     dtype = str(policy.info.history_dtype).removeprefix("torch.")
-    root = Path(cfg.data.cache.root) if cfg.data.cache.root else default_cache_root()
-    for source in open_sources(cfg.data.sources, policy.embodiment):
+    root = Path(settings.root) if settings.root else default_cache_root()
+    for source in open_sources(training.data.sources, policy.embodiment):
         expected = fingerprint(source, memory.storage, tower, dtype)
         folder = cache_folder(root, source, expected)
-        if cfg.dry_run:
-            plan = estimate(source, memory, policy.encode_frames, dtype, cfg.data.cache.batch_size)
+        if command.dry_run:
+            plan = estimate(source, memory, policy.encode_frames, dtype, settings.batch_size)
             print(
                 f"{source.name}: {plan.frames} of {int(source.lengths.sum())} frames to encode,"
                 f" {plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process"
@@ -57,10 +71,14 @@ def main(cfg: DictConfig) -> None:
         with FolderLock(
             folder.parent, "build of this vision cache", f".{folder.name}.{rank}of{world}.lock"
         ):
-            if cfg.rebuild:
+            if command.rebuild:
                 clear_cache(folder)
-            batch_size = cfg.data.cache.batch_size
             n_encoded = build_cache(
-                source, memory, policy.encode_frames, folder, expected, batch_size=batch_size
+                source,
+                memory,
+                policy.encode_frames,
+                folder,
+                expected,
+                batch_size=settings.batch_size,
             )
         print(f"{source.name}: {n_encoded} episodes encoded, {len(source)} in all, at {folder}")

@@ -1,4 +1,4 @@
-"""The decorator that turns a function into a command with a Hydra configuration."""
+"""Run a function as a command with a Hydra configuration."""
 
 import functools
 import logging
@@ -34,59 +34,48 @@ from mme_vla.config.trees import config_dir, library_trees
 from mme_vla.errors import UserError, printable
 
 
-def cli[T](
-    config_name: str, directory: Path | None = None
-) -> Callable[[Callable[[DictConfig], T]], Callable[..., T | None]]:
-    """Make `main(cfg)` a Hydra command: run folder, `--multirun`, `--help`, `--cfg job`,
-    `--config-dir`.
+def run_configured(
+    config_name: str, main: Callable[[DictConfig], object], directory: Path | None = None
+) -> None:
+    """Run a command under Hydra: run folder, `--multirun`, `--help`, `--cfg job`, `--config-dir`.
 
-    The overrides are checked before the command starts. `print_user_errors` surrounds it:
-    exceptions that are bugs keep their traceback. Called with a config, the decorated function runs
-    `main` directly.
+    The command line is checked before `main` is called. `print_user_errors` surrounds both:
+    exceptions that are bugs keep their traceback.
+
+    Args:
+        config_name: a YAML of the tree's top level, without its suffix.
+        main: takes the composed configuration.
+        directory: the tree; the library's own by default.
     """
+    tree = directory or config_dir()
+    sys.argv[1:] = options_first(several_memories(plugins.trust_as_override(sys.argv[1:])))
 
-    def decorate(main: Callable[[DictConfig], T]) -> Callable[..., T | None]:
-        @functools.wraps(main)
-        def job(cfg: DictConfig) -> T:
-            with print_user_errors():
-                # here too: Hydra would print a traceback before it gets further
-                if missing := sorted(OmegaConf.missing_keys(cfg)):
-                    words = " ".join(f"{key}=…" for key in missing)
-                    raise UserError(f"A value is needed for {', '.join(missing)}: add {words}")
-                join_memories(cfg)
-                hydra_cfg = HydraConfig.get()
-                join_plugins(
-                    cfg, str(hydra_cfg.job.config_name), command_trees(), hydra_cfg.overrides.task
-                )
-                import_plugins(cfg)
-                return main(cfg)
+    @functools.wraps(main)  # Hydra names the job after the module
+    def job(cfg: DictConfig) -> object:
+        with print_user_errors():
+            # here too: Hydra would print a traceback before it gets further
+            if missing := sorted(OmegaConf.missing_keys(cfg)):
+                words = " ".join(f"{key}=…" for key in missing)
+                raise UserError(f"A value is needed for {', '.join(missing)}: add {words}")
+            join_memories(cfg)
+            hydra_cfg = HydraConfig.get()
+            name = str(hydra_cfg.job.config_name)
+            join_plugins(cfg, name, command_trees(), hydra_cfg.overrides.task)
+            import_plugins(cfg)
+            return main(cfg)
 
-        @functools.wraps(main)
-        def command(cfg: DictConfig | None = None) -> T | None:
-            if cfg is not None:
-                import_plugins(cfg)
-                return main(cfg)
-            tree = directory or config_dir()
-            sys.argv[1:] = options_first(several_memories(plugins.trust_as_override(sys.argv[1:])))
-            with print_user_errors():
-                _check_command_line(config_name, tree)
-                start = hydra.main(
-                    version_base=VERSION_BASE,
-                    config_path=str(tree.resolve()),
-                    config_name=config_name,
-                )
-                # Hydra makes the run folder: what the disk says to that is to come here, not to be
-                # printed there.
-                os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-                try:
-                    start(job)()
-                except HydraException as error:
-                    raise UserError(str(error)) from error
-            return None
-
-        return command
-
-    return decorate
+    with print_user_errors():
+        _check_command_line(config_name, tree)
+        start = hydra.main(
+            version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name
+        )
+        # Hydra makes the run folder: what the disk says to that is to come here, not to be printed
+        # there.
+        os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+        try:
+            start(job)()
+        except HydraException as error:
+            raise UserError(str(error)) from error
 
 
 def options_first(words: Sequence[str]) -> list[str]:

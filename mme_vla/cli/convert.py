@@ -6,13 +6,11 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from mme_vla.cli.command import cli
 from mme_vla.config.sections import read_section
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 
 
-@cli("convert")
 def main(cfg: DictConfig) -> None:
     """Convert as configs/convert.yaml and the command line say."""
     inputs = [cfg.input] if isinstance(cfg.input, str) else list(cfg.input)

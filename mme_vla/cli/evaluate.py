@@ -6,115 +6,147 @@ import logging
 import multiprocessing
 import os
 import sys
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
+import torch
 from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
 
-from mme_vla.cli.command import cli, log_to_terminal
-from mme_vla.cli.loading import load_policy, prepare_sampling, words_of
+from mme_vla.cli.command import log_to_terminal
+from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling, words_of
 from mme_vla.config.composition import resolved
 from mme_vla.config.devices import process_device
+from mme_vla.config.sections import read_section
+from mme_vla.envs.base import environment
+from mme_vla.envs.episodes import named_tasks
 from mme_vla.errors import check_choice
-
-if TYPE_CHECKING:
-    import torch
-
-    from mme_vla.evaluation.rollout.evaluation import Evaluation
-    from mme_vla.policy.base import Policy
-    from mme_vla.subgoal import SubgoalPredictor, Usage
-
+from mme_vla.evaluation.api import policy_of_split
+from mme_vla.evaluation.records import count_outcomes
+from mme_vla.evaluation.results.events import event_table, idle_events
+from mme_vla.evaluation.results.report import policy_facts
+from mme_vla.evaluation.results.tables import print_table
+from mme_vla.evaluation.rollout.evaluation import (
+    Evaluation,
+    check_subgoals,
+    choose_episodes,
+    choose_shard,
+    default_output,
+    evaluate_events,
+    facts_of,
+    kind_section,
+)
+from mme_vla.evaluation.rollout.events import event_arms
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.subgoals import total_score
+from mme_vla.policy.base import Policy
+from mme_vla.policy.run_folders import find_run, trainings_in
+from mme_vla.subgoal import BackgroundPredictor, SubgoalPredictor, Usage, build_predictor
+from mme_vla.training.runs import check_finished
 
 logger = logging.getLogger("mme_vla.evaluate")
 SUBGOAL_MODES = ("inline", "background")
 
 
-@cli("evaluate")
+@dataclass(frozen=True)
+class EvalRun:
+    """An evaluation as a command line describes it: `configs/evaluate.yaml`, read once.
+
+    Its keys beside those of `RolloutSettings` and `PolicyChoice`, which are read from `config`, the
+    whole configuration as plain values.
+    """
+
+    episodes: Any
+    event: Any
+    recordings: Any
+    sampling: str
+    deterministic: bool
+    subgoal: Mapping[str, Any] | None
+    subgoal_mode: str
+    shard: Any
+    times_from: str | None
+    output: str | None
+    policy: PolicyChoice
+    rollout: RolloutSettings
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Read a composed configuration, plain and resolved."""
+        policy = PolicyChoice.from_config(config)
+        # Each event is a run of its own, beside the run without one.
+        rollout = RolloutSettings.from_config({**config, "event": None})
+        run = read_section(cls, config, others=True, policy=policy, rollout=rollout)
+        if run.deterministic:
+            rollout = replace(rollout, max_batch=1)
+        return replace(run, policy=policy, rollout=rollout)
+
+
 def main(cfg: DictConfig) -> None:
     """Run the episodes that have no result yet; of a folder of trainings those of one training
     after the other.
     """
-    from mme_vla.policy.run_folders import find_run, trainings_in
-    from mme_vla.training.runs import check_finished
-
-    folder = None if cfg.checkpoint is None else find_run(Path(str(cfg.checkpoint)).expanduser())
-    trainings = [] if folder is None else trainings_in(folder)
+    config = resolved(cfg)
+    run = EvalRun.from_config(config)
+    trainings = []
+    if run.policy.checkpoint is not None:
+        trainings = trainings_in(find_run(Path(run.policy.checkpoint).expanduser()))
     check_finished(trainings)
     for training in trainings:
-        one = cfg.copy()
-        one.checkpoint = str(training)
-        evaluate_one(one, training.name)
+        evaluate_one(EvalRun.from_config({**config, "checkpoint": str(training)}), training.name)
     if not trainings:
-        evaluate_one(cfg)
+        evaluate_one(run)
 
 
-def evaluate_one(cfg: DictConfig, training: str = "") -> None:
+def evaluate_one(run: EvalRun, training: str = "") -> None:
     """Run the episodes of one policy; `training` is the folder of its records in `output`."""
-    import torch
-
-    from mme_vla.envs.base import environment
-    from mme_vla.envs.episodes import named_tasks
-    from mme_vla.evaluation.api import policy_of_split
-    from mme_vla.evaluation.results.report import policy_facts
-    from mme_vla.evaluation.rollout.evaluation import (
-        choose_episodes,
-        choose_shard,
-        default_output,
-        evaluate_events,
-        facts_of,
-    )
-    from mme_vla.evaluation.rollout.events import event_arms
-    from mme_vla.evaluation.rollout.settings import RolloutSettings
-
-    values = resolved(cfg)
-    events = event_arms(values["event"])
-    settings = RolloutSettings.from_config({**values, "event": None})
-    if values["deterministic"]:
-        settings = replace(settings, max_batch=1)
+    settings = run.rollout
+    events = event_arms(run.event)
+    if run.deterministic:
         # PyTorch takes kernels whose results repeat; where an operation has none, it warns.
         # read when the GPU is first used
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         torch.use_deterministic_algorithms(True, warn_only=True)
         torch.backends.cudnn.benchmark = False
-    jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
-    shard = choose_shard(values["shard"])
+    tasks = named_tasks(run.policy.config)
+    jobs = choose_episodes(tasks, run.episodes, settings.split, settings.env)
+    shard = choose_shard(run.shard)
     environment(settings.env).check_installed()
     log_to_terminal(logger)
-    device = process_device(str(cfg.device))
-    policy, name, source = load_policy(cfg, "evaluate", logger, device)
-    prepare_sampling(policy, cfg.sampling, logger)
-    subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
-    predictor = None if subgoals is None else str(values["subgoal"]["name"])
+    device = process_device(run.policy.device)
+    policy, name, source = load_policy(run.policy, "evaluate", logger, device)
+    prepare_sampling(policy, run.sampling, logger)
+    subgoals = choose_subgoals(policy, run.subgoal, run.subgoal_mode, device)
+    predictor = None
+    if subgoals is not None and run.subgoal is not None:
+        predictor = str(run.subgoal["name"])
     facts = facts_of(policy, name, source, settings, predictor)
     if not settings.render:
         logger.warning(
             "render=false: the policy sees black images; only the time of the simulation means"
             " anything"
         )
-    output = (
-        default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()
-    ) / training
-    count = f"{len(jobs)} episode{'s'[len(jobs) == 1 :]}"
-    logger.info(
-        "%s into %s%s",
-        count,
-        output,
-        f", shared as {shard.index}/{shard.count}" if shard.count > 1 else "",
-    )
-    notes: dict[str, Any] = {
+    output = default_output(facts) if run.output is None else Path(run.output).expanduser()
+    output = output / training
+    count = "1 episode" if len(jobs) == 1 else f"{len(jobs)} episodes"
+    shared = f", shared as {shard.index}/{shard.count}" if shard.count > 1 else ""
+    logger.info("%s into %s%s", count, output, shared)
+    notes = {
         "device": str(device),
         "workers": settings.workers,
         "max_batch": settings.max_batch,
+        "deterministic": run.deterministic,
+        "policy": policy_facts(policy.config),
+        "composition": facts.composition,
     }
-    notes["deterministic"] = values["deterministic"]
-    notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
     if multiprocessing.get_start_method() == "loky":
         # a job of joblib: a worker of ours cannot look that way up
         multiprocessing.set_start_method("spawn", force=True)
     try:
         done = evaluate_events(
-            policy_of_split(policy, settings.split, values["recordings"]),
+            policy_of_split(policy, settings.split, run.recordings),
             jobs,
             output,
             facts,
@@ -124,7 +156,7 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
             shard=shard,
             source=source,
             notes=notes,
-            times_from=None if cfg.times_from is None else Path(str(cfg.times_from)).expanduser(),
+            times_from=None if run.times_from is None else Path(run.times_from).expanduser(),
         )
     finally:
         if subgoals is not None:
@@ -134,11 +166,11 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
 
 
 def choose_subgoals(
-    policy: "Policy",
-    section: dict[str, Any] | None,
+    policy: Policy,
+    section: Mapping[str, Any] | None,
     mode: str = "inline",
-    device: "torch.device | None" = None,
-) -> "SubgoalPredictor | None":
+    device: torch.device | None = None,
+) -> SubgoalPredictor | None:
     """The predictor, saying the kind of subgoal the policy was trained with unless the command line
     names one.
 
@@ -146,9 +178,6 @@ def choose_subgoals(
     the policy's; a predictor with `device: auto` runs there too. None leaves the choice to the
     predictor.
     """
-    from mme_vla.evaluation.rollout.evaluation import check_subgoals, kind_section
-    from mme_vla.subgoal import BackgroundPredictor, build_predictor
-
     check_choice("subgoal_mode", mode, SUBGOAL_MODES)
     if section is None:
         if policy.require_processor().prompt_spec.reads_subgoal:
@@ -163,40 +192,32 @@ def choose_subgoals(
         section = {**section, "device": str(device)}
     predictor = build_predictor(section)
     check_subgoals(policy, predictor)
-    return (
-        BackgroundPredictor(predictor)
-        if predictor is not None and mode == "background"
-        else predictor
-    )
+    if predictor is not None and mode == "background":
+        return BackgroundPredictor(predictor)
+    return predictor
 
 
-def report(done: "Evaluation", output: Path) -> None:
+def report(done: Evaluation, output: Path) -> None:
     """Say how it went, task by task, and where the table comes from."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from mme_vla.evaluation.records import count_outcomes
-    from mme_vla.evaluation.rollout.subgoals import total_score
-
     tasks = list(dict.fromkeys(record.task for record in done.records))
-    scored = total_score(done.records) is not None
-    judged = ("right subgoals", "points off by") if scored else ()
-    table = Table(
-        "task", *("episodes", "success", "fail", "timeout", "error", "success rate"), *judged
-    )
+    is_scored = total_score(done.records) is not None
+    columns = ["task", "episodes", "success", "fail", "timeout", "error", "success rate"]
+    if is_scored:
+        columns += ["right subgoals", "points off by"]
+    table = Table(*columns)
     rows = [(task, [r for r in done.records if r.task == task]) for task in tasks]
-    for task, records in [*rows, *([("all", done.records)] if len(rows) > 1 else [])]:
+    if len(rows) > 1:
+        rows.append(("all", list(done.records)))
+    for task, records in rows:
         counts = count_outcomes(records)
-        outcomes = [str(counts[name]) for name in ("success", "fail", "timeout", "error")]
-        score = total_score(records)
-        cells = (score.show() if score else ("", "")) if scored else ()
-        table.add_row(
-            task,
-            str(len(records)),
-            *outcomes,
-            f"{100 * counts['success'] / len(records):.1f} %",
-            *cells,
-        )
+        cells = [task, str(len(records))]
+        for name in ("success", "fail", "timeout", "error"):
+            cells.append(str(counts[name]))
+        cells.append(f"{100 * counts['success'] / len(records):.1f} %")
+        if is_scored:
+            score = total_score(records)
+            cells += score.show() if score else ("", "")
+        table.add_row(*cells)
     # Piped into a file there is no terminal to fit: as wide as the table is.
     console = Console(width=None if sys.stdout.isatty() else 160, soft_wrap=True, highlight=False)
     if done.matched:
@@ -214,17 +235,14 @@ def report(done: "Evaluation", output: Path) -> None:
     logger.info("python -m mme_vla.results %s", output)
 
 
-def report_events(done: "Evaluation", width: int) -> None:
+def report_events(done: Evaluation, width: int) -> None:
     """Say what events changed, and where one did not act."""
-    from mme_vla.evaluation.results.events import event_table, idle_events
-    from mme_vla.evaluation.results.tables import print_table
-
     print_table(event_table([*done.records, *done.matched], "first"), width)
     for line in idle_events(done.records):
         logger.warning(line)
 
 
-def report_usage(usage: "Usage") -> None:
+def report_usage(usage: Usage) -> None:
     """Say in one line what a predictor did, as far as it did anything."""
     counts = {
         "calls": usage.calls, "answers from the cache": usage.cached,

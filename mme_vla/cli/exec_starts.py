@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig
 
-from mme_vla.cli.command import cli
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.embodiment import ROBOMME_JOINT
@@ -86,7 +85,6 @@ def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> 
     return matches
 
 
-@cli("exec_starts")
 def main(cfg: DictConfig) -> None:
     """Write the side file as configs/exec_starts.yaml and the command line say."""
     output = Path(cfg.output)

@@ -3,22 +3,26 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from omegaconf import DictConfig
+from PIL.Image import Image
 
+from mme_vla.config.composition import resolved
+from mme_vla.config.sections import Range, read_section
+from mme_vla.data.console import progress
 from mme_vla.envs import metadata
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
+from mme_vla.envs.observations import Include, Observer
+from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.errors import UserError, require
 from mme_vla.utils import read_text
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced
 from mme_vla.utils.pages import render
 
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
-    from PIL.Image import Image
-
+if TYPE_CHECKING:  # it imports the simulator, which is asked for first
     from mme_vla.envs.task import Task
 
 MADE = "Made by `mme-vla gallery`."  # stands on each page
@@ -38,10 +42,8 @@ class Snapshot:
 
 def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snapshot], bool]:
     """Demonstrate a task, with an image every few steps; also returns whether it succeeded."""
-    from mme_vla.envs.observations import Include, Observer
     from mme_vla.envs.robomme.recording.recorder import demonstrate
     from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
-    from mme_vla.envs.subtasks import NO_RECORD
 
     observer = Observer(task, Include(), render=True)
     snapshots: list[Snapshot] = []
@@ -65,7 +67,7 @@ def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snap
     return snapshots, success
 
 
-def strip(snapshots: Sequence[Snapshot], tiles: int) -> "Image":
+def strip(snapshots: Sequence[Snapshot], tiles: int) -> Image:
     """Some of the snapshots side by side, spread evenly, each with its step; video frames have a
     red border.
     """
@@ -78,16 +80,26 @@ def strip(snapshots: Sequence[Snapshot], tiles: int) -> "Image":
     return contact_sheet(images, COLUMNS)
 
 
-def run(cfg: "DictConfig") -> None:
-    """Draw the gallery as configs/show.yaml and the command line say."""
-    from mme_vla.data.console import progress
+@dataclass(frozen=True)
+class Gallery:
+    """The keys of `configs/show.yaml`, where each is explained.
 
-    specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
-    require(
-        isinstance(cfg.tiles, int) and cfg.tiles >= 2,
-        f"tiles={cfg.tiles!r}: expected an integer of at least 2.",
-    )
-    folder = Path(cfg.output)
+    tasks: what `tasks` or `task` name.
+    """
+
+    tasks: str | tuple[str, ...]
+    split: str
+    episodes: Any
+    tiles: Annotated[int, Range(least=2)]
+    output: str
+
+
+def main(cfg: DictConfig) -> None:
+    """Draw the gallery as configs/show.yaml and the command line say."""
+    config = resolved(cfg)
+    gallery = read_section(Gallery, config, others=True, tasks=named_tasks(config))
+    specs = choose_episodes(gallery.tasks, gallery.episodes, gallery.split)
+    folder = Path(gallery.output)
     page = folder / "README.md"
     require(
         not page.exists() or MADE in read_text(page),
@@ -102,7 +114,7 @@ def run(cfg: "DictConfig") -> None:
             env, snapshots = demonstrated(spec)
             several = sum(other.task == spec.task for other in specs) > 1
             image_name = f"{spec.task}-{spec.episode}.jpg" if several else f"{spec.task}.jpg"
-            strip(snapshots, cfg.tiles).save(folder / image_name, quality=82)
+            strip(snapshots, gallery.tiles).save(folder / image_name, quality=82)
             entries.append((spec.task, env.goals()[0], image_name))
             env.close()
             advance(1)
@@ -128,10 +140,3 @@ def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
     raise UserError(
         f"{spec.task}: no demonstration succeeded for seeds {spec.seed} … {spec.seed + 99}."
     )
-
-
-def main() -> None:
-    """Run `mme-vla gallery`."""
-    from mme_vla.cli.command import cli
-
-    cli("show")(run)()

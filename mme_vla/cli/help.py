@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from mme_vla.cli import commands
+from mme_vla.cli.table import commands
 from mme_vla.config.trees import yaml_files
 from mme_vla.errors import UserError, did_you_mean
 

@@ -2,67 +2,94 @@
 remembers of it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
 
-from mme_vla.cli.command import cli
+from mme_vla.backbone.building import shape_of
+from mme_vla.config.composition import resolved
+from mme_vla.config.sections import read_section
+from mme_vla.data.episodes import EpisodeSource, check_episode
+from mme_vla.data.lerobot_files import SAMPLE
+from mme_vla.data.memory_image import memory_sheet
+from mme_vla.data.statistics import normalised_states
+from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment.action_space import numbered
 from mme_vla.errors import UserError, printable
+from mme_vla.memory.base import Memory
+from mme_vla.memory.history import OnlineHistory
+from mme_vla.policy import mme
+from mme_vla.policy.base import Policy
+from mme_vla.policy.run_folders import STATE, resolve_checkpoint
+from mme_vla.training.checkpoint import read_state
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
 
-    from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.memory.base import Memory
+@dataclass(frozen=True)
+class Inspection:
+    """The keys of `configs/inspect.yaml`, where each is explained.
 
-
-@cli("inspect")
-def main(cfg: DictConfig) -> None:
-    """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw
-    its memory.
+    embodiment, backbone, memory: sections that the parts' own classes read.
     """
-    from rich.console import Console
 
+    checkpoint: str | None
+    dataset: str | None
+    exec_starts: str | None
+    episode: int | None
+    step: int | None
+    output: str
+    trust_plugins: bool
+    embodiment: Mapping[str, Any]
+    backbone: Mapping[str, Any]
+    memory: Mapping[str, Any] | None
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Read a composed configuration, plain and resolved."""
+        return read_section(cls, config, others=True)
+
+
+def main(cfg: DictConfig) -> None:
+    """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw its
+    memory.
+    """
+    wanted = Inspection.from_config(resolved(cfg))
     console = Console(markup=False)
-    if (cfg.checkpoint is None) == (cfg.dataset is None):
+    if (wanted.checkpoint is None) == (wanted.dataset is None):
         raise UserError(
             "Name one thing to inspect: checkpoint=<folder>, or dataset=<folder> (`sample` is built"
             " in)."
         )
-    if cfg.checkpoint is not None:
-        return show_checkpoint(Path(cfg.checkpoint), console, bool(cfg.trust_plugins))
-    from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.embodiment import Embodiment
-
-    robot = Embodiment.from_dict(OmegaConf.to_container(cfg.embodiment, resolve=True))  # type: ignore[arg-type]
-    source = EpisodeSource(cfg.dataset, cfg.exec_starts, robot=robot)
-    if cfg.episode is None:
-        return show_dataset(source, console)
-    episode, step = check_place(source, cfg.episode, cfg.step)
+    if wanted.checkpoint is not None:
+        show_checkpoint(Path(wanted.checkpoint), console, wanted.trust_plugins)
+        return
+    assert wanted.dataset is not None
+    robot = Embodiment.from_dict(wanted.embodiment)
+    source = EpisodeSource(wanted.dataset, wanted.exec_starts, robot=robot)
+    if wanted.episode is None:
+        show_dataset(source, console)
+        return
+    episode, step = check_place(source, wanted.episode, wanted.step)
     show_episode(source, episode, step, console)
-    if cfg.memory is None:
-        return None
-    image = draw_memory(
-        source, episode, step, build_memory(cfg), cfg.memory.name, Path(cfg.output), console
-    )
+    if wanted.memory is None:
+        return
+    memory = build_memory(wanted)
+    name = str(wanted.memory["name"])
+    image = draw_memory(source, episode, step, memory, name, Path(wanted.output), console)
     console.print(f"image: {image}", highlight=False, soft_wrap=True)
-    return None
 
 
-def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = False) -> None:
+def show_checkpoint(folder: Path, console: Console, trust_plugins: bool = False) -> None:
     """Print a checkpoint's parts, training state and normalisation statistics.
 
     With `trust_plugins` the modules that the checkpoint names are imported.
     """
-    from mme_vla.embodiment.action_space import numbered
-    from mme_vla.policy.base import Policy
-    from mme_vla.policy.run_folders import STATE, resolve_checkpoint
-    from mme_vla.training.checkpoint import read_state
-
     folder = resolve_checkpoint(folder)
     policy = Policy.from_pretrained(folder, trust_plugins=trust_plugins)
     table = _table(str(folder), "part", "tensors", "parameters", "dtype")
@@ -106,10 +133,8 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
             _show(numbers, console)
 
 
-def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) -> None:
+def show_dataset(source: EpisodeSource, console: Console, most: int = 40) -> None:
     """Print a dataset's episodes, at most `most` of them, and its totals."""
-    from mme_vla.data.lerobot_files import SAMPLE
-
     compared = source.verify()
     table = _table(
         f"{source.name} ({source.root})",
@@ -153,7 +178,7 @@ def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) ->
     console.print(f"checksums: {checksums}", highlight=False)
 
 
-def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Console") -> None:
+def show_episode(source: EpisodeSource, episode: int, step: int, console: Console) -> None:
     """Print an episode's phases, and what is recorded at one step."""
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     table = _table(f"{source.name}, episode {episode}, step {step} of {length}", "", "")
@@ -170,48 +195,36 @@ def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Con
     _show(table, console)
 
 
-def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tuple[int, int]:
+def check_place(source: EpisodeSource, episode: int, step: int | None) -> tuple[int, int]:
     """The episode and step asked for; the last step by default."""
-    from mme_vla.data.episodes import check_episode
-
     check_episode(source, episode)
     length = int(source.lengths[episode])
     step = length - 1 if step is None else step
-    if not isinstance(step, int) or not 0 <= step < length:
+    if not 0 <= step < length:
         raise UserError(
             f"step={step}: episode {episode} of {source.name} has frames 0 … {length - 1}."
         )
     return episode, step
 
 
-def build_memory(cfg: DictConfig) -> "Memory":
-    """The memory the configuration names, of any width: it is only asked to select."""
-    from mme_vla.backbone.building import shape_of
-    from mme_vla.policy import mme
-
-    config: Any = OmegaConf.to_container(cfg, resolve=True)
-    backbone = shape_of(config["backbone"])
-    return mme.build_memory(
-        config["memory"], backbone.vision_width, backbone.grid, backbone.vision_width
-    )
+def build_memory(wanted: Inspection) -> Memory:
+    """The memory that is named, of any width: it is only asked to select."""
+    if wanted.memory is None:
+        raise UserError("memory=none: name a memory, such as memory=tokendrop.")
+    shape = shape_of(wanted.backbone)
+    return mme.build_memory(wanted.memory, shape.vision_width, shape.grid, shape.vision_width)
 
 
 def draw_memory(
-    source: "EpisodeSource",
+    source: EpisodeSource,
     episode: int,
     step: int,
-    memory: "Memory",
+    memory: Memory,
     name: str,
     folder: Path,
-    console: "Console",
+    console: Console,
 ) -> Path:
     """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
-    import torch
-
-    from mme_vla.data.memory_image import memory_sheet
-    from mme_vla.data.statistics import normalised_states
-    from mme_vla.memory.history import OnlineHistory
-
     frames = source.frames(episode, np.arange(step + 1))
     history = OnlineHistory(memory.storage, memory.make_scorer(), int(source.exec_starts[episode]))
     stored, patches = history.to_encode(len(frames)), memory.storage.grid**2
@@ -241,8 +254,7 @@ def draw_memory(
     return path
 
 
-def _table(title: str, *columns: str) -> "Table":
-    from rich.table import Table
+def _table(title: str, *columns: str) -> Table:
 
     table = Table(title=printable(title), show_header=any(columns))
     for i, column in enumerate(columns):
@@ -253,7 +265,7 @@ def _table(title: str, *columns: str) -> "Table":
     return table
 
 
-def _show(table: "Table", console: "Console") -> None:
+def _show(table: Table, console: Console) -> None:
     """Print a table under its title, which may be wider: a path is not broken."""
     console.print(table.title, style="bold", markup=False, highlight=False, soft_wrap=True)
     table.title = None

@@ -4,17 +4,21 @@ trying things out.
 
 import logging
 import time
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
 
-from omegaconf import DictConfig
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
 
 from mme_vla.config.devices import find_device
+from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, check_choice, require
-
-if TYPE_CHECKING:
-    import torch
-
-    from mme_vla.policy.base import Policy
+from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_from_config
+from mme_vla.policy.run_folders import locate_checkpoint
+from mme_vla.processing.normalise import NormStats
 
 # What a checkpoint brings along, so that it cannot be set beside one.
 _MODEL_KEYS = (
@@ -31,41 +35,72 @@ _MODEL_KEYS = (
 )
 
 
+@dataclass(frozen=True)
+class PolicyChoice:
+    """The keys of a command that say which policy it is about.
+
+    config: all of the command's configuration, plain. Without a checkpoint its model is built.
+    """
+
+    name: str
+    checkpoint: str | None
+    revision: str | None
+    device: str
+    dtype: str
+    trust_plugins: bool
+    config: Mapping[str, Any]
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Read a composed configuration, plain and resolved."""
+        checkpoint = config["checkpoint"]
+        choice = read_section(
+            cls,
+            config,
+            others=True,
+            name=str(config["name"]),
+            checkpoint=None if checkpoint is None else str(checkpoint),
+            config={},
+        )
+        return replace(choice, config=config)
+
+
 class LoadedPolicy(NamedTuple):
     """A policy on its device. source: the checkpoint folder or repository it is from; None with
     fresh weights.
     """
 
-    policy: "Policy"
+    policy: Policy
     name: str
     source: str | None
 
 
 def load_policy(
-    cfg: DictConfig, verb: str, logger: logging.Logger, device: "torch.device | None" = None
+    choice: PolicyChoice,
+    verb: str,
+    logger: logging.Logger,
+    device: torch.device | None = None,
 ) -> LoadedPolicy:
     """Load `checkpoint`, or build `model` with fresh weights and say so.
 
-    cfg: with `checkpoint`, `revision`, `device`, `dtype` and what a model is built from. verb: what
-    the command does with it, for messages. device: instead of the configured one.
+    Args:
+        choice: what the command line says.
+        verb: what the command does with the policy, for messages.
+        logger: takes a line on what was loaded.
+        device: instead of the configured one.
     """
-    from mme_vla.policy.base import Policy
-    from mme_vla.policy.build import build_from_config
-    from mme_vla.policy.run_folders import locate_checkpoint
-    from mme_vla.processing.normalise import NormStats
-
-    device = find_device(cfg.device) if device is None else device
+    device = find_device(choice.device) if device is None else device
     named = words_of(*_MODEL_KEYS)
-    if cfg.checkpoint is not None:
+    if choice.checkpoint is not None:
         if named:
             raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
-        where = locate_checkpoint(str(cfg.checkpoint))
+        where = locate_checkpoint(choice.checkpoint)
         policy = Policy.from_pretrained(
             where,
             device=device,
-            dtype=cfg.dtype,
-            revision=cfg.revision,
-            trust_plugins=cfg.trust_plugins,
+            dtype=choice.dtype,
+            revision=choice.revision,
+            trust_plugins=choice.trust_plugins,
         )
         name = str(policy.config.get("name", "policy"))
         logger.info("%s from %s, on %s", name, where, device)
@@ -76,21 +111,23 @@ def load_policy(
         " things out.",
     )
     require(
-        cfg.dtype in ("auto", "float32"),
-        f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.",
+        choice.dtype in ("auto", "float32"),
+        f"dtype={choice.dtype} is for checkpoints; fresh weights are float32.",
     )
-    policy = build_from_config(cfg).to(device)
+    policy = build_from_config(OmegaConf.create(dict(choice.config))).to(device)
     robot = policy.embodiment
     policy.require_processor().stats = NormStats.unit(robot.state.width, robot.action.width)
-    logger.warning("%s is UNTRAINED: its actions mean nothing; use it to try things out", cfg.name)
-    return LoadedPolicy(policy, str(cfg.name), None)
+    logger.warning(
+        "%s is UNTRAINED: its actions mean nothing; use it to try things out", choice.name
+    )
+    return LoadedPolicy(policy, choice.name, None)
 
 
 SAMPLING = ("auto", "eager", "graph", "compiled")
 """How a command computes chunks: `sampling` of configs/evaluate.yaml and configs/serve.yaml."""
 
 
-def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) -> None:
+def prepare_sampling(policy: Policy, sampling: str, logger: logging.Logger) -> None:
     """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where
     there is a GPU.
     """
@@ -116,8 +153,6 @@ def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) ->
 
 def words_of(*keys: str) -> list[str]:
     """The words of the command line that set one of these keys or groups, or something below."""
-    from hydra.core.hydra_config import HydraConfig
-
     overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
     matches = []
     for word in overrides:

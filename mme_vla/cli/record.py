@@ -2,19 +2,25 @@
 
 import glob
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig
 
+from mme_vla.config.composition import resolved
+from mme_vla.config.sections import PositiveInt, read_section
+from mme_vla.data.console import progress
+from mme_vla.data.convert import ConvertOptions, write_previews
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import ROBOMME, make_task, require_simulator
+from mme_vla.envs.robomme.recording.coverage import compare, goal_of, goals_recorded, in_words
 from mme_vla.envs.robomme.recording.frames import FrameChoice
-from mme_vla.envs.robomme.recording.outputs import Job, RecordingPlan
+from mme_vla.envs.robomme.recording.outputs import EpisodeWriter, Job, RecordingPlan
 from mme_vla.envs.robomme.recording.own import DRAFT, episode_file, record_own
 from mme_vla.envs.robomme.recording.processes import carry_out, simulation_pool
 from mme_vla.envs.rows import task_options
@@ -22,13 +28,43 @@ from mme_vla.errors import UserError, require
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
 from mme_vla.utils.processes import signals_deferred
 
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
+if TYPE_CHECKING:  # it imports the simulator, which is asked for first
     from mme_vla.envs.robomme.recording.recorder import Recording
 
 
-KEYS = ("frames", "memory")
+@dataclass(frozen=True)
+class RecordRun:
+    """The keys of `configs/record.yaml`, where each is explained.
+
+    tasks: what `tasks` or `task` name. video: the section of `ConvertOptions`.
+    """
+
+    tasks: str | tuple[str, ...]
+    env: str
+    episodes: Any
+    split: str
+    output: str
+    hdf5: str | None
+    lerobot: bool
+    previews: str | None
+    recovery: bool
+    retries: PositiveInt
+    coverage: str | None
+    workers: PositiveInt
+    frames: Any
+    memory: Mapping[str, Any] | None
+    names: str
+    images: str
+    fps: PositiveInt
+    video: Mapping[str, Any]
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Read a composed configuration, plain and resolved."""
+        run = read_section(cls, config, others=True, tasks=named_tasks(config))
+        return replace(run, memory=config["memory"])
+
+
 FAILED = "the demonstration did not end in success"
 
 
@@ -42,7 +78,6 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
         Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed
         seeds with reasons.
     """
-    from mme_vla.envs.robomme.recording.outputs import EpisodeWriter
     from mme_vla.envs.robomme.recording.recorder import Recorder
     from mme_vla.envs.robomme.scene.placement import SceneError
 
@@ -82,8 +117,6 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
         if result.success:
             draft.rename(folder / f"{job.name}.h5")
             if previews is not None:
-                from mme_vla.data.convert import write_previews
-
                 write_previews(folder / f"{job.name}.h5", job.episode, job.task, previews)
             counts = {"steps": result.steps, "stored": result.stored, "video": result.video}
             done = {
@@ -122,8 +155,6 @@ def record(
     """Demonstrate all episodes that `folder` does not hold yet, with a progress bar; return what is
     known of each.
     """
-    from mme_vla.data.console import progress
-
     folder.mkdir(parents=True, exist_ok=True)
     missing = [job for job in jobs if not (folder / f"{job.name}.json").is_file()]
     with progress("record", len(jobs), len(jobs) - len(missing), "episodes") as advance:
@@ -145,9 +176,6 @@ def report_coverage(
     plan: a recording that is there. workers: processes that build the split's scenes, which tell
     their goals.
     """
-    from mme_vla.data.console import progress
-    from mme_vla.envs.robomme.recording.coverage import compare, goal_of, goals_recorded, in_words
-
     specs, goals = choose_episodes(tasks, None, split), []
     with progress("goals", len(specs), unit="episodes") as advance, ExitStack() as stack:
         with signals_deferred():
@@ -164,63 +192,63 @@ def report_coverage(
     print(f"{in_words(coverage, split)}\n{file}")
 
 
-def plan(cfg: "DictConfig") -> list[Job]:
+def plan(run: RecordRun) -> list[Job]:
     """The episodes that a configuration names."""
-    for name in ("workers", "retries"):
-        if not isinstance(cfg[name], int) or cfg[name] < 1:
-            raise UserError(f"{name}={cfg[name]!r}: expected a positive integer.")
-    specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
-    values: Any = OmegaConf.to_container(cfg)
-    at, memory = (values[key] for key in KEYS)
-    beside = "frames=all draws every frame, those of a memory too: leave out memory, or set frames."
-    require(at != "all" or memory is None, beside)
-    frames = None if at == "all" else FrameChoice(at, memory)
-    return [
-        Job(
-            s.task,
-            s.episode,
-            s.seed,
-            s.difficulty,
-            s.recovery if cfg.recovery else None,
-            cfg.retries if s.row is None else 1,
-            frames,
-            s.row,
+    specs = choose_episodes(run.tasks, run.episodes, run.split)
+    require(
+        run.frames != "all" or run.memory is None,
+        "frames=all draws every frame, those of a memory too: leave out memory, or set frames.",
+    )
+    frames = None if run.frames == "all" else FrameChoice(run.frames, run.memory)
+    jobs = []
+    for spec in specs:
+        recovery = spec.recovery if run.recovery else None
+        # A row describes one scene: another seed would be another row.
+        retries = run.retries if spec.row is None else 1
+        jobs.append(
+            Job(
+                spec.task,
+                spec.episode,
+                spec.seed,
+                spec.difficulty,
+                recovery,
+                retries,
+                frames,
+                spec.row,
+            )
         )
-        for s in specs
-    ]
+    return jobs
 
 
-def run(cfg: "DictConfig") -> None:
+def main(cfg: DictConfig) -> None:
     """Record as configs/record.yaml and the command line say; what the same words have recorded
     stays as it is.
     """
-    from mme_vla.config.sections import read_section
-    from mme_vla.data.convert import ConvertOptions
-
-    if cfg.env != ROBOMME:
-        record_environment(cfg)
+    run = RecordRun.from_config(resolved(cfg))
+    if run.env != ROBOMME:
+        record_environment(run)
         return
     require(
-        cfg.env == "mme_vla", f"env={cfg.env} has no demonstrator here: record with env=mme_vla."
+        run.env == "mme_vla", f"env={run.env} has no demonstrator here: record with env=mme_vla."
     )
-    if not cfg.lerobot and cfg.hdf5 is None:
+    if not run.lerobot and run.hdf5 is None:
         raise UserError("lerobot=false leaves nothing to write: name a folder with hdf5=<folder>.")
     options = read_section(
-        ConvertOptions, cfg.video, "video", images=cfg.images, fps=cfg.fps, names=cfg.names
+        ConvertOptions, run.video, "video", images=run.images, fps=run.fps, names=run.names
     )
-    jobs = plan(cfg)
+    jobs = plan(run)
     recording_plan = RecordingPlan(
         jobs,
-        Path(cfg.output) if cfg.lerobot else None,
-        None if cfg.hdf5 is None else Path(cfg.hdf5),
+        Path(run.output) if run.lerobot else None,
+        None if run.hdf5 is None else Path(run.hdf5),
     )
     places = ", ".join(map(str, recording_plan.places))
-    work = _work_folder(cfg.output)
+    work = _work_folder(run.output)
     if not recording_plan.missing(options) and not work.exists():
         print(f"{places}: {len(jobs)} episodes, all there already.")
-        if cfg.coverage is not None:
+        if run.coverage is not None:
             require_simulator()
-            report_coverage(named_tasks(cfg), recording_plan, Path(cfg.coverage), cfg.workers)
+            report_coverage(run.tasks, recording_plan, Path(run.coverage), run.workers)
         return
     require_simulator()
     with FolderLock(work, "recording"):
@@ -228,52 +256,50 @@ def run(cfg: "DictConfig") -> None:
         # asked again: another process may have finished it meanwhile
         missing = recording_plan.missing(options)
         if missing:
-            previews = None if cfg.previews is None else Path(cfg.previews)
-            begun, there = (
-                time.perf_counter(),
-                {path.stem for path in (work / "episodes").glob("*.json")},
-            )
-            done = record(jobs, work / "episodes", cfg.workers, previews)
+            previews = None if run.previews is None else Path(run.previews)
+            there = {path.stem for path in (work / "episodes").glob("*.json")}
+            begun = time.perf_counter()
+            done = record(jobs, work / "episodes", run.workers, previews)
             seconds = time.perf_counter() - begun
             recording_plan.write(missing, work / "episodes", options)
-            steps, again = sum(d["stored"] for d in done), sum(len(d["failed_seeds"]) for d in done)
+            steps = sum(d["stored"] for d in done)
+            again = sum(len(d["failed_seeds"]) for d in done)
             print(
                 f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were"
                 " replaced by the next."
             )
-            if new := [d for job, d in zip(jobs, done, strict=True) if job.name not in there]:
-                print(_throughput(len(new), sum(d["stored"] for d in new), seconds, cfg.workers))
+            new = [d for job, d in zip(jobs, done, strict=True) if job.name not in there]
+            if new:
+                print(_throughput(len(new), sum(d["stored"] for d in new), seconds, run.workers))
         else:
             print(f"{places}: {len(jobs)} episodes, all there already.")
         recording_plan.tidy()
-        drop_plan(
-            work,
-            *(
-                f"episodes/{job.name}.{ending}"
-                for job in jobs
-                for ending in ("h5", "json", "writing")
-            ),
-        )
-    if cfg.coverage is not None:
-        report_coverage(named_tasks(cfg), recording_plan, Path(cfg.coverage), cfg.workers)
+        drafts = []
+        for job in jobs:
+            for ending in ("h5", "json", "writing"):
+                drafts.append(f"episodes/{job.name}.{ending}")
+        drop_plan(work, *drafts)
+    if run.coverage is not None:
+        report_coverage(run.tasks, recording_plan, Path(run.coverage), run.workers)
 
 
-def record_environment(cfg: "DictConfig") -> None:
+def record_environment(run: RecordRun) -> None:
     """Record demonstrations of an environment of the user's own."""
-    source = environment(cfg.env)
+    source = environment(run.env)
     source.check_installed()
-    specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split, cfg.env)
-    output, work = Path(cfg.output), _work_folder(cfg.output)
+    specs = choose_episodes(run.tasks, run.episodes, run.split, run.env)
+    output = Path(run.output)
+    work = _work_folder(run.output)
     require(
         not output.exists(),
         f"{output} exists already; choose another output, or remove it yourself.",
     )
     with FolderLock(work, "recording"):
-        _claim(work, [{"env": cfg.env, "fps": cfg.fps}, *map(vars, specs)])
-        frames, failures = record_own(source, specs, output, work, cfg.fps)
+        _claim(work, [{"env": run.env, "fps": run.fps}, *map(vars, specs)])
+        frames, failures = record_own(source, specs, output, work, run.fps)
         drop_plan(work, DRAFT, *(glob.escape(episode_file(spec)) for spec in specs))
     print(
-        f"{cfg.output}: {len(specs) - len(failures)} episodes, {frames} steps; {len(failures)} did"
+        f"{run.output}: {len(specs) - len(failures)} episodes, {frames} steps; {len(failures)} did"
         " not succeed."
     )
 
@@ -281,7 +307,7 @@ def record_environment(cfg: "DictConfig") -> None:
 def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
     """A line on the speed; of a resumed recording, on what was added."""
     hours = max(seconds, 1e-9) / 3600
-    named = f"{workers} worker{'s'[: workers > 1]}"
+    named = "1 worker" if workers == 1 else f"{workers} workers"
     return (
         f"{episodes} episodes in {seconds:.0f} s with {named}: {episodes / hours:,.0f} episodes and"
         f" {steps / hours:,.0f} steps an hour."
@@ -299,10 +325,3 @@ def _claim(work: Path, plan: list[dict[str, Any]]) -> None:
         f"{work} holds an interrupted recording of other episodes. Repeat that command to finish"
         " it, choose another output, or remove that folder yourself.",
     )
-
-
-def main() -> None:
-    """Run `mme-vla record`."""
-    from mme_vla.cli.command import cli
-
-    cli("record")(run)()

@@ -4,32 +4,27 @@ import asyncio
 import logging
 import os
 import signal
-from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from mme_vla.cli.command import cli, log_to_terminal
-from mme_vla.cli.loading import load_policy, prepare_sampling
+from mme_vla.cli.command import log_to_terminal
+from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling
 from mme_vla.config.composition import resolved
-
-if TYPE_CHECKING:
-    from mme_vla.serving.server import PolicyServer
-
+from mme_vla.serving.server import PolicyServer
+from mme_vla.serving.settings import ServeSettings, is_local
 
 logger = logging.getLogger("mme_vla.serving")
 
 
-@cli("serve")
 def main(cfg: DictConfig) -> None:
     """Serve `checkpoint`, or a fresh `model`, until SIGTERM or Ctrl-C."""
-    from mme_vla.serving.server import PolicyServer
-    from mme_vla.serving.settings import ServeSettings, is_local
-
-    settings = ServeSettings.from_dict(resolved(cfg))
+    config = resolved(cfg)
+    settings = ServeSettings.from_dict(config)
+    choice = PolicyChoice.from_config(config)
     log_to_terminal(logger, clock=True)
-    policy, name, _ = load_policy(cfg, "serve", logger)
-    prepare_sampling(policy, cfg.sampling, logger)
-    server = PolicyServer(policy, settings, name=name, trained=cfg.checkpoint is not None)
+    policy, name, _ = load_policy(choice, "serve", logger)
+    prepare_sampling(policy, str(cfg.sampling), logger)
+    server = PolicyServer(policy, settings, name=name, trained=choice.checkpoint is not None)
     if not is_local(settings.host) and settings.api_key is None:
         logger.warning(
             "host=%s without api_key: every client that reaches this port can use it", settings.host
@@ -42,7 +37,7 @@ def main(cfg: DictConfig) -> None:
     asyncio.run(run(server))
 
 
-async def run(server: "PolicyServer") -> None:
+async def run(server: PolicyServer) -> None:
     """Start, wait for SIGTERM or Ctrl-C, stop; a second signal does not wait for what
     is running.
     """

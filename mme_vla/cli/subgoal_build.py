@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.cli.command import cli
 from mme_vla.config.sections import NonNegativeInt, read_section
 from mme_vla.subgoal.finetuning.collecting import build, open_input
 from mme_vla.subgoal.finetuning.rows import RowOptions
@@ -28,7 +27,6 @@ class BuildSettings:
     seed: NonNegativeInt
 
 
-@cli("subgoal_build")
 def main(cfg: DictConfig) -> dict[str, int]:
     """Build what configs/subgoal_build.yaml and the command line say."""
     settings = read_section(BuildSettings, OmegaConf.to_container(cfg, resolve=True), others=True)

@@ -4,11 +4,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from mme_vla.cli.command import cli
 from mme_vla.subgoal.finetuning.training import fine_tune
 
 
-@cli("subgoal_train")
 def main(cfg: DictConfig) -> Path:
     """Train as configs/subgoal_train.yaml and the command line say; return the adapter's folder."""
     return fine_tune(cfg)

@@ -1,16 +1,20 @@
-"""Reads a section of a configuration into a dataclass: keys, kinds of values, bounds and choices
-are checked once.
+"""Read a section of a configuration into a dataclass: keys, kinds of values, bounds and choices are
+checked once, by pydantic.
 
 Annotations declare all of it: `port: Annotated[int, Range(0, 65535)]`,
 `kind: Literal["simple", "grounded"]`. `__post_init__` is for what several keys mean together.
 """
 
+import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass
-from functools import cache, partial
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from annotated_types import BaseMetadata, Ge, GroupedMetadata, Gt, Le
+from pydantic import AllowInfNan, TypeAdapter, ValidationError
+from pydantic_core import to_json
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
 
@@ -24,34 +28,37 @@ _WORDS: Mapping[Any, str] = {
 
 
 @dataclass(frozen=True)
-class Range:
-    """Bounds of a finite number: from `least` to `most`, and larger than `above`."""
+class Range(GroupedMetadata):
+    """Bounds of a number: from `least` to `most`, and larger than `above`."""
 
     least: float = -math.inf
     most: float = math.inf
     above: float = -math.inf
 
-    def holds(self, value: float) -> bool:
-        """Whether a number is within the bounds."""
-        return self.above < value < math.inf and self.least <= value <= self.most
+    def __iter__(self) -> Iterator[BaseMetadata]:
+        """The bounds as pydantic reads them."""
+        if math.isfinite(self.least):
+            yield Ge(self.least)
+        if math.isfinite(self.most):
+            yield Le(self.most)
+        if math.isfinite(self.above):
+            yield Gt(self.above)
 
     @property
     def text(self) -> str:
+        """The bounds in words, to be read after "a number"."""
+        if math.isfinite(self.above):
+            upper = f" and at most {self.most:g}" if math.isfinite(self.most) else ""
+            return f" above {self.above:g}{upper}"
         if math.isfinite(self.most):
             return f" from {self.least:g} to {self.most:g}"
-        return (
-            f" above {self.above:g}" if math.isfinite(self.above) else f", {self.least:g} or more"
-        )
+        return f", {self.least:g} or more"
 
 
-Positive = Annotated[float, Range(above=0)]
-NonNegative = Annotated[float, Range(least=0)]
+Positive = Annotated[float, Range(above=0), AllowInfNan(False)]
+NonNegative = Annotated[float, Range(least=0), AllowInfNan(False)]
 PositiveInt = Annotated[int, Range(least=1)]
 NonNegativeInt = Annotated[int, Range(least=0)]
-
-
-class _MisfitError(Exception):
-    """A value that its key does not take."""
 
 
 def read_section[T](
@@ -60,47 +67,34 @@ def read_section[T](
     """Build a dataclass from a mapping.
 
     Args:
-        kind: a dataclass. Its annotations: `bool`, `int`, `float` (whole numbers too), `str`,
-            `Literal`, a dataclass (a section of its own), tuples of these (lists are taken),
-            mappings, `Any`, unions, and numbers with a `Range`.
-        values: the section. where: its dotted name in messages; empty for the top level.
-        others: ignore keys that are no fields. fixed: fields that the section does not set.
+        kind: a dataclass, with annotations that pydantic knows. Lists become tuples, whole numbers
+            become `float` where one is wanted, and dataclasses are sections of their own. Nothing
+            else is converted: a text never becomes a number.
+        values: the section.
+        where: its dotted name in messages; empty for the top level.
+        others: ignore keys that are no fields.
+        fixed: fields that the section does not set.
+
+    Raises:
+        UserError: the first key that does not fit, with its value and what is allowed.
     """
-    specs = {spec.name: spec for spec in fields(kind) if spec.init and spec.name not in fixed}  # type: ignore[arg-type]
-    needed = [
-        n
-        for n, spec in specs.items()
-        if spec.default is MISSING and spec.default_factory is MISSING
-    ]
+    known = [spec.name for spec in fields(kind) if spec.init and spec.name not in fixed]  # type: ignore[arg-type]
     if others and isinstance(values, Mapping):
-        values = {key: value for key, value in values.items() if key in specs}
-    parsed, hints = section_keys(values, where, specs), _hints(kind)  # type: ignore[arg-type]
-    if lacking := [key for key in needed if key not in parsed]:
-        raise _lacking(where, lacking[0], parsed)
-    read: dict[str, Any] = {}
-    for key, value in parsed.items():
-        name = f"{where}.{key}" if where else key
-        try:
-            read[key] = _converted(value, hints[key], name)
-        except _MisfitError:
-            assigned = f"={brief(value)}" if specs[key].repr else ""  # some values are secrets
-            choices = isinstance(value, str) and _choices(hints[key])
-            hint = (
-                f". {did_you_mean(value, map(str, choices))}"
-                if choices
-                else f" must be {_expected(hints[key])}."
-            )
-            raise UserError(f"{name}{assigned}{hint}") from None
-    return kind(**read, **fixed)
+        values = {key: value for key, value in values.items() if key in known}
+    section = {**section_keys(values, where, known), **fixed}
+    # Read as JSON, whose lists and maps may become tuples and dataclasses in strict mode.
+    text = to_json(section, inf_nan_mode="constants", fallback=brief)
+    if kind not in _ADAPTERS:
+        _ADAPTERS[kind] = TypeAdapter(kind)
+    try:
+        read: T = _ADAPTERS[kind].validate_json(text, strict=True, extra="forbid")
+    except ValidationError as error:
+        raise _mistake(error, kind, json.loads(text), where) from None
+    return read
 
 
-_hints = cache(partial(get_type_hints, include_extras=True))
-
-
-@cache
-def _parts(kind: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Origin and arguments of an annotation."""
-    return get_origin(kind), get_args(kind)
+_ADAPTERS: dict[Any, TypeAdapter[Any]] = {}
+"""pydantic's readers of the dataclasses that were read before."""
 
 
 def section_keys(
@@ -113,15 +107,18 @@ def section_keys(
         )
     for key in values:
         if key not in known:
-            name = brief(key, quote=False)
-            raise UserError(
-                f"Unknown key {f'{where}.' if where else ''}{name}."
-                f" {did_you_mean(str(key), list(known))}"
-            )
+            raise _unknown(where, key, list(known))
     for key in required:
         if values.get(key) is None:
             raise _lacking(where, key, values)
     return {str(key): value for key, value in values.items()}
+
+
+def _unknown(where: str, key: Any, known: Sequence[str]) -> UserError:
+    name = brief(key, quote=False)
+    if where:
+        name = f"{where}.{name}"
+    return UserError(f"Unknown key {name}. {did_you_mean(str(key), known)}")
 
 
 def _lacking(where: str, key: str, keys: Iterable[Any]) -> UserError:
@@ -130,58 +127,52 @@ def _lacking(where: str, key: str, keys: Iterable[Any]) -> UserError:
     )
 
 
-def _converted(value: Any, kind: Any, name: str) -> Any:
-    """The value of a field: sections are read, lists become tuples."""
-    origin, inside = _parts(kind)
-    if kind is Any:
-        return value
-    if origin in (Union, UnionType):
-        return _first_that_fits(value, inside, name)
-    if is_dataclass(kind):
-        return (
-            value
-            if isinstance(value, cast(type, kind))
-            else read_section(cast(type, kind), value, name)
-        )
-    if origin is tuple:
-        return _tuple(value, inside, name)
-    if origin is Annotated:
-        value = _converted(value, inside[0], name)
-        fits = all(bound.holds(value) for bound in inside[1:] if isinstance(bound, Range))
-    elif origin is Literal:
-        fits = any(value == choice and type(value) is type(choice) for choice in inside)
-    else:
-        accepted = (int, float) if kind is float else (origin or kind,)
-        fits = isinstance(value, bool) == (kind is bool) and isinstance(value, accepted)
-    if not fits:
-        raise _MisfitError
-    return value
+def _mistake(error: ValidationError, kind: Any, value: Any, where: str) -> UserError:
+    """What is wrong with the first key that pydantic refuses, in the words of its annotation."""
+    errors = error.errors(include_url=False)
+    # A misspelt key says more than the one that is missing for it.
+    misspelt = [one for one in errors if one["type"] == "unexpected_keyword_argument"]
+    first = misspelt[0] if misspelt else errors[0]
+    problem = first.get("ctx", {}).get("error")
+    if isinstance(problem, UserError):
+        return problem  # of a `__post_init__`
+    # Down to the key: what follows it are items of a list, and pydantic's names of alternatives.
+    key = where
+    is_secret = False
+    for part in first["loc"]:
+        section = _section_of(kind)
+        if section is None or not isinstance(value, Mapping):
+            break
+        if is_dataclass(section):
+            names = {spec.name: spec for spec in fields(section)}
+            if first["type"] == "unexpected_keyword_argument" and part not in names:
+                return _unknown(key, part, list(names))
+            if part not in names:
+                continue  # pydantic's name of an alternative
+            if part not in value:
+                return _lacking(key, str(part), value)
+            kind = get_type_hints(section, include_extras=True)[str(part)]
+            is_secret = not names[str(part)].repr
+        elif part in value:
+            kind = get_args(section)[1]
+        else:
+            break
+        key = f"{key}.{part}" if key else str(part)
+        value = value[part]
+    assigned = "" if is_secret else f"={brief(value)}"
+    choices = _choices(kind)
+    if choices and isinstance(value, str):
+        return UserError(f"{key}{assigned}. {did_you_mean(value, map(str, choices))}")
+    return UserError(f"{key}{assigned} must be {_expected(kind)}.")
 
 
-def _first_that_fits(value: Any, kinds: Sequence[Any], name: str) -> Any:
-    for kind in kinds:
-        if is_dataclass(kind) and isinstance(value, Mapping):
-            # its own words for what is wrong inside
-            return _converted(value, kind, name)
-    for kind in kinds:
-        if not is_dataclass(kind) or isinstance(value, cast(type, kind)):
-            try:
-                return _converted(value, kind, name)
-            except _MisfitError:
-                continue
-    raise _MisfitError
-
-
-def _tuple(value: Any, kinds: Sequence[Any], name: str) -> tuple[Any, ...]:
-    endless = len(kinds) == 2 and kinds[1] is Ellipsis
-    if (
-        not isinstance(value, Sequence)
-        or isinstance(value, str)
-        or not (endless or len(value) == len(kinds))
-    ):
-        raise _MisfitError
-    each = [kinds[0]] * len(value) if endless else kinds
-    return tuple(_converted(item, kind, name) for item, kind in zip(value, each, strict=True))
+def _section_of(kind: Any) -> Any:
+    """The dataclass or `Mapping` that an annotation names, alone or beside others; else None."""
+    alternatives = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    for part in alternatives:
+        if is_dataclass(part) or get_origin(part) is Mapping:
+            return part
+    return None
 
 
 def _choices(kind: Any) -> Sequence[Any]:

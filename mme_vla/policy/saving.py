@@ -235,24 +235,36 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def save_policy(
-    policy: "Policy", folder: Path, *, dtype: str = "float32", card: Mapping[str, Any] | None = None
+    policy: "Policy",
+    folder: Path,
+    *,
+    dtype: str = "float32",
+    card: Mapping[str, Any] | None = None,
+    facts: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a policy to a folder; see `Policy.save_pretrained`."""
+    """Write a policy to a folder; see `Policy.save_pretrained`.
+
+    Args:
+        facts: sections that join the policy's configuration in the file.
+    """
     kind = dtype_of(dtype)
     if card is not None:
         policy.config["card"] = {**policy.config.get("card", {}), **card}
     save_tensors(policy.state_dict(), folder, dtype=kind)
-    settings = save_settings(policy, folder)
+    settings = save_settings(policy, folder, facts)
     # without the card, which people edit
     write_sums(folder, [*settings, *list_weight_files(folder)])
 
 
-def save_settings(policy: "Policy", folder: Path) -> list[str]:
+def save_settings(
+    policy: "Policy", folder: Path, facts: Mapping[str, Any] | None = None
+) -> list[str]:
     """Write all files of a checkpoint but the weights; return the names of those that get
     checksums.
     """
-    (folder / CONFIG).write_text(json.dumps(policy.config, indent=2, ensure_ascii=False) + "\n")
-    (folder / CARD_FILE).write_text(model_card(policy, policy.config))
+    config = {**policy.config, **(facts or {})}
+    (folder / CONFIG).write_text(json.dumps(config, indent=2, ensure_ascii=False) + "\n")
+    (folder / CARD_FILE).write_text(model_card(policy, config))
     if policy.processor is None:
         return [CONFIG]
     return [CONFIG, *policy.processor.save(folder)]

@@ -29,7 +29,7 @@ from mme_vla.config.sections import section_keys
 from mme_vla.errors import UserError, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
-from mme_vla.policy.saving import save_settings
+from mme_vla.policy.saving import save_policy, save_settings
 from mme_vla.policy.tensor_files import (
     assign_tensors,
     cast,
@@ -74,24 +74,28 @@ def save_checkpoint(
     optimizer: torch.optim.Optimizer,
     config: Mapping[str, Any],
     keep: KeepRule,
+    facts: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write `folder`/step_…; it appears whole or not at all. Then remove what `keep` does not hold
     on to.
+
+    Args:
+        config: of the training, for `training_state.json`.
+        facts: sections that join the policy's own configuration.
     """
     from safetensors.torch import save_file
 
     target, draft = _places(folder, step)
     shutil.rmtree(draft, ignore_errors=True)
     with ema.applied():
-        policy.save_pretrained(draft)
+        save_policy(policy, draft, facts=facts)
     parameters = trainable(policy)
     save_file({name: _on_cpu(p) for name, p in parameters.items()}, draft / RAW)
-    moments = {
-        f"{name}/{key}": _on_cpu(optimizer.state[p][key])
-        for name, p in parameters.items()
-        for key in _ADAM
-        if p in optimizer.state
-    }
+    moments = {}
+    for name, p in parameters.items():
+        if p in optimizer.state:
+            for key in _ADAM:
+                moments[f"{name}/{key}"] = _on_cpu(optimizer.state[p][key])
     save_file(moments, draft / OPTIMIZER)
     _write_state(draft, step, config)
     write_sums(draft, (RAW, OPTIMIZER, STATE), keep=True)
@@ -109,6 +113,7 @@ def save_shards(
     optimizer: torch.optim.Optimizer,
     config: Mapping[str, Any],
     keep: KeepRule,
+    facts: Mapping[str, Any] | None = None,
     hurry: bool = False,
 ) -> Path:
     """Begin to write `folder`/step_… of a sharded run; all processes call it and wait for the
@@ -126,7 +131,7 @@ def save_shards(
     about: list[str] = []
     if first:
         fresh_folder(draft)
-        about = [*save_settings(policy, draft), STATE]
+        about = [*save_settings(policy, draft, facts), STATE]
 
     def finish() -> None:
         place, notes = draft, shard_notes(draft)
@@ -150,9 +155,10 @@ def load_policy(checkpoint: Path, policy: Policy) -> None:
     """Give a policy, on meta or not, the weights that a run continues from; `restore` brings all
     else.
     """
-    tensors = (
-        read_weights(checkpoint, policy) if shard_files(checkpoint) else load_tensors(checkpoint)
-    )
+    if shard_files(checkpoint):
+        tensors = read_weights(checkpoint, policy)
+    else:
+        tensors = load_tensors(checkpoint)
     assign_tensors(policy, tensors, str(checkpoint))
 
 
@@ -163,19 +169,19 @@ def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optim
         moments = read_shards(folder, policy, ema.tensors(), optimizer, parameters)
     else:
         moments = _read_full(folder, policy, ema)
+    # The optimizer counts its parameters through all groups.
+    numbers: dict[int, int] = {}
+    for group in optimizer.param_groups:
+        for p in group["params"]:
+            numbers[id(p)] = len(numbers)
     state = optimizer.state_dict()
-    place = {
-        id(p): i
-        for i, p in enumerate(p for group in optimizer.param_groups for p in group["params"])
-    }
-    state["state"] = {
-        place[id(p)]: {
-            key: like(p, moments[f"{name}/{key}"]).clone() for key in MOMENTS
-        }  # not in a mapped file
-        | {"step": moments[f"{name}/step"].clone()}
-        for name, p in parameters.items()
-        if f"{name}/step" in moments
-    }
+    state["state"] = {}
+    for name, p in parameters.items():
+        if f"{name}/step" in moments:
+            # Copies, since what was read may lie in a mapped file.
+            saved = {key: like(p, moments[f"{name}/{key}"]).clone() for key in MOMENTS}
+            saved["step"] = moments[f"{name}/step"].clone()
+            state["state"][numbers[id(p)]] = saved
     optimizer.load_state_dict(state)
 
 
@@ -194,12 +200,11 @@ def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
     }
     _check_fit(folder / "model.safetensors", averaged, state)
     _check_fit(folder / RAW, raw, parameters)
-    required = {
-        f"{name}/{key}": p
-        for name, p in parameters.items()
-        for key in _ADAM
-        if f"{name}/{key}" in moments
-    }
+    required = {}
+    for name, p in parameters.items():
+        for key in _ADAM:
+            if f"{name}/{key}" in moments:
+                required[f"{name}/{key}"] = p
     _check_fit(folder / OPTIMIZER, moments, required, scalar="/step")
     for path, tensors in ((folder, averaged), (folder / RAW, raw), (folder / OPTIMIZER, moments)):
         check_values(tensors, str(path))

@@ -2,23 +2,27 @@
 place.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mme_vla.data.cache import COMMAND
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.dataset import GroupDataset, TrainingDataset
-from mme_vla.data.sources import default_val_episodes, open_sources, split_episodes
-from mme_vla.data.statistics import NARROW, check_ranges, compute_norm_stats
-from mme_vla.errors import UserError, check_choice, require
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.sources import Split, default_val_episodes, open_sources, split_episodes
+from mme_vla.data.statistics import check_ranges, compute_norm_stats
+from mme_vla.errors import UserError, require
 from mme_vla.memory.perturbation import build_transforms
 from mme_vla.policy.base import Policy
 from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import SubgoalText
 from mme_vla.registry import TRAINING_SETS
+from mme_vla.training.settings import CacheSettings, DataSettings
 from mme_vla.types import labels_read
 from mme_vla.utils import checked_file
 
@@ -39,7 +43,7 @@ class SplitData:
 
 def prepare_data(
     policy: Policy,
-    data: Mapping[str, Any],
+    data: DataSettings,
     seed: int,
     stats_from: Path | None = None,
     cache_command: str = COMMAND,
@@ -50,8 +54,9 @@ def prepare_data(
     the vision caches.
 
     Args:
-        policy: with the vision weights it will train with. data: the section `data` of a
-            configuration.
+        policy: with the vision weights it will train with.
+        data: the section `data` of a configuration.
+        seed: of statistics that are estimated from a part, and of what training draws.
         cache_command: what to tell the user to run where a cache is missing.
         stats_from: a checkpoint folder whose statistics to use; otherwise they are computed over
             the training split.
@@ -59,110 +64,173 @@ def prepare_data(
         encoder: the policy's `vision_fingerprint`, where this process does not hold the weights; by
             default asked here.
     """
-    sources = open_sources(data["sources"], policy.embodiment)
-    val_episodes = (
-        default_val_episodes(sources) if data["val_episodes"] is None else data["val_episodes"]
-    )
-    split = split_episodes(sources, data["val_fraction"], val_episodes)
-    processor, offset = policy.require_processor(), data["action_offset"]
-    counted = processor.stats_spec
-    horizon = counted.horizon or processor.embodiment.action.horizon
-    narrow = data.get("narrow_ranges") or "refuse"
-    check_choice("data.narrow_ranges", narrow, NARROW)
-    if counted.bounds == "extremes":
-        narrow = "ignore"  # nothing lies beyond them
-    if stats_from is not None:
-        processor.stats = NormStats.load(checked_file(stats_from, STATS_FILE))
-        try:
-            check_ranges(
-                processor.stats,
-                sources,
-                split.train,
-                horizon,
-                offset,
-                policy.embodiment,
-                counted.video,
-                "refuse"
-                if narrow == "widen"
-                else narrow,  # a run's statistics stay what they are to its end
-            )
-        except UserError as error:
-            raise UserError(
-                f"{stats_from / STATS_FILE}, the statistics that this run began with: {error} In a"
-                " run that is resumed they stay as they are: begin a new one with that and"
-                f" init_from={stats_from}, or continue with data.narrow_ranges=warn."
-            ) from None
+    check_changes(policy, data)
+    sources, split = open_split(policy, data)
+    processor = policy.require_processor()
+    if stats_from is None:
+        processor.stats = compute_statistics(policy, data, sources, split, seed)
     else:
-        processor.stats = compute_norm_stats(
-            sources, split.train, horizon, offset, seed, policy.embodiment,
-            every=counted.every, extremes=counted.extremes, exact=counted.exact,
-            video=counted.video, narrow=narrow,
-        )  # fmt: skip
-    memory_parts = set() if policy.memory is None else set(policy.memory.modules())
-    labels = labels_read(*(part for part in policy.modules() if part not in memory_parts))
-    require(
-        data.get("weights") is None
-        or (policy.loss_weights is not None and processor.samples.kind == "steps"),
-        f"data.weights={data.get('weights')}: {type(policy).__name__} does not weigh samples. Set"
-        " data.weights=null.",
-    )
-    subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
+        processor.stats = read_statistics(stats_from, policy, data, sources, split)
     caches = None
     if policy.memory is not None:
-        cache = data["cache"]
-        encoder = encoder or policy.vision_fingerprint()
-        caches = [
-            ensure_cache(
-                source,
-                policy.memory,
-                policy.encode_frames,
-                encoder,
-                root=cache["root"],
-                dtype=str(policy.info.history_dtype).removeprefix("torch."),
-                max_build_frames=cache["max_build_frames"],
-                batch_size=cache["batch_size"],
-                command=cache_command,
-            )
-            for source in sources
-        ]
-
-    transforms = build_transforms(data.get("history_transforms"))
-    require(
-        not transforms or processor.samples.kind == "steps",
-        "data.history_transforms changes frames, and this policy learns from"
-        f" {processor.samples.kind}: leave it empty.",
-    )
-
-    def side(episodes: list[Any], held_out: bool = False) -> Any:
-        if processor.samples.kind != "steps":
-            build = TRAINING_SETS[processor.samples.kind]
-            return build(sources, processor, policy, episodes, seed=seed, sampled=not held_out)
-        kind = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
-        return kind(
-            sources,
-            processor,
-            policy.memory,
-            caches,
-            episodes=episodes,
-            action_offset=offset,
-            mask_padding=data["mask_padding"],
-            jitter=data["jitter"] and not held_out,
-            subgoal=subgoal,
-            labels=labels,
-            weights=data.get("weights"),
-            seed=seed,
-            transforms=() if held_out else transforms,
-        )
-
+        caches = open_caches(policy, data.cache, sources, cache_command, encoder)
+    train = _samples(policy, data, sources, caches, split.train, seed)
     held_out = sum(map(len, split.val))
-    prepared = SplitData(side(split.train), side(split.val, held_out=True) if held_out else None,
-                         [source.fingerprint for source in sources])  # fmt: skip
+    val = None
+    if held_out:
+        val = _samples(policy, data, sources, caches, split.val, seed, held_out=True)
     say(
-        f"data {data['name']}: {len(prepared.train)} training steps in {sum(map(len, split.train))}"
-        f" episodes, {0 if prepared.val is None else len(prepared.val)} held-out steps in"
-        f" {held_out}"
+        f"data {data.name}: {len(train)} training steps in {sum(map(len, split.train))} episodes,"
+        f" {0 if val is None else len(val)} held-out steps in {held_out}"
     )
-    return prepared
+    return SplitData(train, val, [source.fingerprint for source in sources])
+
+
+def check_changes(policy: Policy, data: DataSettings) -> None:
+    """Refuse weights and transforms that the policy's kind of samples does not have."""
+    kind = policy.require_processor().samples.kind
+    require(
+        data.weights is None or (policy.loss_weights is not None and kind == "steps"),
+        f"data.weights={data.weights}: {type(policy).__name__} does not weigh samples. Set"
+        " data.weights=null.",
+    )
+    require(
+        not build_transforms(data.history_transforms) or kind == "steps",
+        f"data.history_transforms changes frames, and this policy learns from {kind}: leave it"
+        " empty.",
+    )
+
+
+def open_split(policy: Policy, data: DataSettings) -> tuple[list[EpisodeSource], Split]:
+    """Open the datasets, and choose the episodes of both sides."""
+    sources = open_sources(data.sources, policy.embodiment)
+    val_episodes: Sequence[int | str] | None = data.val_episodes
+    if val_episodes is None:
+        val_episodes = default_val_episodes(sources)
+    return sources, split_episodes(sources, data.val_fraction, val_episodes)
+
+
+def compute_statistics(
+    policy: Policy, data: DataSettings, sources: list[EpisodeSource], split: Split, seed: int
+) -> NormStats:
+    """The statistics of the training split that the policy's processor normalises with."""
+    processor = policy.require_processor()
+    spec = processor.stats_spec
+    narrow: str = data.narrow_ranges or "refuse"
+    if spec.bounds == "extremes":
+        narrow = "ignore"  # nothing lies beyond them
+    return compute_norm_stats(
+        sources,
+        split.train,
+        spec.horizon or processor.embodiment.action.horizon,
+        data.action_offset,
+        seed,
+        policy.embodiment,
+        every=spec.every,
+        extremes=spec.extremes,
+        exact=spec.exact,
+        video=spec.video,
+        narrow=narrow,
+    )
+
+
+def read_statistics(
+    folder: Path,
+    policy: Policy,
+    data: DataSettings,
+    sources: list[EpisodeSource],
+    split: Split,
+) -> NormStats:
+    """The statistics of a checkpoint, once the training split lies within them.
+
+    Raises:
+        UserError: numbers of the split lie far beyond; a run's statistics stay what they are to its
+            end, so `narrow_ranges=widen` cannot help.
+    """
+    processor = policy.require_processor()
+    spec = processor.stats_spec
+    stats = NormStats.load(checked_file(folder, STATS_FILE))
+    narrow: str = "warn" if data.narrow_ranges == "warn" else "refuse"
+    if spec.bounds == "extremes":
+        narrow = "ignore"
+    try:
+        check_ranges(
+            stats,
+            sources,
+            split.train,
+            spec.horizon or processor.embodiment.action.horizon,
+            data.action_offset,
+            policy.embodiment,
+            spec.video,
+            narrow,
+        )
+    except UserError as error:
+        raise UserError(
+            f"{folder / STATS_FILE}, the statistics that this run began with: {error} In a"
+            " run that is resumed they stay as they are: begin a new one with that and"
+            f" init_from={folder}, or continue with data.narrow_ranges=warn."
+        ) from None
+    return stats
+
+
+def open_caches(
+    policy: Policy,
+    settings: CacheSettings,
+    sources: list[EpisodeSource],
+    command: str,
+    encoder: str | None,
+) -> list[Any]:
+    """The vision cache of each dataset, built first where it is missing and small enough."""
+    assert policy.memory is not None
+    return [
+        ensure_cache(
+            source,
+            policy.memory,
+            policy.encode_frames,
+            encoder or policy.vision_fingerprint(),
+            root=settings.root,
+            dtype=str(policy.history_dtype).removeprefix("torch."),
+            max_build_frames=settings.max_build_frames,
+            batch_size=settings.batch_size,
+            command=command,
+        )
+        for source in sources
+    ]
+
+
+def _samples(
+    policy: Policy,
+    data: DataSettings,
+    sources: list[EpisodeSource],
+    caches: list[Any] | None,
+    episodes: list[np.ndarray],
+    seed: int,
+    held_out: bool = False,
+) -> Any:
+    """The samples of one side. Held-out ones are never changed at random."""
+    processor = policy.require_processor()
+    kind = processor.samples.kind
+    if kind != "steps":
+        build = TRAINING_SETS[kind]
+        return build(sources, processor, policy, episodes, seed=seed, sampled=not held_out)
+    # A memory has labels of its own: they are not the network's.
+    memory_parts = set() if policy.memory is None else set(policy.memory.modules())
+    dataset = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
+    return dataset(
+        sources,
+        processor,
+        policy.memory,
+        caches,
+        episodes=episodes,
+        action_offset=data.action_offset,
+        mask_padding=data.mask_padding,
+        jitter=data.jitter and not held_out,
+        subgoal=SubgoalText.from_config(policy.config.get("subgoal_text")),
+        labels=labels_read(*(part for part in policy.modules() if part not in memory_parts)),
+        weights=data.weights,
+        seed=seed,
+        transforms=() if held_out else build_transforms(data.history_transforms),
+    )
 
 
 def check_frozen(policy: Policy, freeze_vision: bool) -> None:

@@ -109,6 +109,7 @@ class ProgressLine:
     """
 
     def __init__(self, total: int, done: int, visible: bool = True) -> None:
+        self.visible = visible
         self.console = Console(quiet=not visible, highlight=False, soft_wrap=True)
         self._total = total
         self._bar: Progress | None = None

@@ -27,7 +27,7 @@ from mme_vla.training.checkpoint import (
 )
 from mme_vla.training.data import SplitData
 from mme_vla.training.logging import Loggers, ProgressLine, Window, memory_gib, read_metrics
-from mme_vla.training.open_loop import error_lines, open_loop, plot_open_loop
+from mme_vla.training.open_loop import OpenLoop, error_lines, open_loop, plot_open_loop
 from mme_vla.training.optim import EMA, clip_gradients, lr_factors, make_optimizer, scheduled_rate
 from mme_vla.training.order import (
     BatchOrder,
@@ -78,6 +78,7 @@ class Trainer:
         run: Run,
         config: Mapping[str, Any],
         accelerator: Accelerator,
+        facts: Mapping[str, Any] | None = None,
     ) -> None:
         """Put the policy on its device, and back to where `run.checkpoint` left it.
 
@@ -85,9 +86,15 @@ class Trainer:
             policy: with the parameters frozen that shall not learn. samples: the training split.
             validation: held-out samples, if any.
             config: the plain configuration, saved with every checkpoint.
+            facts: sections that join the policy's own configuration in checkpoints: its training
+                and its card.
         """
-        self.settings, self.run_info, self.config = settings, run, config
-        self.accelerator, self.validation = accelerator, validation
+        self.settings = settings
+        self.run_info = run
+        self.config = config
+        self.accelerator = accelerator
+        self.validation = validation
+        self.facts = dict(facts or {})
         self.order = BatchOrder(
             len(samples),
             settings.batch_size,
@@ -97,7 +104,8 @@ class Trainer:
             accelerator.process_index,
             accelerator.num_processes,
         )
-        workers, ahead = settings.workers, None
+        workers = settings.workers
+        ahead = None
         if workers:
             rows = self.order.rows(0)
             batch_bytes = size_of(samples[0]) * (rows.stop - rows.start)
@@ -148,16 +156,15 @@ class Trainer:
         """The signal that ended `run` early."""
 
     def describe(self) -> str:
-        total, trained = (
-            sum(p.numel() for p in part) for part in (self.policy.parameters(), self._parameters)
-        )
-        processes = (
-            f"{self.accelerator.num_processes} × " if self.accelerator.num_processes > 1 else ""
-        )
+        """What is trained, where, in one line."""
+        total = sum(p.numel() for p in self.policy.parameters())
+        trained = sum(p.numel() for p in self._parameters)
+        device = str(self.accelerator.device)
+        if self.accelerator.num_processes > 1:
+            device = f"{self.accelerator.num_processes} × {device}"
         return (
             f"{self.config.get('name', 'policy')}: {total / 1e6:.2f} M parameters,"
-            f" {trained / 1e6:.2f} M trained, on {processes}{self.accelerator.device}, in"
-            f" {self.run_info.folder}"
+            f" {trained / 1e6:.2f} M trained, on {device}, in {self.run_info.folder}"
         )
 
     def run(self, line: ProgressLine, loggers: Loggers) -> bool:
@@ -167,7 +174,8 @@ class Trainer:
             Whether it got there; False when the user or the cluster asked it to stop, which saves a
             checkpoint first.
         """
-        window, settings = Window(self.settings.batch_size), self.settings
+        settings = self.settings
+        window = Window(settings.batch_size)
         if self.run_info.step >= settings.steps:  # killed between its last step and its end
             if self.accelerator.is_main_process:
                 tidy(self.run_info.checkpoints, settings.keep)
@@ -204,7 +212,8 @@ class Trainer:
         """One optimizer update from the next `accumulate` pieces of `batches`; its metrics,
         detached, unwaited for.
         """
-        settings, device = self.settings, self.accelerator.device
+        settings = self.settings
+        device = self.accelerator.device
         rate = scheduled_rate(step, settings)
         for group in self.optimizer.param_groups:
             group["lr"] = rate * group.get("lr_factor", 1.0)
@@ -224,11 +233,10 @@ class Trainer:
             torch.manual_seed(
                 seed_of(settings.seed, "model", step, piece, self.accelerator.process_index)
             )
-            last = piece == settings.accumulate - 1
-            with self._gradients_shared(last):
-                loss, metrics = self.model(
-                    batch, {name: send(value[rows], device) for name, value in draws.items()}
-                )
+            piece_draws = {name: send(value[rows], device) for name, value in draws.items()}
+            is_last = piece == settings.accumulate - 1
+            with self._gradients_shared(is_last):
+                loss, metrics = self.model(batch, piece_draws)
                 self.accelerator.backward(loss / settings.accumulate)
             for name, value in metrics.items():
                 part = value.detach().float() / settings.accumulate
@@ -258,14 +266,16 @@ class Trainer:
         """
         if self.validation is None:
             return None
-        processes = self.accelerator.process_index, self.accelerator.num_processes
         with self.ema.applied():
-            loss = self.validation.loss(self.policy, *processes, self.accelerator.reduce)
+            loss = self.validation.loss(
+                self.policy,
+                self.accelerator.process_index,
+                self.accelerator.num_processes,
+                self.accelerator.reduce,
+            )
         loggers.write(step, {"val/loss": loss})
-        self.policy.config.setdefault("card", {})["results"] = {
-            "validation loss": round(loss, 4),
-            "at step": step,
-        }
+        results = {"validation loss": round(loss, 4), "at step": step}
+        self.facts["card"] = {**self.facts.get("card", {}), "results": results}
         line.say(f"step {step}/{self.settings.steps} · validation loss {loss:.4f}")
         return loss
 
@@ -277,7 +287,7 @@ class Trainer:
             stopping: the process may be killed before long: what resuming needs comes first.
         """
         folder, keep = self.run_info.checkpoints, self.settings.keep
-        saved = (self.policy, self.ema, self.optimizer, self.config, keep)
+        saved = (self.policy, self.ema, self.optimizer, self.config, keep, self.facts)
         if self._shard_writer is not None:
             save_shards(self._shard_writer, folder, step, *saved, hurry=stopping)
         else:
@@ -335,25 +345,12 @@ def finish(
     Args:
         seconds: what the run took so far, for the summary.
     """
-    folder, settings, policy = trainer.run_info.folder, trainer.settings, trainer.policy
-    samples = data.train if data.val is None else data.val
-    first, result = trainer.accelerator.is_main_process, None
-    if settings.open_loop_chunks and not isinstance(samples, TrainingDataset):
-        line.say(
-            "no open-loop check: it compares chunks step by step, and these samples are keyframes"
-        )
-    elif (
-        isinstance(samples, TrainingDataset)
-        and settings.open_loop_chunks
-        and (first or trainer.sharded)
-    ):
-        with trainer.ema.applied(), gathered(policy):
-            if first:
-                policy.eval()
-                result = open_loop(
-                    policy, samples, settings.open_loop_chunks, settings.seed, data.val is not None
-                )
-    if not first:
+    folder = trainer.run_info.folder
+    settings = trainer.settings
+    result = None
+    if settings.open_loop_chunks:
+        result = _check_open_loop(trainer, data, line)
+    if not trainer.accelerator.is_main_process:
         return {}
     summary: dict[str, Any] = {"steps": settings.steps, **loss_change(read_metrics(folder))}
     if result is not None:
@@ -361,7 +358,8 @@ def finish(
         loggers.log_image(settings.steps, "open_loop", folder / PLOT)
         summary["open_loop"] = result.summary()
         line.say("\n".join([f"open loop on {result.title}", *error_lines(summary["open_loop"])]))
-        if verdict := worse_than_still(summary["open_loop"], settings.steps):
+        verdict = worse_than_still(summary["open_loop"], settings.steps)
+        if verdict:
             line.say(verdict)
         line.say(f"plot: {folder / PLOT}")
     summary |= {"checkpoint": str(trainer.last_checkpoint), "seconds": round(seconds, 1)}
@@ -373,6 +371,34 @@ def finish(
     )
     line.say(f"checkpoint: {trainer.last_checkpoint}")
     return summary
+
+
+def _check_open_loop(trainer: Trainer, data: SplitData, line: ProgressLine) -> OpenLoop | None:
+    """Compare chunks of the averaged weights with recorded ones, in the first process.
+
+    The others only take part where the weights are shared.
+    """
+    samples = data.train if data.val is None else data.val
+    if not isinstance(samples, TrainingDataset):
+        line.say(
+            "no open-loop check: it compares chunks step by step, and these samples are keyframes"
+        )
+        return None
+    is_first = trainer.accelerator.is_main_process
+    if not (is_first or trainer.sharded):
+        return None
+    settings = trainer.settings
+    with trainer.ema.applied(), gathered(trainer.policy):
+        if not is_first:
+            return None
+        trainer.policy.eval()
+        return open_loop(
+            trainer.policy,
+            samples,
+            settings.open_loop_chunks,
+            settings.seed,
+            data.val is not None,
+        )
 
 
 def worse_than_still(summary: Mapping[str, Any], steps: int) -> str:
@@ -405,20 +431,23 @@ def loss_change(lines: Sequence[Mapping[str, Any]], share: float = 0.05) -> dict
     Args:
         lines: of `metrics.jsonl`; each holds the mean since the line before it.
     """
-    losses = [(line["step"], line["train/loss"]) for line in lines if "train/loss" in line]
-    if not losses:
+    spans: list[tuple[int, int, float]] = []  # from which step to which, and the mean loss
+    total = 0
+    for line in lines:
+        if "train/loss" in line:
+            spans.append((total, line["step"], line["train/loss"]))
+            total = line["step"]
+    if not spans:
         return {}
-    total = losses[-1][0]
-    before = [0, *(step for step, _ in losses[:-1])]
-    spans = [(begun, step, loss) for begun, (step, loss) in zip(before, losses, strict=True)]
 
     def mean(entries: list[tuple[int, int, float]]) -> float:
-        return sum((end - begun) * loss for begun, end, loss in entries) / sum(
-            end - begun for begun, end, _ in entries
-        )
+        weighted = sum((end - begun) * loss for begun, end, loss in entries)
+        return weighted / sum(end - begun for begun, end, _ in entries)
 
     first = [span for span in spans if span[0] < max(share * total, 1)]
     last = [span for span in spans if span[1] > min((1 - share) * total, total - 1)]
     change = {"first_loss": mean(first), "last_loss": mean(last)}
     held_out = [line["val/loss"] for line in lines if "val/loss" in line]
-    return {**change, "val_loss": held_out[-1]} if held_out else change
+    if held_out:
+        change["val_loss"] = held_out[-1]
+    return change

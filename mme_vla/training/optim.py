@@ -32,18 +32,20 @@ def scheduled_rate(step: int, settings: TrainSettings) -> float:
     that is `lr` times `schedule_end` at `schedule_steps`, or `gamma` times less from each of the
     `milestones` on.
     """
-    peak, warmup = settings.lr, settings.warmup
+    peak = settings.lr
+    warmup = settings.warmup
+    if step < warmup and settings.warmup_from_zero:
+        return peak * step / warmup
     if step < warmup:
-        return (
-            peak * step / warmup if settings.warmup_from_zero else learning_rate(step, peak, warmup)
-        )
+        return learning_rate(step, peak, warmup)
     if settings.schedule == "cosine":
         total = settings.schedule_steps or settings.steps
         done = min((step - warmup) / max(total - warmup, 1), 1.0)
         least = settings.schedule_end
         return peak * (least + (1 - least) * 0.5 * (1 + math.cos(math.pi * done)))
     if settings.schedule == "steps":
-        return peak * settings.gamma ** sum(step >= milestone for milestone in settings.milestones)
+        passed = sum(step >= milestone for milestone in settings.milestones)
+        return peak * settings.gamma**passed
     return peak
 
 
@@ -70,38 +72,33 @@ def make_optimizer(
         factors: of each parameter's learning rate, of `lr_factors`; a group keeps its own as
             `lr_factor`. None: all 1.
     """
-    parameters_list, least = list(parameters), settings.decay_min_dim
+    parameters = list(parameters)
+    if factors is None:
+        factors = [1.0] * len(parameters)
     members: dict[tuple[float, bool], list[nn.Parameter]] = {}
-    for parameter, factor in zip(
-        parameters_list, factors or [1.0] * len(parameters_list), strict=True
-    ):
-        members.setdefault((factor, parameter.ndim >= least), []).append(parameter)
-    groups: list[dict[str, Any]] = [
-        {"params": group}
-        | ({} if decays else {"weight_decay": 0.0})
-        | ({} if factor == 1 else {"lr_factor": factor})
-        for (factor, decays), group in sorted(
-            members.items(), key=lambda item: (-item[0][0], -item[0][1])
-        )
-    ]
+    for parameter, factor in zip(parameters, factors, strict=True):
+        decays = parameter.ndim >= settings.decay_min_dim
+        members.setdefault((factor, decays), []).append(parameter)
+    groups = []
+    # Large factors first, and of one factor those that decay: checkpoints count on the order.
+    for factor, decays in sorted(members, reverse=True):
+        group: dict[str, Any] = {"params": members[factor, decays]}
+        if not decays:
+            group["weight_decay"] = 0.0
+        if factor != 1:
+            group["lr_factor"] = factor
+        groups.append(group)
+    options: dict[str, Any] = {
+        "lr": settings.lr,
+        "betas": settings.betas,
+        "eps": settings.eps,
+        "weight_decay": settings.weight_decay,
+    }
     if settings.optimizer == "lamb":
         from mme_vla.training.lamb import ClippedLamb  # imports timm, and so torchvision
 
-        return ClippedLamb(
-            groups,
-            lr=settings.lr,
-            betas=settings.betas,
-            eps=settings.eps,
-            weight_decay=settings.weight_decay,
-        )
-    return torch.optim.AdamW(
-        groups,
-        lr=settings.lr,
-        betas=settings.betas,
-        eps=settings.eps,
-        weight_decay=settings.weight_decay,
-        fused=True,
-    )
+        return ClippedLamb(groups, **options)
+    return torch.optim.AdamW(groups, **options, fused=True)
 
 
 @torch.no_grad()

@@ -3,6 +3,7 @@ nothing.
 """
 
 import hashlib
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -49,14 +50,20 @@ class BatchOrder:
             "lower the batch size or add data.",
         )
         require(
-            not (batch_size % (accumulate * processes)),
+            batch_size % (accumulate * processes) == 0,
             f"train.batch_size={batch_size} counts the samples of one update over all processes: it"
             f" must be a multiple of {processes} processes × train.accumulate={accumulate}.",
         )
-        self.samples, self.batch_size, self.seed, self.steps = samples, batch_size, seed, steps
-        self.accumulate, self.process, self.processes = accumulate, process, processes
+        self.samples = samples
+        self.batch_size = batch_size
+        self.seed = seed
+        self.steps = steps
+        self.accumulate = accumulate
+        self.process = process
+        self.processes = processes
         self.steps_per_epoch = samples // batch_size
-        self._epoch, self._shuffled = -1, torch.empty(0, dtype=torch.int64)
+        self._epoch = -1
+        self._shuffled = torch.empty(0, dtype=torch.int64)
 
     def batch(self, step: int) -> list[int]:
         """The whole batch of one update, in order."""
@@ -76,7 +83,8 @@ class BatchOrder:
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
         for step in self.steps:
-            batch, epoch = self.batch(step), step // self.steps_per_epoch
+            batch = self.batch(step)
+            epoch = step // self.steps_per_epoch
             for piece in range(self.accumulate):
                 yield [(epoch, index) for index in batch[self.rows(piece)]]
 
@@ -88,13 +96,16 @@ MOST_AHEAD = 4  # batches a worker
 
 
 def size_of(item: Any) -> int:
+    """Bytes of all tensors in a sample."""
     if isinstance(item, Tensor):
         return item.nbytes
     if isinstance(item, Mapping):
         return sum(map(size_of, item.values()))
     if isinstance(item, Sequence) and not isinstance(item, str | bytes):
         return sum(map(size_of, item))
-    return sum(map(size_of, vars(item).values())) if hasattr(item, "__dict__") else 0
+    if hasattr(item, "__dict__"):
+        return sum(map(size_of, vars(item).values()))
+    return 0
 
 
 def readers(workers: int, batch_bytes: int, most: float) -> tuple[int, int]:
@@ -105,7 +116,9 @@ def readers(workers: int, batch_bytes: int, most: float) -> tuple[int, int]:
     """
     fitting = max(int(most // max(batch_bytes, 1)), 1)
     workers = min(workers, fitting)
-    return workers, min(fitting // workers, MOST_AHEAD) if workers else 0
+    if not workers:
+        return 0, 0
+    return workers, min(fitting // workers, MOST_AHEAD)
 
 
 class Samples(Protocol):
@@ -125,12 +138,10 @@ class Validation:
         self, samples: Samples, collate: Collate, count: int, batch_size: int, seed: int
     ) -> None:
         """Choose `count` samples, evenly spaced over the split (all, if it has no more)."""
-        self._samples, self._collate, self._batch_size, self._seed = (
-            samples,
-            collate,
-            batch_size,
-            seed,
-        )
+        self._samples = samples
+        self._collate = collate
+        self._batch_size = batch_size
+        self._seed = seed
         size = len(samples)
         self.indices = np.linspace(0, size - 1, min(count, size)).round().astype(int).tolist()
         self._batches: list[Any] = []
@@ -158,24 +169,25 @@ class Validation:
         was_training = policy.training
         policy.eval()
         total = torch.zeros((), dtype=torch.float64)
-        places = [
-            self.indices[i : i + self._batch_size]
-            for i in range(0, len(self.indices), self._batch_size)
-        ]
-        mine = places[process::processes]
-        for number in range(-(-len(places) // processes)):
-            place = mine[number] if number < len(mine) else places[process % len(places)]
+        chunks = []
+        for i in range(0, len(self.indices), self._batch_size):
+            chunks.append(self.indices[i : i + self._batch_size])
+        share = chunks[process::processes]
+        for number in range(math.ceil(len(chunks) / processes)):
+            counts = number < len(share)
+            indices = share[number] if counts else chunks[process % len(chunks)]
             if number == len(self._batches):
-                self._batches.append(self._collate([self._samples[i] for i in place]))
-            rows = [
-                policy.training_noise(1, generator_for(self._seed, "validation", i)) for i in place
-            ]
-            draws = {
-                name: torch.cat([row[name] for row in rows]).to(policy.device) for name in rows[0]
-            }
+                self._batches.append(self._collate([self._samples[i] for i in indices]))
+            # Each sample has its own noise, whatever batch it is in.
+            rows = []
+            for i in indices:
+                rows.append(policy.training_noise(1, generator_for(self._seed, "validation", i)))
+            draws = {}
+            for name in rows[0]:
+                draws[name] = torch.cat([row[name] for row in rows]).to(policy.device)
             loss, _ = policy(self._batches[number].to(policy.device), draws)
-            if number < len(mine):
-                total += float(loss) * len(place)
+            if counts:
+                total += float(loss) * len(indices)
         policy.train(was_training)
         if reduce is not None and processes > 1:
             total = reduce(total.to(policy.device), reduction="sum")

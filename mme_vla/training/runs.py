@@ -2,15 +2,13 @@
 change then.
 """
 
-import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 from mme_vla.config.naming import flat
-from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import (
@@ -22,16 +20,12 @@ from mme_vla.policy.run_folders import (
     step_of,
     trainings_in,
 )
-from mme_vla.policy.saving import policy_name
 from mme_vla.policy.training_identity import NONE
-from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, Registry
 from mme_vla.training.checkpoint import read_state
-from mme_vla.training.settings import TrainSettings
 from mme_vla.utils import FolderLock, to_json
 from mme_vla.utils.locks import LOCK
 from mme_vla.weights import transfer
 
-PARTS = {"memory": MEMORIES, "integration": INTEGRATIONS}
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
 
 MAY_DIFFER = (
@@ -64,6 +58,13 @@ The name is a label alone. `data.content`, the fingerprints of the datasets, is 
 are open (`check_content`). A run's statistics stay what they are: `data.narrow_ranges` decides only
 whether it continues with narrow ones.
 """
+
+ONLY_CHOICES = {
+    "backbone.head.name": "flow",
+    "data.history_transforms": [],
+    "learning.history_transforms": [],
+}
+"""Keys that checkpoints do not name where there was no other choice yet, and that choice."""
 
 
 @dataclass(frozen=True)
@@ -128,26 +129,16 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
             f"continue it with resume={folder}, or choose another output.",
         )
         return Run(folder)
-    checkpoint = (
-        _newest_unfinished(folder) if resume == "auto" else resolve_checkpoint(Path(resume))
-    )
-    if checkpoint is None:
-        return Run(folder)
+    if resume == "auto":
+        newest = _newest_unfinished(folder)
+        if newest is None:
+            return Run(folder)
+        checkpoint = newest
+    else:
+        checkpoint = resolve_checkpoint(Path(resume))
     state = read_state(checkpoint)
-    changed = changed_settings(state["config"], config)
-    if changed:
-        pairs = [
-            f"  {brief(key, quote=False)}: {brief(old)} then, {brief(new)} now"
-            for key, (old, new) in changed.items()
-        ]
-        more = [f"  … and {len(pairs) - 7:,} more"] if len(pairs) > 7 else []
-        lines = "\n".join([*pairs[:7], *more])
-        raise UserError(
-            f"{checkpoint} was trained with other settings, so continuing from it would be another"
-            f" run:\n{lines}\nRepeat the settings of {checkpoint.parent.parent / CONFIG}, or start"
-            f" anew with init_from={checkpoint}."
-        )
-    steps = config["train"]["steps"]
+    check_settings(checkpoint, state["config"], config)
+    steps: int = config["train"]["steps"]
     require(
         state["step"] <= steps,
         f"{checkpoint} has done {state['step']} steps already, more than train.steps={steps}: give"
@@ -162,6 +153,29 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
         f"{checkpoint.name} would overwrite: resume from the newest, or move those away.",
     )
     return Run(checkpoint.parent.parent, checkpoint, state["step"])
+
+
+def check_settings(checkpoint: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Make sure that a resumed run has the settings it began with.
+
+    Args:
+        checkpoint: it continues from.
+        then, now: plain configurations, of the checkpoint and of the command.
+    """
+    changed = differing_keys(then, now)
+    if not changed:
+        return
+    lines = []
+    for key, (old, new) in changed.items():
+        lines.append(f"  {brief(key, quote=False)}: {brief(old)} then, {brief(new)} now")
+    if len(lines) > 7:
+        lines[7:] = [f"  … and {len(lines) - 7:,} more"]
+    listing = "\n".join(lines)
+    raise UserError(
+        f"{checkpoint} was trained with other settings, so continuing from it would be another"
+        f" run:\n{listing}\nRepeat the settings of {checkpoint.parent.parent / CONFIG}, or start"
+        f" anew with init_from={checkpoint}."
+    )
 
 
 def check_content(checkpoint: Path, now: Sequence[str]) -> None:
@@ -181,77 +195,19 @@ def check_content(checkpoint: Path, now: Sequence[str]) -> None:
         )
 
 
-def changed_settings(
-    before: Mapping[str, Any], now: Mapping[str, Any]
-) -> dict[str, tuple[Any, Any]]:
-    """Dotted keys that a run may not change, with their values before and now, of two plain
-    configurations.
-    """
-    return differing_keys(_completed(before), _completed(now))
-
-
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Dotted keys whose values differ and must not, with both values."""
-    before, after = (flat(to_json(values)) for values in (old, new))
-    return {
-        key: (before.get(key), after.get(key))
-        for key in sorted(before.keys() | after.keys())
-        if before.get(key) != after.get(key)
-        and not any(f"{key}.".startswith(f"{free}.") for free in MAY_DIFFER)
-    }
-
-
-def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration with what runs of earlier versions did not say, because there was no other
-    choice.
-    """
-    options = [f for f in fields(TrainSettings) if f.name != "seed"]
-    train = {f.name: f.default for f in options if f.default is not MISSING}
-    train |= {f.name: {} for f in options if f.default_factory is dict}
-    data = {"history_transforms": [], **(config.get("data") or {})}
-    learning = (
-        {"learning": {"history_transforms": [], **config["learning"]}}
-        if config.get("learning")
-        else {}
-    )
-    if list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]:
-        # now the default
-        data["val_episodes"] = None
-    return {
-        **config,
-        "embodiment": embodiment_of(config).to_dict(),
-        "train": {**train, **config["train"]},
-        "data": data,
-        **learning,
-        "policy": {"name": policy_name(config), **(config.get("policy") or {})},
-        **{
-            key: _with_defaults(table, config[key])
-            for key, table in PARTS.items()
-            if config.get(key)
-        },
-        **({"backbone": _with_head(config["backbone"])} if config.get("backbone") else {}),
-    }
-
-
-def _with_head(section: Mapping[str, Any]) -> dict[str, Any]:
-    """The section `backbone` with the default flow head, where earlier versions had no other."""
-    sizes: Any = BACKBONES[section["name"]].Config if section["name"] in BACKBONES else None
-    heads = [
-        f.default_factory
-        for f in (fields(sizes) if is_dataclass(sizes) else ())
-        if f.name == "head"
-    ]
-    return ({"head": heads[0]()} if heads and heads[0] is not MISSING else {}) | dict(section)
-
-
-def _with_defaults(table: Registry[Any], section: Mapping[str, Any]) -> dict[str, Any]:
-    """A part's section with the options that it leaves to the constructor: some came later than the
-    run.
-    """
-    if section.get("name") not in table:
-        return dict(section)
-    options = inspect.signature(table[str(section["name"])]).parameters.values()
-    return {o.name: o.default for o in options if o.default is not o.empty} | dict(section)
+    """Dotted keys that a run may not change, with their values in two plain configurations."""
+    before = flat(to_json(old))
+    after = flat(to_json(new))
+    for key, value in ONLY_CHOICES.items():
+        if key in after:
+            before.setdefault(key, value)
+    differing: dict[str, tuple[Any, Any]] = {}
+    for key in sorted(before.keys() | after.keys()):
+        may_differ = any(f"{key}.".startswith(f"{free}.") for free in MAY_DIFFER)
+        if not may_differ and before.get(key) != after.get(key):
+            differing[key] = (before.get(key), after.get(key))
+    return differing
 
 
 def _holds_run(folder: Path) -> bool:
@@ -263,14 +219,14 @@ def _newest_unfinished(folder: Path) -> Path | None:
     is finished.
     """
     beside = [path for path in folder.parent.glob("*") if (path / CHECKPOINTS).is_dir()]
-    runs = [
-        folder,
-        *sorted(beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True),
-    ]
-    for run in runs:
+    beside.sort(key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True)
+    for run in [folder, *beside]:
         checkpoints = checkpoints_in(run / CHECKPOINTS)
-        if checkpoints:
-            return None if (run / SUMMARY).is_file() and run != folder else checkpoints[-1]
+        if not checkpoints:
+            continue
+        if run != folder and (run / SUMMARY).is_file():
+            return None
+        return checkpoints[-1]
     return None
 
 
@@ -323,5 +279,6 @@ def start_from(policy: Policy, source: str) -> str:
         A sentence that says what was taken, what is new and what was left behind.
     """
     newest = newest_checkpoint(Path(source))
-    source = source if newest == Path(source) else str(newest)
+    if newest != Path(source):
+        source = str(newest)
     return f"weights from {source}: {transfer(policy, source)}"

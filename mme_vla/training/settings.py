@@ -1,7 +1,9 @@
-"""What a training run may be told (`configs/train`), checked before anything starts."""
+"""What a training run may be told (`configs/train.yaml` and its groups), checked before anything
+starts.
+"""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, Self
 
 from mme_vla.config.sections import (
@@ -47,7 +49,7 @@ class TrainSettings:
     schedule_steps: int | None = None
     schedule_end: Annotated[float, Range(0, 1)] = 0.0
     milestones: tuple[PositiveInt, ...] = ()
-    gamma: float = 0.1
+    gamma: Annotated[float, Range(above=0, most=1)] = 0.1
     decay_min_dim: NonNegativeInt = 0
     ema_warmup: bool = False
     accumulate: PositiveInt = 1
@@ -64,7 +66,7 @@ class TrainSettings:
     save_every: PositiveInt = 1000
     keep: KeepRule = field(default_factory=KeepRule)
     open_loop_chunks: NonNegativeInt = 32
-    losses: Mapping[str, Any] | None = None
+    losses: Mapping[str, NonNegative] | None = None
     seed: int = 42
 
     @classmethod
@@ -73,39 +75,118 @@ class TrainSettings:
         return read_section(cls, values, "train", seed=seed)
 
     def __post_init__(self) -> None:
-        steps, milestones = self.schedule_steps, list(self.milestones)
-        checks = {
-            "schedule_steps": (
-                steps is None or steps >= max(self.warmup, 1),
-                f"no fewer than train.warmup={self.warmup}, or null",
-            ),
-            "milestones": (
-                milestones == sorted(milestones),
-                "updates in ascending order, such as [1000, 2000]",
-            ),
-            "gamma": (0 < self.gamma <= 1, "above 0 and at most 1"),
-            "ema": (0 <= self.ema < 1, "at least 0 (no averaging) and below 1"),
-            "betas": (all(0 <= beta < 1 for beta in self.betas), "two numbers in [0, 1)"),
-            "batch_size": (
-                not self.batch_size % self.accumulate,
-                f"a multiple of train.accumulate={self.accumulate}",
-            ),
-        }
-        for name, weight in (self.losses or {}).items():
-            number = (
-                isinstance(weight, int | float)
-                and not isinstance(weight, bool)
-                and 0 <= weight < float("inf")
-            )
-            require(
-                number,
-                f"train.losses.{name}={weight!r} must be a number of 0 or more, the weight of this"
-                " loss.",
-            )
-        for name, (fits, expected) in checks.items():
-            require(fits, f"train.{name}={getattr(self, name)!r} must be {expected}.")
+        """Check what several keys mean together, and numbers that must stay below a bound."""
+        require(
+            all(0 <= beta < 1 for beta in self.betas),
+            f"train.betas={self.betas} must be two numbers in [0, 1).",
+        )
+        require(
+            0 <= self.ema < 1,
+            f"train.ema={self.ema!r} must be at least 0 (no averaging) and below 1.",
+        )
+        require(
+            self.schedule_steps is None or self.schedule_steps >= max(self.warmup, 1),
+            f"train.schedule_steps={self.schedule_steps} must be no fewer than"
+            f" train.warmup={self.warmup}, or null.",
+        )
+        require(
+            list(self.milestones) == sorted(self.milestones),
+            f"train.milestones={self.milestones} must be updates in ascending order, such as"
+            " [1000, 2000].",
+        )
+        require(
+            self.batch_size % self.accumulate == 0,
+            f"train.batch_size={self.batch_size} must be a multiple of"
+            f" train.accumulate={self.accumulate}.",
+        )
 
     @property
     def recomputation(self) -> Recompute:
         """What the backward pass computes again."""
-        return self.gradient_checkpointing and (SELECTIVE if self.recompute == SELECTIVE else True)
+        if not self.gradient_checkpointing:
+            return False
+        return SELECTIVE if self.recompute == SELECTIVE else True
+
+
+@dataclass(frozen=True)
+class CacheSettings:
+    """Where vision caches are and how they are built: `data.cache`."""
+
+    root: str | None = None
+    local: bool = False
+    batch_size: PositiveInt = 32
+    max_build_frames: NonNegativeInt = 5000
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """The keys of `configs/data/*.yaml`, where each is explained."""
+
+    sources: Any
+    name: str = "data"
+    val_fraction: float = 0.0
+    val_episodes: tuple[int | str, ...] | None = None
+    action_offset: int = 0
+    mask_padding: bool = False
+    jitter: bool = False
+    history_transforms: Any = None
+    weights: str | None = None
+    narrow_ranges: Literal["refuse", "widen", "warn"] | None = None
+    cache: CacheSettings = field(default_factory=CacheSettings)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Read the section `data` of a composed configuration."""
+        return read_section(cls, values, "data")
+
+
+@dataclass(frozen=True)
+class FinetuneSettings:
+    """The keys of `configs/finetune/*.yaml`: the options of `apply_finetuning`."""
+
+    mode: Literal["full", "expert_only", "lora"] = "full"
+    freeze_vision: bool = True
+    frozen_dtype: str | None = None
+    rank: PositiveInt = 16
+    alpha: float = 16.0
+    dropout: float = 0.0
+    init: str = "uniform"
+    targets: tuple[str, ...] | None = None
+    train: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class TrainRun:
+    """A training as a command line describes it: `configs/train.yaml`, read once.
+
+    config: all of it as plain values. The sections of the model are read where its parts are built.
+    Checkpoints keep it whole.
+    """
+
+    name: str
+    seed: int
+    output: str
+    trainings: PositiveInt
+    resume: str | None
+    init_from: str | None
+    train: TrainSettings
+    data: DataSettings
+    finetune: FinetuneSettings
+    config: Mapping[str, Any]
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Read a composed configuration.
+
+        Args:
+            config: plain and resolved.
+        """
+        settings = TrainSettings.from_dict(config["train"], config["seed"])
+        run = read_section(
+            cls, config, others=True, name=str(config["name"]), train=settings, config={}
+        )
+        return replace(run, config=config)
+
+    def with_keys(self, **changes: Any) -> Self:
+        """The same training with other values of keys of the top level."""
+        return self.from_config({**self.config, **changes})

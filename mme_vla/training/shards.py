@@ -171,10 +171,11 @@ def read_weights(checkpoint: Path, policy: nn.Module) -> dict[str, Tensor]:
 def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: bool = False) -> None:
     folder = checkpoint / SHARDS
     files = shard_files(checkpoint)
-    rank, world = (0, 1) if alone else (distributed.get_rank(), distributed.get_world_size())
+    rank = 0 if alone else distributed.get_rank()
+    world = 1 if alone else distributed.get_world_size()
     sums: dict[Path, Sums] = {}
     if any(name.startswith(f"{SHARDS}/") for name in Sums(checkpoint).table):
-        # earlier versions listed none
+        # checkpoints of the first version list none
         check_sums(checkpoint, shard_notes(checkpoint))
     for file in files:
         note = file.with_suffix(".sha256")

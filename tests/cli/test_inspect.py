@@ -8,6 +8,7 @@ from rich.console import Console
 
 from mme_vla import UserError, build_policy
 from mme_vla.cli.inspect import (
+    Inspection,
     build_memory,
     check_place,
     draw_memory,
@@ -16,7 +17,7 @@ from mme_vla.cli.inspect import (
     show_dataset,
     show_episode,
 )
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, resolved
 from mme_vla.data.episodes import EpisodeSource
 
 
@@ -47,7 +48,8 @@ def test_an_episode_shows_its_phases_and_subgoals(sample: EpisodeSource, console
 def test_a_memory_is_rendered_as_it_selects(
     sample: EpisodeSource, console: Console, tmp_path: Path
 ) -> None:
-    memory = build_memory(compose("inspect", ["memory=tokendrop"]))
+    config = resolved(compose("inspect", ["memory=tokendrop"]))
+    memory = build_memory(Inspection.from_config(config))
     path = draw_memory(sample, 3, 120, memory, "tokendrop", tmp_path, console)
     with Image.open(path) as image:
         assert image.width > 800

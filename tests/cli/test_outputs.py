@@ -10,6 +10,7 @@ import pytest
 
 from mme_vla.cli import docs, gallery, results, train_tokenizer
 from mme_vla.cli.errors import print_user_errors
+from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.extras.nano.cli import board
 from mme_vla.extras.nano.fitting import _remove_drafts
@@ -157,18 +158,15 @@ def test_a_gallery_replaces_no_readme_but_its_own(
         raise RuntimeError("reached")
 
     monkeypatch.setattr(gallery, "require_simulator", stop)
-    cfg = SimpleNamespace(
-        tasks="StopCube", task=None, episodes=[2], split="test", tiles=8, output=str(tmp_path)
-    )
-    monkeypatch.setattr(gallery, "named_tasks", lambda cfg: "StopCube")
+    cfg = compose("show", ["tasks=StopCube", f"output={tmp_path}"])
     page = tmp_path / "README.md"
     page.write_text("# My project\n")
     with pytest.raises(UserError, match=r"README\.md exists"):
-        gallery.run(cfg)  # type: ignore[arg-type]
+        gallery.main(cfg)
     assert page.read_text() == "# My project\n"
     page.write_text(gallery.render("gallery.md", entries=[("StopCube", "press", "StopCube.jpg")]))
     with pytest.raises(RuntimeError, match="reached"):
-        gallery.run(cfg)  # type: ignore[arg-type]
+        gallery.main(cfg)
 
 
 def test_a_checkpoint_that_is_written_again_leaves_a_copy_beside_it_alone(tmp_path: Path) -> None:

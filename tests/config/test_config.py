@@ -12,7 +12,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from helpers import commands
-from mme_vla.cli.command import check_overrides, cli, options_first
+from mme_vla.cli.command import check_overrides, options_first, run_configured
 from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.trees import library_files, library_trees
 from mme_vla.errors import UserError
@@ -215,10 +215,9 @@ def test_plugins_are_imported_from_the_current_folder(
 
 APP = """
     from pathlib import Path
-    from mme_vla.cli.command import cli
+    from mme_vla.cli.command import run_configured
     from mme_vla.errors import UserError
 
-    @cli("demo", Path({tree!r}))
     def main(cfg):
         if cfg.seed == 13:
             raise UserError("Seed 13 brings [bad] luck.")
@@ -228,7 +227,7 @@ APP = """
         print("ran", cfg.name, cfg.memory.get("budget"), cfg.train.lr, HydraConfig.get().job.name)
 
     if __name__ == "__main__":
-        main()
+        run_configured("demo", main, Path({tree!r}))
 """
 
 
@@ -294,7 +293,7 @@ def test_a_command_ends_before_it_starts_a_run(
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["app", *words])
     with pytest.raises(SystemExit) as ended:
-        cli("demo", tree)(lambda cfg: None)()
+        run_configured("demo", lambda cfg: None, tree)
     assert ended.value.code == code
     assert message in "".join(capfd.readouterr())
 

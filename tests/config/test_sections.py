@@ -72,7 +72,7 @@ def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
         ({"name": "a", "limit": True}, r"outer\.limit=True must be a whole number or null"),
         ({"name": "a", "limit": 2.0}, r"outer\.limit=2\.0 must be a whole number or null"),
         ({"name": "a", "inner": {"width": "3"}}, r"outer\.inner\.width='3' must be a whole number"),
-        ({"name": "a", "inner": 3}, r"outer\.inner must be a section of keys, got 3"),
+        ({"name": "a", "inner": 3}, r"outer\.inner=3 must be a section of keys"),
         ({"name": "a", "other": 3}, r"outer\.other=3 must be a section of keys or null"),
         (
             {"name": "a", "betas": [0.1]},

@@ -625,7 +625,7 @@ def test_a_change_in_the_middle_of_a_large_table_is_read(tmp_path: Path) -> None
 
 
 def test_inspecting_names_the_contradiction(tmp_path: Path, monkeypatch, capsys) -> None:
-    from mme_vla.cli.inspect import main
+    from mme_vla.cli import run
 
     root = tmp_path / "copy"
     shutil.copytree(SAMPLE, root)
@@ -633,7 +633,7 @@ def test_inspecting_names_the_contradiction(tmp_path: Path, monkeypatch, capsys)
     change(root, ROWS, "frame_index", [7, *rows[1:]])
     monkeypatch.setattr("sys.argv", ["inspect", f"dataset={root}"])
     with pytest.raises(SystemExit):
-        main()
+        run("inspect")
     assert "has frame_index 7" in capsys.readouterr().err
 
 

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 
 from helpers.h5_files import Recorded, write_file
 from helpers.memory_fakes import LastFrames, encode, same
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, resolved
 from mme_vla.data.cache import VisionCache
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.convert import ConvertOptions, convert
@@ -28,6 +28,7 @@ from mme_vla.processing.prompt import SubgoalText
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.testing.small import small_policy
 from mme_vla.training.data import prepare_data
+from mme_vla.training.settings import DataSettings
 
 PNG = ConvertOptions(images="png")
 
@@ -218,7 +219,8 @@ def test_only_the_sample_holds_out_an_episode_by_default(
 ) -> None:
     make_source(tmp_path, "Alpha", [6, 5, 4, 3], [0, 0, 0, 0])
     sources = ",".join([str(tmp_path / "Alpha"), *named])
-    data = compose("train", [f"data.sources=[{sources}]"]).data
+    composed = compose("train", [f"data.sources=[{sources}]"])
+    data = DataSettings.from_dict(resolved(composed)["data"])
     split = prepare_data(small_policy("pi05"), data, seed=0, say=lambda line: None)
     steps = range(0 if split.val is None else len(split.val))
     assert {split.val.locate(i)[:2] for i in steps} == held_out

@@ -29,6 +29,7 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.envs.vector.pool import Job
 from mme_vla.memory.history import StorageSpec
 from mme_vla.testing.small import SMALL_VISION, unit_stats
+from mme_vla.training.settings import TrainRun
 
 EXAMPLE = REPOSITORY / "examples" / "bimanual"
 PAGE = (REPOSITORY / "docs" / "extend" / "your-robot.md").read_text()
@@ -134,7 +135,8 @@ def test_the_page_from_the_dataset_to_a_served_policy(
     assert "2 episodes encoded" in capsys.readouterr().out
     cfg = compose("train", [*training[5:], *SMALL, *BRIEF], extra_dirs=folders)
     config: Any = OmegaConf.to_container(cfg, resolve=True)
-    checkpoint = train(cfg, config, Path(config["output"]), begun=time.perf_counter())
+    run = TrainRun.from_config(config)
+    checkpoint = train(run, Path(run.output), begun=time.perf_counter())
     assert "runs/two_arms" in str(checkpoint)
     summary = json.loads((checkpoint.parents[1] / "summary.json").read_text())
     assert summary["open_loop"]["names"][0] == "left_0"

@@ -12,6 +12,7 @@ from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
 from mme_vla.testing.small import ALL_MODELS, BEYOND, NEURAL, RECURRENT
 from mme_vla.training.logging import read_metrics
+from mme_vla.training.settings import TrainRun
 
 pytestmark = pytest.mark.slow
 
@@ -64,7 +65,7 @@ def run(model: str, folder: Path, caches: Path, *overrides: str) -> None:
         "train", [f"model={model}", *SMALL, *memory, f"data.cache.root={caches}", *overrides]
     )
     config: Any = OmegaConf.to_container(cfg, resolve=True)
-    train(cfg, config, folder, begun=time.perf_counter())
+    train(TrainRun.from_config(config), folder, begun=time.perf_counter())
 
 
 @pytest.mark.parametrize("model", [*ALL_MODELS, *BEYOND])

@@ -12,7 +12,7 @@ pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact
 
 from mme_vla.cli import gallery as show
 from mme_vla.cli import record
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, resolved
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.envs.make import make_task
@@ -70,7 +70,7 @@ def test_the_command_saves_both_layouts_and_only_what_is_missing(
     monkeypatch.setattr(
         record, "record_episode", lambda *_: pytest.fail("a finished episode was recorded again")
     )
-    record.run(cfg)
+    record.main(cfg)
     assert not work.exists()
     assert "1 episodes" in capsys.readouterr().out
     source = EpisodeSource(output)
@@ -78,11 +78,11 @@ def test_the_command_saves_both_layouts_and_only_what_is_missing(
     with open_episode(ref) as episode:
         assert len(source) == 1
         assert len(source.states(0)) == episode.length
-    record.run(cfg)
+    record.main(cfg)
     assert "all there already" in capsys.readouterr().out
     jobs.append(record.Job("PatternLock", 1, seed=1, difficulty="easy", recovery=None, retries=3))
     with pytest.raises(UserError, match="exists already"):
-        record.run(cfg)
+        record.main(cfg)
 
 
 def test_a_folder_of_another_recording_is_refused(tmp_path: Path) -> None:
@@ -104,7 +104,8 @@ def test_a_folder_of_another_recording_is_refused(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_recorded_is_refused_by_name(words: list[str], message: str) -> None:
     with pytest.raises(UserError, match=message):
-        record.plan(compose("record", [*words, "output=somewhere"]))
+        config = resolved(compose("record", [*words, "output=somewhere"]))
+        record.plan(record.RecordRun.from_config(config))
 
 
 @pytest.mark.parametrize("task", ["VideoUnmask", "PickHighlight"])

@@ -74,7 +74,7 @@ def test_its_demonstrations_are_recorded(tmp_path: Path) -> None:
         f"hdf5={tmp_path / 'h5'}",
         f"output={tmp_path / 'x'}",
     ]
-    record.run(compose("record", words))
+    record.main(compose("record", words))
     (file,) = (tmp_path / "h5").glob("*TwoButtons*.h5")
     with h5py.File(file) as recorded:
         (episode,) = recorded.values()

@@ -28,6 +28,7 @@ from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.serving.server import PolicyServer
 from mme_vla.serving.settings import ServeSettings
+from mme_vla.training.settings import TrainRun
 
 
 def test_poses_are_converted_and_read_as_actions(folder: Path) -> None:
@@ -110,7 +111,7 @@ def test_a_policy_trains_and_keeps_its_robot(
     cfg = compose("train", words)
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     policy = MMEPolicy.from_pretrained(
-        train(cfg, config, tmp_path / "run", begun=time.perf_counter())
+        train(TrainRun.from_config(config), tmp_path / "run", begun=time.perf_counter())
     )
     stats = policy.require_processor().require_stats()
     assert policy.embodiment == robomme_robot(name) and len(stats.state) == 8

@@ -80,7 +80,7 @@ def test_a_recording_is_compared_with_the_test_split(
     if dataset is not None:
         convert(refs, dataset, ConvertOptions(images="png"))
     request = RecordingPlan(jobs, dataset, None if lerobot else tmp_path)
-    monkeypatch.setattr(coverage, "goal_of", lambda spec: f"do task {spec.episode % 3}")
+    monkeypatch.setattr(record, "goal_of", lambda spec: f"do task {spec.episode % 3}")
     record.report_coverage("StopCube", request, tmp_path / "coverage.json", workers=1)
     result = json.loads((tmp_path / "coverage.json").read_text())["StopCube"]
     assert (

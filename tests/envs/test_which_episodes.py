@@ -3,7 +3,7 @@
 import pytest
 
 from mme_vla.cli import record
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, resolved
 from mme_vla.envs.episodes import choose_episodes, choose_numbers, named_tasks
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout import evaluation as rollout_plan
@@ -34,7 +34,7 @@ def test_the_same_words_choose_the_same_episodes_in_every_command(command: str) 
     cfg = compose(command, ["tasks=[StopCube,BinFill]", "episodes=[0-2,7]", *more])
     choose = rollout_plan.choose_episodes if command == "evaluate" else choose_episodes
     specs = (
-        record.plan(cfg)
+        record.plan(record.RecordRun.from_config(resolved(cfg)))
         if command == "record"
         else choose(named_tasks(cfg), cfg.episodes, cfg.split)
     )

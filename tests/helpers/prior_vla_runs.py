@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
 from mme_vla.training.logging import read_metrics
+from mme_vla.training.settings import TrainRun
 
 TOWERS = [f"backbone.vision.{tower}.{size}" for tower in ("dino", "siglip") for size in (
     "width=8", "depth=2", "mlp_dim=16", "num_heads=1")]  # fmt: skip
@@ -40,7 +41,7 @@ def run(model: str, folder: Path, *overrides: str, short: Sequence[str] = SHORT)
         [f"model={model}", *short, f"data.cache.root={folder.parent / 'caches'}", *overrides],
     )
     config: Any = OmegaConf.to_container(cfg, resolve=True)
-    return train(cfg, config, folder, begun=time.perf_counter())
+    return train(TrainRun.from_config(config), folder, begun=time.perf_counter())
 
 
 def losses(folder: Path) -> list[float]:

@@ -5,12 +5,9 @@ extremes.
 from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
 
 from mme_vla import MMEPolicy, Policy, UserError, build_policy, register
-from mme_vla.config.composition import compose
 from mme_vla.policy.saving import composition_digest, policy_class, policy_options
-from mme_vla.training.runs import _completed, differing_keys
 from mme_vla.training.settings import TrainSettings
 
 
@@ -77,28 +74,3 @@ def test_the_default_kind_changes_no_digest_and_another_does() -> None:
 def test_recipes_that_cannot_be(values: dict[str, Any], says: str) -> None:
     with pytest.raises(UserError, match=says):
         TrainSettings.from_dict({"steps": 100, "batch_size": 1, "lr": 1.0, "warmup": 10, **values})
-
-
-def test_runs_of_before_resume_though_they_know_none_of_the_new_keys() -> None:
-    now: Any = OmegaConf.to_container(compose("train", ["model=pi05"]), resolve=True)
-    config = {key: now[key] for key in ("train", "policy", "backbone", "embodiment")}
-    new = (
-        "warmup_from_zero",
-        "schedule",
-        "schedule_steps",
-        "milestones",
-        "gamma",
-        "decay_min_dim",
-        "ema_warmup",
-    )
-    then = {
-        **config,
-        "train": {key: value for key, value in config["train"].items() if key not in new},
-        "policy": {key: value for key, value in config["policy"].items() if key != "name"},
-    }
-    assert set(new) <= set(config["train"])
-    assert differing_keys(_completed(then), _completed(config)) == {}
-    changed = {**config, "train": {**config["train"], "schedule": "cosine"}}
-    assert differing_keys(_completed(then), _completed(changed)) == {
-        "train.schedule": ("constant", "cosine")
-    }

@@ -25,6 +25,7 @@ from mme_vla.processing.normalise import (
     RunningStats,
     normalize,
 )
+from mme_vla.training.settings import DataSettings
 
 FRAMES = 600
 
@@ -115,10 +116,10 @@ def test_statistics_of_other_data_are_compared_with_these(tmp_path: Path) -> Non
     assert widened.actions.q01[1] < -299 and widened.actions.q01[0] == -1
 
 
-def training_data(root: Path, **changes: Any) -> dict[str, Any]:
+def training_data(root: Path, **changes: Any) -> DataSettings:
     data = OmegaConf.to_container(OmegaConf.load(REPOSITORY / "configs" / "data" / "sample.yaml"))
     assert isinstance(data, dict)
-    return data | {"sources": [str(root)], "val_episodes": []} | changes
+    return DataSettings.from_dict(data | {"sources": [str(root)], "val_episodes": []} | changes)
 
 
 def test_training_refuses_unless_told_to_widen(tmp_path: Path) -> None:

@@ -21,14 +21,20 @@ from helpers.serving_fakes import (
     serving_policy,
     wait_until,
 )
-from mme_vla.cli.loading import load_policy
-from mme_vla.config.composition import compose
+from mme_vla.cli.loading import PolicyChoice, load_policy
+from mme_vla.config.composition import compose, resolved
 from mme_vla.errors import UserError
 from mme_vla.serving import Client, Limits, pack, unpack
 from mme_vla.serving.requests import AddBuffer, Reset
 from mme_vla.serving.session import BusyError, NoEpisodeError
 
 LOGGER = logging.getLogger(__name__)
+
+
+def choice(words: list[str]) -> PolicyChoice:
+    return PolicyChoice.from_config(resolved(compose("serve", words)))
+
+
 CLOSE = {"rtol": 1e-4, "atol": 1e-5}
 
 
@@ -232,12 +238,12 @@ def test_the_command_serves_and_stops_on_request(tmp_path):
 )
 def test_the_command_says_what_it_needs(words, expected):
     with pytest.raises(UserError, match=expected):
-        load_policy(compose("serve", words), "serve", LOGGER)
+        load_policy(choice(words), "serve", LOGGER)
 
 
 def test_the_command_loads_a_checkpoint(policy, tmp_path):
     policy.save_pretrained(tmp_path)
-    loaded, name, _ = load_policy(compose("serve", [f"checkpoint={tmp_path}"]), "serve", LOGGER)
+    loaded, name, _ = load_policy(choice([f"checkpoint={tmp_path}"]), "serve", LOGGER)
     assert name == "tokendrop_expert"
     parts = course(rounds=0)
     np.testing.assert_array_equal(
@@ -299,4 +305,4 @@ def test_what_a_checkpoint_defines_cannot_be_set_beside_it(word, monkeypatch):
     monkeypatch.setattr("hydra.core.hydra_config.HydraConfig.initialized", lambda: True)
     monkeypatch.setattr("hydra.core.hydra_config.HydraConfig.get", lambda: overrides)
     with pytest.raises(UserError, match=f"leave out {re.escape(word)}"):
-        load_policy(compose("serve", ["checkpoint=x"]), "serve", LOGGER)
+        load_policy(choice(["checkpoint=x"]), "serve", LOGGER)

@@ -100,7 +100,7 @@ def test_subgoals_and_policies_must_go_together(caplog: pytest.LogCaptureFixture
 
 
 def test_a_predictor_on_auto_runs_on_the_policys_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    import mme_vla.subgoal as module
+    import mme_vla.cli.evaluate as module
 
     devices = []
     monkeypatch.setattr(

@@ -22,7 +22,7 @@ from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.memory.base import stack_history
 from mme_vla.testing.small import open_gates, random_batch, small_policy, unit_stats
 from mme_vla.training.data import prepare_data
-from mme_vla.training.settings import TrainSettings
+from mme_vla.training.settings import DataSettings, TrainSettings
 from mme_vla.types import Batch, Labels, ReadsLabels
 
 EXAMPLE = REPOSITORY / "examples" / "write_head"
@@ -69,7 +69,7 @@ def prepared(policy: MMEPolicy, folder: Path, **options: object) -> TrainingData
         "cache": {"root": str(folder), "batch_size": 32, "max_build_frames": 5000},
         **options,
     }
-    dataset = prepare_data(policy, data, 0, say=lambda line: None).train
+    dataset = prepare_data(policy, DataSettings.from_dict(data), 0, say=lambda line: None).train
     assert isinstance(dataset, TrainingDataset)
     return dataset
 
@@ -111,8 +111,8 @@ def test_evaluation_has_no_auxiliary_loss(policy: MMEPolicy) -> None:
 def test_an_unknown_name_in_the_weights_is_an_error(policy: MMEPolicy) -> None:
     with pytest.raises(UserError, match="Did you mean 'write'"):
         loss_of(policy, labelled(policy), writes=1.0)
-    with pytest.raises(UserError, match=r"train.losses.write=-1 must be a number of 0 or more"):
-        TrainSettings(1, 1, 1.0, losses={"write": -1})
+    with pytest.raises(UserError, match=r"train.losses.write=-1 must be a number, 0 or more"):
+        TrainSettings.from_dict({"steps": 1, "batch_size": 1, "lr": 1.0, "losses": {"write": -1}})
 
 
 def test_weights_multiply_a_samples_loss_after_its_mean() -> None:

@@ -43,7 +43,7 @@ def test_several_trainings_resume_and_share_a_cache(
     original, calls = command.train, []
 
     def interrupted(*args: Any, **options: Any) -> Path:
-        calls.append(args[2].name)
+        calls.append(args[1].name)
         if len(calls) == 2:
             raise KeyboardInterrupt
         return original(*args, **options)
@@ -79,7 +79,7 @@ def test_several_trainings_resume_and_share_a_cache(
     monkeypatch.setattr(
         evaluation,
         "evaluate_one",
-        lambda cfg, name="": evaluated.append((str(cfg.checkpoint), name)),
+        lambda run, name="": evaluated.append((run.policy.checkpoint, name)),
     )
     evaluation.main(compose("evaluate", [f"checkpoint={output}", "tasks=StopCube"]))
     assert evaluated == [(str(run), run.name) for run in trainings_in(output)]

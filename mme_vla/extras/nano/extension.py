@@ -14,6 +14,7 @@ EXTENSION = Extension(
             "small policies from nothing to results on two cores; `nano board` ranks them",
             "nano",
             "python -m mme_vla.nano",
+            reads_words=True,
         ),
         "vision-pretrain": Command(
             "mme_vla.extras.nano.cli.vision_pretrain",

@@ -18,11 +18,13 @@ from torch.utils.flop_counter import FlopCounterMode
 from mme_vla.config.composition import compose, import_plugins, resolved
 from mme_vla.config.naming import digest
 from mme_vla.config.plugins import plugins_of
+from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.extras.nano.learning import Decisions, choice_errors, position_error, statistics
 from mme_vla.extras.nano.rows import CONFIG, TRAINED
+from mme_vla.extras.nano.settings import LearningSettings
 from mme_vla.extras.nano.tokens import FrameTokens, TokenStore
 from mme_vla.memory.perturbation import build_transforms
 from mme_vla.policy.build import build_from_config
@@ -34,7 +36,7 @@ from mme_vla.training.checkpoint import checkpoints_in, read_state, tidy
 from mme_vla.training.logging import ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.order import Validation
-from mme_vla.training.runs import CHECKPOINTS, METRICS, changed_settings, check_content, claim_run
+from mme_vla.training.runs import CHECKPOINTS, METRICS, check_content, claim_run, differing_keys
 from mme_vla.training.settings import KeepRule, TrainSettings
 from mme_vla.utils import FolderLock, read_json, read_lines, write_json
 
@@ -125,7 +127,7 @@ class Training:
         if not (self.folder / TRAINED).is_file():
             return False
         now, then = self.full_config, read_state(self.checkpoint)["config"]
-        changed = changed_settings(then, now)
+        changed = differing_keys(then, now)
         if then["train"]["steps"] != now["train"]["steps"]:
             changed["train.steps"] = (then["train"]["steps"], now["train"]["steps"])
         about = read_json(self.folder / TRAINED, "a training's end")
@@ -190,11 +192,7 @@ def train(job: Training) -> Path:
         if job.tower_seed != int(job.config["seed"]):
             copy_tower(build({**job.config, "seed": job.tower_seed}), policy)
         samples, val_set = prepared(policy, job)
-        policy.config[TRAINING] = identify(full_config, full_config["data"]["content"])
-        policy.config["card"] = {
-            "data": f"{len(job.files)} demonstrations",
-            "recipe": dict(settings),
-        }
+        card = {"data": f"{len(job.files)} demonstrations", "recipe": dict(settings)}
         validation = Validation(
             val_set,
             val_set.collate,
@@ -212,6 +210,10 @@ def train(job: Training) -> Path:
             run,
             full_config,
             Accelerator(cpu=True),
+            facts={
+                TRAINING: identify(full_config, full_config["data"]["content"]),
+                "card": card,
+            },
         )
         line, loggers = (
             ProgressLine(train_settings.steps, run.step),
@@ -326,7 +328,8 @@ def content_of(files: tuple[Path, ...], choice: tuple[int, ...]) -> tuple[str, .
 
 def prepared(policy: MMEPolicy, job: Training) -> tuple[Decisions, Decisions]:
     """Decisions to learn from, and to measure by, which history transforms do not change."""
-    learning, files = job.learning, job.files
+    learning = read_section(LearningSettings, job.learning, "learning")
+    files = job.files
     measured = files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]
     learnt = [file for file in files if file not in measured] or files  # there may be one alone
     processor = policy.require_processor()
@@ -340,17 +343,17 @@ def prepared(policy: MMEPolicy, job: Training) -> tuple[Decisions, Decisions]:
     samples = Decisions.of(
         policy,
         read(learnt),
-        learning["elsewhere"],
-        build_transforms(learning.get("history_transforms")),
+        learning.elsewhere,
+        build_transforms(learning.history_transforms),
         int(job.config["seed"]),
-        learning["reflect"],
-        learning["sides"],
-        oversample=learning["often"],
-        noise=learning["noise"],
-        token_noise=learning["blur"],
-        balanced=learning["balanced"],
+        learning.reflect,
+        learning.sides,
+        oversample=learning.often,
+        noise=learning.noise,
+        token_noise=learning.blur,
+        balanced=learning.balanced,
     )
-    return samples, Decisions.of(policy, read(measured), learning["elsewhere"])
+    return samples, Decisions.of(policy, read(measured), learning.elsewhere)
 
 
 def learning_curve(folder: Path) -> list[dict[str, float]]:

@@ -1,5 +1,5 @@
-"""A run of nanoMME: demonstrations, tokens, trainings and evaluations of all rows, each as far as
-it is not there.
+"""A run of nanoMME: demonstrations, tokens, trainings and evaluations of all rows. What exists is
+skipped.
 """
 
 import logging
@@ -10,21 +10,38 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, count, islice, zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from mme_vla.data.console import progress
+from mme_vla.embodiment import Embodiment
 from mme_vla.envs.episodes import choose_episodes, choose_tasks
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.robomme.recording.frames import DECISIONS, FrameChoice
+from mme_vla.envs.robomme.recording.processes import carry_out
 from mme_vla.envs.rows import DIFFICULTIES
-from mme_vla.errors import UserError, brief, check_choice, require
+from mme_vla.errors import UserError, brief, require
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.extras.nano.board import MATCHED
+from mme_vla.extras.nano.demonstrations import Scene, demonstrated
+from mme_vla.extras.nano.evaluating import (
+    DEMONSTRATOR,
+    FREQUENT,
+    ORACLE_FRAMES,
+    PLANNER,
+    RANDOM,
+    Rules,
+    built_scenes,
+    evaluate_row,
+    frequent_moves,
+    play_all,
+    record_videos,
+)
+from mme_vla.extras.nano.fitting import Training, compose_policy, train_in_process
+from mme_vla.extras.nano.learning import check_reflection
+from mme_vla.extras.nano.page import write_page
+from mme_vla.extras.nano.settings import NanoRun
+from mme_vla.extras.nano.tokens import TokenStore
 from mme_vla.utils import read_json, write_json
-
-if TYPE_CHECKING:
-    from mme_vla.embodiment import Embodiment
-    from mme_vla.envs.metadata import EpisodeSpec
-    from mme_vla.envs.robomme.recording.frames import FrameChoice
-    from mme_vla.evaluation.records import EpisodeRecord
-    from mme_vla.extras.nano.demonstrations import Scene
-    from mme_vla.extras.nano.evaluating import Rules
-    from mme_vla.extras.nano.fitting import Training
 
 logger = logging.getLogger("mme_vla.nano")
 SEEDS_APART = 100_000  # first seeds of two difficulties
@@ -32,55 +49,48 @@ RETRIES = 20  # scenes in a row that no demonstration succeeds in
 STAGES = ("record", "tokens", "train", "evaluate", "all")
 
 
-def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
+def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
     """All stages of a run, up to `stage`; the path of its page, or of the folder that holds what
     was made.
 
-    config: as `configs/nano.yaml`. extra_dirs: trees of the user's own models, as
-    `--config-dir` adds them.
+    extra_dirs: trees of the user's own models, as `--config-dir` adds them.
     """
-    from mme_vla.envs.robomme.recording.processes import carry_out
-    from mme_vla.extras.nano.fitting import train_in_process
-    from mme_vla.extras.nano.page import write_page
-    from mme_vla.extras.nano.tokens import TokenStore
-
-    check_choice("stage", config["stage"], STAGES)
-    until = STAGES.index(config["stage"])
-    folder, workers = Path(config["output"]), config["workers"]
+    until = STAGES.index(nano.stage)
+    folder = Path(nano.output)
     folder.mkdir(parents=True, exist_ok=True)
-    rows = compose_rows(config, extra_dirs)
+    rows = compose_rows(nano, extra_dirs)
     minutes = Minutes(folder / "clock.json")
     with minutes.of("demonstrations"):
-        files = record_all(config, folder / "demonstrations", rows.choices, rows.robot)
+        files = record_all(nano, folder / "demonstrations", rows.choices, rows.robot)
     if until < STAGES.index("tokens"):
         return folder / "demonstrations"
     store = TokenStore.of(folder / "tokens", list(rows.composed.values()))
     with minutes.of("tokens"):
-        for _ in carry_out(files, store.make, workers):
+        for _ in carry_out(files, store.make, nano.workers):
             pass
     if until < STAGES.index("train"):
         return store.folder
-    jobs = trainings_of(config, rows.composed, folder / "training", files, store)
+    jobs = trainings_of(nano, rows.composed, folder / "training", files, store)
     with minutes.of("training"):
         todo = [job for job in chain(*jobs.values()) if not job.done]
-        for _ in carry_out(todo, train_in_process, workers):
+        for _ in carry_out(todo, train_in_process, nano.workers):
             pass
     if until < STAGES.index("evaluate"):
         return folder / "training"
-    results = folder / config["split"]
+    results = folder / nano.split
     with minutes.of("evaluation"):
-        records = evaluate_all(config, results, jobs, files, rows.robot)
-    if config["shard"] is not None or len(choose_tasks(config["task"])) > 1:
+        records = evaluate_all(nano, results, jobs, files, rows.robot)
+    if nano.shard is not None or len(choose_tasks(nano.task)) > 1:
         for row, of_row in records.items():
             logger.info(
                 "%s: %d of %d episodes", row, sum(record.success for record in of_row), len(of_row)
             )
         return results
     with minutes.of("videos"):
-        videos = videos_of(config, jobs, records, folder / "videos")
+        videos = videos_of(nano, jobs, records, folder / "videos")
     page = write_page(
         folder,
-        config,
+        nano.config,
         records,
         rows.blind,
         minutes.spent,
@@ -101,45 +111,42 @@ class Rows:
     """
 
     composed: Mapping[str, Mapping[str, Any]]
-    choices: Sequence["FrameChoice"]
-    robot: "Embodiment"
+    choices: Sequence[FrameChoice]
+    robot: Embodiment
     blind: str | None
 
 
-def compose_rows(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Rows:
+def compose_rows(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Rows:
     """Every model at every budget."""
-    from mme_vla.embodiment import Embodiment
-    from mme_vla.envs.robomme.recording.frames import DECISIONS, FrameChoice
-    from mme_vla.extras.nano.board import MATCHED
-    from mme_vla.extras.nano.fitting import compose_policy
-    from mme_vla.extras.nano.learning import check_reflection
-
     words = [
-        f"backbone={config['with_backbone']}",
-        f"embodiment={config['with_embodiment']}",
+        f"backbone={nano.with_backbone}",
+        f"embodiment={nano.with_embodiment}",
         "policy.augment=false",
+        f"seed={nano.seed}",
+        *nano.overrides,
     ]
-    words += [f"seed={config['seed']}", *config["overrides"]]
-    how = (config["memories"], words, extra_dirs, config["plugins"])
-    models = list(
-        dict.fromkeys([*as_list(config["with_memory"]), *config["beside"], *config["also"]])
+    compose_model = partial(
+        compose_policy,
+        memories=nano.memories,
+        words=words,
+        extra_dirs=extra_dirs,
+        plugins=nano.plugins,
     )
+    models = nano.models
     require(models, "No row is to be trained: name one, such as model=framesamp_modul.")
     composed: dict[str, dict[str, Any]] = {}
     for model in models:
         # The floor that reads the current frame alone has the tokens of that frame, at any budget.
-        for budget in [None] if model == MATCHED else as_list(config["budget"]):
-            each = compose_policy(model, *how, budget=budget)
-            composed[model if budget is None or each["memory"] is None else f"{model}@{budget}"] = (
-                each
-            )
-    others = [
-        compose_policy(model, *how) for model in config["rendered_for"] if model not in models
-    ]
+        for budget in (None,) if model == MATCHED else nano.budgets:
+            each = compose_model(model, budget=budget)
+            has_budget = budget is not None and each["memory"] is not None
+            composed[f"{model}@{budget}" if has_budget else model] = each
+    others = [compose_model(model) for model in nano.rendered_for if model not in models]
     robot = Embodiment.from_dict(next(iter(composed.values()))["embodiment"])
-    for vision in (each["backbone"].get("vision") for each in composed.values()):
+    for each in composed.values():
+        vision = each["backbone"].get("vision")
         layout = vision.get("layout") if isinstance(vision, Mapping) else None
-        check_reflection(config["learning"]["reflect"], robot.action, layout)
+        check_reflection(nano.learning["reflect"], robot.action, layout)
     memories = [each["memory"] for each in (*composed.values(), *others) if each["memory"]]
     choices = [FrameChoice(DECISIONS, memory, robot.action.execute) for memory in [None, *memories]]
     blind = [
@@ -148,76 +155,51 @@ def compose_rows(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> 
     return Rows(composed, choices, robot, next(iter(blind), None))
 
 
-def as_list(value: Any) -> list[Any]:
-    """A value of a configuration that may be one or several."""
-    return list(value) if isinstance(value, list | tuple) else [value]
-
-
 def trainings_of(
-    config: Mapping[str, Any],
+    nano: NanoRun,
     composed: Mapping[str, Mapping[str, Any]],
     folder: Path,
     files: Sequence[Path],
     store: Any,
-) -> dict[str, list["Training"]]:
+) -> dict[str, list[Training]]:
     """Row → its trainings, with consecutive seeds."""
-    from mme_vla.extras.nano.fitting import Training
-
-    seed, jobs = int(config["seed"]), {}
+    jobs: dict[str, list[Training]] = {}
     for row, each in composed.items():
-        numbers = range(
-            seed, seed + (config["also_trainings"] if of_also(config, row) else config["trainings"])
-        )
-        jobs[row] = [
-            Training(
+        trainings = nano.also_trainings if nano.is_further(row) else nano.trainings
+        jobs[row] = []
+        for seed in range(nano.seed, nano.seed + trainings):
+            job = Training(
                 row,
-                {**each, "seed": number},
-                config["train"],
-                config["learning"],
-                folder / row / str(number),
+                {**each, "seed": seed},
+                nano.train,
+                nano.learning,
+                folder / row / str(seed),
                 files,
                 store,
-                seed,
+                nano.seed,
             )
-            for number in numbers
-        ]
+            jobs[row].append(job)
     return jobs
 
 
-def of_also(config: Mapping[str, Any], row: str) -> bool:
-    """Whether a row is one of `also`, which have fewer trainings and episodes."""
-    return row.partition("@")[0] in config["also"]
-
-
 def evaluate_all(
-    config: Mapping[str, Any],
+    nano: NanoRun,
     folder: Path,
-    jobs: Mapping[str, Sequence["Training"]],
+    jobs: Mapping[str, Sequence[Training]],
     files: Sequence[Path],
-    robot: "Embodiment",
-) -> dict[str, list["EpisodeRecord"]]:
+    robot: Embodiment,
+) -> dict[str, list[EpisodeRecord]]:
     """Row → the records of all its trainings; a row's folder is
     `<folder>/<row>/<training seed>`.
     """
-    from mme_vla.extras.nano.evaluating import (
-        DEMONSTRATOR,
-        FREQUENT,
-        ORACLE_FRAMES,
-        PLANNER,
-        RANDOM,
-        evaluate_row,
-        frequent_moves,
-        play_all,
-    )
-
-    rules, specs = rules_of(config), episodes_of(config, folder)
+    rules = rules_of(nano)
+    specs = episodes_of(nano, folder, nano.episodes)
+    further = episodes_of(nano, folder, nano.also_episodes) if nano.also else specs
     records: dict[str, list[EpisodeRecord]] = {}
     for row, of_row in jobs.items():
-        selected = (
-            episodes_of(config, folder, config["also_episodes"]) if of_also(config, row) else specs
-        )
+        selected = further if nano.is_further(row) else specs
         model, at, budget = row.partition("@")
-        oracle = f"{ORACLE_FRAMES}{at}{budget}" if model == config["oracle"] else None
+        oracle = f"{ORACLE_FRAMES}{at}{budget}" if model == nano.oracle else None
         for name in [row] if oracle is None else [row, oracle]:
             records[name] = []
             for job in of_row:
@@ -228,36 +210,36 @@ def evaluate_all(
                 records[name] += evaluate_row(
                     job.folder, job.checkpoint, place, selected, rules, ceiling
                 )
-    if config["shard"] is None:
+    if nano.shard is None:
         by_choice = bool(robot.action.choice)
         moves = frequent_moves(files, robot.action) if by_choice else {}
-        ceilings = [DEMONSTRATOR if by_choice else PLANNER] if config["planner"] else []
-        for name in ceilings + ([RANDOM, FREQUENT] if config["floors"] else []):
+        ceilings = [DEMONSTRATOR if by_choice else PLANNER] if nano.planner else []
+        for name in ceilings + ([RANDOM, FREQUENT] if nano.floors else []):
             records[name] = play_all(name, folder / name / "0", specs, rules, moves)
     return records
 
 
-def rules_of(config: Mapping[str, Any]) -> "Rules":
+def rules_of(nano: NanoRun) -> "Rules":
     """How the run's episodes are run."""
-    from mme_vla.extras.nano.evaluating import Rules
+    return Rules(
+        seed=nano.policy_seed,
+        split=nano.split,
+        max_steps=nano.max_steps,
+        max_choices=nano.max_choices,
+        only_possible=nano.only_possible,
+        workers=nano.workers,
+        shard=nano.shard,
+    )
 
-    names = ("split", "max_steps", "max_choices", "only_possible", "workers", "shard")
-    return Rules(seed=config["policy_seed"], **{name: config[name] for name in names})
 
-
-def episodes_of(
-    config: Mapping[str, Any], folder: Path, episodes: Any = None
-) -> list["EpisodeSpec"]:
-    """The episodes of the run; with `replace` scenes that cannot be built are replaced by later
+def episodes_of(nano: NanoRun, folder: Path, episodes: Any) -> list[EpisodeSpec]:
+    """Those episodes of the split; with `replace` scenes that cannot be built are replaced by later
     ones.
     """
-    from mme_vla.extras.nano.evaluating import built_scenes
-
-    selected = config["episodes"] if episodes is None else episodes
-    if not config["replace"]:
-        return choose_episodes(config["task"], selected, config["split"])
+    if not nano.replace:
+        return choose_episodes(nano.task, episodes, nano.split)
     specs, left_out = built_scenes(
-        folder / "scenes.json", config["task"], config["split"], selected, config["workers"]
+        folder / "scenes.json", nano.task, nano.split, episodes, nano.workers
     )
     for line in left_out:
         logger.info("left out: %s", line)
@@ -265,29 +247,35 @@ def episodes_of(
 
 
 def videos_of(
-    config: Mapping[str, Any],
-    jobs: Mapping[str, Sequence["Training"]],
+    nano: NanoRun,
+    jobs: Mapping[str, Sequence[Training]],
     records: Mapping[str, Sequence[Any]],
     folder: Path,
 ) -> list[Path]:
     """Videos of a success and a failure of the first row's first training."""
-    from mme_vla.extras.nano.evaluating import record_videos
-
-    if not config["videos"]:
+    if not nano.videos:
         return []
     row, of_row = next(iter(jobs.items()))
     first = records[row][: len(records[row]) // len(of_row)]
-    return record_videos(of_row[0].checkpoint, folder, first, rules_of(config))
+    return record_videos(of_row[0].checkpoint, folder, first, rules_of(nano))
 
 
 # Demonstrations -----------------------------------------------------------------------------------
 
 
-def counts_of(config: Mapping[str, Any]) -> dict[tuple[str, str], int]:
-    """How many demonstrations of each task and difficulty."""
+def counts_of(
+    task: Any, demonstrations: Mapping[str, Any], others: Mapping[str, Mapping[str, Any]] | None
+) -> dict[tuple[str, str], int]:
+    """How many demonstrations of each task and difficulty.
+
+    Args:
+        task: the run's tasks.
+        demonstrations: difficulty → how many.
+        others: of some tasks, other numbers.
+    """
     counts: dict[tuple[str, str], int] = {}
-    for task in choose_tasks(config["task"]):
-        amounts = {**config["demonstrations"], **(config["demonstrations_of"] or {}).get(task, {})}
+    for name in choose_tasks(task):
+        amounts = {**demonstrations, **(others or {}).get(name, {})}
         fits = set(amounts) <= set(DIFFICULTIES) and all(
             isinstance(n, int) and n >= 0 for n in amounts.values()
         )
@@ -296,38 +284,42 @@ def counts_of(config: Mapping[str, Any]) -> dict[tuple[str, str], int]:
             f"demonstrations={brief(amounts)}: write how many of each difficulty"
             f" ({', '.join(DIFFICULTIES)}), such as {{easy: 100}}.",
         )
-        counts |= {(task, level): n for level, n in amounts.items()}
+        counts |= {(name, level): n for level, n in amounts.items()}
     require(
         sum(counts.values()) >= 2,
-        f"demonstrations={brief(config['demonstrations'])}: it takes two, to learn from and to"
-        " measure by.",
+        f"demonstrations={brief(demonstrations)}: it takes two, to learn from and to measure by.",
     )
     return counts
 
 
 def record_all(
-    config: Mapping[str, Any], folder: Path, choices: "Sequence[FrameChoice]", robot: "Embodiment"
+    nano: NanoRun, folder: Path, choices: Sequence[FrameChoice], robot: Embodiment
 ) -> list[Path]:
     """Demonstrate until there are as many as wanted, each in a file of its own; the files, task by
     task.
 
     choices: what the memories that will train on them read. robot: the one that does.
     """
-    from mme_vla.extras.nano.demonstrations import Scene
-
-    groups, how = (
-        [],
-        (tuple(robot.camera_names), tuple(choices), config["carried_out"], robot.action),
-    )
-    for (task, level), required in counts_of(config).items():
+    groups = []
+    counts = counts_of(nano.task, nano.demonstrations, nano.demonstrations_of)
+    for (task, level), required in counts.items():
         (folder / task).mkdir(parents=True, exist_ok=True)
-        first = int(config["first_seed"]) + DIFFICULTIES.index(level) * SEEDS_APART
-        scene = Scene(task, first, level, folder / task, *how)
+        first = nano.first_seed + DIFFICULTIES.index(level) * SEEDS_APART
+        scene = Scene(
+            task,
+            first,
+            level,
+            folder / task,
+            tuple(robot.camera_names),
+            tuple(choices),
+            nano.carried_out,
+            robot.action,
+        )
         groups.append(Group(map(partial(_with_seed, scene), count(first)), required))
-    return demonstrate(groups, config["workers"])
+    return demonstrate(groups, nano.workers)
 
 
-def _with_seed(scene: "Scene", seed: int) -> "Scene":
+def _with_seed(scene: Scene, seed: int) -> "Scene":
     return replace(scene, seed=seed)
 
 
@@ -337,19 +329,19 @@ class Group:
     are.
     """
 
-    scenes: Iterator["Scene"]
+    scenes: Iterator[Scene]
     required: int
     files: list[Path] = field(default_factory=list)
     failed: int = 0
     """Scenes in a row that no demonstration succeeded in."""
 
-    def next(self) -> list["Scene"]:
+    def next(self) -> list[Scene]:
         """The scenes to try now."""
         return list(
             islice(self.scenes, min(RETRIES - self.failed, self.required - len(self.files)))
         )
 
-    def take(self, tried: Sequence["Scene"]) -> None:
+    def take(self, tried: Sequence[Scene]) -> None:
         """Note what came of them."""
         new = [scene.path for scene in tried if scene.made]
         for scene in tried:
@@ -369,10 +361,6 @@ def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
     """The files of the first demonstrations of each group that succeed; existing ones are not made
     again.
     """
-    from mme_vla.data.console import progress
-    from mme_vla.envs.robomme.recording.processes import carry_out
-    from mme_vla.extras.nano.demonstrations import demonstrated
-
     with progress(
         "record", sum(group.required for group in groups), unit="demonstrations"
     ) as advance:

@@ -4,24 +4,30 @@
 
 import logging
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from omegaconf import DictConfig
 
-from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.cli.command import log_to_terminal
 from mme_vla.config.composition import resolved
-from mme_vla.config.sections import PositiveInt, read_section
+from mme_vla.config.sections import PositiveInt, Range, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import INDIFFERENT
+from mme_vla.extras.play import build_player
+from mme_vla.extras.play.desk import Desk
 from mme_vla.extras.play.game import ChoiceSession
+from mme_vla.extras.play.players import play
 from mme_vla.extras.play.run import Identity, PlayRun, make_session
+from mme_vla.extras.play.web import require_page, serve
 
 log = logging.getLogger("mme_vla.play")
 HUMAN = "human"
@@ -37,41 +43,68 @@ class PlaySettings:
     max_choices: PositiveInt
 
 
-@cli("play")
+@dataclass(frozen=True)
+class PlayCommand:
+    """The other keys of `configs/play.yaml`, where each is explained."""
+
+    player: Mapping[str, Any]
+    episodes: Any
+    split: str
+    env: str
+    max_steps: PositiveInt | None
+    retry_errors: bool
+    output: str
+    host: str
+    port: Annotated[int, Range(0, 65535)]
+
+
 def main(cfg: DictConfig) -> None:
     """Play the episodes that are not played yet, on the page or by a model, and compare with the
     paper.
     """
-    from mme_vla.envs.rendering import render_backend
-    from mme_vla.extras.play import build_player
-    from mme_vla.extras.play.desk import Desk
-    from mme_vla.extras.play.web import require_page, serve
-
     config = resolved(cfg)
+    command = read_section(PlayCommand, config, others=True)
     log_to_terminal(log, clock=True)
-    player: dict[str, Any] = config["player"]
-    specs = choose_episodes(named_tasks(config), config["episodes"], config["split"], config["env"])
-    if config["max_steps"] is None:
-        config["max_steps"] = environment(config["env"]).step_limit(config["split"])
-    settings: dict[str, Any] = asdict(read_section(PlaySettings, config, others=True))
-    settings["player"] = {key: value for key, value in player.items() if key not in INDIFFERENT}
-    human = player["name"] == HUMAN
-    built = None if human else build_player(player)
-    if human:
+    source = environment(command.env)
+    specs = choose_episodes(named_tasks(config), command.episodes, command.split, command.env)
+    max_steps = command.max_steps or source.step_limit(command.split)
+    settings = read_section(PlaySettings, {**config, "max_steps": max_steps}, others=True)
+    by_hand = command.player["name"] == HUMAN
+    built = None if by_hand else build_player(command.player)
+    if by_hand:
         require_page()
     needs_images = built is None or built.needs_images
-    environment(config["env"]).check_installed()
-    if config["env"] == "mme_vla" and needs_images:
+    source.check_installed()
+    if command.env == "mme_vla" and needs_images:
         render_backend()
-    name, who = (HUMAN, str(player["participant"])) if built is None else (built.model, 0)
-    identity = Identity(name, who, player.get("seed", 0), config["max_steps"], settings)
-    limits = {limit: config[limit] for limit in ("max_steps", "max_choices")}
-    make = partial(make_session, env=config["env"], **limits, images=needs_images)
-    folder = Path(str(config["output"])).expanduser()
+    name = HUMAN
+    participant: int | str = 0
+    if built is None:
+        participant = str(command.player["participant"])
+    else:
+        name = built.model
+    identity = Identity(
+        name,
+        participant,
+        command.player.get("seed", 0),
+        max_steps,
+        {
+            **asdict(settings),
+            "player": {k: v for k, v in command.player.items() if k not in INDIFFERENT},
+        },
+    )
+    make = partial(
+        make_session,
+        env=command.env,
+        max_steps=max_steps,
+        max_choices=settings.max_choices,
+        images=needs_images,
+    )
+    folder = Path(command.output).expanduser()
     try:
-        with PlayRun(folder, specs, identity, make, config["retry_errors"]) as run:
+        with PlayRun(folder, specs, identity, make, command.retry_errors) as run:
             if built is None:
-                serve(Desk(run, str(who)), str(config["host"]), config["port"])
+                serve(Desk(run, str(participant)), command.host, command.port)
                 played = len(run.episodes) - len(run.todo)
                 of = f"{played} of {len(run.episodes)} episodes played"
                 log.info("ended · %s; the same command continues with the others", of)
@@ -92,8 +125,6 @@ def _by_itself(run: PlayRun, player: Any) -> None:
 
 def _play_one(run: PlayRun, which: EpisodeSpec, player: Any) -> EpisodeRecord:
     """Play and record one episode; what breaks in it ends it with an error, but not the run."""
-    from mme_vla.extras.play.players import play
-
     session: ChoiceSession | None = None
     try:
         session = run.make(which)

@@ -37,6 +37,7 @@ EXTENSION = Extension(
             "probe",
             "python -m mme_vla.probe",
             "shared",
+            reads_words=True,
         ),
     },
     configs=Path(__file__).parent / "configs",

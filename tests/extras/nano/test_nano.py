@@ -128,18 +128,14 @@ def test_tokens_made_beforehand_give_the_loss_of_the_images() -> None:
 )
 def test_demonstrations_are_counted_by_difficulty(counts: object, words: str) -> None:
     with pytest.raises(UserError, match=words):
-        counts_of({"task": "StopCube", "demonstrations": counts, "demonstrations_of": {}})
-    more = {
-        "task": ["StopCube", "BinFill"],
-        "demonstrations": {"easy": 2},
-        "demonstrations_of": {"BinFill": {"hard": 1}},
-    }
-    assert counts_of(more) == {
+        counts_of("StopCube", counts, {})  # type: ignore[arg-type]
+    tasks = ["StopCube", "BinFill"]
+    assert counts_of(tasks, {"easy": 2}, {"BinFill": {"hard": 1}}) == {
         ("StopCube", "easy"): 2,
         ("BinFill", "easy"): 2,
         ("BinFill", "hard"): 1,
     }
-    assert counts_of({**more, "demonstrations_of": None}) == {
+    assert counts_of(tasks, {"easy": 2}, None) == {
         ("StopCube", "easy"): 2,
         ("BinFill", "easy"): 2,
     }

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from omegaconf import DictConfig
 
 from mme_vla import build_policy
 from mme_vla.config.composition import compose, resolved
@@ -27,6 +28,7 @@ from mme_vla.extras.nano.evaluating import Rules, built_scenes, frequent_moves, 
 from mme_vla.extras.nano.learning import Decisions, choice_errors, statistics
 from mme_vla.extras.nano.rows import read_rows
 from mme_vla.extras.nano.runs import compose_rows
+from mme_vla.extras.nano.settings import NanoRun
 from mme_vla.policy.mme import MMEPolicy
 
 
@@ -66,8 +68,12 @@ def test_present_gives_the_current_frame_and_as_many_parameters_as_a_memory() ->
     assert history is not None and history.positions[:, :, 0].float().std(1).max() == 0
 
 
+def nano_run(cfg: DictConfig) -> NanoRun:
+    return NanoRun.from_config(resolved(cfg))
+
+
 def test_all_memories_read_decisions_and_the_same_frames() -> None:
-    rows = compose_rows(resolved(compose("nano", ["nano=nano16"])))
+    rows = compose_rows(nano_run(compose("nano", ["nano=nano16"])))
     decisions = np.array([66, 71, 140, 333, 640, 1201])
     stored, every = {0, *range(15, 1300, 16)}, set[int]()
     for choice in rows.choices:
@@ -92,7 +98,7 @@ def test_all_memories_read_decisions_and_the_same_frames() -> None:
         "keyframes",
     }
     of_one = compose_rows(
-        resolved(compose("nano", ["nano=nano16", "with_memory=framesamp_modul", "also=[]"]))
+        nano_run(compose("nano", ["nano=nano16", "with_memory=framesamp_modul", "also=[]"]))
     )
     assert every == set().union(*(choice.read(decisions, 66) for choice in of_one.choices)), (
         "later rows render none"
@@ -101,7 +107,7 @@ def test_all_memories_read_decisions_and_the_same_frames() -> None:
 
 def test_planned_motions_of_several_tasks_are_one_run() -> None:
     config = resolved(compose("nano", ["nano=motions"]))
-    rows = compose_rows(config)
+    rows = compose_rows(NanoRun.from_config(config))
     assert (
         rows.robot.action.answers == "waypoint"
         and rows.blind == "pi05"
@@ -123,10 +129,10 @@ def test_backbone_and_embodiment_are_chosen_on_the_command_line() -> None:
 def test_mirrored_places_of_motions_are_refused_before_anything_is_recorded() -> None:
     one = ["with_memory=framesamp_modul", "beside=[]", "also=[]", "rendered_for=[]"]
     with pytest.raises(UserError, match=r"learning\.reflect=0\.5 needs a point"):
-        compose_rows(resolved(compose("nano", ["nano=motions", "learning.reflect=0.5", *one])))
+        compose_rows(nano_run(compose("nano", ["nano=motions", "learning.reflect=0.5", *one])))
     with pytest.raises(UserError, match=r"backbone=nano_choice"):
         compose_rows(
-            resolved(compose("nano", ["nano=nano16", "with_backbone=tiny", "overrides=[]", *one]))
+            nano_run(compose("nano", ["nano=nano16", "with_backbone=tiny", "overrides=[]", *one]))
         )
 
 

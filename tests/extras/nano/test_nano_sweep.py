@@ -21,6 +21,7 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.extras.nano import evaluating, fitting, runs, tokens
 from mme_vla.extras.nano.cli.nano import with_settings
 from mme_vla.extras.nano.demonstrations import Demonstration
+from mme_vla.extras.nano.settings import NanoRun
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.training_identity import identity_of
 from mme_vla.utils import read_json
@@ -83,7 +84,7 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     words += ["trainings=2", "beside=[]", "rendered_for=[]", "planner=false", "videos=false"]
     words += ["train.steps=2", "train.val_samples=4", "train.batch_size=2", "train.log_every=1"]
     words += [f"output={tmp_path / 'run'}"]
-    page = runs.run(resolved(compose("nano", words))).read_text()
+    page = runs.run(NanoRun.from_config(resolved(compose("nano", words)))).read_text()
     assert len(recorded) == 1 and len(made) == 2, "each frame is encoded once"
     assert all(f"| framesamp_modul | {budget} | 50 ± 0 % (2/4) |" in page for budget in (2, 4))
     trained = sorted((tmp_path / "run").glob("training/*/*/trained.json"))
@@ -111,19 +112,19 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
         and about["parameters"] > 1e6
         and about["update_flops"] > 1e6
     )
-    runs.run(resolved(compose("nano", words)))
+    runs.run(NanoRun.from_config(resolved(compose("nano", words))))
     assert len(made) == 2, "a finished run is not made again"
     for changed, message in (
         ("train.steps=3", "steps was 2, and is 3"),
         ("learning.noise=0.5", "learning.noise was"),
     ):
         with pytest.raises(UserError, match=message):
-            runs.run(resolved(compose("nano", [*words, changed])))
+            runs.run(NanoRun.from_config(resolved(compose("nano", [*words, changed]))))
     killed = tmp_path / "run" / "training" / "framesamp_modul@2" / "0"
     (killed / "trained.json").unlink()
     # as before the first one: there are only lines of progress
     shutil.rmtree(killed / "checkpoints")
-    runs.run(resolved(compose("nano", words)))
+    runs.run(NanoRun.from_config(resolved(compose("nano", words))))
     assert read_json(killed / "trained.json", "a training's end")["steps"] == 2
 
 

@@ -14,11 +14,13 @@ from torch import Tensor, nn
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
 from mme_vla import UserError
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, resolved
+from mme_vla.config.sections import read_section
 from mme_vla.envs.grounding import project
 from mme_vla.envs.robomme.scene.placement import SceneError
 from mme_vla.extras.nano import pretraining, scenes
-from mme_vla.extras.nano.cli.vision_pretrain import run
+from mme_vla.extras.nano.cli import vision_pretrain
+from mme_vla.extras.nano.cli.vision_pretrain import PretrainRun, run
 from mme_vla.extras.nano.pretraining import (
     PretrainSettings,
     Scenes,
@@ -180,20 +182,10 @@ def record(
     ) -> list[list[str]]:
         return [[file.name for file in group] for group in (files, held_out)]
 
-    monkeypatch.setattr(pretraining, "pretrain", names)
-    return run(
-        compose(
-            "vision_pretrain",
-            [
-                "tasks=[StopCube]",
-                "scenes=4",
-                "held_out=1",
-                "workers=1",
-                f"output={tmp_path}",
-                *words,
-            ],
-        )
-    )
+    monkeypatch.setattr(vision_pretrain, "pretrain", names)
+    words = ("tasks=[StopCube]", "scenes=4", "held_out=1", "workers=1", *words)
+    config = resolved(compose("vision_pretrain", [*words, f"output={tmp_path}"]))
+    return run(read_section(PretrainRun, config, others=True))
 
 
 def test_the_last_scenes_of_a_task_are_held_out_and_only_demonstrated(

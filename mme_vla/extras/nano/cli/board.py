@@ -8,14 +8,14 @@ it.
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.composition import compose, resolved
 from mme_vla.errors import printable, require
+from mme_vla.extras.nano.settings import NanoRun
 from mme_vla.utils import require_replaceable
 
 SHIPPED = Path(__file__).resolve().parents[4] / "benchmarks" / "nano16"
@@ -64,9 +64,8 @@ def main(
         config = compose("nano", with_settings(words), extra_dirs=trees)
         trained: list[Path] = []
         if any(word.startswith("model=") for word in words):
-            trained = row_folders(
-                resolved(compose("nano", with_settings(alone(words)), extra_dirs=trees)), trees
-            )
+            composed = compose("nano", with_settings(alone(words)), extra_dirs=trees)
+            trained = row_folders(NanoRun.from_config(resolved(composed)), trees)
             sys.argv[1:] = alone(words) + [
                 word for tree in trees for word in ("--config-dir", str(tree))
             ]
@@ -74,7 +73,7 @@ def main(
         run(args, str(config.split), trained)
 
 
-def row_folders(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
+def row_folders(nano: NanoRun, trees: Sequence[Path]) -> list[Path]:
     """The folders of the rows that a run trains; others in its output may be unfinished.
 
     Raises:
@@ -84,14 +83,15 @@ def row_folders(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
     from mme_vla.extras.nano.rows import TRAINED, read_training, rules_text, table_of
     from mme_vla.extras.nano.runs import compose_rows, rules_of
 
-    rows, rules, split = compose_rows(config, trees), rules_of(config), config["split"]
+    rows = compose_rows(nano, trees)
+    rules = rules_of(nano)
     actions = rows.robot.action.answers or rows.robot.name
-    shipped = SHIPPED / table_of(split, actions)
+    shipped = SHIPPED / table_of(nano.split, actions)
     if not shipped.is_dir():
         print(NO_PUBLISHED_ROWS)
     if folder := next((file.parent for file in sorted(shipped.rglob(TRAINED))), None):
         other = read_training(folder)
-        specs = choose_episodes(config["task"], config["episodes"], split)
+        specs = choose_episodes(nano.task, nano.episodes, nano.split)
         compared = {
             "episodes": tuple(
                 dict(Counter(scene.task for scene in scenes)) for scenes in (specs, other.records)
@@ -104,7 +104,7 @@ def row_folders(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
                 value == expected,
                 f"A row with {name} {value} does not fit those of {shipped}: they have {expected}.",
             )
-    return [Path(config["output"]) / split / row for row in rows.composed]
+    return [Path(nano.output) / nano.split / row for row in rows.composed]
 
 
 def alone(words: Sequence[str]) -> list[str]:

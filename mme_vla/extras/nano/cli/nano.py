@@ -9,10 +9,9 @@ from collections.abc import Sequence
 
 from omegaconf import DictConfig
 
-from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.cli.command import log_to_terminal, run_configured
 from mme_vla.config.composition import command_trees, resolved
 from mme_vla.config.trees import library_files
-from mme_vla.errors import brief, require
 
 ALL_TASKS = "nano16"
 """The file of configs/nano for a command that names no task."""
@@ -29,7 +28,7 @@ def main() -> None:
 
         return board.main(sys.argv[2:], main, with_settings)
     sys.argv[1:] = with_settings(sys.argv[1:])
-    command()
+    run_configured("nano", command)
 
 
 def with_settings(words: Sequence[str]) -> list[str]:
@@ -75,22 +74,16 @@ def _as_lists(words: Sequence[str]) -> list[str]:
     ]
 
 
-@cli("nano")
 def command(cfg: DictConfig) -> None:
-    """Record, train, evaluate and write the page, each as far as it is not there."""
+    """Record, train, evaluate and write the page; what exists is skipped."""
     from mme_vla.envs.episodes import choose_tasks
     from mme_vla.envs.make import check_names, require_simulator
     from mme_vla.extras.nano.runs import run
+    from mme_vla.extras.nano.settings import NanoRun
 
-    config = resolved(cfg)
+    nano = NanoRun.from_config(resolved(cfg))
     log_to_terminal(logging.getLogger("mme_vla.nano"))
-    for task in choose_tasks(config["task"]):
+    for task in choose_tasks(nano.task):
         check_names(task, "waypoint", None, None)
-    for key in ("trainings", "also_trainings", "workers"):
-        value = config[key]
-        require(
-            isinstance(value, int) and value >= 1,
-            f"{key}={brief(value)}: must be a whole number from 1 on.",
-        )
     require_simulator()
-    run(config, command_trees()[1:])
+    run(nano, command_trees()[1:])

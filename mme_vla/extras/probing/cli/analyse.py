@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.extras.probing.analyses.rerun_log import RerunLog
     from mme_vla.extras.probing.analyses.watches import Watch
+    from mme_vla.memory.base import Memory
     from mme_vla.policy.mme import MMEPolicy
 
 EXAMPLES = (
@@ -177,16 +178,23 @@ def recurrence(args: argparse.Namespace) -> None:
     print(f"wrote {path} and {table}")
 
 
+def _memory(name: str, words: Sequence[str]) -> "Memory":
+    """A memory of `mme-vla inspect`, with overrides."""
+    from mme_vla.cli.inspect import Inspection, build_memory
+    from mme_vla.config.composition import compose, resolved
+
+    config = resolved(compose("inspect", [f"memory={name}", *words]))
+    return build_memory(Inspection.from_config(config))
+
+
 def selection(args: argparse.Namespace) -> None:
     """Write what a memory remembers along an episode as an mp4, and its last image as PNG."""
-    from mme_vla.cli.inspect import build_memory
-    from mme_vla.config.composition import compose
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.extras.probing.analyses.replay import selection_sheets
     from mme_vla.utils.media import of_one_size, write_video
 
     source = EpisodeSource(args.dataset)
-    memory = build_memory(compose("inspect", [f"memory={args.memory}", *args.set]))
+    memory = _memory(args.memory, args.set)
     sheets = []
     with _rerun(args) as log:
         for step, sheet in selection_sheets(source, args.episode, memory, args.memory, args.every):
@@ -268,8 +276,6 @@ def writing(args: argparse.Namespace) -> None:
     """Score what memories keep along demonstrations against the frames that show the facts of each
     task.
     """
-    from mme_vla.cli.inspect import build_memory
-    from mme_vla.config.composition import compose
     from mme_vla.envs.episodes import choose_episodes
     from mme_vla.envs.make import require_simulator
     from mme_vla.extras.probing.evidence import record_evidence
@@ -286,10 +292,7 @@ def writing(args: argparse.Namespace) -> None:
     require_simulator()
     policy: MMEPolicy | None = None
     selectors: dict[str, Memory | str] = {
-        name: name
-        if name in REFERENCES
-        else build_memory(compose("inspect", [f"memory={name}", *args.set]))
-        for name in args.memories
+        name: name if name in REFERENCES else _memory(name, args.set) for name in args.memories
     }
     if args.checkpoint is not None:
         policy = MMEPolicy.from_pretrained(

@@ -8,9 +8,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from mme_vla.cli.command import cli, log_to_terminal
-from mme_vla.cli.evaluate import choose_subgoals, report_usage
-from mme_vla.cli.loading import load_policy
+from mme_vla.cli.command import log_to_terminal, run_configured
 from mme_vla.config.composition import resolved
 from mme_vla.config.devices import process_device
 from mme_vla.config.sections import read_section
@@ -23,12 +21,13 @@ def main() -> None:
     """Run the command; the first word `card` means `card=true`."""
     if sys.argv[1:2] == ["card"]:
         sys.argv[1] = "card=true"
-    probe()
+    run_configured("probe", probe)
 
 
-@cli("probe")
 def probe(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
+    from mme_vla.cli.evaluate import choose_subgoals, report_usage
+    from mme_vla.cli.loading import PolicyChoice, load_policy
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import choose_numbers, named_tasks
@@ -74,7 +73,7 @@ def probe(cfg: DictConfig) -> None:
         environment(settings.env).check_installed()
     log_to_terminal(logger)
     device = process_device(str(cfg.device))
-    policy, name, source = load_policy(cfg, "probe", logger, device)
+    policy, name, source = load_policy(PolicyChoice.from_config(values), "probe", logger, device)
     data = values["recordings"]
     recordings = [] if data is None else all_recordings(open_sources(data, policy.embodiment))
     numbers = (

@@ -16,6 +16,7 @@ from mme_vla import Policy
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.errors import UserError
 from mme_vla.training.data import prepare_data
+from mme_vla.training.settings import DataSettings
 
 if TYPE_CHECKING:
     from lerobot_policy_mme_vla.configuration_mme_vla import MMEVLAConfig
@@ -96,7 +97,7 @@ def _steps(model: Policy, config: "MMEVLAConfig", entry: dict[str, Any]) -> Trai
             "max_build_frames": config.max_build_frames,
         },
     }
-    steps = prepare_data(model, data, config.seed).train
+    steps = prepare_data(model, DataSettings.from_dict(data), config.seed).train
     if type(steps) is not TrainingDataset:
         raise UserError(
             f"{config.model} is trained on groups of steps or on keyframes, which LeRobot's sampler"

@@ -18,6 +18,7 @@ from mme_vla.config.composition import compose
 from mme_vla.extras.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.memory.base import full_history
 from mme_vla.testing.small import unit_stats
+from mme_vla.training.settings import TrainRun
 from mme_vla.types import HistoryTokens
 
 SMALL = {
@@ -128,7 +129,7 @@ def test_it_trains_on_cached_tokens(tmp_path: Path) -> None:
         ],
     )
     config: Any = OmegaConf.to_container(cfg, resolve=True)
-    checkpoint = train(cfg, config, tmp_path / "run", begun=time.perf_counter())
+    checkpoint = train(TrainRun.from_config(config), tmp_path / "run", begun=time.perf_counter())
     again = Policy.from_pretrained(checkpoint)
     assert again.config["name"] == "diffusion_policy"
     assert again.memory is not None and again.memory.budget == 64

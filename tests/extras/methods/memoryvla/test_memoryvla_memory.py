@@ -20,6 +20,7 @@ from mme_vla.memory.base import full_history, stack_history
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.testing.small import BEYOND_MEMORIES, moving_frames
 from mme_vla.training.data import check_frozen, prepare_data
+from mme_vla.training.settings import DataSettings
 from mme_vla.types import HistoryTokens
 from mme_vla.weights.load import transfer
 from mme_vla.weights.writers import write_policy
@@ -163,7 +164,7 @@ def test_each_frame_of_a_group_has_the_history_of_its_step(tmp_path: Path) -> No
     data = OmegaConf.to_container(
         compose("train", [f"data.cache.root={tmp_path}"]).data, resolve=True
     )
-    samples = prepare_data(policy, data, 42, say=str).train  # type: ignore[arg-type]
+    samples = prepare_data(policy, DataSettings.from_dict(data), 42, say=str).train  # type: ignore[arg-type]
     for item in (samples[0], samples.observation(40)):
         for moment, time in zip(item["moments"], item["times"].tolist(), strict=True):
             assert moment["history"].step == time == moment["history"].positions[-1, 0]
