@@ -101,13 +101,11 @@ class Desk:
     def state(self) -> dict[str, Any]:
         """All but the frames, as JSON takes it."""
         # The simulator's thread changes these meanwhile: each is read once.
-        run, phase, session, session_id, todo = (
-            self.run,
-            self.phase,
-            self.session,
-            self.session_id,
-            list(self.run.todo),
-        )
+        run = self.run
+        phase = self.phase
+        session = self.session
+        session_id = self.session_id
+        todo = list(run.todo)
         done = len(run.episodes) - len(todo)
         state: dict[str, Any] = {
             "phase": phase,
