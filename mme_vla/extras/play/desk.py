@@ -127,7 +127,11 @@ class Desk:
                 }
                 for task, successes, count, paper in run.summary()
             ]
-        which = session.episode if session is not None else todo[0] if todo else None
+        which = None
+        if session is not None:
+            which = session.episode
+        elif todo:
+            which = todo[0]
         if which is not None:
             state |= {"task": which.task, "split": which.split, "episode": which.episode}
         if session is not None and session.reveals:

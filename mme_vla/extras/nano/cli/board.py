@@ -64,12 +64,11 @@ def main(
         config = compose("nano", with_settings(words), extra_dirs=trees)
         trained: list[Path] = []
         if any(word.startswith("model=") for word in words):
-            trained = row_folders(
-                resolved(compose("nano", with_settings(alone(words)), extra_dirs=trees)), trees
-            )
-            sys.argv[1:] = alone(words) + [
-                word for tree in trees for word in ("--config-dir", str(tree))
-            ]
+            composed = compose("nano", with_settings(alone(words)), extra_dirs=trees)
+            trained = row_folders(resolved(composed), trees)
+            sys.argv[1:] = alone(words)
+            for tree in trees:
+                sys.argv += ["--config-dir", str(tree)]
             nano()
         run(args, str(config.split), trained)
 
@@ -84,25 +83,32 @@ def row_folders(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
     from mme_vla.extras.nano.rows import TRAINED, read_training, rules_text, table_of
     from mme_vla.extras.nano.runs import compose_rows, rules_of
 
-    rows, rules, split = compose_rows(config, trees), rules_of(config), config["split"]
+    rows = compose_rows(config, trees)
+    rules = rules_of(config)
+    split = config["split"]
     actions = rows.robot.action.answers or rows.robot.name
     shipped = SHIPPED / table_of(split, actions)
     if not shipped.is_dir():
         print(NO_PUBLISHED_ROWS)
-    if folder := next((file.parent for file in sorted(shipped.rglob(TRAINED))), None):
-        other = read_training(folder)
+    trainings = sorted(file.parent for file in shipped.rglob(TRAINED))
+    if trainings:
+        published = read_training(trainings[0])
         specs = choose_episodes(config["task"], config["episodes"], split)
-        compared = {
-            "episodes": tuple(
-                dict(Counter(scene.task for scene in scenes)) for scenes in (specs, other.records)
-            ),
-            "max_steps": (rules.steps, other.records[0].max_steps),
-            "rules": (rules_text(actions, rules.max_choices, rules.only_possible), other.rules),
+        values = {
+            "episodes": dict(Counter(spec.task for spec in specs)),
+            "max_steps": rules.steps,
+            "rules": rules_text(actions, rules.max_choices, rules.only_possible),
         }
-        for name, (value, expected) in compared.items():
+        expected = {
+            "episodes": dict(Counter(record.task for record in published.records)),
+            "max_steps": published.records[0].max_steps,
+            "rules": published.rules,
+        }
+        for name, value in values.items():
             require(
-                value == expected,
-                f"A row with {name} {value} does not fit those of {shipped}: they have {expected}.",
+                value == expected[name],
+                f"A row with {name} {value} does not fit those of {shipped}: they have"
+                f" {expected[name]}.",
             )
     return [Path(config["output"]) / split / row for row in rows.composed]
 

@@ -63,23 +63,24 @@ def _record(
     from mme_vla.data.console import progress
     from mme_vla.envs.robomme.recording.processes import carry_out
 
-    folder, first = Path(config["output"]) / "scenes", config["first_seed"]
+    folder = Path(config["output"]) / "scenes"
+    first = config["first_seed"]
+    n_learned = config["scenes"] - config["held_out"]
     learned: list[Path] = []
     held_out: list[Path] = []
     jobs = []
     for number in range(config["scenes"]):
-        measures = number >= config["scenes"] - config["held_out"]
-        arrangements = 0 if measures else config["arrangements"]
+        arrangements = config["arrangements"] if number < n_learned else 0
         level = DIFFICULTIES[number % len(DIFFICULTIES)]
         jobs += [(folder, task, first + number, level, arrangements, size) for task in tasks]
     with progress("scenes", len(jobs)) as advance:
         for seed, file, error in carry_out(jobs, _recorded, config["workers"]):
             if file is None:
                 logger.info("left out: %s", error)
+            elif seed < first + n_learned:
+                learned.append(file)
             else:
-                (
-                    learned if seed < first + config["scenes"] - config["held_out"] else held_out
-                ).append(file)
+                held_out.append(file)
             advance(1)
     if not learned:
         raise UserError(f"None of the {len(jobs)} scenes can be built: change first_seed={first}.")
