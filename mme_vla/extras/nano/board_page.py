@@ -2,6 +2,7 @@
 tables.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from mme_vla.evaluation.results.compare import show_p
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, comparison_table, show, span
-from mme_vla.extras.nano.board import Board, Row, published_success
+from mme_vla.extras.nano.board import Board, Row, Separation, published_success
 from mme_vla.extras.nano.rows import CHOICES
 
 PAINT = {"policy": COLOURS[0], "floor": FAINT, "ceiling": COLOURS[2]}
@@ -22,43 +23,30 @@ def ranking(board: Board, brief: bool = False) -> Table:
     """Place, success by suite, and costs of every row; without costs where `brief`."""
     suites = board.protocol.suites
     columns = ["row", "place", "trainings", "success (%)", "95 %", *suites]
-    columns += (
-        []
-        if brief
-        else ["parameters", "GFLOPs an update", "seconds an update", "CPU minutes of a training"]
-    )
+    if not brief:
+        columns += ["parameters", "GFLOPs an update", "seconds an update"]
+        columns += ["CPU minutes of a training"]
     rows: list[list[str]] = []
     strong: set[int] = set()
     for row in board.rows:
-        place, at = board.places.get(row.name), ""
-        if place is not None:
-            low, high = place[1]
-            at = f"{place[0]} [{low:.0f}, {high:.0f}]"
-        trainings = str(len(row.method.trainings)) if row.facts.trained else "–"
-        cells = [
-            f"{board.success(row, board.protocol.choose('suite', suite)):.1f}" for suite in suites
-        ]
         facts = row.facts
-        gflops = None if facts.update_flops is None else facts.update_flops / 1e9
-        numbers = [
-            (facts.parameters, ",.0f"),
-            (gflops, ".2f"),
-            (facts.update_s, ".3f"),
-            (facts.cpu_minutes, ".1f"),
-        ]
-        costs = [] if brief else [_cell(value, spec) for value, spec in numbers]
-        strong |= {len(rows)} if row.is_local else set()
-        rows.append(
-            [
-                row.name,
-                at,
-                trainings,
-                success(board, row),
-                span(board.interval(row)),
-                *cells,
-                *costs,
-            ]
-        )
+        place = ""
+        if row.name in board.places:
+            number, (low, high) = board.places[row.name]
+            place = f"{number} [{low:.0f}, {high:.0f}]"
+        trainings = str(len(row.method.trainings)) if facts.trained else "–"
+        cells = [row.name, place, trainings, success(board, row), span(board.interval(row))]
+        for suite in suites:
+            cells.append(f"{board.success(row, board.protocol.choose('suite', suite)):.1f}")
+        if not brief:
+            gflops = None if facts.update_flops is None else facts.update_flops / 1e9
+            cells.append(_cell(facts.parameters, ",.0f"))
+            cells.append(_cell(gflops, ".2f"))
+            cells.append(_cell(facts.update_s, ".3f"))
+            cells.append(_cell(facts.cpu_minutes, ".1f"))
+        if row.is_local:
+            strong.add(len(rows))
+        rows.append(cells)
     return Table(f"Ranking, split {board.split}", columns, rows, strong=strong)
 
 
@@ -71,24 +59,27 @@ def success(board: Board, row: Row) -> str:
 def tasks(board: Board) -> Table:
     """Success of every row on every task."""
     names = board.protocol.tasks
-    rows = [
-        [row.name, *(f"{board.success(row, [task]):.0f}" for task in names)] for row in board.rows
-    ]
+    rows = []
+    for row in board.rows:
+        rows.append([row.name, *[f"{board.success(row, [task]):.0f}" for task in names]])
     return Table("Success by task (%)", ["row", *names], rows)
 
 
 def trainings(board: Board) -> Table:
     """Scenes that each training solves, of rows with several: in all, by suite and by task."""
     suites = [tuple(board.protocol.choose("suite", suite)) for suite in board.protocol.suites]
-    scopes = [board.protocol.tasks, *suites, *((task,) for task in board.protocol.tasks)]
+    scopes = [board.protocol.tasks, *suites, *[(task,) for task in board.protocol.tasks]]
     rows: list[list[str]] = []
     for row in board.rows:
         seeds = [runs[0].key.training.seed for runs in row.method.trainings if runs[0].key.training]
-        if len(seeds) > 1:
-            # each [trainings]
-            solved = [sum(row.outcomes(task).sum(0) for task in scope) for scope in scopes]
-            for seed, *counts in zip(seeds, *solved, strict=True):
-                rows.append([row.name, str(seed), *(f"{count:g}" for count in counts)])
+        if len(seeds) < 2:
+            continue
+        solved_by_task = {task: row.outcomes(task).sum(0) for task in board.protocol.tasks}
+        for training, seed in enumerate(seeds):
+            cells = [row.name, str(seed)]
+            for scope in scopes:
+                cells.append(f"{sum(solved_by_task[task][training] for task in scope):g}")
+            rows.append(cells)
     columns = ["row", "training seed", "all", *board.protocol.suites, *board.protocol.tasks]
     return Table("Scenes solved by each training", columns, rows)
 
@@ -97,7 +88,8 @@ def separations(board: Board) -> Table:
     """Tasks and budgets at which memories differ, the clearest first."""
     rows = []
     for s in sorted(board.separations, key=lambda s: (s.p, -s.deviation)):
-        above, below = (None if end is None else abs(s.mean - end) for end in (s.floor, s.ceiling))
+        above = None if s.floor is None else abs(s.mean - s.floor)
+        below = None if s.ceiling is None else abs(s.mean - s.ceiling)
         over_trainings = "–" if s.p_repeated is None else f"{show_p(s.p_repeated)} ({s.repeated})"
         rows.append(
             [
@@ -130,48 +122,48 @@ def separations(board: Board) -> Table:
 
 def separating(board: Board) -> list[str]:
     """How many tasks separate memories, a sentence a budget."""
-    made = board.separations
+    by_budget: dict[str, list[Separation]] = {}
+    for separation in board.separations:
+        by_budget.setdefault(separation.budget, []).append(separation)
     sentences = []
-    for budget in dict.fromkeys(s.budget for s in made):
-        here = [s for s in made if s.budget == budget]
+    for budget, tested in by_budget.items():
         tokens = f"At {budget} tokens" if budget else "At the default budgets"
-        separated = [s.task for s in here if s.p < 0.05]
-        names = f": {', '.join(separated)}" if separated else ""
+        differing = [s.task for s in tested if s.p < 0.05]
         sentence = (
-            f"{tokens} the {here[0].memories} trained policies differ in {len(separated)} of"
-            f" {len(here)} tasks "
+            f"{tokens} the {tested[0].memories} trained policies differ in {len(differing)} of"
+            f" {len(tested)} tasks (p < 0.05){_after_colon(differing)}."
         )
-        sentence += f"(p < 0.05){names}."
-        if here[0].p_repeated is not None:
-            separated = [s.task for s in here if s.p_repeated is not None and s.p_repeated < 0.05]
-            names = f": {', '.join(separated)}" if separated else ""
+        if tested[0].p_repeated is not None:
+            differing = [s.task for s in tested if s.p_repeated is not None and s.p_repeated < 0.05]
             sentence += (
-                f" Tested over trainings, the {here[0].repeated} with several differ in"
-                f" {len(separated)}{names}."
+                f" Tested over trainings, the {tested[0].repeated} with several differ in"
+                f" {len(differing)}{_after_colon(differing)}."
             )
         sentences.append(sentence)
     return sentences
+
+
+def _after_colon(names: Sequence[str]) -> str:
+    return f": {', '.join(names)}" if names else ""
 
 
 def published(board: Board) -> Table:
     """Success and place of each published method here and in the paper, over all tasks and by
     suite.
     """
-    scopes = [
-        ("all", board.protocol.tasks),
-        *((s, board.protocol.choose("suite", s)) for s in board.protocol.suites),
-    ]
+    scopes = {"all": board.protocol.tasks}
+    for suite in board.protocol.suites:
+        scopes[suite] = board.protocol.choose("suite", suite)
     rows = [[row.name] for row, _ in board.published]
     columns = ["row"]
-    for name, of_scope in scopes:
-        here = np.array([board.success(row, of_scope) for row, _ in board.published])
-        there = np.array([published_success(method, of_scope) for _, method in board.published])
+    for name, scope in scopes.items():
         columns += [f"{name}, here", f"{name}, paper"]
-        for cells, mine, its in zip(rows, here, there, strict=True):
-            cells += [
-                f"{mine:.1f} ({1 + (here > mine).sum()})",
-                f"{its:.1f} ({1 + (there > its).sum()})",
-            ]
+        measured = np.array([board.success(row, scope) for row, _ in board.published])
+        reported = np.array([published_success(method, scope) for _, method in board.published])
+        for i, cells in enumerate(rows):
+            for values in (measured, reported):
+                place = 1 + (values > values[i]).sum()
+                cells.append(f"{values[i]:.1f} ({place})")
     return Table("Beside the published ranking: success in percent (place)", columns, rows)
 
 
@@ -206,11 +198,9 @@ def notes(board: Board) -> list[str]:
     """What a reader of the tables has to know."""
     noise = board.noise()
     single = sum(row.facts.trained and len(row.method.trainings) == 1 for row in board.rows)
-    actions = (
-        ""
-        if board.action_space == CHOICES
-        else f" Actions are `{board.action_space}`, not choices."
-    )
+    actions = ""
+    if board.action_space != CHOICES:
+        actions = f" Actions are `{board.action_space}`, not choices."
     lines = [
         f"{len(board.protocol.tasks)} tasks × {board.protocol.episodes} scenes of split"
         f" `{board.split}`, the same for all rows.{actions}"
@@ -266,16 +256,11 @@ def success_figure(board: Board) -> str:
     with figure((7.2, 0.26 * len(rows) + 1.0)) as (canvas, (axes,)):
         for at, row in enumerate(rows):
             low, high = board.interval(row)
-            mean, colour = board.success(row), LOCAL if row.is_local else PAINT[row.kind]
+            colour = LOCAL if row.is_local else PAINT[row.kind]
             axes.plot([low, high], [at, at], color=colour, lw=1.6)
-            axes.plot(mean, at, "o", color=colour, ms=6)
-            axes.plot(
-                row.mean(board.protocol.tasks),
-                np.full(len(row.method.trainings), at),
-                "|",
-                color=INK,
-                ms=7,
-            )
+            axes.plot(board.success(row), at, "o", color=colour, ms=6)
+            of_trainings = row.mean(board.protocol.tasks)
+            axes.plot(of_trainings, np.full(len(of_trainings), at), "|", color=INK, ms=7)
         axes.set_yticks(range(len(rows)), [row.name for row in rows])
         axes.set_xlim(0, 100)
         axes.set_xlabel("success over all tasks (%); strokes: trainings")
@@ -296,14 +281,13 @@ def budget_figure(board: Board) -> str:
         return ""
     with figure((5.6, 3.6)) as (canvas, (axes,)):
         for number, (model, rows) in enumerate(several.items()):
-            points = sorted(
-                (row.facts.budget or 0, board.success(row), board.interval(row)) for row in rows
-            )
-            gaps = np.array([(mean - low, high - mean) for _, mean, (low, high) in points]).T
+            rows.sort(key=lambda row: row.facts.budget or 0)
+            means = np.array([board.success(row) for row in rows])
+            low, high = np.array([board.interval(row) for row in rows]).T
             axes.errorbar(
-                [b for b, *_ in points],
-                [m for _, m, _ in points],
-                np.maximum(gaps, 0),
+                [row.facts.budget or 0 for row in rows],
+                means,
+                np.maximum([means - low, high - means], 0),
                 fmt="-o",
                 ms=5,
                 capsize=3,
@@ -335,9 +319,8 @@ def published_figure(board: Board) -> str:
 
 def variants(board: Board) -> list[Table]:
     """Integrations of one memory, and memories with one integration, where there are several."""
-    integrations, memories = (
-        comparison_table(board.variants(part)) for part in ("integration", "memory")
-    )
+    integrations = comparison_table(board.variants("integration"))
+    memories = comparison_table(board.variants("memory"))
     tables = [
         replace(integrations, title="Integrations of a memory, percentage points"),
         replace(memories, title="Memories with an integration, percentage points"),

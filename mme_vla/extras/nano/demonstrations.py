@@ -151,7 +151,8 @@ class Scene:
     def _complete(self) -> bool:
         with np.load(self.path) as file:
             about = parse_json(str(file["about"]), str(self.path))
-            carried_out, width = about.get("carried_out", False), file["targets"].shape[1]
+            carried_out = about.get("carried_out", False)
+            width = file["targets"].shape[1]
             required = width if self.acts is None else self.acts.width
             require(
                 (carried_out, width) == (self.carried_out, required),
@@ -159,16 +160,37 @@ class Scene:
                 f" this command records {required} with carried_out={self.carried_out}: choose"
                 " another output.",
             )
-            decisions = [file["decisions"][:: choice.every] for choice in self.choices]
-            read = [
-                choice.read(at, about["exec_start"])
-                for choice, at in zip(self.choices, decisions, strict=True)
-            ]
-            for camera in self.cameras:
-                rendered = set(file.get(f"{camera}_frames", np.zeros(0, np.int64)).tolist())
-                if not set().union(*(read if camera == "front" else decisions)) <= rendered:
+            required_frames = frames_required(
+                file["decisions"], about["exec_start"], self.choices, self.cameras
+            )
+            for camera, frames in required_frames.items():
+                rendered = file.get(f"{camera}_frames", np.zeros(0, np.int64))
+                if not frames <= set(rendered.tolist()):
                     return False
             return True
+
+
+def frames_required(
+    decisions: np.ndarray,
+    exec_start: int,
+    choices: Sequence["FrameChoice"],
+    cameras: Sequence[str],
+) -> dict[str, set[int]]:
+    """Camera → the frames to render: those of the decisions, and at the front all that the memories
+    read there.
+
+    decisions: frames [m] at which a motion begins. exec_start: number of frames of the video.
+    choices: what the memories read; without one all decisions count.
+    """
+    decided: set[int] = set()
+    read: set[int] = set()
+    for choice in choices:
+        frames = decisions[:: choice.every]
+        decided.update(frames.tolist())
+        read.update(choice.read(frames, exec_start))
+    if not choices:
+        decided.update(decisions.tolist())
+    return {camera: decided | read if camera == "front" else decided for camera in cameras}
 
 
 def demonstrated(scene: Scene) -> bool:
@@ -226,17 +248,7 @@ def record(
             motions = _carry_out(taken, motions.targets, chooser)
         if motions is None:
             return None
-        frame_lists = [motions.decisions[:: choice.every] for choice in choices] or [
-            motions.decisions
-        ]
-        at = {frame for frames in frame_lists for frame in frames.tolist()}
-        read = at.union(
-            *(
-                choice.read(frames, taken.video)
-                for choice, frames in zip(choices, frame_lists, strict=False)
-            )
-        )
-        required = {camera: read if camera == "front" else at for camera in cameras}
+        required = frames_required(motions.decisions, taken.video, choices, cameras)
         images: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
         for frame in sorted(set().union(*required.values())):
             taken.put_back(frame)
@@ -244,11 +256,9 @@ def record(
             capture(env, rendered)
             for camera in rendered:
                 images[camera][frame] = read_images(env, camera, rgb=True)["rgb"]
-        goal = (
-            env.goals()[0].lower()
-            if chooser is None
-            else chooser.worded(env.goals()[0].lower(), _options(env, chooser))
-        )
+        goal = env.goals()[0].lower()
+        if chooser is not None:
+            goal = chooser.worded(goal, _options(env, chooser))
         subgoals = {kind: _subgoal_texts(taken.texts, motions.decisions, kind) for kind in SUBGOALS}
         return Demonstration(
             type(env).__name__,
@@ -277,7 +287,8 @@ class _Taken:
     """
 
     def __init__(self, env: "Task") -> None:
-        self.env, self.video = env, 0
+        self.env = env
+        self.video = 0
         self.states: list[np.ndarray] = []
         self.texts: list[Mapping[str, Any]] = []
         self._snapshots: list[tuple[list[Any], list[float], list[tuple[Any, Any]]]] = []
@@ -349,19 +360,21 @@ def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None"
     """
     from mme_vla.envs.interface import RoboMMEEnv
 
-    env = RoboMMEEnv(taken.env, "waypoint" if chooser is None else "multi_choice")
+    action_space = "waypoint" if chooser is None else "multi_choice"
+    env = RoboMMEEnv(taken.env, action_space)
     env.render_request = RenderRequest(now=())
     env.on_frame = taken.add
     env.reset()
     decisions = []
     for number, target in enumerate(targets, 1):
         decisions.append(len(taken.states) - 1)
-        _, _, ended, _, info = env.step(
-            target if chooser is None else benchmark_action(chooser, target)
-        )
-        if ended:
-            done = info["status"] == "success"
-            return Motions(np.array(decisions, np.int64), targets[:number]) if done else None
+        action = target if chooser is None else benchmark_action(chooser, target)
+        _, _, ended, _, info = env.step(action)
+        if not ended:
+            continue
+        if info["status"] != "success":
+            return None
+        return Motions(np.array(decisions, np.int64), targets[:number])
     return None
 
 
@@ -376,9 +389,12 @@ def _subgoal_texts(
     named = [online_subgoal(text, kind) for text in texts]
     result: list[str] = []
     for frame in decisions:
-        result.append(
-            named[frame] or (result[-1] if result else next(filter(None, named[frame:]), ""))
-        )
+        if named[frame]:
+            result.append(named[frame])
+        elif result:
+            result.append(result[-1])
+        else:
+            result.append(next(filter(None, named[frame:]), ""))
     return result
 
 
@@ -387,6 +403,5 @@ def _boundaries(texts: Sequence[Mapping[str, Any]]) -> np.ndarray:
     `data.columns`.
     """
     subgoals = [text.get("simple_subgoal", text.get("simple_subgoal_online")) for text in texts]
-    return np.array(
-        [i for i, text in enumerate(subgoals) if not i or text != subgoals[i - 1]], np.int64
-    )
+    frames = [0] + [i for i in range(1, len(subgoals)) if subgoals[i] != subgoals[i - 1]]
+    return np.array(frames, np.int64)

@@ -20,7 +20,7 @@ from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import Include
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import require
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import (
     VIDEOS,
     choose_shard,
@@ -98,32 +98,32 @@ class FrequentPlayer(Player):
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
         move = dict(self._moves[min(len(session.decisions), len(self._moves) - 1)])
         offered = [option.label for option in session.options]
-        return (move if move["choice"] in offered else {**move, "choice": offered[0]}), {}
+        if move["choice"] not in offered:
+            move["choice"] = offered[0]
+        return move, {}
 
 
 def frequent_moves(files: Sequence[Path], space: Any) -> dict[str, list[dict[str, Any]]]:
     """Task → for each place in an episode the most frequent letter, and the middle of its points in
     pixels.
     """
-    made: dict[str, dict[int, list[np.ndarray]]] = defaultdict(lambda: defaultdict(list))
+    # Task → place in an episode → the choices made there
+    choices: dict[str, dict[int, list[np.ndarray]]] = defaultdict(lambda: defaultdict(list))
     for file in files:
         demonstration = Demonstration.load(file, images=False)
         for place, row in enumerate(demonstration.motions.targets):
-            made[demonstration.task][place].append(row)
-
-    def move(rows: Sequence[np.ndarray]) -> dict[str, Any]:
-        table = np.stack(rows)
-        letters = table[:, list(space.choice)].argmax(1)
-        best = Counter(letters.tolist()).most_common(1)[0][0]
-        action = benchmark_action(space, np.median(table[letters == best], axis=0))
-        return {
-            "choice": str(action["choice"]).lower(),
-            "point": [float(x) for x in action["point"]],
-        }
-
-    return {
-        task: [move(rows) for _, rows in sorted(places.items())] for task, places in made.items()
-    }
+            choices[demonstration.task][place].append(row)
+    moves: dict[str, list[dict[str, Any]]] = {}
+    for task, places in choices.items():
+        moves[task] = []
+        for _, rows in sorted(places.items()):
+            table = np.stack(rows)
+            letters = table[:, list(space.choice)].argmax(1)
+            best = Counter(letters.tolist()).most_common(1)[0][0]
+            action = benchmark_action(space, np.median(table[letters == best], axis=0))
+            letter = str(action["choice"]).lower()
+            moves[task].append({"choice": letter, "point": [float(x) for x in action["point"]]})
+    return moves
 
 
 def play_episode(job: Play) -> EpisodeRecord:
@@ -131,8 +131,14 @@ def play_episode(job: Play) -> EpisodeRecord:
     spec, rules = job.spec, job.rules
     if job.name == PLANNER:
         return replay(spec, rules.steps)
-    players: dict[str, Any] = {RANDOM: RandomPlayer, DEMONSTRATOR: OraclePlayer}
-    player = FrequentPlayer(job.moves) if job.name == FREQUENT else players[job.name]()
+    player: Player
+    if job.name == FREQUENT:
+        player = FrequentPlayer(job.moves)
+    elif job.name == RANDOM:
+        player = RandomPlayer()
+    else:
+        assert job.name == DEMONSTRATOR
+        player = OraclePlayer()
     env = make_env(
         spec.task, spec.split, spec.episode, "multi_choice", max_steps=rules.steps, render=False,
         include=Include(possible=rules.only_possible),
@@ -142,8 +148,9 @@ def play_episode(job: Play) -> EpisodeRecord:
         record = play(session, player).record(job.name, 0, 0, rules.steps)
     finally:
         session.close()
-    outcome = "fail" if record.outcome == "error" else record.outcome
-    return replace(record, outcome=outcome, error=None, extra={}, refused=record.error)
+    if record.outcome == "error":
+        return replace(record, outcome="fail", error=None, extra={}, refused=record.error)
+    return replace(record, extra={})
 
 
 def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
@@ -154,10 +161,12 @@ def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
     env = make_env(
         spec.task, spec.split, spec.episode, "waypoint", max_steps=max_steps, render=False
     )
-    status, reason = "fail", None
+    targets = [] if motions is None else list(motions.targets)
+    status = "fail"
+    reason = None
     try:
         env.reset()
-        for target in () if motions is None else motions.targets:
+        for target in targets:
             *_, info = env.step(target)
             status, reason = str(info["status"]), info.get("error_message")
             if status != "ongoing":
@@ -168,9 +177,10 @@ def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
         env.close()
     extra: dict[str, Any] = {"status": status, "demonstrated": motions is not None}
     refused = str(reason) if reason else None  # why a motion was not carried out
+    outcome = status if status in ("success", "fail", "timeout") else "fail"
     return EpisodeRecord(
-        PLANNER, "none", 0, spec.task, spec.episode, spec.seed, spec.difficulty,
-        status if status in ("success", "fail", "timeout") else "fail", steps, split=spec.split,
+        PLANNER, "none", 0, spec.task, spec.episode, spec.seed, spec.difficulty, outcome, steps,
+        split=spec.split,
         max_steps=max_steps, action_space="waypoint", extra=extra, scene=scene,
         refused=refused,
     )  # fmt: skip
@@ -206,13 +216,16 @@ def play_all(
     (folder / CONFIG).write_text(f"name: {name}\n", encoding="utf-8")
     write_json(folder / TRAINED, {"row": name, "kind": KINDS[name], "trained": False, "seed": 0})
     file = folder / RECORDS
-    known = {record.key for record in (read_records(file) if file.is_file() else ())}
-    jobs = [Play(name, spec, rules, moves.get(spec.task, ())) for spec in specs]
+    known = {record.key for record in read_records(file)} if file.is_file() else set()
+    selected = {EpisodeKey(spec.task, spec.episode): spec for spec in specs}
+    missing = [
+        Play(name, spec, rules, moves.get(spec.task, ()))
+        for key, spec in selected.items()
+        if key not in known
+    ]
     with RecordLog(file) as log:
-        missing = [job for job in jobs if (job.spec.task, job.spec.episode) not in known]
         for record in carry_out(missing, play_episode, rules.workers):
             log.append(record)
-    selected = {(spec.task, spec.episode) for spec in specs}
     return [record for record in read_records(file) if record.key in selected]
 
 
@@ -231,7 +244,8 @@ def run_episodes(
     this name.
     """
     policy: Policy = MMEPolicy.from_pretrained(str(checkpoint)).eval()
-    subgoals = predictor_of(policy, None if subgoal_kind(policy) is None else ORACLE)
+    subgoal_source = None if subgoal_kind(policy) is None else ORACLE
+    subgoals = predictor_of(policy, subgoal_source)
     settings = RolloutSettings.from_config(
         {
             "seed": rules.seed,
@@ -252,10 +266,8 @@ def run_episodes(
             why is None,
             f"oracle={facts.model}: it needs {why}. Name another model, or set oracle=null.",
         )
-        policy, facts = (
-            ProbedPolicy(policy, arm).eval(),
-            replace(facts, model=named(facts.model, arm)),
-        )
+        policy = ProbedPolicy(policy, arm).eval()
+        facts = replace(facts, model=named(facts.model, arm))
     jobs = [Job(spec.task, spec.split, spec.episode) for spec in specs]
     done = evaluate(
         policy, jobs, folder, facts, settings, subgoals=subgoals, shard=choose_shard(rules.shard),
@@ -281,9 +293,9 @@ def evaluate_row(
     # Only then: a folder of other weights was refused, and keeps its files.
     shutil.copy(training / CONFIG, folder / CONFIG)
     about = read_json(training / TRAINED, "a training's end")
-    write_json(
-        folder / TRAINED, about if oracle is None else {**about, "row": oracle, "kind": "ceiling"}
-    )
+    if oracle is not None:
+        about |= {"row": oracle, "kind": "ceiling"}
+    write_json(folder / TRAINED, about)
     return records
 
 
@@ -295,14 +307,12 @@ def record_videos(
 
     folder: of the videos; what it has is not rendered again.
     """
-    for won in (True, False):
+    alone = replace(rules, workers=1, shard=None)
+    for name, won in (("success", True), ("failure", False)):
         record = next((record for record in records if record.success is won), None)
         if record is not None:
             specs = choose_episodes(record.task, [record.episode], record.split)
-            place = folder / ("success" if won else "failure")
-            run_episodes(
-                checkpoint, place, specs, replace(rules, workers=1, shard=None), video="all"
-            )
+            run_episodes(checkpoint, folder / name, specs, alone, video="all")
     return sorted(folder.glob(f"*/{VIDEOS}/*.mp4"))
 
 
@@ -320,31 +330,32 @@ def built_scenes(
         isinstance(count, int),
         f"episodes={count}: with replace=true write how many scenes of each task.",
     )
-    known: dict[str, str] = (
-        read_json(file, "the scenes of a split")["tried"] if file.is_file() else {}
-    )
-    source, names = environment("mme_vla"), choose_tasks(tasks)
+    # Episode → why its scene cannot be built, empty if it can
+    tried: dict[str, str] = {}
+    if file.is_file():
+        tried = read_json(file, "the scenes of a split")["tried"]
+    source = environment("mme_vla")
     while True:
-        good = {
-            task: [spec for spec in source.episodes(task, split) if known.get(_key(spec)) == ""]
-            for task in names
-        }
-        missing: list[EpisodeSpec] = []
-        for task in names:
-            fresh = [spec for spec in source.episodes(task, split) if _key(spec) not in known]
-            lacking = max(count - len(good[task]), 0)
+        built: list[EpisodeSpec] = []
+        untried: list[EpisodeSpec] = []
+        for task in choose_tasks(tasks):
+            specs = source.episodes(task, split)
+            good = [spec for spec in specs if tried.get(_key(spec)) == ""][:count]
+            fresh = [spec for spec in specs if _key(spec) not in tried]
+            n_missing = count - len(good)
             require(
-                len(fresh) >= lacking,
+                len(fresh) >= n_missing,
                 f"{task}: of split {split} fewer than {count} scenes can be built.",
             )
-            missing += fresh[:lacking]
-        if not missing:
+            built += good
+            untried += fresh[:n_missing]
+        if not untried:
             break
-        for key, reason in carry_out(missing, tried_scene, workers):
-            known[key] = reason
-            write_json(file, {"split": split, "tried": dict(sorted(known.items()))})
-    left_out = [f"{key}: {reason}" for key, reason in sorted(known.items()) if reason]
-    return [spec for task in names for spec in good[task][:count]], left_out
+        for key, reason in carry_out(untried, tried_scene, workers):
+            tried[key] = reason
+            write_json(file, {"split": split, "tried": dict(sorted(tried.items()))})
+    left_out = [f"{key}: {reason}" for key, reason in sorted(tried.items()) if reason]
+    return built, left_out
 
 
 def _key(spec: EpisodeSpec) -> str:

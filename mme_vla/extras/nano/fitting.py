@@ -60,11 +60,11 @@ def compose_policy(
     `memories`.
     """
     base = compose("policy", [f"model={model}", *words], extra_dirs=extra_dirs)
-    memory = None if base.memory is None else str(base.memory.name)
-    settings = {
-        **memories.get(memory or "", {}),
-        **({} if budget is None or memory is None else {"budget": budget}),
-    }
+    settings: dict[str, Any] = {}
+    if base.memory is not None:
+        settings |= memories.get(str(base.memory.name), {})
+        if budget is not None:
+            settings["budget"] = budget
     memory_words = [f"memory.{key}={value}" for key, value in settings.items()]
     composed = compose("policy", [f"model={model}", *words, *memory_words], extra_dirs=extra_dirs)
     composed.plugins = list(dict.fromkeys([*plugins, *plugins_of(composed, model)]))
@@ -176,9 +176,11 @@ def train(job: Training) -> Path:
 
     if job.done:
         return job.checkpoint
-    begun, cpu = time.perf_counter(), time.process_time()
-    folder, settings, full_config = job.folder, job.settings, job.full_config
-    train_settings = TrainSettings.from_dict(settings, int(job.config["seed"]))
+    started = time.perf_counter()
+    started_cpu = time.process_time()
+    folder = job.folder
+    full_config = job.full_config
+    train_settings = TrainSettings.from_dict(job.settings, int(job.config["seed"]))
     resume = str(folder) if checkpoints_in(folder / CHECKPOINTS) else None
     if resume is None:
         with FolderLock(folder, "training run"):  # it may have ended before its first checkpoint
@@ -192,7 +194,7 @@ def train(job: Training) -> Path:
         if job.tower_seed != int(job.config["seed"]):
             copy_tower(build({**job.config, "seed": job.tower_seed}), policy)
         samples, val_set = prepared(policy, job)
-        card = {"data": f"{len(job.files)} demonstrations", "recipe": dict(settings)}
+        card = {"data": f"{len(job.files)} demonstrations", "recipe": dict(job.settings)}
         validation = Validation(
             val_set,
             val_set.collate,
@@ -215,14 +217,12 @@ def train(job: Training) -> Path:
                 "card": card,
             },
         )
-        line, loggers = (
-            ProgressLine(train_settings.steps, run.step),
-            open_loggers(folder, {}, run.step),
-        )
+        line = ProgressLine(train_settings.steps, run.step)
+        loggers = open_loggers(folder, {}, run.step)
         line.say(
             f"{trainer.describe()}; {len(samples)} decisions of {len(job.files)} demonstrations"
         )
-        updating = time.process_time()
+        updates_cpu = time.process_time()
         try:
             with line:
                 finished = trainer.run(line, loggers)
@@ -231,31 +231,28 @@ def train(job: Training) -> Path:
     assert trainer.last_checkpoint is not None
     if not finished:
         raise SystemExit(128 + (trainer.stopped_by or 0))
+    spent: dict[str, float | None] = {"update_s": None, "minutes": None, "cpu_minutes": None}
     updates = train_settings.steps - run.step
-    resumed = run.step > 0  # what it took before is not known
-    spent = {
-        "update_s": (time.process_time() - updating) / updates if updates else None,
-        "minutes": (time.perf_counter() - begun) / 60 if not resumed else None,
-        "cpu_minutes": (time.process_time() - cpu) / 60 if not resumed else None,
-    }  # fmt: skip
+    if updates:
+        spent["update_s"] = (time.process_time() - updates_cpu) / updates
+    if run.step == 0:  # what a resumed training took before is not known
+        spent["minutes"] = (time.perf_counter() - started) / 60
+        spent["cpu_minutes"] = (time.process_time() - started_cpu) / 60
+
+    # The saved policy, as anyone else will load it
     learned = MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval()
-    (folder / CONFIG).write_text(
-        OmegaConf.to_yaml(OmegaConf.create(learned.config)), encoding="utf-8"
-    )
-    write_json(
-        folder / TRAINED,
-        summary(job, learned, len(samples.tasks))
-        | cost
-        | spent
-        | held_out(learned, val_set, folder),
-    )
+    config_text = OmegaConf.to_yaml(OmegaConf.create(learned.config))
+    (folder / CONFIG).write_text(config_text, encoding="utf-8")
+    about = summary(job, learned, len(samples.tasks))
+    about |= cost | spent | held_out(learned, val_set, folder)
+    write_json(folder / TRAINED, about)
     return trainer.last_checkpoint
 
 
 def summary(job: Training, policy: MMEPolicy, decisions: int) -> dict[str, Any]:
     """What was trained on what, as `trained.json` says it."""
-    identity, memory = identity_of(policy.config), policy.config.get("memory")
-    integration = policy.config.get("integration")
+    identity = identity_of(policy.config)
+    assert identity is not None  # `train` has written it
     return {
         "row": job.row,
         "kind": "policy",
@@ -266,12 +263,18 @@ def summary(job: Training, policy: MMEPolicy, decisions: int) -> dict[str, Any]:
         "batch_size": job.settings["batch_size"],
         "decisions": decisions,
         "demonstrations": dict(Counter(file.parent.name for file in job.files)),
-        **{name: getattr(identity, name) for name in ("data", "recipe", "weights")},
+        "data": identity.data,
+        "recipe": identity.recipe,
+        "weights": identity.weights,
         "tower": job.store.tower,
-        "memory": memory["name"] if memory else None,
-        "integration": integration["name"] if integration else None,
-        "budget": policy.memory.budget if policy.memory is not None else None,
+        "memory": _name_of(policy.config.get("memory")),
+        "integration": _name_of(policy.config.get("integration")),
+        "budget": None if policy.memory is None else policy.memory.budget,
     }
+
+
+def _name_of(section: Mapping[str, Any] | None) -> str | None:
+    return None if section is None else section["name"]
 
 
 def measured_cost(policy: MMEPolicy, samples: Decisions, batch_size: int) -> dict[str, Any]:
@@ -292,16 +295,17 @@ def measured_cost(policy: MMEPolicy, samples: Decisions, batch_size: int) -> dic
 
 def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, Any]:
     """How a trained policy does on demonstrations that it did not learn from."""
-    losses = [
-        (line["val/loss"], line["step"]) for line in learning_curve(folder) if "val/loss" in line
-    ]
-    best = {
-        "val_loss": losses[-1][0] if losses else None,
-        "best_update": min(losses)[1] if losses else None,
-    }
+    losses = []
+    for line in learning_curve(folder):
+        if "val/loss" in line:
+            losses.append((line["val/loss"], line["step"]))
+    found: dict[str, Any] = {"val_loss": None, "best_update": None}
+    if losses:
+        found["val_loss"] = losses[-1][0]
+        found["best_update"] = min(losses)[1]
     if policy.embodiment.action.choice:
-        return best | asdict(choice_errors(policy, val_set))
-    return best | {"off_by_m": position_error(policy, val_set).tolist()}
+        return found | asdict(choice_errors(policy, val_set))
+    return found | {"off_by_m": position_error(policy, val_set).tolist()}
 
 
 @lru_cache(maxsize=1)  # all trainings of a run have the same
@@ -320,8 +324,8 @@ def content_of(files: tuple[Path, ...], choice: tuple[int, ...]) -> tuple[str, .
         letters = targets[:, list(choice)].argmax(1).tolist() if choice else None
         facts = {"decisions": len(targets), "letters": letters}
         facts |= {name: getattr(made, name) for name in ("task", "seed", "difficulty", "goal")}
-        # others keep the digest they had without it
-        facts |= {"carried_out": True} if made.carried_out else {}
+        if made.carried_out:  # others keep the digest that they had without it
+            facts["carried_out"] = True
         digests.append(digest(facts, 64))
     return tuple(digests)
 

@@ -115,19 +115,23 @@ class Reflection:
         """
         if not p or (policy.memory is not None and policy.memory.uses_proprio):
             return None
-        space, stats = policy.embodiment.action, policy.require_processor().stats
+        space = policy.embodiment.action
         backbone = policy.backbone
-        check_reflection(
-            p, space, backbone.config.vision.layout if isinstance(backbone, NanoBackbone) else None
-        )
+        layout = backbone.config.vision.layout if isinstance(backbone, NanoBackbone) else None
+        check_reflection(p, space, layout)
+        stats = policy.require_processor().stats
         assert stats is not None
         columns = list(space.point)
-        low, high = (
-            torch.as_tensor(end, dtype=torch.float32)[columns]
-            for end in stats.actions.bounds("quantiles")
+        low, high = stats.actions.bounds("quantiles")
+        bounds = (
+            torch.as_tensor(low, dtype=torch.float32)[columns],
+            torch.as_tensor(high, dtype=torch.float32)[columns],
         )
-        fixed = [any(re.search(rf"\b{side}\b", goal) for side in sides) for goal in goals]
-        return cls(p, (low, high), columns, torch.tensor(fixed))
+        fixed = torch.zeros(len(goals), dtype=torch.bool)
+        if sides:
+            names_a_side = re.compile("|".join(rf"\b{side}\b" for side in sides))
+            fixed = torch.tensor([names_a_side.search(goal) is not None for goal in goals])
+        return cls(p, bounds, columns, fixed)
 
     def __call__(self, batch: Batch, rows: Sequence[int]) -> Batch:
         """The batch of these decisions with its objects elsewhere, as chosen by the rows."""
@@ -191,9 +195,16 @@ class Decisions(Dataset[int]):
         replay: Replay | None = None,
         balanced: bool = False,
     ) -> None:
-        self.replay, self.tasks, self.reflection = replay, tasks, reflection
-        self.batch, self.distant, self.noise, self.token_noise = batch, distant, noise, token_noise
-        repeats = torch.where(distant, oversample, 1) * (_to_balance(tasks) if balanced else 1)
+        self.batch = batch
+        self.distant = distant
+        self.tasks = tasks
+        self.noise = noise
+        self.token_noise = token_noise
+        self.reflection = reflection
+        self.replay = replay
+        repeats = torch.where(distant, oversample, 1)
+        if balanced:
+            repeats = repeats * _to_balance(tasks)
         self._rows = torch.arange(len(batch.prompt)).repeat_interleave(repeats)
 
     @classmethod
@@ -221,22 +232,21 @@ class Decisions(Dataset[int]):
         tasks: list[str] = []
         goals: list[str] = []
         for entry in demonstrations:
-            demonstration, made = (
-                (entry, tokenize(policy, entry)) if isinstance(entry, Demonstration) else entry
-            )
-            history = _history(policy, demonstration, made)
-            new = _items(policy, demonstration, history, made)
+            if isinstance(entry, Demonstration):
+                demonstration = entry
+                tokens = tokenize(policy, entry)
+            else:
+                demonstration, tokens = entry
+            history = _history(policy, demonstration, tokens)
+            new = _items(policy, demonstration, history, tokens)
             items += new
             tasks += [demonstration.task] * len(new)
             goals += [demonstration.goal] * len(new)
             if history is not None and transforms:
                 labels = _labels(policy.require_memory(), demonstration)
                 rows += [(history, frame, labels) for frame in _decisions(policy, demonstration)]
-            distant.append(
-                _distant(demonstration.motions.targets, min_distance)[
-                    :: policy.embodiment.action.execute
-                ]
-            )
+            is_distant = _distant(demonstration.motions.targets, min_distance)
+            distant.append(is_distant[:: policy.embodiment.action.execute])
         require(items, "The demonstrations hold no decision to learn from.")
         if labels_read(policy.memory) and not all(item["history"].labels for item in items):
             logger.warning(OLD_FILES)

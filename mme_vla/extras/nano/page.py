@@ -4,6 +4,7 @@ curves.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +48,14 @@ def write_page(
     videos: one of a success, one of a failure, as far as there are such. runs: of each model, the
     folders of its trainings. demonstrations: how many they learned from.
     """
-    ends = {
-        model: [read_json(run / TRAINED, "a training's end") for run in folders]
-        for model, folders in runs.items()
-    }
     results, comparisons = compared(records, config["task"], config["split"], without)
-    curves = {
-        model if len(folders) == 1 else f"{model}, {run.name}": learning_curve(run)
-        for model, folders in runs.items() for run in folders
-    }  # fmt: skip
+    ends: dict[str, list[Any]] = {}
+    curves: dict[str, list[dict[str, float]]] = {}
+    for model, folders in runs.items():
+        ends[model] = [read_json(run / TRAINED, "a training's end") for run in folders]
+        for run in folders:
+            label = model if len(folders) == 1 else f"{model}, {run.name}"
+            curves[label] = learning_curve(run)
     plot_curves(curves, folder / CURVES)
     text = render(
         "nano.md",
@@ -85,34 +85,38 @@ def compared(
 
     With none without memory: the first model against each other one.
     """
-    every = [record for model_records in records.values() for record in model_records]
-    numbers = {
-        episode: number
-        for number, episode in enumerate(sorted({record.episode for record in every}))
-    }
-    every = [replace(record, episode=numbers[record.episode]) for record in every]
+    # A protocol numbers its episodes from 0; the scenes that can be built have gaps.
+    pooled = list(chain.from_iterable(records.values()))
+    numbers = {n: i for i, n in enumerate(sorted({record.episode for record in pooled}))}
     protocol = Protocol((task,), len(numbers))
-    results = aggregate(every, protocol, split)
+    renumbered = [replace(record, episode=numbers[record.episode]) for record in pooled]
+    results = aggregate(renumbered, protocol, split)
+
     methods = {
         model: _method(results, model_records[0])
         for model, model_records in records.items()
         if model != PLANNER
     }
-    fixed = next(iter(methods)) if without is None else without
-    others = [method for model, method in methods.items() if model != fixed]
-    pairs = [
-        (methods[fixed], other) if without is None else (other, methods[fixed]) for other in others
-    ]
-    results.notes += [why_unpaired(*pair) for pair in pairs if not common_episodes(*pair)]
-    comparisons = compare_all([pair for pair in pairs if common_episodes(*pair)], protocol)
-    results.notes += [note for comparison in comparisons for note in comparison.notes]
+    baseline = methods.pop(next(iter(methods)) if without is None else without)
+    pairs = []
+    for method in methods.values():
+        pair = (baseline, method) if without is None else (method, baseline)
+        if common_episodes(*pair):
+            pairs.append(pair)
+        else:
+            results.notes.append(why_unpaired(*pair))
+    comparisons = compare_all(pairs, protocol)
+    for comparison in comparisons:
+        results.notes += comparison.notes
     return results, comparisons
 
 
 def _method(results: Results, record: EpisodeRecord) -> Method:
-    return next(
-        method for method in results.methods if any(run.key == record.run for run in method.runs)
-    )
+    """The method to which a record's run belongs."""
+    for method in results.methods:
+        if record.run in [run.key for run in method.runs]:
+            return method
+    raise KeyError(record.run)
 
 
 def success_table(
@@ -127,62 +131,42 @@ def success_table(
     ends: of each trained model, what each training wrote: how far off its held-out decisions to go
     elsewhere were.
     """
-    columns = (
-        "memory tokens",
-        "all",
-        "95 % interval",
-        *DIFFICULTIES,
-        "off by, held out",
-        "within 2 cm",
-    )
+    columns = ["memory tokens", "all", "95 % interval", *DIFFICULTIES]
+    columns += ["off by, held out", "within 2 cm"]
     lines = ["| model | " + " | ".join(columns) + " |", "| --- " + "| ---: " * len(columns) + "|"]
     for model, model_records in records.items():
-        rate, episodes = (
-            _won(model_records) / len(model_records),
-            len({record.episode for record in model_records}),
-        )
-        interval = wilson(rate, episodes)
-        levels = [
-            [record for record in model_records if record.difficulty == level]
-            for level in DIFFICULTIES
-        ]
-        cells = [f"{_won(part)}/{len(part)}" if part else "" for part in (model_records, *levels)]
+        # Success with its interval
+        won = sum(record.success for record in model_records)
+        n_episodes = len({record.episode for record in model_records})
+        rate = won / len(model_records)
+        interval = wilson(rate, n_episodes)
         deviation = ""
         average = _method(results, model_records[0]).average
-        if (
-            len(ends.get(model, ())) > 1
-            and average.std is not None
-            and average.interval is not None
-        ):
-            deviation, interval = (
-                f" ± {average.std:.0f}",
-                Interval(*(value / 100 for value in average.interval)),
-            )
-        success = f"{100 * rate:.0f}{deviation} % ({cells[0]})"
-        confidence = f"{100 * interval.low:.0f} … {100 * interval.high:.0f} %"
-        measured = [
-            end["off_by_m"] for end in ends.get(model, ()) if end.get("off_by_m") is not None
-        ]
-        off = np.concatenate(measured) if measured else None
-        errors = (
-            ("", "")
-            if off is None
-            else (f"{100 * np.median(off):.1f} cm", f"{100 * np.mean(off <= 0.02):.0f} %")
-        )
-        row = (
+        several = len(ends.get(model, ())) > 1
+        if several and average.std is not None and average.interval is not None:
+            deviation = f" ± {average.std:.0f}"
+            low, high = average.interval
+            interval = Interval(low / 100, high / 100)
+        cells = [
             model_records[0].model,
-            model_records[0].memory_budget or "",
-            success,
-            confidence,
-            *cells[1:],
-            *errors,
-        )
-        lines.append("| " + " | ".join(map(str, row)) + " |")
+            str(model_records[0].memory_budget or ""),
+            f"{100 * rate:.0f}{deviation} % ({won}/{len(model_records)})",
+            f"{100 * interval.low:.0f} … {100 * interval.high:.0f} %",
+        ]
+        # The same by difficulty
+        for level in DIFFICULTIES:
+            outcomes = [record.success for record in model_records if record.difficulty == level]
+            cells.append(f"{sum(outcomes)}/{len(outcomes)}" if outcomes else "")
+        # Distances on held-out decisions
+        measured = [end["off_by_m"] for end in ends.get(model, ()) if end.get("off_by_m")]
+        if measured:
+            distances = np.concatenate(measured)
+            within = 100 * np.mean(distances <= 0.02)
+            cells += [f"{100 * np.median(distances):.1f} cm", f"{within:.0f} %"]
+        else:
+            cells += ["", ""]
+        lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
-
-
-def _won(records: Sequence[EpisodeRecord]) -> int:
-    return sum(record.success for record in records)
 
 
 def plot_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> None:
@@ -195,7 +179,8 @@ def plot_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path)
     figure, axes = pyplot.subplots(figsize=(6, 3.2), dpi=120)
     for model, curve in curves.items():
         points = [(line["step"], line["val/loss"]) for line in curve if "val/loss" in line]
-        axes.plot(*zip(*points, strict=True), label=model) if points else None
+        if points:
+            axes.plot(*zip(*points, strict=True), label=model)
     axes.set(xlabel="updates", ylabel="loss on held-out demonstrations", yscale="log")
     axes.legend(frameon=False)
     figure.tight_layout()

@@ -342,25 +342,28 @@ def evaluate_tower(tower: PlaceTower, scenes: Scenes) -> dict[str, ClassResult]:
 
     A report is compared with objects in the horizontal plane through their centres, in centimetres.
     """
-    reports: list[list[list[tuple[float, float]]]] = []  # image, class, object
+    # What it reports in each image: a list of places for each class
+    reports: list[list[list[tuple[float, float]]]] = []
     for start in range(0, len(scenes.images), BATCH):
         logits, offsets = tower.locate(to_unit_range(scenes.images[start : start + BATCH]))
         for presence, places in zip(logits.sigmoid(), offsets, strict=True):
             reports.append([find_objects(*pair) for pair in zip(presence, places, strict=True)])
+
     results = {}
     for number, name in enumerate(CLASSES):
         errors: list[float] = []
+        n_reported = 0
         rows = (scenes.classes == number).nonzero()[:, 0]
-        for image, places in enumerate(detected[number] for detected in reports):
+        for image, report in enumerate(reports):
+            found = report[number]
+            n_reported += len(found)
             centres = scenes.centres[rows[scenes.owners[rows] == image].numpy()]
-            distances = [
-                [np.linalg.norm(on_plane(place, z) - (x, y)) for place in places]
-                for x, y, z in centres
-            ]
-            errors += match(100 * np.array(distances).reshape(len(centres), len(places)))
-        results[name] = ClassResult(
-            len(rows), sum(len(detected[number]) for detected in reports), np.array(errors)
-        )
+            distances = np.zeros((len(centres), len(found)))
+            for row, (x, y, z) in enumerate(centres):
+                for column, place in enumerate(found):
+                    distances[row, column] = np.linalg.norm(on_plane(place, z) - (x, y))
+            errors += match(100 * distances)
+        results[name] = ClassResult(len(rows), n_reported, np.array(errors))
     return results
 
 

@@ -61,11 +61,9 @@ class Trained:
     @property
     def identity(self) -> TrainingIdentity | None:
         """What its records say of the training."""
-        return (
-            TrainingIdentity(self.seed, self.recipe, self.data, self.weights)
-            if self.trained
-            else None
-        )
+        if not self.trained:
+            return None
+        return TrainingIdentity(self.seed, self.recipe, self.data, self.weights)
 
 
 @dataclass(frozen=True)
@@ -126,9 +124,9 @@ def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, 
     rows: dict[str, list[Training]] = {}
     for training in sorted(trainings, key=lambda training: training.facts.seed):
         name = training.facts.row
-        row = rows.setdefault(
-            f"{name} (yours)" if training.is_local and name in names else name, []
-        )
+        if training.is_local and name in names:
+            name = f"{name} (yours)"
+        row = rows.setdefault(name, [])
         for earlier in row:
             _check_alike(earlier, training)
         row.append(training)
@@ -139,13 +137,14 @@ def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, 
         )
         scenes, expected = training.scenes, trainings[0].scenes
         if scenes != expected:
-            differing = sorted(
-                {key for key in scenes | expected if scenes.get(key) != expected.get(key)}
-            )
+            differing = [
+                f"{key.task} {key.episode}"
+                for key in sorted(scenes | expected)
+                if scenes.get(key) != expected.get(key)
+            ]
             raise UserError(
                 f"{training.folder} and {trainings[0].folder} have different scenes or step limits:"
-                f" {listed(f'{key.task} {key.episode}' for key in differing)}. Rows of one board"
-                " have the same."
+                f" {listed(differing)}. Rows of one board have the same."
             )
     return rows
 
@@ -193,11 +192,9 @@ def read_training(folder: Path) -> Training:
     twice = [f"{key.task} {key.episode}" for key, count in counts.items() if count > 1]
     require(not twice, f"{folder} has episodes twice: {listed(twice)}. Keep one record of each.")
     settings = run["settings"]
-    n_choices, possible = (
-        settings.get("max_actions", settings.get("max_choices")),
-        settings.get("only_possible", False),
-    )
-    rules = rules_text(records[0].action_space, n_choices, possible)
+    max_choices = settings.get("max_actions", settings.get("max_choices"))
+    only_possible = settings.get("only_possible", False)
+    rules = rules_text(records[0].action_space, max_choices, only_possible)
     return Training(folder, facts, _numbered(folder, records), rules)
 
 
@@ -205,10 +202,14 @@ def _ended(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
     """The records without the errors of episodes that were repeated, of which the last stays where
     all are errors.
     """
-    newest = {record.key: record for record in records if record.outcome == "error"}
-    ended = {record.key for record in records if record.outcome != "error"}
+    newest_errors = {record.key: record for record in records if record.outcome == "error"}
+    for record in records:
+        if record.outcome != "error":
+            newest_errors.pop(record.key, None)
     return [
-        r for r in records if r.outcome != "error" or (r.key not in ended and r is newest[r.key])
+        record
+        for record in records
+        if record.outcome != "error" or record is newest_errors.get(record.key)
     ]
 
 
@@ -245,28 +246,34 @@ def _numbered(folder: Path, records: Sequence[EpisodeRecord]) -> list[EpisodeRec
     Raises:
         UserError: they are not the first scenes of each task that can be built.
     """
-    file, split = folder.resolve().parent.parent / SCENES, records[0].split
-    tried = read_json(file, "the scenes of a split").get("tried", {}) if file.is_file() else {}
+    split = records[0].split
+    file = folder.resolve().parent.parent / SCENES
+    # Episode → why its scene cannot be built, empty if it can
+    tried: dict[str, str] = {}
+    if file.is_file():
+        tried = read_json(file, "the scenes of a split").get("tried", {})
     n_scenes = max(Counter(record.task for record in records).values())
     by_key = {record.key: record for record in records}
-    numbered, missing = [], []
+    numbered = []
+    missing = []
     for task in dict.fromkeys(record.task for record in records):
         built = [spec for spec in episodes(task, split) if not tried.get(f"{task} {spec.episode}")]
         for number, spec in enumerate(built[:n_scenes]):
             record = by_key.pop(EpisodeKey(task, spec.episode), None)
-            missing += [] if record else [f"{task} {spec.episode}"]
-            if record is not None:
-                require(
-                    (record.seed, record.difficulty) == (spec.seed, spec.difficulty),
-                    f"{folder}: {task} {spec.episode} has seed {record.seed} ({record.difficulty}),"
-                    f" but that of split {split!r} has {spec.seed} ({spec.difficulty}).",
-                )
-                numbered.append(replace(record, episode=number))
+            if record is None:
+                missing.append(f"{task} {spec.episode}")
+                continue
+            require(
+                (record.seed, record.difficulty) == (spec.seed, spec.difficulty),
+                f"{folder}: {task} {spec.episode} has seed {record.seed} ({record.difficulty}),"
+                f" but that of split {split!r} has {spec.seed} ({spec.difficulty}).",
+            )
+            numbered.append(replace(record, episode=number))
+    others = [f"{task} {n}" for task, n in by_key]
     require(
-        not missing and not by_key,
+        not missing and not others,
         f"{folder} does not have the first {n_scenes} scenes of each task in split {split!r}: it"
-        f" lacks {listed(missing) or 'none'}, and has"
-        f" {listed(f'{task} {n}' for task, n in by_key) or 'none'} beside them.",
+        f" lacks {listed(missing) or 'none'}, and has {listed(others) or 'none'} beside them.",
     )
     return numbered
 
@@ -278,11 +285,12 @@ def _check_alike(first: Training, other: Training) -> None:
     here and there.
     """
     for name in ("kind", "recipe", "demonstrations", "budget"):
-        values = [getattr(training.facts, name) for training in (first, other)]
+        value = getattr(first.facts, name)
+        other_value = getattr(other.facts, name)
         require(
-            values[0] == values[1],
+            value == other_value,
             f"{first.folder} and {other.folder} are trainings of the row {first.facts.row}, but"
-            f" {name} is {values[0]} and {values[1]}. Give them different names of rows.",
+            f" {name} is {value} and {other_value}. Give them different names of rows.",
         )
     require(
         first.facts.seed != other.facts.seed and first.facts.weights != other.facts.weights,

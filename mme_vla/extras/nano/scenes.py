@@ -66,17 +66,18 @@ def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
     lit = list(_lit_discs(env))
     for thing in env.things:
         name = _class_of(thing)
-        for item in (thing.head, thing.tail) if isinstance(thing, Peg) else (thing,):
-            where, ids = item.position, _visible_ids(item, [disc for _, disc in lit])
-            yield name, where, ids
+        parts = (thing.head, thing.tail) if isinstance(thing, Peg) else (thing,)
+        for part in parts:
+            position = part.position
+            ids = _visible_ids(part, [disc for _, disc in lit])
+            yield name, position, ids
             if isinstance(thing, Button) and pressed(thing):
-                yield "pressed button", where, ids
-            if _in_gripper(env, name, where):
-                yield (
-                    f"held {name}" if f"held {name}" in CLASSES else "other held object",
-                    where,
-                    ids,
-                )
+                yield "pressed button", position, ids
+            if _in_gripper(env, name, position):
+                held = f"held {name}"
+                if held not in CLASSES:
+                    held = "other held object"
+                yield held, position, ids
     for name, disc in lit:
         yield name, disc.position, disc.segmentation_ids
 
@@ -93,8 +94,9 @@ def _visible_ids(thing: Any, lit: Sequence[Any]) -> list[int]:
     if isinstance(thing, Button):
         return ids + [int(link.per_scene_id[0]) for link in thing.articulation.links]
     if isinstance(thing, Disc):
-        marks = [mark for mark in lit if distance_xy(mark.position, thing.position) < UNDER_MARK]
-        return ids + [number for mark in marks for number in mark.segmentation_ids]
+        for mark in lit:
+            if distance_xy(mark.position, thing.position) < UNDER_MARK:
+                ids = ids + mark.segmentation_ids
     return ids
 
 
@@ -103,11 +105,13 @@ def _class_of(thing: Any) -> str:
     from mme_vla.envs.robomme.scene.objects import COLOURS, Board, Container, Cube, Disc
 
     if isinstance(thing, Cube):
-        colour = np.array(COLOURS[thing.colour] if isinstance(thing.colour, str) else thing.colour)
+        colour = thing.colour
+        if isinstance(colour, str):
+            colour = COLOURS[colour]
         second, first = np.sort(colour)[-2:]
-        is_clear = first - second > CLEAR_COLOUR
-        name = ("red", "green", "blue")[colour.argmax()] if is_clear else "other"
-        return f"{name} cube"
+        if first - second <= CLEAR_COLOUR:
+            return "other cube"
+        return ("red cube", "green cube", "blue cube")[np.argmax(colour)]
     if isinstance(thing, Disc):
         return "disc" if thing.name.startswith("disc") else "target"
     types = {Container: "container", Button: "button", Board: "board", Peg: "peg end"}
@@ -231,16 +235,16 @@ def _arrange(env: "Task", arm: Any, rng: np.random.Generator) -> None:
     over = near[rng.integers(len(near))] if near and rng.random() < 0.6 else None
     if over is not None:
         place = over.position + np.array([0, 0, rng.uniform(0.01, 0.2)])
-    joints = arm.ik(
-        _pose(place) * _yaw_pose(rng.uniform(-0.8, 0.8)) * _pose(q=(0, 1, 0, 0)), env.qpos
-    )
+    target = _pose(place) * _yaw_pose(rng.uniform(-0.8, 0.8)) * _pose(q=(0, 1, 0, 0))
+    joints = arm.ik(target, env.qpos)
     if joints is None:
         return
     grasped = not env.stick and over is not None and rng.random() < 0.5
     grasped = grasped and _class_of(over).endswith(("cube", "container"))
-    fingers = (
-        [] if env.stick else [rng.uniform(0.014, 0.021) if grasped else rng.uniform(0.03, 0.04)] * 2
-    )
+    fingers: list[float] = []
+    if not env.stick:
+        width = rng.uniform(0.014, 0.021) if grasped else rng.uniform(0.03, 0.04)
+        fingers = [width, width]
     env.agent.robot.set_qpos(torch.as_tensor(np.append(joints, fingers), dtype=torch.float32)[None])
     if grasped and over is not None:
         over.move_to(_pose(env.tcp_pose.p, over.pose.q))
@@ -274,13 +278,11 @@ def _light(env: "Task", rng: np.random.Generator) -> None:
     for name, actor in env.scene.actors.items():
         among = bases.get(name.partition("_")[0])
         if among:
-            disc, lit = Thing(name, actor), rng.random() > 0.6
-            below = (
-                among[rng.integers(len(among))].position - [0, 0, Highlight.DEPTH]
-                if lit
-                else BELOW_TABLE
-            )
-            disc.move_to(_pose(below, disc.pose.q))
+            disc = Thing(name, actor)
+            position = BELOW_TABLE
+            if rng.random() > 0.6:
+                position = among[rng.integers(len(among))].position - [0, 0, Highlight.DEPTH]
+            disc.move_to(_pose(position, disc.pose.q))
 
 
 def _pose(p: Any = (0, 0, 0), q: Any = (1, 0, 0, 0)) -> Any:

@@ -147,17 +147,21 @@ def _play_one(run: PlayRun, which: EpisodeSpec, player: Any) -> EpisodeRecord:
 
 def line(record: EpisodeRecord) -> str:
     """One episode in one line."""
-    choices = " ".join(
-        decision["choice"]
-        + ("" if decision["point"] is None else "({:.0f},{:.0f})".format(*decision["point"]))
-        for decision in record.extra["decisions"]
-    )
+    choices = []
+    for decision in record.extra["decisions"]:
+        choice = decision["choice"]
+        if decision["point"] is not None:
+            choice += "({:.0f},{:.0f})".format(*decision["point"])
+        choices.append(choice)
+    parts = [
+        f"{record.task} {record.episode}: {record.outcome}",
+        " ".join(choices) or "no choice",
+        f"{record.steps} steps, {record.seconds.total:.0f} s",
+    ]
     reason = record.error or record.extra.get("ended_by", "")
-    took = f"{record.steps} steps, {record.seconds.total:.0f} s"
-    return (
-        f"{record.task} {record.episode}: {record.outcome} · {choices or 'no choice'} · {took}"
-        + (f" · {reason}" if reason else "")
-    )
+    if reason:
+        parts.append(reason)
+    return " · ".join(parts)
 
 
 def print_summary(run: PlayRun) -> None:
@@ -169,27 +173,23 @@ def print_summary(run: PlayRun) -> None:
     if not rows:
         return
     methods = list(rows[0][3])  # empty for the user's own tasks, which come last
-    table = Table(
-        "task", "episodes", run.identity.model, *(f"{method} (paper)" for method in methods)
-    )
+    headings = ["task", "episodes", run.identity.model]
+    table = Table(*headings, *[f"{method} (paper)" for method in methods])
+    rates = []
     for task, successes, count, paper in rows:
-        table.add_row(
-            task,
-            str(count),
-            f"{100 * successes / count:.1f}",
-            *(f"{paper[m]:.0f}" if paper else "–" for m in methods),
-        )
-    rates = [100 * successes / count for _, successes, count, _ in rows]
+        rate = 100 * successes / count
+        rates.append(rate)
+        reported = [f"{paper[m]:.0f}" if paper else "–" for m in methods]
+        table.add_row(task, str(count), f"{rate:.1f}", *reported)
     if len(rows) > 1:
-        reported = [paper for *_, paper in rows if paper]
-        means = [sum(paper[m] for paper in reported) / len(reported) for m in methods]
+        n_episodes = sum(count for _, _, count, _ in rows)
+        means = []
+        for method in methods:
+            values = [paper[method] for *_, paper in rows if paper]
+            means.append(f"{sum(values) / len(values):.2f}")
         table.add_section()
-        table.add_row(
-            "mean of tasks",
-            str(sum(count for _, _, count, _ in rows)),
-            f"{sum(rates) / len(rates):.2f}",
-            *(f"{mean:.2f}" for mean in means),
-        )
+        mean = sum(rates) / len(rates)
+        table.add_row("mean of tasks", str(n_episodes), f"{mean:.2f}", *means)
     console = Console(width=None if sys.stdout.isatty() else 160)
     console.print(table)
     console.print(

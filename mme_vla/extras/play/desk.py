@@ -101,13 +101,11 @@ class Desk:
     def state(self) -> dict[str, Any]:
         """All but the frames, as JSON takes it."""
         # The simulator's thread changes these meanwhile: each is read once.
-        run, phase, session, session_id, todo = (
-            self.run,
-            self.phase,
-            self.session,
-            self.session_id,
-            list(self.run.todo),
-        )
+        run = self.run
+        phase = self.phase
+        session = self.session
+        session_id = self.session_id
+        todo = list(run.todo)
         done = len(run.episodes) - len(todo)
         state: dict[str, Any] = {
             "phase": phase,
@@ -129,7 +127,11 @@ class Desk:
                 }
                 for task, successes, count, paper in run.summary()
             ]
-        which = session.episode if session is not None else todo[0] if todo else None
+        which = None
+        if session is not None:
+            which = session.episode
+        elif todo:
+            which = todo[0]
         if which is not None:
             state |= {"task": which.task, "split": which.split, "episode": which.episode}
         if session is not None and session.reveals:

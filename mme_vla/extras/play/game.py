@@ -109,13 +109,12 @@ class ChoiceSession:
         observation, info = self.env.reset()
         self._simulated += self._clock() - started
         frames = self._frames(observation)
-        if not frames or "available_multi_choices" not in info:
-            way = (
-                'offers no options: make it with action_space="multi_choice"'
-                if frames
-                else "shows no images: make it with render=True"
+        if not frames:
+            raise UserError("The environment shows no images: make it with render=True.")
+        if "available_multi_choices" not in info:
+            raise UserError(
+                'The environment offers no options: make it with action_space="multi_choice".'
             )
-            raise UserError(f"The environment {way}.")
         title = "Conditioning video" if len(frames) > 1 else "The scene"
         self._take(frames, info, title)
         return self.reveals[0]
@@ -157,21 +156,22 @@ class ChoiceSession:
 
     def check(self, action: Mapping[str, Any]) -> tuple[Option, tuple[float, float] | None]:
         """The option and point that an action means."""
-        options = {option.label: option for option in self.options}
-        choice = action.get("choice") if isinstance(action, Mapping) else None
-        label = choice.strip().lower() if isinstance(choice, str) else None
-        problem = ""
+        if not self.reveals:
+            raise UserError("No choice can be made before start().")
         if self.status != ONGOING:
-            when = f": the episode is over ({self.status})" if self.reveals else " before start()"
-            problem = f"No choice can be made{when}."
-        elif label is None:
-            problem = f'{action!r} is no choice; expected {{"choice": "a", "point": [y, x]}}.'
-        elif label not in options:
-            problem = f"There is no option {choice!r}. {did_you_mean(label, options)}"
-        if problem or label is None:
-            raise UserError(problem)
+            raise UserError(f"No choice can be made: the episode is over ({self.status}).")
+        choice = action.get("choice") if isinstance(action, Mapping) else None
+        if not isinstance(choice, str):
+            raise UserError(
+                f'{action!r} is no choice; expected {{"choice": "a", "point": [y, x]}}.'
+            )
+        label = choice.strip().lower()
+        options = {option.label: option for option in self.options}
+        if label not in options:
+            raise UserError(f"There is no option {choice!r}. {did_you_mean(label, options)}")
         option = options[label]
-        return option, checked_point(action.get("point"), option) if option.needs_point else None
+        point = checked_point(action.get("point"), option) if option.needs_point else None
+        return option, point
 
     def give_up(self, outcome: str, reason: str) -> None:
         """End the episode without the environment. outcome: what it counts as. reason: why, kept in

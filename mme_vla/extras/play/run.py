@@ -141,12 +141,14 @@ class PlayRun:
         The user's own tasks come last, without rates.
         """
         known = {row["method"]: row for row in paper_table("oracle_planner")}
+        outcomes: dict[str, list[bool]] = {task: [] for task in PAPER_ORDER}
+        for record in merge(self.records, "last"):
+            outcomes.setdefault(record.task, []).append(record.success)
         rows = []
-        for task in dict.fromkeys((*PAPER_ORDER, *(record.task for record in self.records))):
-            played = [record for record in merge(self.records, "last") if record.task == task]
+        for task, played in outcomes.items():
             if played:
                 paper = {method: float(row[task]) for method, row in known.items() if task in row}
-                rows.append((task, sum(record.success for record in played), len(played), paper))
+                rows.append((task, sum(played), len(played), paper))
         return rows
 
     def __enter__(self) -> Self:

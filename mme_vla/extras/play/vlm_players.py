@@ -116,25 +116,21 @@ def parse_choice(reply: str, options: Sequence[Option]) -> dict[str, Any]:
     letter = fields.get("choice")
     label = letter.strip().strip("().:[]").lower() if isinstance(letter, str) else None
     option = next((option for option in options if option.label == label), None)
-    problem = None
+    if not reply.strip():
+        raise MalformedReply("the answer is empty")
     if not fields:
-        problem = "the answer holds no JSON object" if reply.strip() else "the answer is empty"
-    elif label is None:
-        problem = 'the answer has no "choice"'
-    elif option is None:
-        problem = (
-            f"there is no option {brief(letter)}; the options are"
-            f" {', '.join(o.label for o in options)}"
-        )
-    elif option.needs_point:
-        problem = _misfit(fields.get("point"), option)
-    if problem is not None or option is None:
+        raise MalformedReply("the answer holds no JSON object")
+    if label is None:
+        raise MalformedReply('the answer has no "choice"')
+    if option is None:
+        labels = ", ".join(option.label for option in options)
+        raise MalformedReply(f"there is no option {brief(letter)}; the options are {labels}")
+    if not option.needs_point:
+        return {"choice": label, "point": None}
+    problem = _misfit(fields.get("point"), option)
+    if problem is not None:
         raise MalformedReply(problem)
-    point = (
-        [min(to_pixels(value, SIDE), SIDE - 1) for value in fields["point"]]
-        if option.needs_point
-        else None
-    )
+    point = [min(to_pixels(value, SIDE), SIDE - 1) for value in fields["point"]]
     return {"choice": label, "point": point}
 
 

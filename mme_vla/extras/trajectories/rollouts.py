@@ -179,16 +179,16 @@ def join(batches: Sequence[Batch]) -> Batch:
     )
     length = max(batch.prompt.shape[1] for batch in batches)
     joined: dict[str, Any] = {}
-    for name in (member.name for member in fields(Batch)):
+    for member in fields(Batch):
+        name = member.name
         values = [getattr(batch, name) for batch in batches]
         known = [value for value in values if value is not None]
         if name in ("prompt", "prompt_mask"):
             values = [functional.pad(value, (0, length - value.shape[1])) for value in values]
         elif known and name in ("weight", "action_mask", "options"):
-            ones = [known[0].new_ones(len(batch.prompt), *known[0].shape[1:]) for batch in batches]
-            values = [
-                one if value is None else value for value, one in zip(values, ones, strict=True)
-            ]
+            for i, batch in enumerate(batches):
+                if values[i] is None:
+                    values[i] = known[0].new_ones(len(batch.prompt), *known[0].shape[1:])
         elif len(known) not in (0, len(values)):
             raise UserError(
                 f"{len(known)} of {len(values)} batches to join have {name!r}: give it to all, or"
@@ -202,15 +202,20 @@ def _cat(values: Sequence[Any]) -> Any:
     """Tensors, labels or structs of tensors as one; of anything else the first."""
     first = values[0]
     if isinstance(first, HistoryTokens):
-        return stack_history([row for value in values for row in _unbatched(value)])
+        rows: list[HistoryTokens] = []
+        for history in values:
+            rows += [history._map(lambda x, i=i: x[i]) for i in range(len(history.mask))]
+        return stack_history(rows)
     if isinstance(first, Labels):
         return Labels({name: torch.cat([value[name] for value in values]) for name in first})
     if isinstance(first, TensorStruct):
-        members = [member.name for member in fields(first)]  # type: ignore[arg-type]
-        return type(first)(
-            **{name: _cat([getattr(value, name) for value in values]) for name in members}
-        )
-    return torch.cat(list(values)) if isinstance(first, Tensor) else first
+        members: dict[str, Any] = {}
+        for member in fields(first):  # type: ignore[arg-type]
+            members[member.name] = _cat([getattr(value, member.name) for value in values])
+        return type(first)(**members)
+    if isinstance(first, Tensor):
+        return torch.cat(list(values))
+    return first
 
 
 @torch.no_grad()
@@ -221,17 +226,11 @@ def with_view_tokens(policy: MMEPolicy, batch: Batch, size: int = 32) -> Batch:
     tokens = []
     with policy.autocast():
         for start in range(0, len(batch.prompt), size):
-            images = policy.model.prepare_images(
-                batch.rows(slice(start, start + size)).to(policy.device)
-            ).images
-            tokens.append(
-                policy.backbone.encode_images(images.flatten(0, 1)).unflatten(0, images.shape[:2])
-            )
+            rows = batch.rows(slice(start, start + size)).to(policy.device)
+            images = policy.model.prepare_images(rows).images  # b v 3 s s
+            encoded = policy.backbone.encode_images(images.flatten(0, 1))
+            tokens.append(encoded.unflatten(0, images.shape[:2]))
     return replace(batch, view_tokens=torch.cat(tokens))
-
-
-def _unbatched(history: HistoryTokens) -> list[HistoryTokens]:
-    return [history._map(lambda x, i=i: x[i]) for i in range(len(history.mask))]
 
 
 def _env_options(
@@ -374,7 +373,9 @@ class _Collector(Rollout):
         chunks = [decision.chunk for decision in decisions]
         log_probs = [d.log_prob for d in decisions if d.log_prob is not None]
         paths = [d.path for d in decisions if d.path is not None]
-        observations, rewards, oracle = None, None, None
+        observations = None
+        rewards = None
+        oracle = None
         if "observations" in self.keep and executed:
             observations = join(executed)
         if "rewards" in self.keep:
@@ -403,16 +404,16 @@ class _Collector(Rollout):
         """A row with these actions [n, w] in the network's units, repeated to a chunk, of which
         they alone count.
         """
-        processor, horizon = self.policy.require_processor(), self.policy.horizon
-        before, count = processor.samples.window - 1, len(actions)
-        last = (
-            actions[-1:]
-            if count
-            else np.zeros((1, self.policy.embodiment.action.width), np.float32)
-        )
-        chunk = np.concatenate(
-            [last.repeat(before, 0), actions, last.repeat(horizon - before - count, 0)]
-        )
+        processor = self.policy.require_processor()
+        horizon = self.policy.horizon
+        before = processor.samples.window - 1
+        count = len(actions)
+        if count:
+            last = actions[-1:]
+        else:
+            last = np.zeros((1, self.policy.embodiment.action.width), np.float32)
+        after = horizon - before - count
+        chunk = np.concatenate([last.repeat(before, 0), actions, last.repeat(after, 0)])
         mask = torch.zeros(1, horizon, dtype=torch.bool)
         mask[:, before : before + count] = True
         return replace(row, actions=processor.actions(chunk, state)[None], action_mask=mask)

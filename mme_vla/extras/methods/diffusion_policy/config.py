@@ -52,11 +52,10 @@ class DiffusionSizes:
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            numbers = [
-                n for n in (value if isinstance(value, tuple) else [value]) if isinstance(n, int)
-            ]
-            if value == () or not all(1 <= n <= LARGEST for n in numbers):
-                # which the backbone follows
+            members = value if isinstance(value, tuple) else (value,)
+            allowed = [1 <= n <= LARGEST for n in members if isinstance(n, int)]
+            if not members or not all(allowed):
+                # The processor decides the window, and the backbone follows.
                 where = "processor" if f.name == "window" else "backbone"
                 raise UserError(
                     f"{where}.{f.name}={brief(value)} must be made of whole numbers from 1 to"

@@ -229,16 +229,11 @@ class DiffusionProcessor(GoalProcessor):
         }
 
     def collate(self, items: Sequence[dict[str, Any]]) -> DiffusionBatch:
-        def stack(name: str) -> Tensor | None:
-            return torch.stack([item[name] for item in items]) if name in items[0] else None
-
-        images, state, text = (
-            torch.stack([item[name] for item in items]) for name in ("images", "state", "text")
-        )
-        history = (
-            stack_history([item["history"] for item in items]) if "history" in items[0] else None
-        )
-        return DiffusionBatch(images, state, text, stack("actions"), stack("action_mask"), history)
+        stacked: dict[str, Any] = {}
+        for name in items[0]:
+            stack = stack_history if name == "history" else torch.stack
+            stacked[name] = stack([item[name] for item in items])
+        return DiffusionBatch(**stacked)
 
     # Folders
 

@@ -150,32 +150,32 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         a group of one.
         """
         groups = [item.get("moments", [item]) for item in items]
-        times = [torch.as_tensor(item.get("times", item["place"][-1:])) for item in items]
-        longest = max(map(len, groups))
-        rows = [np.minimum(np.arange(longest), len(group) - 1).tolist() for group in groups]
+        longest = max(len(group) for group in groups)
+        moments: list[Any] = []  # of all groups, one after the other
+        times: list[Tensor] = []
+        valid: list[Tensor] = []
+        for item, group in zip(items, groups, strict=True):
+            rows = np.minimum(np.arange(longest), len(group) - 1).tolist()
+            moments += [group[i] for i in rows]
+            times.append(torch.as_tensor(item.get("times", item["place"][-1:]))[rows])
+            valid.append(torch.arange(longest) < len(group))
 
         def stack(name: str) -> Tensor:
-            return torch.stack(
-                [
-                    torch.stack([group[i][name] for i in at])
-                    for group, at in zip(groups, rows, strict=True)
-                ]
-            )
+            stacked = torch.stack([moment[name] for moment in moments])
+            return stacked.unflatten(0, (len(groups), longest))
 
         history = None
-        if "history" in groups[0][0]:
-            every = [
-                group[i]["history"] for group, at in zip(groups, rows, strict=True) for i in at
-            ]
-            history = stack_history(every)._map(lambda x: x.unflatten(0, (len(groups), longest)))
+        if "history" in moments[0]:
+            histories = stack_history([moment["history"] for moment in moments])
+            history = histories._map(lambda x: x.unflatten(0, (len(groups), longest)))
         mask = stack("prompt_mask")
         length = int(mask.sum(-1).max())
         return GroupBatch(
             images=stack("images"),
             prompt=stack("prompt")[..., :length],
             prompt_mask=mask[..., :length],
-            times=torch.stack([of[at] for of, at in zip(times, rows, strict=True)]),
-            valid=torch.stack([torch.arange(longest) < len(group) for group in groups]),
+            times=torch.stack(times),
+            valid=torch.stack(valid),
             actions=stack("actions"),
             action_mask=stack("action_mask") if "action_mask" in groups[0][0] else None,
             history=history,

@@ -276,9 +276,11 @@ class OpenVlaProcessor(Processor):
         self, frames: np.ndarray | Tensor, device: torch.device | str | None = None
     ) -> Tensor:
         """As `Processor.memory_images`, resized with Lanczos-3; neither cropped nor augmented."""
-        array = frames.cpu().numpy() if isinstance(frames, Tensor) else frames
-        resized = torch.from_numpy(np.require(self._resized(array), requirements=["C", "W"]))
-        return to_unit_range(resized.to(device) if device is not None else resized).movedim(-1, 1)
+        if isinstance(frames, Tensor):
+            frames = frames.cpu().numpy()
+        resized = np.require(self._resized(frames), requirements=["C", "W"])
+        images = torch.from_numpy(resized).to(device)
+        return to_unit_range(images).movedim(-1, 1)
 
     @property
     def memory_image_format(self) -> str:
@@ -286,7 +288,9 @@ class OpenVlaProcessor(Processor):
         return "jpeg" if self.jpeg else ""
 
     def _resized(self, frames: np.ndarray) -> np.ndarray:
-        return lanczos(jpeg_round_trip(frames) if self.jpeg else frames, self.image_size)
+        if self.jpeg:
+            frames = jpeg_round_trip(frames)
+        return lanczos(frames, self.image_size)
 
     # Words
 

@@ -168,63 +168,68 @@ def openvla_adapter(policy: Policy) -> Adapter:
     names = [
         name for name in policy.state_dict() if ".lora_" not in name and ".base_layer." not in name
     ]
-    table = {name: [Piece(source)] for name in names if (source := openvla_name(name)) is not None}
-    return Adapter(
-        table, fresh=frozenset(n for n in names if policy.finetune_spec.component_of(n) == "action")
-    )
+    table = {}
+    fresh = set()
+    for name in names:
+        source = openvla_name(name)
+        if source is not None:
+            table[name] = [Piece(source)]
+        if policy.finetune_spec.component_of(name) == "action":
+            fresh.add(name)
+    return Adapter(table, fresh=frozenset(fresh))
 
 
 def with_heads(tensors: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
     """The model's tensors, and those of the newest head and state token beside it, each behind its
     module's name.
     """
-    known = tuple(f"{module.rstrip('/')}--" for module in (HEAD, STATE))
-    unknown = sorted(
-        file.name for file in folder.glob("*?--*_checkpoint.pt") if not file.name.startswith(known)
-    )
+    known = {module: f"{module.rstrip('/')}--" for module in (HEAD, STATE)}
+    unknown = []
+    for file in sorted(folder.glob("*?--*_checkpoint.pt")):
+        if not file.name.startswith(tuple(known.values())):
+            unknown.append(file.name)
     if unknown:
+        readable = ", ".join(f"{start}*_checkpoint.pt" for start in known.values())
         raise UserError(
             f"{folder} holds {listed(unknown)}: model=openvla_oft has no place for these weights,"
-            " and would act differently without them. Read are"
-            f" {', '.join(f'{name}*_checkpoint.pt' for name in known)}. A vision_backbone is of a"
-            " run with FiLM (use_film), a noisy_action_projector of one with a diffusion head"
+            f" and would act differently without them. Read are {readable}. A vision_backbone is of"
+            " a run with FiLM (use_film), a noisy_action_projector of one with a diffusion head"
             " (use_diffusion): use a run without them."
         )
     merged = {f"{VLA}{name}": tensor for name, tensor in tensors.items()}
-    for module in (HEAD, STATE):
-        files = sorted(folder.glob(f"{module.rstrip('/')}--*_checkpoint.pt"), key=_step)
+    for module, start in known.items():
+        files = sorted(folder.glob(f"{start}*_checkpoint.pt"), key=_step)
         if files:
             heads = read_torch_file(inside(folder, files[-1].name, "weights"))
-            merged |= {
-                f"{module}{name.removeprefix(_WRAPPED)}": tensor for name, tensor in heads.items()
-            }
+            for name, tensor in heads.items():
+                merged[f"{module}{name.removeprefix(_WRAPPED)}"] = tensor
     return merged
 
 
 def _step(file: Path) -> tuple[int, str]:
     number = file.name.split("--")[1].split("_")[0]
-    return (int(number) if number.isdigit() else -1, file.name)
+    step = int(number) if number.isdigit() else -1
+    return step, file.name
 
 
 def read_dataset_statistics(folder: Path) -> NormStats | None:
     """The statistics of `dataset_statistics.json`, where it is of one dataset that has states."""
     if not (folder / STATISTICS).is_file():
         return None
-    data = read_json(
-        checked_file(folder, STATISTICS, "statistics"), "normalisation statistics", limit=2**24
-    )
-    of = next(iter(data.values())) if len(data) == 1 else None
-    if not isinstance(of, dict) or not all(
-        isinstance(of.get(source_name), dict) for source_name in _FEATURES.values()
-    ):
+    file = checked_file(folder, STATISTICS, "statistics")
+    data = read_json(file, "normalisation statistics", limit=2**24)
+    if len(data) != 1:
         return None
-    keys = ("mean", "std", "q01", "q99", "min", "max")
-    known = {
-        name: {key: of[name][key] for key in keys if key in of[name]} for name in _FEATURES.values()
-    }
-    return NormStats(
-        **{part: QuantileStats.from_dict(known[name], name) for part, name in _FEATURES.items()}
-    )
+    (dataset,) = data.values()
+    stats: dict[str, QuantileStats] = {}
+    for part, name in _FEATURES.items():
+        values = dataset.get(name) if isinstance(dataset, dict) else None
+        if not isinstance(values, dict):
+            return None
+        keys = ("mean", "std", "q01", "q99", "min", "max")
+        known = {key: values[key] for key in keys if key in values}
+        stats[part] = QuantileStats.from_dict(known, name)
+    return NormStats(**stats)
 
 
 def write_openvla(

@@ -244,17 +244,22 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
             sampled: whether a sample is sampled anew each epoch; else it is the place of its
                 number.
         """
-        self.sources, self.processor, self.length = list(sources), processor, length
-        self.seed, self.epoch = seed, 0
-        selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
-        self.total_frames, self.sampled = 0, sampled
+        self.sources = list(sources)
+        self.processor = processor
+        self.length = length
+        self.seed = seed
+        self.epoch = 0
+        self.sampled = sampled
+        self.total_frames = 0
+        if episodes is None:
+            episodes = [np.arange(len(source)) for source in sources]
         self._items: list[tuple[int, int, EpisodeKeyframes, list[Link]]] = []
         # how often an item is sampled within its task, relative to the task's others
         shares: list[float] = []
         tasks: list[str] = []
         counted: Counter[str] = Counter()
         longest = 0
-        for number, (source, part) in enumerate(zip(sources, selected, strict=True)):
+        for number, (source, part) in enumerate(zip(sources, episodes, strict=True)):
             for episode in map(int, part):
                 # a sample has one: an episode of several is refused here, not while training
                 source.goal(episode)
@@ -262,13 +267,19 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
                 keyframes = EpisodeKeyframes(KeyframeFile.file_of(source.root, episode))
                 chains = [chain for chain in keyframes.chains if len(chain) >= length]
                 longest = max(longest, *map(len, keyframes.chains))
-                runs = [[link] for chain in chains for link in chain] if length == 1 else chains
-                self._items += [(number, episode, keyframes, run) for run in runs]
+                runs = chains
+                share = 1 / len(keyframes.chains)
+                if length == 1:  # every keyframe is a sample
+                    runs = [[link] for chain in chains for link in chain]
+                    share = 1.0
                 # An episode too short for any run still takes its turn, and the draw is repeated
                 # for all tasks alike.
-                counted[source.task(episode)] += 1
-                shares += [1.0 if length == 1 else 1 / len(keyframes.chains)] * len(runs)
-                tasks += [source.task(episode)] * len(runs)
+                task = source.task(episode)
+                counted[task] += 1
+                for run in runs:
+                    self._items.append((number, episode, keyframes, run))
+                    shares.append(share)
+                    tasks.append(task)
         require(
             self._items,
             f"No chain of keyframes in the data has {length} of them; the longest has {longest}."

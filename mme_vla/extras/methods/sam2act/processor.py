@@ -374,10 +374,9 @@ class SAM2ActProcessor(GoalProcessor):
     def item(self, sample: Recorded) -> dict[str, Any]:
         clouds = [cloud_of(shots, self.side) for shots in sample.shots]
         targets = np.asarray(sample.targets, np.float32)
-        states = [
-            self.commanded_state(bool(o), int(p))
-            for o, p in zip(sample.open, sample.places, strict=True)
-        ]
+        states = []
+        for is_open, place in zip(sample.open, sample.places, strict=True):
+            states.append(self.commanded_state(bool(is_open), int(place)))
         rotation = quaternions_of(torch.rad2deg(torch.from_numpy(targets[:, 3:6]).double()))
         return {
             "points": torch.from_numpy(np.stack([points for points, _ in clouds])),
@@ -392,10 +391,10 @@ class SAM2ActProcessor(GoalProcessor):
         }
 
     def collate(self, items: Sequence[dict[str, Any]]) -> KeyframeBatch:
-        names = KeyframeBatch.__dataclass_fields__
-        return KeyframeBatch(
-            **{name: torch.stack([item[name] for item in items]) for name in names}
-        )
+        stacked = {}
+        for name in KeyframeBatch.__dataclass_fields__:
+            stacked[name] = torch.stack([item[name] for item in items])
+        return KeyframeBatch(**stacked)
 
     # Folders
 

@@ -408,22 +408,31 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         others in one batch.
         """
         running = [_video_episode(episode) for episode in episodes]
+        features = []
         with self.autocast():
-            features = [
-                episode.encode(self.backbone, episode.pairs(episode.step)) for episode in running
-            ]
+            for episode in running:
+                features.append(episode.encode(self.backbone, episode.pairs(episode.step)))
         memory = self.encode_memories(episodes)
         prefills = [episode.take_prefill(self._tokens(episode)) for episode in running]
-        alone = [[i] for i, prefill in enumerate(prefills) if prefill is not None]
-        together = [i for i, prefill in enumerate(prefills) if prefill is None]
+
+        # Episodes with a prefill go alone, all others in one batch.
+        groups: list[list[int]] = []
+        together: list[int] = []
+        for i, prefill in enumerate(prefills):
+            if prefill is None:
+                together.append(i)
+            else:
+                groups.append([i])
+        if together:
+            groups.append(together)
+
         chunks: dict[int, Tensor] = {}
-        for group in [*alone, *([together] if together else [])]:
+        for group in groups:
             index = torch.tensor(group)
-            here = index.to(self.device)
-            part = replace(batch.rows(here), features=torch.cat([features[i] for i in group]))
-            responses, condition = self.generate(
-                part, None if memory is None else memory.rows(here), prefills[group[0]]
-            )
+            rows = index.to(self.device)
+            part = replace(batch.rows(rows), features=torch.cat([features[i] for i in group]))
+            part_memory = None if memory is None else memory.rows(rows)
+            responses, condition = self.generate(part, part_memory, prefills[group[0]])
             chunk = self._sample(part, condition, {"noise": noise["noise"][index]}, steps)
             chunks |= dict(zip(group, chunk, strict=True))
             for i, words in zip(group, responses, strict=True):

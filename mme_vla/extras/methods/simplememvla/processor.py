@@ -118,22 +118,22 @@ class VideoBatch(TensorStruct):
 
     def rows(self, index: Tensor | slice) -> Self:
         """Rows of the batch, with the temporal patches that belong to them."""
-        indices = np.arange(len(self.ids))[
-            index if isinstance(index, slice) else index.cpu().numpy()
-        ].tolist()
+        selected = index if isinstance(index, slice) else index.cpu().numpy()
+        indices = np.arange(len(self.ids))[selected].tolist()
         starts = np.cumsum([0, *self.patches])
-        places = torch.tensor(
-            [p for i in indices for p in range(starts[i], starts[i + 1])], dtype=torch.int64
-        )
-        changed: dict[str, Any] = {
-            name: None if (x := getattr(self, name)) is None else x[places.to(x.device)]
-            for name in ("video", "features")
-        }
-        for name in ("prompts", "lengths", "patches"):
-            changed[name] = tuple(getattr(self, name)[i] for i in indices)
-        words = None if self.words is None else tuple(self.words[i] for i in indices)
+        patches = [np.arange(starts[i], starts[i + 1]) for i in indices]
+        places = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *patches]))
+        changed: dict[str, Any] = {}
+        for name in ("video", "features"):  # rows are temporal patches
+            values = getattr(self, name)
+            if values is not None:
+                changed[name] = values[places.to(values.device)]
+        for name in ("prompts", "lengths", "patches", "words"):
+            values = getattr(self, name)
+            if values is not None:
+                changed[name] = tuple(values[i] for i in indices)
         bare = replace(self, video=None, features=None)
-        return replace(bare._map(lambda x: x[index]), words=words, **changed)
+        return replace(bare._map(lambda x: x[index]), **changed)
 
 
 @PROCESSORS.register(NAME)
@@ -349,23 +349,18 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         }
 
     def collate(self, items: Sequence[dict[str, Any]]) -> VideoBatch:
-        def stack(name: str) -> Tensor | None:
-            return torch.stack([item[name] for item in items]) if name in items[0] else None
-
-        states = torch.stack([item["state"] for item in items])
-        batch = self.batch(
-            [item["tokens"] for item in items], [item["images"] for item in items], states
-        )
-        return replace(
-            batch,
-            video=_joined([item["video"] for item in items]),
-            patches=tuple(len(item["video"]) for item in items),
-            actions=stack("actions"),
-            action_mask=stack("action_mask"),
-            history=stack_history([item["history"] for item in items])
-            if "history" in items[0]
-            else None,
-        )
+        columns = {name: [item[name] for item in items] for name in items[0]}
+        states = torch.stack(columns["state"])
+        batch = self.batch(columns["tokens"], columns["images"], states)
+        patches = tuple(len(video) for video in columns["video"])
+        batch = replace(batch, video=_joined(columns["video"]), patches=patches)
+        if "actions" in columns:
+            batch = replace(batch, actions=torch.stack(columns["actions"]))
+        if "action_mask" in columns:
+            batch = replace(batch, action_mask=torch.stack(columns["action_mask"]))
+        if "history" in columns:
+            batch = replace(batch, history=stack_history(columns["history"]))
+        return batch
 
     def batch(
         self, tokens: Sequence[Tokens], images: Sequence[Tensor], states: Tensor
@@ -391,14 +386,14 @@ class SimpleMemVlaProcessor(PolicyProcessor):
     # Folders
 
     def to_config(self) -> dict[str, Any]:
-        values = vars(self.settings)
+        settings = dict(vars(self.settings))
+        for name, value in settings.items():
+            if isinstance(value, tuple):
+                settings[name] = list(value)  # as YAML and JSON have it
         shipped = self.tokenizer.spec == BYTES
         return {
             "name": NAME,
-            **{
-                name: list(value) if isinstance(value, tuple) else value
-                for name, value in values.items()
-            },
+            **settings,
             "tokenizer": BYTES if shipped else TOKENIZER_FILE,
             "tokenizer_fingerprint": self.tokenizer.fingerprint,
             "factor": self.factor,
@@ -423,7 +418,8 @@ class SimpleMemVlaProcessor(PolicyProcessor):
             raise UserError(f"{folder} holds a processor of another kind of policy.")
         try:
             sizes = {key: values.pop(key) for key in ("factor", "memory_tokens", "image_side")}
-            robot, stats = Embodiment.from_dict(values.pop("embodiment")), values.pop("stats")
+            robot = Embodiment.from_dict(values.pop("embodiment"))
+            stats = values.pop("stats")
             fingerprint = values.pop("tokenizer_fingerprint")
         except KeyError as error:
             raise UserError(

@@ -192,12 +192,20 @@ def check_config(policy: Policy, config: Mapping[str, Any], source: str) -> None
     sections = {"backbone": backbone_section(config), "processor": processor_section(config)}
     for section, expected in sections.items():
         current = dict(target.config[section])
-        for key, value in {k: v for k, v in expected.items() if k != "vlm"}.items():
-            pairs = value.items() if isinstance(value, dict) else [("", value)]
-            for inner, source_value in pairs:
-                has = current[key].get(inner) if inner else current.get(key)
-                name = ".".join(filter(None, (section, key, inner)))
-                if (list(has) if isinstance(has, list | tuple) else has) != source_value:
+        for key, value in expected.items():
+            if key == "vlm":
+                continue
+            # (dotted name, the source's value, the policy's)
+            triples = [(f"{section}.{key}", value, current.get(key))]
+            if isinstance(value, dict):
+                triples = [
+                    (f"{section}.{key}.{name}", member, current[key].get(name))
+                    for name, member in value.items()
+                ]
+            for name, source_value, has in triples:
+                if isinstance(has, tuple):
+                    has = list(has)
+                if has != source_value:
                     raise UserError(
                         f"{source} was trained with {name}={brief(source_value)}; this policy has"
                         f" {brief(has)}. Set {name}={brief(source_value)}."

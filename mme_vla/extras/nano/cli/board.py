@@ -66,9 +66,9 @@ def main(
         if any(word.startswith("model=") for word in words):
             composed = compose("nano", with_settings(alone(words)), extra_dirs=trees)
             trained = row_folders(NanoRun.from_config(resolved(composed)), trees)
-            sys.argv[1:] = alone(words) + [
-                word for tree in trees for word in ("--config-dir", str(tree))
-            ]
+            sys.argv[1:] = alone(words)
+            for tree in trees:
+                sys.argv += ["--config-dir", str(tree)]
             nano()
         run(args, str(config.split), trained)
 
@@ -89,20 +89,25 @@ def row_folders(nano: NanoRun, trees: Sequence[Path]) -> list[Path]:
     shipped = SHIPPED / table_of(nano.split, actions)
     if not shipped.is_dir():
         print(NO_PUBLISHED_ROWS)
-    if folder := next((file.parent for file in sorted(shipped.rglob(TRAINED))), None):
-        other = read_training(folder)
+    trainings = sorted(file.parent for file in shipped.rglob(TRAINED))
+    if trainings:
+        published = read_training(trainings[0])
         specs = choose_episodes(nano.task, nano.episodes, nano.split)
-        compared = {
-            "episodes": tuple(
-                dict(Counter(scene.task for scene in scenes)) for scenes in (specs, other.records)
-            ),
-            "max_steps": (rules.steps, other.records[0].max_steps),
-            "rules": (rules_text(actions, rules.max_choices, rules.only_possible), other.rules),
+        values = {
+            "episodes": dict(Counter(spec.task for spec in specs)),
+            "max_steps": rules.steps,
+            "rules": rules_text(actions, rules.max_choices, rules.only_possible),
         }
-        for name, (value, expected) in compared.items():
+        expected = {
+            "episodes": dict(Counter(record.task for record in published.records)),
+            "max_steps": published.records[0].max_steps,
+            "rules": published.rules,
+        }
+        for name, value in values.items():
             require(
-                value == expected,
-                f"A row with {name} {value} does not fit those of {shipped}: they have {expected}.",
+                value == expected[name],
+                f"A row with {name} {value} does not fit those of {shipped}: they have"
+                f" {expected[name]}.",
             )
     return [Path(nano.output) / nano.split / row for row in rows.composed]
 

@@ -44,19 +44,20 @@ def with_settings(words: Sequence[str]) -> list[str]:
     named = any(word.startswith("model=") for word in words)
     if named and not any(word.startswith("also=") for word in words):
         words = [*words, "also=[]"]
-    words = _as_lists(
-        [
-            f"{KEYS.get(key, key)}{equals}{value}"
-            for key, equals, value in (word.partition("=") for word in words)
-        ]
-    )
+    renamed = []
+    for word in words:
+        key, equals, value = word.partition("=")
+        renamed.append(f"{KEYS.get(key, key)}{equals}{value}")
+    words = _as_lists(renamed)
     if "nano=null" in words:  # without the task's file; Hydra takes no null for a group
         return [word for word in words if word != "nano=null"]
+    if any(word.startswith("nano=") for word in words):
+        return words
     tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
     name = tasks[-1] if tasks else ALL_TASKS
-    if name not in library_files("nano") or any(word.startswith("nano=") for word in words):
-        return list(words)
-    return [f"nano={name}", *words]
+    if name in library_files("nano"):
+        words = [f"nano={name}", *words]
+    return words
 
 
 def _as_lists(words: Sequence[str]) -> list[str]:
@@ -64,14 +65,18 @@ def _as_lists(words: Sequence[str]) -> list[str]:
     nothing else is swept.
     """
     lists = []
+    is_sweep = False
     for word in words:
         key, _, value = word.partition("=")
-        several = key in ("with_memory", "budget") and "," in value and not value.startswith("[")
-        lists.append(f"{key}=[{value}]" if several else word)
-    swept = [word for word in lists if "," in re.sub(r"[\[{(].*[\]})]", "", word.partition("=")[2])]
-    return [
-        word for word in lists if swept or lists == list(words) or word not in ("--multirun", "-m")
-    ]
+        outside_brackets = re.sub(r"[\[{(].*[\]})]", "", value)
+        if key in ("with_memory", "budget") and "," in value and not value.startswith("["):
+            word = f"{key}=[{value}]"
+        elif "," in outside_brackets:
+            is_sweep = True
+        lists.append(word)
+    if is_sweep or lists == list(words):
+        return lists
+    return [word for word in lists if word not in ("--multirun", "-m")]
 
 
 def command(cfg: DictConfig) -> None:
