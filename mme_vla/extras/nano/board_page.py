@@ -151,7 +151,7 @@ def published(board: Board) -> Table:
     """Success and place of each published method here and in the paper, over all tasks and by
     suite.
     """
-    scopes = {"all": board.protocol.tasks}
+    scopes: dict[str, Sequence[str]] = {"all": board.protocol.tasks}
     for suite in board.protocol.suites:
         scopes[suite] = board.protocol.choose("suite", suite)
     rows = [[row.name] for row, _ in board.published]

@@ -279,7 +279,7 @@ def _light(env: "Task", rng: np.random.Generator) -> None:
         among = bases.get(name.partition("_")[0])
         if among:
             disc = Thing(name, actor)
-            position = BELOW_TABLE
+            position = np.array(BELOW_TABLE)
             if rng.random() > 0.6:
                 position = among[rng.integers(len(among))].position - [0, 0, Highlight.DEPTH]
             disc.move_to(_pose(position, disc.pose.q))
