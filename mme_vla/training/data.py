@@ -189,7 +189,7 @@ def open_caches(
             policy.encode_frames,
             encoder or policy.vision_fingerprint(),
             root=settings.root,
-            dtype=str(policy.history_dtype).removeprefix("torch."),
+            dtype=str(policy.info.history_dtype).removeprefix("torch."),
             max_build_frames=settings.max_build_frames,
             batch_size=settings.batch_size,
             command=command,

@@ -4,6 +4,7 @@ are not.
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +20,7 @@ from mme_vla.extras.probing.channels import Channel, MemorySnapshot, Remembered,
 from mme_vla.extras.probing.interventions import Moment
 from mme_vla.extras.probing.recordings import SUBGOAL, Recording, all_recordings, stored_frames
 from mme_vla.memory.base import MemoryModule
-from mme_vla.policy.base import Policy
+from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.registry import SPLIT_POLICIES
@@ -223,11 +224,6 @@ def others(
 class ProbedPolicy(Policy):
     """`inner` under an arm. It evaluates and rolls out as any policy does, with the same noise."""
 
-    n_distractor_episodes: int = 0
-    """Episodes of a stress split's sessions, which a run names; those of a probe's arm do not
-    count.
-    """
-
     def __init__(
         self,
         inner: Policy,
@@ -248,10 +244,13 @@ class ProbedPolicy(Policy):
         self.n_before = sum(recording.length for recording in self.sessions)
         """Frames of the sessions."""
         self.memory, self.processor, self.config = inner.memory, inner.processor, dict(inner.config)
-        self.horizon, self.action_dim = inner.horizon, inner.action_dim
-        self.history_dtype = inner.history_dtype
-        self.sample_steps = inner.sample_steps
-        self.max_actions = inner.max_actions
+        self.horizon = inner.horizon
+        # Episodes of a stress split's sessions count (`with_sessions`), those of an arm do not.
+        self.info = PolicyInfo(
+            sample_steps=inner.info.sample_steps,
+            max_actions=inner.info.max_actions,
+            history_dtype=inner.info.history_dtype,
+        )
         if arm.parts:
             self.config["probe"] = [arm.name, options_of(arm)]
 
@@ -442,7 +441,7 @@ def with_sessions(policy: Policy, split: str, recordings: Any) -> Policy:
             f" {len(episodes)}: name them with recordings=…."
         )
     probed = ProbedPolicy(policy, read_arm(f"distract:{count}"), episodes).eval()
-    probed.n_distractor_episodes = count
+    probed.info = replace(probed.info, n_distractor_episodes=count)
     probed.config["sessions"] = [recording.name for recording in probed.sessions]
     return probed
 
