@@ -121,6 +121,10 @@ class Embodiment:
                 f"{where}: the state goes under this name in messages; call the camera something"
                 " else.",
             )
+            require(
+                "name" not in options,
+                f"{where}.name: a camera is named by its key, {brief(name)}; remove `name`.",
+            )
             cameras.append(validated(Camera, {**options, "name": name}, where, where))
         names = [camera.name for camera in cameras]
         memory_camera = values.memory_camera or names[0]

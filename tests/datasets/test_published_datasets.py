@@ -11,6 +11,7 @@ import pytest
 
 from helpers.h5_files import write_file
 from mme_vla.cli.exec_starts import annotated_episodes, first_frames, main
+from mme_vla.config.composition import compose
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
@@ -103,28 +104,25 @@ def converted(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return folder
 
 
-def make_side_file(
-    recordings: Path, dataset: Path, output: Path, monkeypatch: pytest.MonkeyPatch
-) -> Path:
+def make_side_file(recordings: Path, dataset: Path, output: Path) -> Path:
     words = [f"input={recordings}", f"dataset={dataset}", f"output={output}"]
-    monkeypatch.setattr("sys.argv", ["exec_starts", *words])
-    main()
+    main(compose("exec_starts", words))
     return output
 
 
 def test_videos_in_av1_without_flags_are_read_with_a_side_file(
-    tmp_path: Path, recordings: Path, av1: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, recordings: Path, av1: Path
 ) -> None:
     with pytest.raises(UserError, match="does not mark its conditioning videos"):
         EpisodeSource(av1)
-    starts = make_side_file(recordings, av1, tmp_path / "starts.json", monkeypatch)
+    starts = make_side_file(recordings, av1, tmp_path / "starts.json")
     assert json.loads(starts.read_text()) == {"0": 2, "1": 4, "2": 0}
     source = EpisodeSource(av1, exec_starts=starts)
     assert source.exec_starts.tolist() == [2, 4, 0] and source.fps == 10
     assert source.frames(0, [0, 8]).shape == (2, 64, 64, 3)
     assert set(source.lossy) == {"front", "wrist"} and source.lossy["front"].startswith("av1")
-    with pytest.raises(SystemExit):
-        make_side_file(recordings, av1, starts, monkeypatch)
+    with pytest.raises(UserError, match="exists: name a new file"):
+        make_side_file(recordings, av1, starts)
 
 
 def test_a_memory_that_scores_patches_is_warned_of_lossy_videos(

@@ -230,9 +230,10 @@ class DiffusionProcessor(GoalProcessor):
 
     def collate(self, items: Sequence[dict[str, Any]]) -> DiffusionBatch:
         stacked: dict[str, Any] = {}
-        for name in items[0]:
-            stack = stack_history if name == "history" else torch.stack
-            stacked[name] = stack([item[name] for item in items])
+        for name in DiffusionBatch.__dataclass_fields__:
+            if name in items[0]:  # a sample may hold more than the network reads
+                stack = stack_history if name == "history" else torch.stack
+                stacked[name] = stack([item[name] for item in items])
         return DiffusionBatch(**stacked)
 
     # Folders
