@@ -18,7 +18,6 @@ from rich.table import Table
 
 from mme_vla.cli.command import log_to_terminal
 from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling, words_of
-from mme_vla.config.composition import resolved
 from mme_vla.config.devices import process_device
 from mme_vla.config.sections import read_section
 from mme_vla.envs.base import environment
@@ -43,6 +42,7 @@ from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import total_score
 from mme_vla.policy.base import Policy
+from mme_vla.policy.build import policy_config
 from mme_vla.policy.run_folders import find_run, trainings_in
 from mme_vla.subgoal import BackgroundPredictor, SubgoalPredictor, Usage, build_predictor
 from mme_vla.training.runs import check_finished
@@ -88,7 +88,7 @@ def main(cfg: DictConfig) -> None:
     """Run the episodes that have no result yet; of a folder of trainings those of one training
     after the other.
     """
-    config = resolved(cfg)
+    config = policy_config(cfg)
     run = EvalRun.from_config(config)
     trainings = []
     if run.policy.checkpoint is not None:

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from mme_vla.cli.command import log_to_terminal
 from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling
-from mme_vla.config.composition import resolved
+from mme_vla.policy.build import policy_config
 from mme_vla.serving.server import PolicyServer
 from mme_vla.serving.settings import ServeSettings, is_local
 
@@ -18,7 +18,7 @@ logger = logging.getLogger("mme_vla.serving")
 
 def main(cfg: DictConfig) -> None:
     """Serve `checkpoint`, or a fresh `model`, until SIGTERM or Ctrl-C."""
-    config = resolved(cfg)
+    config = policy_config(cfg)
     settings = ServeSettings.from_dict(config)
     choice = PolicyChoice.from_config(config)
     log_to_terminal(logger, clock=True)

@@ -13,11 +13,11 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torch import distributed
 
-from mme_vla.config.composition import command_trees, resolved
+from mme_vla.config.composition import command_trees
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, require
 from mme_vla.policy.base import Policy
-from mme_vla.policy.build import build_from_config
+from mme_vla.policy.build import build_from_config, policy_config
 from mme_vla.policy.finetune import (
     apply_finetuning,
     cast_frozen,
@@ -51,7 +51,7 @@ from mme_vla.utils import remove_drafts, started_processes, write_atomically
 def main(cfg: DictConfig) -> None:
     """Train from the beginning, or continue with a run that was interrupted."""
     begun = time.perf_counter()
-    run = TrainRun.from_config(resolved(cfg))
+    run = TrainRun.from_config(policy_config(cfg))
     folder = Path(run.output)
     named = True
     if HydraConfig.initialized():

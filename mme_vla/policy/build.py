@@ -5,7 +5,7 @@ commands use.
 import copy
 from collections.abc import Mapping, Set
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -185,12 +185,23 @@ def build_from_config(
     return policy.eval()
 
 
+def policy_config(cfg: DictConfig) -> dict[str, Any]:
+    """A command's configuration as plain values, with the embodiment of its environment.
+
+    Plugins are imported first: one of them may register the environment.
+    """
+    import_plugins(plugins_of(cfg, "the configuration"))
+    values = OmegaConf.to_container(with_embodiment(cfg), resolve=True)
+    return cast("dict[str, Any]", values)
+
+
 def with_embodiment(config: DictConfig) -> DictConfig:
     """The configuration with the embodiment of `env`, unless another than the default
     is selected.
     """
     name = config.get("env")
-    if name is None or config.embodiment.name != ROBOMME_JOINT.name:
+    robot = config.get("embodiment")
+    if name is None or robot is None or robot.name != ROBOMME_JOINT.name:
         return config
     section = ENVS[name].embodiment
     if section is None:

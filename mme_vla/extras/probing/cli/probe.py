@@ -9,10 +9,10 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import log_to_terminal, run_configured
-from mme_vla.config.composition import resolved
 from mme_vla.config.devices import process_device
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, require
+from mme_vla.policy.build import policy_config
 
 logger = logging.getLogger("mme_vla.probe")
 
@@ -47,7 +47,7 @@ def probe(cfg: DictConfig) -> None:
     )
     from mme_vla.utils import safe_name
 
-    values = resolved(cfg)
+    values = policy_config(cfg)
     if (folders := values["compare"]) is not None:
         listed = [folders] if isinstance(folders, str) else list(folders)
         print(table_of({folder: probed_folder(Path(folder)) for folder in listed}))
