@@ -43,6 +43,8 @@ import mme_vla
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path.append(str(REPOSITORY / "tests"))
+from net.models import words  # noqa: E402, beside the tests
+
 TINY = {
     "backbone.vision": {
         "image_size": 16,
@@ -137,18 +139,6 @@ ROLLOUT = [
 ]
 FINISHED = {"sweep": 1, "scripted": 2, "shared": 1}
 """Folder of runs → episodes of each task."""
-
-
-def words(settings: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Settings as words of a command line."""
-    found: list[str] = []
-    for key, value in settings.items():
-        found += (
-            words(value, f"{prefix}{key}.")
-            if isinstance(value, Mapping)
-            else [f"{prefix}{key}={value}"]
-        )
-    return found
 
 
 def nested(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -59,29 +59,29 @@ def main(cfg: DictConfig) -> None:
     """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw its
     memory.
     """
-    wanted = Inspection.from_config(resolved(cfg))
+    inspection = Inspection.from_config(resolved(cfg))
     console = Console(markup=False)
-    if (wanted.checkpoint is None) == (wanted.dataset is None):
+    if (inspection.checkpoint is None) == (inspection.dataset is None):
         raise UserError(
             "Name one thing to inspect: checkpoint=<folder>, or dataset=<folder> (`sample` is built"
             " in)."
         )
-    if wanted.checkpoint is not None:
-        show_checkpoint(Path(wanted.checkpoint), console, wanted.trust_plugins)
+    if inspection.checkpoint is not None:
+        show_checkpoint(Path(inspection.checkpoint), console, inspection.trust_plugins)
         return
-    assert wanted.dataset is not None
-    robot = Embodiment.from_dict(wanted.embodiment)
-    source = EpisodeSource(wanted.dataset, wanted.exec_starts, robot=robot)
-    if wanted.episode is None:
+    assert inspection.dataset is not None
+    robot = Embodiment.from_dict(inspection.embodiment)
+    source = EpisodeSource(inspection.dataset, inspection.exec_starts, robot=robot)
+    if inspection.episode is None:
         show_dataset(source, console)
         return
-    episode, step = check_place(source, wanted.episode, wanted.step)
+    episode, step = check_place(source, inspection.episode, inspection.step)
     show_episode(source, episode, step, console)
-    if wanted.memory is None:
+    if inspection.memory is None:
         return
-    memory = build_memory(wanted)
-    name = str(wanted.memory["name"])
-    image = draw_memory(source, episode, step, memory, name, Path(wanted.output), console)
+    memory = build_memory(inspection)
+    name = str(inspection.memory["name"])
+    image = draw_memory(source, episode, step, memory, name, Path(inspection.output), console)
     console.print(f"image: {image}", highlight=False, soft_wrap=True)
 
 
@@ -207,12 +207,12 @@ def check_place(source: EpisodeSource, episode: int, step: int | None) -> tuple[
     return episode, step
 
 
-def build_memory(wanted: Inspection) -> Memory:
+def build_memory(inspection: Inspection) -> Memory:
     """The memory that is named, of any width: it is only asked to select."""
-    if wanted.memory is None:
+    if inspection.memory is None:
         raise UserError("memory=none: name a memory, such as memory=tokendrop.")
-    shape = shape_of(wanted.backbone)
-    return mme.build_memory(wanted.memory, shape.vision_width, shape.grid, shape.vision_width)
+    shape = shape_of(inspection.backbone)
+    return mme.build_memory(inspection.memory, shape.vision_width, shape.grid, shape.vision_width)
 
 
 def draw_memory(

@@ -90,10 +90,10 @@ def train_several(run: TrainRun, folder: Path) -> list[Path]:
     for number in range(run.trainings):
         place = folder / training_name(number)
         one = run.with_keys(seed=run.seed + number, output=str(place), resume="auto")
-        found = open_run(place, "auto", one.config)
-        is_finished = (place / SUMMARY).is_file() and found.step == one.train.steps
-        if is_finished and found.checkpoint is not None:
-            checkpoints.append(found.checkpoint)
+        existing = open_run(place, "auto", one.config)
+        is_finished = (place / SUMMARY).is_file() and existing.step == one.train.steps
+        if is_finished and existing.checkpoint is not None:
+            checkpoints.append(existing.checkpoint)
             continue
         print(f"training {number + 1} of {run.trainings}, seed {one.seed}, in {place}")
         checkpoints.append(train(one, place, time.perf_counter(), tower_seed=run.seed))

@@ -173,8 +173,8 @@ def _chunks(
     span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
     for start in range(0, length, span):
         stop = min(start + span, length)
-        kept = stored[(stored >= start) & (stored < stop)]
-        required = np.union1d(kept, scored[(scored >= start) & (scored < stop)])
+        in_chunk = stored[(stored >= start) & (stored < stop)]
+        required = np.union1d(in_chunk, scored[(scored >= start) & (scored < stop)])
         if not len(required):
             continue
         images = source.frames(episode, required)
@@ -184,7 +184,7 @@ def _chunks(
             if row is not None:
                 frames.append(frame)
                 values.append(np.asarray(row, np.float32))
-        yield _Chunk(stop - start, images[np.isin(required, kept)], frames, values)
+        yield _Chunk(stop - start, images[np.isin(required, in_chunk)], frames, values)
 
 
 def _build_episode(

@@ -203,16 +203,16 @@ def _match_foreign(
         known = {constant.path for constant in adapter.derived} | set(reduced.shapes(state))
         unknown = set(tensors) - known
         left = sorted(name for name in unknown if re.search(adapter.of_memory, name))
-        kept = {name: tensor for name, tensor in tensors.items() if name not in left}
-        return reduced, kept, left
+        named = {name: tensor for name, tensor in tensors.items() if name not in left}
+        return reduced, named, left
 
     def check_names(tensors: Mapping[str, Tensor]) -> None:
-        reduced, kept, _ = split(tensors)
-        reduced.check_fit(kept, state, source)
+        reduced, named, _ = split(tensors)
+        reduced.check_fit(named, state, source)
 
     tensors = checkpoint.tensors(check_names)
-    reduced, kept, left = split(tensors)
-    return reduced.translate(kept, state, source), left
+    reduced, named, left = split(tensors)
+    return reduced.translate(named, state, source), left
 
 
 def _part(policy: Policy, name: str) -> str | None:

@@ -299,13 +299,13 @@ def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, A
     for line in learning_curve(folder):
         if "val/loss" in line:
             losses.append((line["val/loss"], line["step"]))
-    found: dict[str, Any] = {"val_loss": None, "best_update": None}
+    metrics: dict[str, Any] = {"val_loss": None, "best_update": None}
     if losses:
-        found["val_loss"] = losses[-1][0]
-        found["best_update"] = min(losses)[1]
+        metrics["val_loss"] = losses[-1][0]
+        metrics["best_update"] = min(losses)[1]
     if policy.embodiment.action.choice:
-        return found | asdict(choice_errors(policy, val_set))
-    return found | {"off_by_m": position_error(policy, val_set).tolist()}
+        return metrics | asdict(choice_errors(policy, val_set))
+    return metrics | {"off_by_m": position_error(policy, val_set).tolist()}
 
 
 @lru_cache(maxsize=1)  # all trainings of a run have the same

@@ -355,12 +355,12 @@ def evaluate_tower(tower: PlaceTower, scenes: Scenes) -> dict[str, ClassResult]:
         n_reported = 0
         rows = (scenes.classes == number).nonzero()[:, 0]
         for image, report in enumerate(reports):
-            found = report[number]
-            n_reported += len(found)
+            places = report[number]
+            n_reported += len(places)
             centres = scenes.centres[rows[scenes.owners[rows] == image].numpy()]
-            distances = np.zeros((len(centres), len(found)))
+            distances = np.zeros((len(centres), len(places)))
             for row, (x, y, z) in enumerate(centres):
-                for column, place in enumerate(found):
+                for column, place in enumerate(places):
                     distances[row, column] = np.linalg.norm(on_plane(place, z) - (x, y))
             errors += match(100 * distances)
         results[name] = ClassResult(len(rows), n_reported, np.array(errors))

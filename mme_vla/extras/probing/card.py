@@ -360,11 +360,11 @@ def _scenes(folder: Path, plan: ProbePlan) -> Scenes:
     """Records of the card's scenes in a folder; those that ended in an error are left out."""
     scenes = {(job.task, job.split, job.episode) for job in plan.jobs}
     records = read_folders(path for path in find_records([folder]) if path.parent == folder)
-    found: Scenes = {}
+    by_scene: Scenes = {}
     for record in records:
         if record.outcome != "error" and (record.task, record.split, record.episode) in scenes:
-            found.setdefault(record.key, []).append(record)
-    return found
+            by_scene.setdefault(record.key, []).append(record)
+    return by_scene
 
 
 def _reference(name: str, place: str, plan: ProbePlan) -> Scenes:
