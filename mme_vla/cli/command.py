@@ -110,9 +110,9 @@ def _check_command_line(config_name: str, tree: Path) -> None:
         )
     extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     if args.help:
-        trees = [tree.resolve(), *extra]
-        if tree == config_dir():
-            trees += library_trees()[1:]
+        # As Hydra searches them: the extras' trees come before the user's.
+        trees = [*library_trees()] if tree == config_dir() else [tree.resolve()]
+        trees += extra
         print(help_page(args.config_name or config_name, args.overrides, trees))
         raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:

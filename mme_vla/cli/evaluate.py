@@ -19,7 +19,7 @@ from rich.table import Table
 from mme_vla.cli.command import log_to_terminal
 from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling, words_of
 from mme_vla.config.devices import process_device
-from mme_vla.config.sections import read_section
+from mme_vla.config.sections import PathText, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
 from mme_vla.errors import check_choice
@@ -67,8 +67,8 @@ class EvalRun:
     subgoal: Mapping[str, Any] | None
     subgoal_mode: str
     shard: Any
-    times_from: str | None
-    output: str | None
+    times_from: PathText | None
+    output: PathText | None
     policy: PolicyChoice
     rollout: RolloutSettings
 

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from PIL.Image import Image
 
 from mme_vla.config.composition import resolved
-from mme_vla.config.sections import Range, read_section
+from mme_vla.config.sections import PathText, Range, read_section
 from mme_vla.data.console import progress
 from mme_vla.envs import metadata
 from mme_vla.envs.episodes import choose_episodes, named_tasks
@@ -91,7 +91,7 @@ class Gallery:
     split: str
     episodes: Any
     tiles: Annotated[int, Range(least=2)]
-    output: str
+    output: PathText
 
 
 def main(cfg: DictConfig) -> None:

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from mme_vla.backbone.building import shape_of
 from mme_vla.config.composition import resolved
-from mme_vla.config.sections import read_section
+from mme_vla.config.sections import PathText, read_section
 from mme_vla.data.episodes import EpisodeSource, check_episode
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.data.memory_image import memory_sheet
@@ -43,7 +43,7 @@ class Inspection:
     exec_starts: str | None
     episode: int | None
     step: int | None
-    output: str
+    output: PathText
     trust_plugins: bool
     embodiment: Mapping[str, Any]
     backbone: Mapping[str, Any]
@@ -255,7 +255,6 @@ def draw_memory(
 
 
 def _table(title: str, *columns: str) -> Table:
-
     table = Table(title=printable(title), show_header=any(columns))
     for i, column in enumerate(columns):
         table.add_column(

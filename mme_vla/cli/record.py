@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 from omegaconf import DictConfig
 
 from mme_vla.config.composition import resolved
-from mme_vla.config.sections import PositiveInt, read_section
+from mme_vla.config.sections import PathText, PositiveInt, read_section
 from mme_vla.data.console import progress
 from mme_vla.data.convert import ConvertOptions, write_previews
 from mme_vla.envs.base import environment
@@ -43,7 +43,7 @@ class RecordRun:
     env: str
     episodes: Any
     split: str
-    output: str
+    output: PathText
     hdf5: str | None
     lerobot: bool
     previews: str | None

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.sections import NonNegativeInt, read_section
+from mme_vla.config.sections import NonNegativeInt, PathText, read_section
 from mme_vla.subgoal.finetuning.collecting import build, open_input
 from mme_vla.subgoal.finetuning.rows import RowOptions
 from mme_vla.subgoal.finetuning.training import write_arguments
@@ -18,7 +18,7 @@ class BuildSettings:
     """The keys of configs/subgoal_build.yaml."""
 
     input: str | tuple[str, ...]
-    output: str
+    output: PathText
     sets: tuple[Literal["simple", "grounded", "memer", "memer_simple"], ...]
     episodes: tuple[NonNegativeInt, ...] | None
     tasks: str | None

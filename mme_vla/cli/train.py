@@ -306,7 +306,7 @@ def config_of(run: TrainRun, place: Run) -> dict[str, Any]:
     if place.checkpoint is not None:
         began_with: dict[str, Any] = read_state(place.checkpoint)["config"]
         data = began_with["data"]
-        config["init_from"] = began_with["init_from"]
+        config["init_from"] = began_with.get("init_from")
         config["data"] = {**config["data"], "narrow_ranges": data.get("narrow_ranges")}
     return config
 

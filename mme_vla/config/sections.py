@@ -13,8 +13,8 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from annotated_types import BaseMetadata, Ge, GroupedMetadata, Gt, Le
-from pydantic import AllowInfNan, TypeAdapter, ValidationError
-from pydantic_core import to_json
+from pydantic import AllowInfNan, BeforeValidator, TypeAdapter, ValidationError
+from pydantic_core import PydanticSerializationError, to_json
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
 
@@ -61,6 +61,15 @@ PositiveInt = Annotated[int, Range(least=1)]
 NonNegativeInt = Annotated[int, Range(least=0)]
 
 
+def _number_as_text(value: Any) -> Any:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return str(value) if is_number else value
+
+
+PathText = Annotated[str, BeforeValidator(_number_as_text)]
+"""A path. A command line reads a folder called `7` as a number."""
+
+
 def read_section[T](
     kind: type[T], values: Any, where: str = "", *, others: bool = False, **fixed: Any
 ) -> T:
@@ -83,7 +92,12 @@ def read_section[T](
         values = {key: value for key, value in values.items() if key in known}
     section = {**section_keys(values, where, known), **fixed}
     # Read as JSON, whose lists and maps may become tuples and dataclasses in strict mode.
-    text = to_json(section, inf_nan_mode="constants", fallback=brief)
+    try:
+        text = to_json(section, inf_nan_mode="constants", fallback=brief)
+    except PydanticSerializationError as error:  # half of a surrogate pair
+        raise UserError(
+            f"{where or 'the configuration'} holds a text that is not Unicode: {brief(str(error))}."
+        ) from None
     if kind not in _ADAPTERS:
         _ADAPTERS[kind] = TypeAdapter(kind)
     try:
@@ -185,7 +199,8 @@ def _expected(kind: Any) -> str:
     """What a field takes, for messages."""
     inside = get_args(kind)
     if get_origin(kind) is Annotated:
-        return f"{_expected(inside[0])}{inside[1].text}"
+        bounds = "".join(part.text for part in inside[1:] if isinstance(part, Range))
+        return f"{_expected(inside[0])}{bounds}"
     if get_origin(kind) is Literal:
         return " or ".join(map(str, inside))
     if get_origin(kind) in (Union, UnionType):

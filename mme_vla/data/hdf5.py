@@ -117,8 +117,8 @@ class RawEpisode:
         require(
             steps and steps == list(range(self.length)),
             f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(self.length - 1, 0)}"
-            f" without gaps, found {self.length} steps, the last of them {steps[-1:]}. The file is"
-            " damaged.",
+            f" without gaps, found {self.length} steps up to number {max(steps, default=-1)}. The"
+            " file is damaged.",
         )
         needed = ["setup/task_goal"]
         needed += [f"timestep_0/{name}" for name in _REQUIRED]

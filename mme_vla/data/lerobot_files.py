@@ -280,20 +280,21 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
         " episode_index and exec_start_idx, all whole numbers from 0."
     )
     require_file(file, "exec_starts, first execution frames")
-    table: dict[Any, Any] = {}
+    rows: list[tuple[Any, Any]] = []
     if file.suffix == ".json":
         for key, value in read_json(file, "first execution frames").items():
             is_number = key.isdecimal() and len(key) < 10
-            table[int(key) if is_number else key] = value
+            rows.append((int(key) if is_number else key, value))
     else:
         import pyarrow.parquet as pq
 
         with decoding(file, "a parquet table", expected), pq.ParquetFile(file) as opened:
             columns = opened.read(columns=["episode_index", "exec_start_idx"]).to_pydict()
-            table.update(zip(columns["episode_index"], columns["exec_start_idx"], strict=True))
-    for episode, start in table.items():
+            rows += zip(columns["episode_index"], columns["exec_start_idx"], strict=True)
+    for episode, start in rows:
         if not all(type(number) is int and 0 <= number < 2**40 for number in (episode, start)):
             raise UserError(f"{file} says {brief(start)} of episode {brief(episode)}. {expected}")
+    table = dict(rows)
     missing = [episode for episode in range(episodes) if episode not in table]
     require(
         not missing,

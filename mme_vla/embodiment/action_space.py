@@ -193,7 +193,7 @@ class ActionSpace:
     frames: int | None = 1
     choice: Places = ()
     point: Places = ()
-    options_length: Annotated[int, Field(strict=True, ge=0, le=LARGEST)] = 0
+    options_length: Annotated[int, Field(strict=True, ge=0, le=LARGEST), NullIsDefault] = 0
     of_pose: Places = ()
     pose_key: Columns = ()
 

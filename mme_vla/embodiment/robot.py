@@ -109,7 +109,8 @@ class Embodiment:
             f" {brief(values.cameras)}.",
         )
         cameras = []
-        for name, settings in values.cameras.items():
+        for key, settings in values.cameras.items():
+            name = str(key)  # YAML reads a camera called 0 as a number
             where = f"embodiment.cameras.{name}"
             options = settings or {}
             require(

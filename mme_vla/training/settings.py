@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from mme_vla.config.sections import (
     NonNegative,
     NonNegativeInt,
+    PathText,
     Positive,
     PositiveInt,
     Range,
@@ -165,7 +166,7 @@ class TrainRun:
 
     name: str
     seed: int
-    output: str
+    output: PathText
     trainings: PositiveInt
     resume: str | None
     init_from: str | None

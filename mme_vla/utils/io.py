@@ -55,10 +55,12 @@ def disk_trouble(error: BaseException) -> str | None:
     """
     number: int | None = None
     place: str | None = None
+    visited: list[BaseException] = []  # causes may form a circle
     current: BaseException | None = error
-    while current is not None:
+    while current is not None and current not in visited:
+        visited.append(current)
         number = number or _refusal(current)
-        place = place or getattr(current, "filename", None)
+        place = getattr(current, "filename", None) or place
         current = current.__cause__ or current.__context__
     if number is None or (place is None and number in (errno.EACCES, errno.EPERM)):
         return None
@@ -88,12 +90,13 @@ def _refusal(error: BaseException) -> int | None:
     text = str(error)
     if isinstance(error, OSError) and _SHORT_WRITE.search(text):
         return errno.ENOSPC
-    match = _NUMBER_IN_TEXT.search(text)
     # Messages of users' mistakes may quote such a text.
-    if match is None or isinstance(error, ValueError | TypeError | LookupError):
+    if isinstance(error, ValueError | TypeError | LookupError):
         return None
-    number = int(match[1])
-    return number if number in _REFUSALS else None
+    for match in _NUMBER_IN_TEXT.finditer(text):
+        if int(match[1]) in _REFUSALS:
+            return int(match[1])
+    return None
 
 
 def require_file(path: Path, what: str = "a file") -> Path:

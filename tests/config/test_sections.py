@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import pytest
 
-from mme_vla.config.sections import Positive, Range, read_section
+from mme_vla.config.sections import PathText, Positive, Range, read_section
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.serving.settings import ServeSettings
@@ -34,6 +34,7 @@ class Outer:
     port: Annotated[int, Range(0, 9)] | None = None
     seconds: Positive = 1.0
     kind: Literal["simple", "grounded"] | None = None
+    output: PathText | None = None
 
 
 def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
@@ -94,6 +95,17 @@ def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
 def test_a_mistake_names_key_value_and_expectation(given: Any, message: str) -> None:
     with pytest.raises(UserError, match=message):
         read_section(Outer, given, "outer")
+
+
+def test_a_folder_may_be_called_by_a_number() -> None:
+    assert read_section(Outer, {"name": "a", "output": 7}).output == "7"
+    with pytest.raises(UserError, match="output=True must be a text or null"):
+        read_section(Outer, {"name": "a", "output": True})
+
+
+def test_half_a_surrogate_pair_is_refused() -> None:
+    with pytest.raises(UserError, match="outer holds a text that is not Unicode"):
+        read_section(Outer, {"name": "\ud800"}, "outer")
 
 
 def test_a_secret_is_not_reported() -> None:

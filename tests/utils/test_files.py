@@ -2,6 +2,7 @@
 sums, locks.
 """
 
+import errno
 import json
 import os
 import signal
@@ -29,6 +30,7 @@ from mme_vla.utils import (
     write_json,
     write_sums,
 )
+from mme_vla.utils.io import disk_trouble
 
 DEEP = "[" * 200_000
 
@@ -221,3 +223,11 @@ def test_reading_takes_the_memory_that_a_file_needs_not_its_limit(tmp_path: Path
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
         tracemalloc.stop()
+
+
+def test_errors_that_cause_each_other_are_described_once() -> None:
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/full/disk")
+    outer = RuntimeError("cannot save")
+    outer.__cause__ = full
+    full.__cause__ = outer
+    assert str(disk_trouble(outer)).startswith("/full/disk cannot be written or opened")

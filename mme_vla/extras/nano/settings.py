@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
-from mme_vla.config.sections import NonNegativeInt, PositiveInt, read_section
+from mme_vla.config.sections import NonNegativeInt, PathText, PositiveInt, read_section
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class NanoRun:
     memories: Mapping[str, Mapping[str, Any]]
     plugins: Any
     seed: int
-    output: str
+    output: PathText
     config: Mapping[str, Any]
 
     @classmethod

@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from mme_vla.cli.command import log_to_terminal
 from mme_vla.config.composition import resolved
-from mme_vla.config.sections import PositiveInt, Range, read_section
+from mme_vla.config.sections import PathText, PositiveInt, Range, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.metadata import EpisodeSpec
@@ -53,7 +53,7 @@ class PlayCommand:
     env: str
     max_steps: PositiveInt | None
     retry_errors: bool
-    output: str
+    output: PathText
     host: str
     port: Annotated[int, Range(0, 65535)]
 

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from mme_vla.cli.command import log_to_terminal
 from mme_vla.config.composition import compose, resolved
-from mme_vla.config.sections import NonNegativeInt, Positive, PositiveInt, read_section
+from mme_vla.config.sections import NonNegativeInt, PathText, Positive, PositiveInt, read_section
 from mme_vla.data.console import progress
 from mme_vla.envs.episodes import choose_tasks
 from mme_vla.envs.make import require_simulator
@@ -39,7 +39,7 @@ class PretrainRun:
     lr: Positive
     save_every: PositiveInt
     seed: int
-    output: str
+    output: PathText
 
 
 def main(cfg: DictConfig) -> None:
