@@ -84,7 +84,12 @@ def make_env(
         scene = metadata.episode(task, split, episode).options
     if recovery is not None:
         scene["recovery"] = recovery
-    include = include or Include()
+    if include is None:
+        include = Include()
+    require(
+        isinstance(include, Include),
+        f"include={include!r} must be an Include, such as Include(front_depth=True).",
+    )
     if action_space == "multi_choice":
         # A policy that chooses a pixel needs the front camera's matrices.
         include = replace(include, front_camera_extrinsic=True, front_camera_intrinsic=True)

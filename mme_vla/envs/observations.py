@@ -64,8 +64,8 @@ _FRONT_EYE, _FRONT_TARGET = np.array([0.3, 0.0, 0.4]), np.array([0.0, 0.0, -0.2]
 class Include:
     """What a frame or an info dict holds beyond the standard keys.
 
-    possible: with `available_multi_choices`, whether an object that each option fits is within
-        reach. (The benchmark offers such options, and choosing one ends the episode.)
+    possible: where options are listed, whether an object that each option fits is within reach.
+        (The benchmark offers such options, and choosing one ends the episode.)
     """
 
     front_depth: bool = False

@@ -31,7 +31,7 @@ from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import require
+from mme_vla.errors import check_choice, require
 from mme_vla.utils.processes import signals_deferred
 
 
@@ -345,7 +345,7 @@ def _work(plugins: Sequence[str], *arguments: Any) -> None:
 
 def make_vec_env(
     tasks: str | Sequence[str],
-    episodes: Sequence[int] | None = None,
+    episodes: Iterable[int] | None = None,
     workers: int = 2,
     split: str = "test",
     action_space: str = "joint_angle",
@@ -366,22 +366,26 @@ def make_vec_env(
         timeout: seconds after which a command without result counts as hung.
         factory: what makes an environment, importable by name.
         env: the environment whose tasks these are; another one than RoboMME is opened itself.
-        options: further arguments of `make_env`, such as `max_steps`, `render` and `include`.
+        options: further arguments of `make_env`, such as `max_steps`, `render` and `include`;
+            `max_steps` and `render` alone for another environment.
     """
     names = [tasks] if isinstance(tasks, str) else list(tasks)
     require(names, "No task given; expected a task name or several.")
     source = environment(env)
+    if factory is make_env:
+        source.check_installed()
+    chosen = None if episodes is None else list(episodes)
     jobs = []
     for name in names:
         if factory is make_env and env == ROBOMME:
             check_names(name, action_space, None, None)
-        numbers = episodes
+        numbers = chosen
         if numbers is None:
-            numbers = range(len(source.episodes(name, split)))
+            numbers = list(range(len(source.episodes(name, split))))
         for number in numbers:
             jobs.append(Job(name, split, source.episode(name, split, number).episode))
-    if factory is make_env:
-        source.check_installed()
-        if env != ROBOMME:
-            factory = partial(open_episode, env)
+    if factory is make_env and env != ROBOMME:
+        for option in options:  # a process would end with a traceback
+            check_choice(f"options of env={env}", option, ("max_steps", "render"))
+        factory = partial(open_episode, env)
     return VecEnv(jobs, workers, factory, {"action_space": action_space, **options}, timeout)

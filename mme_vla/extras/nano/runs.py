@@ -39,14 +39,13 @@ from mme_vla.extras.nano.evaluating import (
 from mme_vla.extras.nano.fitting import Training, compose_policy, train_in_process
 from mme_vla.extras.nano.learning import check_reflection
 from mme_vla.extras.nano.page import write_page
-from mme_vla.extras.nano.settings import NanoRun
+from mme_vla.extras.nano.settings import STAGES, NanoRun
 from mme_vla.extras.nano.tokens import TokenStore
 from mme_vla.utils import read_json, write_json
 
 logger = logging.getLogger("mme_vla.nano")
 SEEDS_APART = 100_000  # first seeds of two difficulties
 RETRIES = 20  # scenes in a row that no demonstration succeeds in
-STAGES = ("record", "tokens", "train", "evaluate", "all")
 
 
 def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
@@ -194,7 +193,9 @@ def evaluate_all(
     """
     rules = rules_of(nano)
     specs = episodes_of(nano, folder, nano.episodes)
-    further = episodes_of(nano, folder, nano.also_episodes) if nano.also else specs
+    further = specs
+    if nano.also and nano.also_episodes is not None:
+        further = episodes_of(nano, folder, nano.also_episodes)
     records: dict[str, list[EpisodeRecord]] = {}
     for row, of_row in jobs.items():
         selected = further if nano.is_further(row) else specs
@@ -203,10 +204,8 @@ def evaluate_all(
         for name in [row] if oracle is None else [row, oracle]:
             records[name] = []
             for job in of_row:
-                place, ceiling = (
-                    folder / name / str(job.config["seed"]),
-                    None if name == row else oracle,
-                )
+                place = folder / name / str(job.config["seed"])
+                ceiling = None if name == row else oracle
                 records[name] += evaluate_row(
                     job.folder, job.checkpoint, place, selected, rules, ceiling
                 )

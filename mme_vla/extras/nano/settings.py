@@ -2,9 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 from mme_vla.config.sections import NonNegativeInt, PathText, PositiveInt, read_section
+
+Stage = Literal["record", "tokens", "train", "evaluate", "all"]
+STAGES: tuple[Stage, ...] = get_args(Stage)
+"""In the order in which they run."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class NanoRun:
     """
 
     task: Any
-    stage: Literal["record", "tokens", "train", "evaluate", "all"]
+    stage: Stage
     with_memory: str | tuple[str, ...]
     budget: int | tuple[int, ...] | None
     trainings: PositiveInt
@@ -70,6 +74,7 @@ class NanoRun:
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read a composed configuration, plain and resolved."""
         run = read_section(cls, config, others=True, config={})
+        read_section(LearningSettings, config["learning"], "learning")
         return replace(run, train=config["train"], learning=config["learning"], config=config)
 
     @property

@@ -198,7 +198,7 @@ class SAM2ActPolicy(NetworkPolicy):
         self.horizon, self.action_dim = 1, WIDTH
         sizes = backbone.sizes
         processor_sizes = {"text.width": sizes.language, "text.words": sizes.words}
-        self.info = PolicyInfo(processor_sizes=processor_sizes)
+        self.info = replace(self._info, processor_sizes=processor_sizes)
         # Single keyframes first, then one more than can be remembered.
         self.keyframes = 1 if stage == "first" else backbone.sizes.remembered + 1
 
