@@ -22,6 +22,7 @@ from mme_vla.envs.robomme.scene.predicates import (
 from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import (
+    SAMPLED_COLOURS,
     add_button,
     press,
     press_choice,
@@ -34,7 +35,6 @@ AVAILABLE = {"easy": 1, "medium": 2, "hard": 3}
 GOAL_COLOURS = {"easy": (1, 1), "medium": (1, 2), "hard": (2, 3)}
 GOAL_CUBES = {"easy": (1, 3), "medium": (2, 4), "hard": (3, 5)}
 CUBES = {"easy": (4, 6), "medium": (8, 10), "hard": (10, 12)}
-COLOURS = ("red", "blue", "green")
 ORDERED = ("blue", "red", "green")  # from which the order of the sub-tasks is sampled
 BOARD_X = 0.15  # metres
 TABLE = Region((-0.1, 0.0), (0.2, 0.25))
@@ -68,17 +68,17 @@ class BinFill(Task):
         self.board = self.add(build_board(self, (BOARD_X + dx, y), math.radians(degrees)))
         numbers = values("objects.target_numbers", lambda: self._draw_counts(draws))
         are_counts = isinstance(numbers, list) and all(type(n) is int and n >= 0 for n in numbers)
-        if not are_counts or len(numbers) != len(COLOURS) or not any(numbers):
+        if not are_counts or len(numbers) != len(SAMPLED_COLOURS) or not any(numbers):
             raise values.error(
                 "objects.target_numbers", f"is {numbers}; expected three numbers: red, blue, green"
             )
-        self.goal = Counter(dict(zip(COLOURS, numbers, strict=True)))
-        self.cubes: dict[str, list[Cube]] = {colour: [] for colour in COLOURS}
+        self.goal = Counter(dict(zip(SAMPLED_COLOURS, numbers, strict=True)))
+        self.cubes: dict[str, list[Cube]] = {colour: [] for colour in SAMPLED_COLOURS}
         if values.specified:
             self._read_cubes()
         else:
             self._draw_cubes(draws)
-        for colour in COLOURS:
+        for colour in SAMPLED_COLOURS:
             if len(self.cubes[colour]) < self.goal[colour]:
                 problem = f"a {colour} cube for the bin"
                 if values.specified:
@@ -89,7 +89,7 @@ class BinFill(Task):
         """How many red, blue and green cubes belong into the bin; also samples how many lie on the
         table.
         """
-        available = [COLOURS[i] for i in draws.permutation(3)][: AVAILABLE[self.difficulty]]
+        available = [SAMPLED_COLOURS[i] for i in draws.permutation(3)][: AVAILABLE[self.difficulty]]
         low, high = GOAL_COLOURS[self.difficulty]
         selected = available[: draws.integer(low, high + 1)]
         low, high = GOAL_CUBES[self.difficulty]
@@ -107,12 +107,12 @@ class BinFill(Task):
             # With one colour nothing is sampled.
             index = draws.integer(0, len(available)) if len(available) > 1 else 0
             self.spawned[available[index]] += 1
-        return [goal[colour] for colour in COLOURS]
+        return [goal[colour] for colour in SAMPLED_COLOURS]
 
     def _draw_cubes(self, draws: Draws) -> None:
         """Add cubes at random places; one that finds no place is left out."""
         colours: list[str] = []
-        for colour in COLOURS:
+        for colour in SAMPLED_COLOURS:
             colours += [colour] * self.spawned[colour]
         count = 0
         for i in draws.permutation(len(colours)):
@@ -136,9 +136,10 @@ class BinFill(Task):
             )
         for i, name in enumerate(names):
             colour = str(name).split("_")[0]
-            if colour not in COLOURS:
+            if colour not in SAMPLED_COLOURS:
                 raise self.values.error(
-                    f"objects.slot_assignment.{i}", f"is {name!r}; expected {', '.join(COLOURS)}"
+                    f"objects.slot_assignment.{i}",
+                    f"is {name!r}; expected {', '.join(SAMPLED_COLOURS)}",
                 )
             self._add_cube(colour, self.values.place(f"layout.slots.{i}", list, size=3))
 
@@ -164,7 +165,7 @@ class BinFill(Task):
         """A disc for each cube that is still to be put into the bin, of its colour."""
         places = row(self.goal.total())
         cues: list[Cue] = []
-        for colour in COLOURS:
+        for colour in SAMPLED_COLOURS:
             count = self.goal[colour]
             cues += tally(places[:count], partial(self._missing, colour), colour)
             places = places[count:]
@@ -181,7 +182,7 @@ class BinFill(Task):
         if self.progress.index < len(self.progress.subtasks) - 1:
             return pressed(self.button)
         surplus = any(self._falls_into_bin(cube) for cube in self.all_cubes())
-        return surplus or any(self._missing(colour) for colour in COLOURS)
+        return surplus or any(self._missing(colour) for colour in SAMPLED_COLOURS)
 
     def _falls_into_bin(self, cube: Cube) -> bool:
         near = distance_xy(cube.position, self.board.position) <= ON_TARGET
@@ -236,7 +237,7 @@ class BinFill(Task):
 
     def goals(self) -> list[str]:
         parts: list[str] = []
-        for colour in COLOURS:
+        for colour in SAMPLED_COLOURS:
             count = self.goal[colour]
             if count == 1:
                 parts.append(f"one {colour} cube")

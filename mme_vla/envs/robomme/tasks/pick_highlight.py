@@ -11,6 +11,7 @@ from mme_vla.envs.robomme.scene.placement import Draws, Region
 from mme_vla.envs.robomme.scene.predicates import any_picked_up, picked_up
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import (
+    SAMPLED_COLOURS,
     add_button,
     add_cube,
     pick,
@@ -77,7 +78,7 @@ class PickHighlight(Task):
         if self.values.find("objects.color_rgba") is not None:
             return self.values.colour(f"objects.color_rgba.{i}", list)
         return self.values.word(
-            f"objects.colors.{i}", lambda: ("red", "blue", "green")[draws.integer(0, 3)], COLOURS
+            f"objects.colors.{i}", lambda: SAMPLED_COLOURS[draws.integer(0, 3)], COLOURS
         )
 
     def cues(self) -> list[Cue]:

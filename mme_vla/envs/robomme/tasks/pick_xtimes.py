@@ -9,6 +9,7 @@ from mme_vla.envs.robomme.scene.placement import Draws, Region
 from mme_vla.envs.robomme.scene.predicates import any_picked_up, pressed
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import (
+    SAMPLED_COLOURS,
     add_button,
     add_cubes,
     add_distractors,
@@ -24,7 +25,6 @@ from mme_vla.envs.robomme.tasks.families.stages import (
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 
-COLOURS = ("red", "blue", "green")
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
 REPETITIONS = {"easy": (1, 3), "medium": (1, 3), "hard": (4, 5)}  # fewest and most
 TABLE = Region((-0.1, 0.0), 0.2)
@@ -44,7 +44,7 @@ class PickXtimes(Task):
 
     def build(self, draws: Draws) -> None:
         self.button = add_button(self, draws, (-0.2, 0.0))
-        colours = sample_colours(self, draws, COLOURS)[: CUBES[self.difficulty]]
+        colours = sample_colours(self, draws, SAMPLED_COLOURS)[: CUBES[self.difficulty]]
         draws.integer(0, 3)  # part of the official stream, without effect
         self.cubes = add_cubes(self, draws, colours, TABLE, [self.button])
         avoid = [self.button, *self.cubes]

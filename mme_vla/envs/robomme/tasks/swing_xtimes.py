@@ -10,6 +10,7 @@ from mme_vla.envs.robomme.scene.predicates import any_picked_up, pressed
 from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import (
+    SAMPLED_COLOURS,
     add_button,
     add_cubes,
     add_distractors,
@@ -27,7 +28,6 @@ from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 
 SWINGS = {"easy": (1, 3), "medium": (1, 2), "hard": (3, 3)}
-COLOURS = ("red", "blue", "green")
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
 TABLE = Region((-0.1, 0), 0.25)
 TARGET_RADIUS = 0.04
@@ -75,7 +75,7 @@ class SwingXtimes(Task):
 
     def build(self, draws: Draws) -> None:
         self.button = add_button(self, draws, (-0.2, 0))
-        colours = sample_colours(self, draws, COLOURS)[: CUBES[self.difficulty]]
+        colours = sample_colours(self, draws, SAMPLED_COLOURS)[: CUBES[self.difficulty]]
         draws.integer(0, 3)  # part of the official stream, without effect
         self.cubes = add_cubes(self, draws, colours, TABLE, [self.button])
         targets: list[Disc] = []

@@ -21,6 +21,7 @@ from mme_vla.envs.robomme.scene.placement import ANCHOR_HALF, Draws, Region, rot
 from mme_vla.envs.robomme.scene.predicates import StaticFor, any_picked_up, pressed
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import (
+    SAMPLED_COLOURS,
     add_button,
     add_cube,
     delay,
@@ -36,7 +37,6 @@ from mme_vla.envs.robomme.tasks.families.stages import (
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 
-SAMPLED_COLOURS = ("red", "blue", "green")
 SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
 ROUNDS = 5  # of the three colours, in hard episodes
 GO_HOME_STEPS = 20

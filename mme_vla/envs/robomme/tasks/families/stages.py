@@ -30,6 +30,8 @@ from mme_vla.envs.robomme.scene.things import Thing
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 
+SAMPLED_COLOURS = ("red", "blue", "green")
+"""The colours of cubes in the order in which the benchmark samples them."""
 TARGET_THICKNESS = 0.005
 RELEASE_Z = 0.07
 """Height of the tool where it lets a cube go, unless a task has its own, metres."""

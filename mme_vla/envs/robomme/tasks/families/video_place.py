@@ -15,6 +15,7 @@ from mme_vla.envs.robomme.scene.placement import Avoid, Draws, Region
 from mme_vla.envs.robomme.scene.predicates import any_picked_up, dropped, dropped_onto
 from mme_vla.envs.robomme.scene.things import Thing
 from mme_vla.envs.robomme.tasks.families.stages import (
+    SAMPLED_COLOURS,
     add_button,
     add_cubes,
     add_target,
@@ -32,7 +33,6 @@ from mme_vla.envs.robomme.tasks.families.stages import (
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 
-COLOURS = ("red", "blue", "green")
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
 TARGET_RADIUS = 0.04
 TABLE_Z = 0.01
@@ -75,7 +75,7 @@ class VideoPlace(Task):
             self, draws, "spot", "layout.goal_xy", region, self.spot_radius, [], gap=H
         )
         self.button = add_button(self, draws, (0.1, 0), (0.05, 0.3))
-        colours = sample_colours(self, draws, COLOURS)[: CUBES[self.difficulty]]
+        colours = sample_colours(self, draws, SAMPLED_COLOURS)[: CUBES[self.difficulty]]
         self.cubes = add_cubes(self, draws, colours, table, [self.spot, self.button])
         self.targets = self._add_targets(draws, table)
         # The spot is not to be seen: a cube is put down where it would be.
