@@ -15,6 +15,7 @@ none.
 """
 
 import argparse
+import gc
 import json
 import os
 import sys
@@ -78,6 +79,7 @@ def chunk(model: str, backbone: str = "pi05") -> dict[str, float]:
         memory = policy.encode_memory(batch.history)
     # an episode's tokens are counted where episodes are
     batch = replace(batch, history=None, actions=None)
+    gc.collect()  # a policy and its model refer to each other
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
     for _ in range(2):

@@ -166,9 +166,11 @@ class Registry[T]:
     def _shipped(self) -> dict[str, str]:
         """Name → module: the library's own, its extras', and those of installed packages."""
         modules = dict(self._core)
+        keys = {self.key, *(key for key, registry in REGISTRIES.items() if registry is self)}
         for extension in extensions():
-            for name, module in extension.parts.get(self.key, {}).items():
-                modules.setdefault(name, module)
+            for key in sorted(keys):
+                for name, module in extension.parts.get(key, {}).items():
+                    modules.setdefault(name, module)
         return modules
 
     def _module_of(self, name: str) -> str | None:

@@ -236,7 +236,7 @@ class Batch(TensorStruct):
     options: [b, letters] bool; the letters offered to a policy that chooses among options. None
         means all.
     weight: [b] float32; multiplies each sample's loss (`data.weights`). None counts all alike.
-    labels: in training, labels of the current frame (`ReadsLabels` of a backbone).
+    labels: in training, labels of the current frame (`ReadsLabels` of any part but the memory).
     """
 
     images: Tensor
@@ -270,11 +270,11 @@ class Batch(TensorStruct):
 
 
 class ReadsLabels:
-    """Capability of a memory or a backbone: it learns from labels of the dataset.
+    """Capability of a memory, an integration or a backbone: it learns from labels of the dataset.
 
     reads_labels: columns of numbers in the dataset: `subtask_boundary` (1 where a sub-task begins,
         else 0) or `subtask_index` (how many sub-tasks have begun). A memory has them by frame in
-        `HistoryTokens.labels`, a backbone of the current frame in `Batch.labels`.
+        `HistoryTokens.labels`, the others of the current frame in `Batch.labels`.
     """
 
     reads_labels: Sequence[str] = ()

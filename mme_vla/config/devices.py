@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from mme_vla.errors import UserError, check_choice
+from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
     import torch
@@ -49,13 +49,6 @@ def process_device(name: str) -> "torch.device":
     if device.type != "cuda" or device.index is not None:
         return device
     return torch.device("cuda", rank % torch.cuda.device_count())
-
-
-def checked_products(how: str) -> str:
-    """`how`, once it is one of `FLOAT32_PRODUCTS`."""
-    # exact; inputs keep ten bits on a GPU
-    check_choice("policy.float32_products", how, FLOAT32_PRODUCTS)
-    return how
 
 
 @contextmanager

@@ -394,6 +394,9 @@ def _code(folders: frozenset[str]) -> dict[str, str]:
             changes = [change for change in status if f"mme_vla/{folder}/" in change]
             if changes:
                 changes += _git("diff", "HEAD", "--", folder)
+                new_files = _git("ls-files", "--others", "--exclude-standard", "--", folder)
+                if new_files:
+                    changes += _git("hash-object", "--", *new_files)
                 names[f"git {folder}"] += f"+{digest({'changes': changes}, 12)}"
     except (OSError, subprocess.CalledProcessError):  # no clone, or no git
         return {}

@@ -303,6 +303,10 @@ def build_perturbation(section: Mapping[str, Any], option: str, key: str) -> Per
     name = section["name"]
     check_choice(f"{key}: name", name, PERTURBATIONS)
     kind: Any = PERTURBATIONS[name]
+    require(
+        isinstance(kind, type) and issubclass(kind, Perturbation),
+        f"{key}: {name} must be a class that derives from mme_vla.Perturbation, and is {kind!r}.",
+    )
     serving = [f"{other}=…" for other, hooks in _HOOKS.items() if overrides(kind, *hooks)]
     require(
         f"{option}=…" in serving or not serving,

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import FineTuneSpec as FineTuneSpec
 from mme_vla.errors import UserError, brief, check_choice, did_you_mean, missing_extra, require
 from mme_vla.policy.tensor_files import dtype_of
 

@@ -15,9 +15,9 @@ from mme_vla.backbone.building import read_backbone, shapes_only
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.backbone.layers import check_backend
 from mme_vla.backbone.siglip import pool_grid
-from mme_vla.config.devices import checked_products
+from mme_vla.config.devices import FLOAT32_PRODUCTS
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, listed
+from mme_vla.errors import UserError, check_choice, listed
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import (
     MemoryModule,
@@ -108,7 +108,7 @@ class MMEPolicy(NetworkPolicy):
                 f"policy.attention={attention}: {type(backbone).__name__} has one attention"
                 " backend; leave it at auto."
             )
-        checked_products(float32_products)
+        check_choice("policy.float32_products", float32_products, FLOAT32_PRODUCTS)
         for module in self.modules():
             if isinstance(module, RecurrentMemory):
                 module.float32_products = float32_products
@@ -234,7 +234,8 @@ class MMEPolicy(NetworkPolicy):
             )
         count, generator = len(batch.actions), torch.default_generator
         values = named_noise(noise, time=time)
-        if not isinstance(noise, Mapping) and time is None:
+        is_complete = isinstance(noise, Mapping) or (noise is not None and time is not None)
+        if not values or not is_complete:
             values = self.training_noise(count, generator) | values
         if "changes" not in values:
             values = self.augmentation_params(count, generator) | values
@@ -461,7 +462,8 @@ class MMEPolicy(NetworkPolicy):
         if "memory" in components:
             of_memory += f"|{components['memory']}"
         components["memory"] = of_memory
-        return replace(spec, components=components)
+        frozen = None if spec.frozen is None else rf"backbone\.(?:{spec.frozen})"
+        return replace(spec, components=components, frozen=frozen)
 
 
 def mme_of(policy: Policy, what: str) -> MMEPolicy:

@@ -38,7 +38,7 @@ def check_backbone(name: str, **sizes: Any) -> None:
         " repeats"
     )
     check_parts(backbone)
-    print(f"{name}: parts() covers every parameter, vision and action among them")
+    print(f"{name}: finetune_spec covers every parameter, vision and action among them")
 
 
 def _batch(backbone: Backbone) -> Batch:
@@ -117,9 +117,12 @@ def check_sample(backbone: Backbone, batch: Batch) -> None:
 
 
 def check_parts(backbone: Backbone) -> None:
-    """Every parameter belongs to a part, and the parts fine-tuning freezes have parameters."""
+    """Every parameter belongs to a component; those that fine-tuning freezes have parameters."""
     spec = backbone.finetune_spec
-    parts = {spec.component_of(name) for name, _ in backbone.named_parameters()}
+    try:
+        parts = {spec.component_of(name) for name, _ in backbone.named_parameters()}
+    except ValueError as error:
+        raise AssertionError(str(error)) from None
     assert {"vision", "action"} <= parts, (
         "the components of finetune_spec must name 'vision' and 'action'; parameters fall into"
         f" {parts}."

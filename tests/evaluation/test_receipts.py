@@ -4,6 +4,7 @@ import json
 import lzma
 import re
 import shutil
+import subprocess
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -458,6 +459,24 @@ def test_the_code_that_can_change_a_result_is_named_by_git_and_no_source_is_read
     assert all(re.fullmatch(r"[0-9a-f]{40}(\+[0-9a-f]{12})?", name) for name in names.values())
     assert receipts._extras_of(quick_policy("framesamp_modul")) == set()
     assert receipts._extras_of(nano()) == {"extras/nano"}
+
+
+def test_the_content_of_a_new_file_is_part_of_the_codes_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "mme_vla"
+    (package / "memory").mkdir(parents=True)
+    (package / "evaluation").mkdir()
+    (package / "memory" / "old.py").write_text("old = 1\n")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.example"]
+    for words in (["init", "-q"], ["add", "."], ["commit", "-qm", "a"]):
+        subprocess.run([*git, *words], check=True)
+    monkeypatch.setattr(receipts, "__file__", str(package / "evaluation" / "receipts.py"))
+    names = [NAMES_OF_CODE(frozenset({"memory"}))["git memory"]]
+    for content in ("new = 1\n", "new = 2\n"):
+        (package / "memory" / "new.py").write_text(content)
+        names.append(NAMES_OF_CODE(frozenset({"memory"}))["git memory"])
+    assert len(set(names)) == 3
 
 
 def test_digests_of_the_code_that_earlier_versions_wrote_are_not_compared(finished: Path) -> None:

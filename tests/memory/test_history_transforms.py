@@ -106,6 +106,22 @@ def test_entries_that_are_no_transforms_are_reported() -> None:
             build_transforms(entries)
 
 
+def test_what_is_no_perturbation_is_refused_by_name() -> None:
+    register("perturbation", "a_function")(lambda: None)
+    try:
+        with pytest.raises(UserError, match="a_function must be a class that derives from"):
+            build_transforms(["a_function"])
+    finally:
+        del PERTURBATIONS._entries["a_function"]
+
+
+def test_a_pause_is_written_by_the_name_that_a_probe_was_given() -> None:
+    (repeated,) = options_of(read_arm("repeat_frame:16"))
+    assert repeated == {"intervention": "RepeatFrame", "frames": 16, "at": None, "p": 1.0}
+    (paused,) = options_of(read_arm("pause:16"))
+    assert paused == {"intervention": "Pause", "frames": 16, "at": 0}
+
+
 def test_a_transform_that_returns_too_few_numbers_is_reported() -> None:
     class Short(Perturbation):
         def repeats(

@@ -271,6 +271,16 @@ def test_foreign_checkpoints_are_refused(tmp_path):
         MMEPolicy.from_pretrained(tmp_path / "other")
 
 
+def test_noise_that_is_not_given_is_sampled():
+    policy = small_policy("pi05", backbone=FEW_TOKENS)
+    batch = random_batch(policy, batch=2)
+    noise, time_ = torch.randn(batch.actions.shape), torch.full((2,), 0.5)
+    with torch.no_grad():
+        for given in ({}, {"noise": {}}, {"noise": noise}, {"time": time_}):
+            loss, _ = policy(batch, **given)
+            assert torch.isfinite(loss)
+
+
 def test_a_masked_loss_does_not_depend_on_what_is_computed_together():
     policy = small_policy("pi05", backbone=FEW_TOKENS)
     batch = random_batch(policy, batch=4)

@@ -248,9 +248,9 @@ def extrapolation(
     table["run"] = [str(run._replace(split=BASE)) for run in table["run"]]
     table["amount"] = amounts
     curves: Extrapolation = {}
-    for (run, task, amount), members in table.groupby(["run", "task", "amount"]):
+    for (run, task, amount), members in table.groupby(["run", "task", "amount"], sort=False):
         curves.setdefault((run, task), {})[amount] = count_successes(members, confidence)
-    return curves
+    return {curve: dict(sorted(points.items())) for curve, points in curves.items()}
 
 
 def extrapolation_table(curves: Extrapolation) -> Table | None:

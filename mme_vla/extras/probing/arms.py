@@ -192,10 +192,14 @@ def choose_arms(
 
 def options_of(arm: Arm) -> list[dict[str, Any]]:
     """The options of an arm's parts, as plain values."""
+    words = arm.name.split("+")
     options = []
-    for part in arm.parts:
+    for i, part in enumerate(arm.parts):
         values = {"intervention": type(part).__name__, **vars(part)}
-        if isinstance(part, Pause):  # as earlier versions named it, so that their probes continue
+        # The two names of a pause are written as two classes, so that probes of before continue.
+        if isinstance(part, Pause) and words[i : i + 1] and words[i].startswith("repeat_frame"):
+            values["intervention"] = "RepeatFrame"
+        elif isinstance(part, Pause):
             values = {"intervention": "Pause", "frames": part.frames, "at": part.at or 0}
         options.append(values)
     return options

@@ -19,7 +19,6 @@ from mme_vla.extras.probing.arms import UNPROBED, Arm, options_of, read_arm
 from mme_vla.extras.probing.channels import Channel, MemorySnapshot, Remembered, channel_of
 from mme_vla.extras.probing.interventions import Moment
 from mme_vla.extras.probing.recordings import SUBGOAL, Recording, all_recordings, stored_frames
-from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode
 from mme_vla.processing.prompt import subgoal_kind
@@ -264,9 +263,6 @@ class ProbedPolicy(Policy):
         self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
     ) -> Tensor:
         return self.inner.sample_actions(batch, draws, steps)
-
-    def require_memory(self) -> MemoryModule:
-        return self.inner.require_memory()
 
     def vision_fingerprint(self) -> str:
         return self.inner.vision_fingerprint()

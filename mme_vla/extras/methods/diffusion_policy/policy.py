@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, require
 from mme_vla.extras.methods.diffusion_policy import model
@@ -21,7 +22,6 @@ from mme_vla.memory.base import Memory, full_history
 from mme_vla.model import masked_mean
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
 from mme_vla.policy.saving import policy_options
 from mme_vla.registry import INTEGRATIONS, POLICIES

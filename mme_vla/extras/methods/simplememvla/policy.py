@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.backbone.building import shapes_only
 from mme_vla.backbone.flow import EULER_STEPS
 from mme_vla.backbone.siglip import pool_grid
@@ -45,7 +46,6 @@ from mme_vla.extras.methods.simplememvla.video import TEMPORAL, Window, augment,
 from mme_vla.memory.base import MemoryModule, full_history
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.processing.base import PolicyProcessor

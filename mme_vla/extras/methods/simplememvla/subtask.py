@@ -9,18 +9,18 @@ Shapes: b batch · n tokens of images and prompt · S words · d width of memory
 """
 
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.errors import UserError
 from mme_vla.extras.methods.simplememvla.prompt import clean_response
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
-from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.base import Sample
 from mme_vla.processing.processor import Processor
@@ -258,7 +258,7 @@ class SubtaskPolicy(MMEPolicy):
         """As of `MMEPolicy`; the decoder belongs to the component `memory`."""
         spec = super().finetune_spec
         components = {**spec.components, "memory": rf"{spec.components['memory']}|subtask\."}
-        return FineTuneSpec(components, spec.lora_targets, spec.full_train, spec.lora_exclude)
+        return replace(spec, components=components)
 
     def full_batch(self, device: torch.device | str = "cpu") -> SubtaskBatch:
         words = torch.zeros(1, _COUNTED_WORDS, dtype=torch.int64, device=device)
