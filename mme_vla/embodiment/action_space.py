@@ -269,7 +269,7 @@ class ActionSpace:
             "binary": list(self.binary),
             "angles": {str(place): centre for place, centre in self.angles.items()},
         }
-        # Keys that a robot does not need are absent, as in the files of earlier versions.
+        # Keys that a robot does not need are absent.
         if self.choice:
             section["choice"] = list(self.choice)
             section["point"] = list(self.point)

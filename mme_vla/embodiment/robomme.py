@@ -1,4 +1,4 @@
-"""RoboMME's Panda in joint space: the robot of checkpoints that name none."""
+"""RoboMME's Panda in joint space, and what the benchmark takes and gives."""
 
 from collections.abc import Mapping, Sequence
 from string import ascii_uppercase
@@ -40,19 +40,18 @@ ROBOMME_JOINT = Embodiment(
     fps=20.0,
     conditioning_video=True,
 )
-"""The same as `configs/embodiment/robomme_joint.yaml`; here too, so that a checkpoint loads without
-any YAML.
-"""
+"""The same as `configs/embodiment/robomme_joint.yaml`, for Python that reads no YAML."""
 
 
 def embodiment_of(config: Mapping[str, Any]) -> Embodiment:
-    """The robot of a policy's configuration; RoboMME's Panda where it names none, as before robots
-    could be chosen.
+    """The robot of a policy's configuration.
+
+    Raises:
+        UserError: the section `embodiment` is missing or cannot be read, or the backbone has other
+            sizes.
     """
+    robot = Embodiment.from_dict(config.get("embodiment"))
     backbone = config.get("backbone", {})
-    if config.get("embodiment") is None:
-        return ROBOMME_JOINT.with_horizon(backbone.get("horizon", ROBOMME_JOINT.action.horizon))
-    robot = Embodiment.from_dict(config["embodiment"])
     if {"action_dim", "horizon"} <= set(backbone):
         robot.check_network(backbone["action_dim"], backbone["horizon"])
     return robot

@@ -96,7 +96,7 @@ class Embodiment:
         return tuple(camera.augment for camera in self.cameras)
 
     @classmethod
-    def from_dict(cls, section: Mapping[str, Any]) -> Self:
+    def from_dict(cls, section: Any) -> Self:
         """Read the section `embodiment` of a configuration.
 
         Raises:
@@ -150,7 +150,7 @@ class Embodiment:
         cameras: dict[str, dict[str, Any]] = {}
         for camera in self.cameras:
             cameras[camera.name] = {"key": camera.key, "augment": camera.augment}
-            if camera.depth:  # absent in files of earlier versions
+            if camera.depth:
                 cameras[camera.name]["depth"] = True
         return {
             "name": self.name,

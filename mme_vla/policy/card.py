@@ -40,7 +40,7 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
         "memory": _part(config.get("memory")),
         "integration": _part(config.get("integration")),
         "backbone": network,
-        "robot": str((config.get("embodiment") or {}).get("name", "robomme_joint")),
+        "robot": embodiment_of(config).name,
         "action chunk": (
             f"{backbone.get('horizon', '?')} steps of {backbone.get('action_dim', '?')} numbers"
         ),

@@ -53,7 +53,6 @@ def composition_digest(config: Mapping[str, Any]) -> str:
     settings = {key: value for key, value in settings.items() if value is not None}
     robot = embodiment_of(config)
     if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):
-        # which configurations did not use to name
         settings |= flat({"embodiment": robot.to_dict()})
     return digest(settings, 12)
 
@@ -406,7 +405,7 @@ def check_processor(policy: "Policy", source: str) -> None:
     """Make sure that a policy and its processor have the same robot and sizes."""
     processor = policy.require_processor()
     robot = embodiment_of(policy.config)
-    if policy.config.get("embodiment") is not None and robot != processor.embodiment:
+    if robot != processor.embodiment:
         raise UserError(
             f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the"
             f" configuration of {brief(robot.name)}, or they describe it differently. The files are"

@@ -49,8 +49,6 @@ from mme_vla.types import Batch
 from mme_vla.utils import Sums, checked_file, inside
 
 TOKENIZER_FILE = "tokenizer.model"
-OLD_VIEWS = ["base_0_rgb", "left_wrist_0_rgb"]
-"""What processors named before robots could be chosen: front and wrist."""
 
 
 def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) -> dict[str, Any]:
@@ -60,26 +58,19 @@ def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) ->
         arguments: the constructor's, by name.
     """
     settings = dict(config)
-    known = {*arguments, "tokenizer_fingerprint", "views"}
+    known = {*arguments, "tokenizer_fingerprint"}
     for key in settings:
         if key not in known:
             raise UserError(
                 f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}"
             )
-    for key in ("image_size", "tokenizer"):
+    for key in ("image_size", "tokenizer", "embodiment"):
         require(
             key in settings,
             f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.",
         )
     PROMPTS[str(settings.get("prompt", "plain"))]  # checks the name before any file is read
-    views = settings.pop("views", OLD_VIEWS)
-    if views != OLD_VIEWS:
-        raise UserError(
-            f"processor.views={brief(views)}: cameras are named in the section 'embodiment' now."
-        )
-    robot = settings.pop("embodiment", None)
-    if robot is not None:
-        settings["embodiment"] = Embodiment.from_dict(robot)
+    settings["embodiment"] = Embodiment.from_dict(settings["embodiment"])
     fingerprint = settings.pop("tokenizer_fingerprint", None)
     tokenizer = Tokenizer.load(settings["tokenizer"])
     if fingerprint is not None and tokenizer.fingerprint != fingerprint:
@@ -153,12 +144,11 @@ class Processor(PolicyProcessor):
         prompt_length: longest prompt in tokens, without the options of a robot that chooses.
         subgoal_length: longest subgoal in it, in tokens; None for no limit of its own.
         action_dim: a; width of the network's actions, the robot's own padded with zeros.
-        horizon: h; steps in a chunk; None for the embodiment's.
         embodiment: the robot: its cameras, in the order the network sees them, its state and its
             actions.
         stats: normalisation statistics; without them everything works but states and actions.
-        goal_case: `lower` spells every goal and subgoal as in training; `given` leaves them, as the
-            benchmark's robots and checkpoints from before there was a choice do.
+        goal_case: `lower` spells every goal and subgoal as in training; `given` leaves them, as
+            those of the benchmark's robots.
     """
 
     def __init__(
@@ -168,7 +158,6 @@ class Processor(PolicyProcessor):
         prompt: str = "plain",
         prompt_length: int = 64,
         action_dim: int = 32,
-        horizon: int | None = None,
         embodiment: Embodiment = ROBOMME_JOINT,
         stats: NormStats | None = None,
         subgoal_length: int | None = None,
@@ -178,8 +167,6 @@ class Processor(PolicyProcessor):
         check_integer("processor.image_size", image_size)
         check_integer("processor.prompt_length", prompt_length)
         check_integer("processor.action_dim", action_dim)
-        if horizon is not None:
-            check_integer("processor.horizon", horizon)
         if subgoal_length is not None:
             check_integer("processor.subgoal_length", subgoal_length)
         require(isinstance(prompt, str), f"processor.prompt must be a name, got {brief(prompt)}.")
@@ -190,8 +177,8 @@ class Processor(PolicyProcessor):
         self.prompt_length = prompt_length
         self.subgoal_length = subgoal_length
         self.action_dim = action_dim
-        self.embodiment = embodiment if horizon is None else embodiment.with_horizon(horizon)
-        self.embodiment.check_network(action_dim, self.embodiment.action.horizon)
+        self.embodiment = embodiment
+        embodiment.check_network(action_dim, embodiment.action.horizon)
         self.stats = stats
         self.goal_case = goal_case
 
@@ -370,7 +357,7 @@ class Processor(PolicyProcessor):
             "embodiment": self.embodiment.to_dict(),
             "stats": None if self.stats is None else STATS_FILE,
         }
-        if self.goal_case != "given":  # absent in files of earlier versions, which left goals
+        if self.goal_case != "given":
             config["goal_case"] = self.goal_case
         return config
 
@@ -381,8 +368,8 @@ class Processor(PolicyProcessor):
         Args:
             config: the constructor's arguments by name, some in words: `tokenizer` as
                 `Tokenizer.load` takes it, `stats` as the path of a `norm_stats.json` or None,
-                `embodiment` as `Embodiment.to_dict` writes it (left out: RoboMME's Panda, as
-                before). `tokenizer_fingerprint`, if given, is checked.
+                `embodiment` as `Embodiment.to_dict` writes it. `tokenizer_fingerprint`, if given,
+                is checked.
         """
         return cls(**constructor_settings(config, inspect.signature(cls).parameters))
 

@@ -26,6 +26,7 @@ _TYPES = {
     for problem in ("type", "parsing")
 }
 _TYPES["dataclass_type"] = "a section of keys"
+_TYPES["model_type"] = "a section of keys"
 _TYPES["dict_type"] = "a map of keys"
 _TYPES["tuple_type"] = "a list"
 """What a value must be, by pydantic's names of mistakes."""

@@ -22,6 +22,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.data.sources import split_episodes
 from mme_vla.data.statistics import compute_norm_stats
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.prompt import SubgoalText
@@ -72,7 +73,10 @@ def test_golden_samples_are_reproduced(parity: Path, tmp_path: Path) -> None:
     convert(list_episodes(find_files([tmp_path / "h5"])), tmp_path / "out")
     source = EpisodeSource(tmp_path / "out")
     horizon = len(golden["samples"][0]["actions"])
-    dataset = TrainingDataset([source], Processor(28, Tokenizer.load("sample"), horizon=horizon))
+    dataset = TrainingDataset(
+        [source],
+        Processor(28, Tokenizer.load("sample"), embodiment=ROBOMME_JOINT.with_horizon(horizon)),
+    )
     assert len(dataset) == golden["stats"]["execution_samples"]
     assert source.lengths.sum() == golden["stats"]["total_samples"]
     for sample in golden["samples"]:

@@ -20,7 +20,7 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import check_benchmark, embodiment_of
 from mme_vla.policy.saving import composition_digest
 from mme_vla.processing.processor import Processor
-from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
+from mme_vla.testing.small import SMALL_VISION, unit_stats
 from mme_vla.utils import SUMS
 
 SHIPPED = list(library_files("embodiment"))
@@ -43,10 +43,11 @@ def action(**changes: Any) -> dict[str, Any]:
     return section(action={**ROBOMME_JOINT.action.to_dict(), **changes})
 
 
-def test_the_default_yaml_is_the_robot_of_old_checkpoints() -> None:
+def test_the_default_yaml_is_the_robot_of_python() -> None:
     assert shipped("robomme_joint") == ROBOMME_JOINT
-    assert embodiment_of({}) == ROBOMME_JOINT
-    assert embodiment_of({"backbone": {"horizon": 10}}).action.horizon == 10
+    assert embodiment_of({"embodiment": section()}) == ROBOMME_JOINT
+    with pytest.raises(UserError, match="embodiment"):
+        embodiment_of({})
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -119,24 +120,15 @@ def test_a_processor_of_another_robot_than_the_configurations_is_refused(tmp_pat
         MMEPolicy.from_pretrained(tmp_path)
 
 
-def test_a_checkpoint_saved_before_robots_could_be_selected_is_the_panda(tmp_path: Path) -> None:
-    policy = saved(tmp_path)
-    file = tmp_path / "config.json"
-    config = json.loads(file.read_text())
-    assert config.pop("embodiment")["name"] == "robomme_joint"
-    file.write_text(json.dumps(config))
-    file = tmp_path / "processor.json"
-    settings = json.loads(file.read_text())
-    del settings["embodiment"]
-    file.write_text(
-        json.dumps({**settings, "horizon": 20, "views": ["base_0_rgb", "left_wrist_0_rgb"]})
-    )
-    loaded = MMEPolicy.from_pretrained(tmp_path)
-    assert loaded.embodiment == ROBOMME_JOINT and "embodiment" not in loaded.config
-    batch, noise = random_batch(policy), torch.zeros(2, 20, 32)
-    assert torch.equal(
-        loaded.sample_actions(batch, noise, 2), policy.sample_actions(batch, noise, 2)
-    )
+def test_a_checkpoint_without_its_robot_is_refused(tmp_path: Path) -> None:
+    saved(tmp_path)
+    for name in ("config.json", "processor.json"):
+        settings = json.loads((tmp_path / name).read_text())
+        del settings["embodiment"]
+        (tmp_path / name).write_text(json.dumps(settings))
+        with pytest.raises(UserError, match="embodiment"):
+            MMEPolicy.from_pretrained(tmp_path)
+        (tmp_path / name).write_text(json.dumps({**settings, "embodiment": section()}))
 
 
 def test_a_checkpoint_keeps_its_robot(tmp_path: Path) -> None:
@@ -146,10 +138,9 @@ def test_a_checkpoint_keeps_its_robot(tmp_path: Path) -> None:
     assert Processor.load(tmp_path).embodiment.action.horizon == 4
 
 
-def test_the_robot_tells_compositions_apart_and_the_panda_goes_without_saying() -> None:
+def test_the_robot_tells_compositions_apart() -> None:
     config: dict[str, Any] = {"memory": None, "backbone": {"horizon": 20}}
-    digest = composition_digest(config)
-    assert composition_digest({**config, "embodiment": section()}) == digest
+    digest = composition_digest({**config, "embodiment": section()})
     assert composition_digest({**config, "embodiment": action(relative=[])}) != digest
 
 

@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from mme_vla.backbone.base import BackboneConfig, ExpertConfig, VisionConfig
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.types import Batch, MemoryTokens
 from mme_vla.weights.released import from_released
@@ -71,6 +72,7 @@ def config(about: dict[str, Any]) -> dict[str, Any]:
     sections: dict[str, Any] = {
         "backbone": {"name": "pi05", **vars(backbone)},
         "policy": {"augment": False},
+        "embodiment": ROBOMME_JOINT.with_horizon(backbone.horizon).to_dict(),
     }
     if history.get("representation_type") not in ("perceptual", "recurrent"):
         return sections

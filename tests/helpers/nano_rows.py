@@ -6,6 +6,7 @@ from typing import Any
 
 import yaml
 
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.envs.metadata import episodes
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import claim_run
@@ -36,6 +37,7 @@ def write_training(
         "name": model,
         "backbone": {"name": "nano"},
         "memory": {"name": model, "budget": budget},
+        "embodiment": ROBOMME_JOINT.to_dict(),
     }
     settings = {"model": model, "checkpoint": 100, "seed": 7, "split": SPLIT, "max_steps": 500}
     claim_run(folder, settings)

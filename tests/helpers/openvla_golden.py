@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from helpers.baselines import rule_weight
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.extras.methods.openvla_oft.model import OpenVlaBackbone
 from mme_vla.extras.methods.openvla_oft.weights import VLA, openvla_name
 from mme_vla.policy.finetune import apply_finetuning
@@ -83,7 +84,8 @@ def sections(about: dict[str, Any], values: dict[str, Tensor]) -> dict[str, Any]
         "state_dim": sizes["proprio"],
         "horizon": sizes["chunk"],
     }
-    built: dict[str, Any] = {"backbone": backbone}
+    robot = ROBOMME_JOINT.with_horizon(sizes["chunk"])
+    built: dict[str, Any] = {"backbone": backbone, "embodiment": robot.to_dict()}
     if "memory/project.weight" in values:
         built["memory"] = {
             "name": "framesamp",

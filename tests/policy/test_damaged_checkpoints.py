@@ -164,8 +164,8 @@ def test_damaged_json_is_one_short_paragraph(
     ("name", "changes"),
     [
         ("processor.json", {"prompt": []}),
-        ("processor.json", {"views": [1]}),
-        ("processor.json", {"horizon": 10**9}),
+        ("processor.json", {"embodiment": [1]}),
+        ("processor.json", {"prompt_length": 10**9}),
         ("processor.json", {"tokenizer": None}),
         ("processor.json", {"stats": 3}),
         ("processor.json", {"x" * 9999: 1}),

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from mme_vla import MMEPolicy, Policy, UserError, build_policy, register
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.policy.saving import composition_digest, policy_class, policy_options
 from mme_vla.training.settings import TrainSettings
 
@@ -56,7 +57,8 @@ def test_a_kind_comes_back_as_what_it_was(tmp_path: Any) -> None:
 
 
 def test_the_default_kind_changes_no_digest_and_another_does() -> None:
-    config = {"backbone": {"name": "pi05"}, "memory": None}
+    robot = ROBOMME_JOINT.to_dict()
+    config = {"backbone": {"name": "pi05"}, "memory": None, "embodiment": robot}
     named = {**config, "policy": {"name": "mme", "compute_dtype": "float32"}}
     assert composition_digest(config) == composition_digest(named)
     assert composition_digest(config) != composition_digest({**config, "policy": {"name": "quiet"}})

@@ -26,7 +26,7 @@ def processor(**changes) -> Processor:
         "image_size": 28,
         "tokenizer": Tokenizer.load("sample"),
         "prompt_length": 32,
-        "horizon": 5,
+        "embodiment": ROBOMME_JOINT.with_horizon(5),
     }
     return Processor(**{**settings, "stats": stats(), **changes})
 
@@ -100,7 +100,7 @@ def test_config_names_a_tokenizer_and_statistics_by_path(tmp_path: Path) -> None
             "image_size": 56,
             "tokenizer": "sample",
             "stats": str(tmp_path / "mine.json"),
-            "horizon": 10,
+            "embodiment": ROBOMME_JOINT.with_horizon(10).to_dict(),
         }
     )
     assert (
@@ -115,9 +115,8 @@ def test_config_names_a_tokenizer_and_statistics_by_path(tmp_path: Path) -> None
     [
         ({"prompt": "subgaol"}, "Did you mean 'subgoal'"),
         ({"prompt_lenght": 3}, "Did you mean 'prompt_length'"),
-        ({"horizon": 0}, "horizon must be a positive"),
         ({"image_size": "224"}, "image_size must be a positive"),
-        ({"views": ["base_0_rgb"]}, "named in the section 'embodiment'"),
+        ({"embodiment": {"name": "mine"}}, "embodiment lacks cameras"),
         ({"stats": "nowhere.json"}, "nowhere.json"),
         ({"tokenizer": "nowhere.model"}, "nowhere.model"),
         ({"tokenizer_fingerprint": "0123"}, "fingerprint"),
@@ -125,7 +124,14 @@ def test_config_names_a_tokenizer_and_statistics_by_path(tmp_path: Path) -> None
 )
 def test_impossible_settings_are_refused(change: dict, message: str) -> None:
     with pytest.raises(UserError, match=message):
-        Processor.from_config({"image_size": 28, "tokenizer": "sample", **change})
+        Processor.from_config(
+            {
+                "image_size": 28,
+                "tokenizer": "sample",
+                "embodiment": ROBOMME_JOINT.to_dict(),
+                **change,
+            }
+        )
 
 
 def test_settings_without_a_tokenizer_are_refused() -> None:

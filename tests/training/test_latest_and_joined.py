@@ -2,14 +2,12 @@
 command says.
 """
 
-import shutil
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, load_weights
 from mme_vla.cli.weights import convert
 from mme_vla.config.composition import compose
@@ -18,14 +16,15 @@ from mme_vla.weights import transfer
 from mme_vla.weights.released import to_released
 from mme_vla.weights.source import open_source
 
-RUN = REPOSITORY / "tests" / "data" / "earlier_layout" / "run"
 TTT = {"name": "ttt", "hidden": 16}
 
 
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
     """A folder of runs, of which one has a checkpoint."""
-    shutil.copytree(RUN, tmp_path / "runs" / "first")
+    step = tmp_path / "runs" / "first" / "checkpoints" / "step_000002"
+    small_policy("framesamp_modul").save_pretrained(step)
+    (step / "training_state.json").write_text("{}")
     return tmp_path / "runs"
 
 
