@@ -17,6 +17,8 @@ Run it from the root of a clone with all extras, on a CPU with one thread. It wr
 - `runs.tar.xz`: a converted dataset, its cache, training runs (plain, with adapters, in two
   shards), an evaluation with its receipt, a probe, a report card, and rows of nanoMME's board.
 - `runs.json.xz`: what the commands say of them, and the losses of the runs when they are continued.
+- `formats.tar.xz`: a policy in the formats of LeRobot, openpi and the released code, and a dataset
+  with videos. `formats.json`: what `inspect` counts in it, and a hash of nano's vision tower.
 - `times.json`: seconds and imported modules of `import mme_vla` and `mme-vla --help`. Only modules
   are compared.
 
@@ -158,6 +160,23 @@ def record_figures(scratch: Path) -> None:
     write("runs.json.xz", found)
 
 
+def record_formats(scratch: Path) -> None:
+    """The exports of a policy, a dataset with videos, and what commands say of them."""
+    from net import formats, models
+    from net.archives import inside, pack, unpack
+
+    saved = unpack(NET / "models.tar.xz", scratch / "models") / formats.POLICY
+    models.restore(saved)
+    place = scratch / "formats"
+    place.mkdir()
+    saved.rename(place / "policy")
+    with inside(place):
+        formats.make()
+        pack(place, NET / "formats.tar.xz")
+        content = {"inspected": formats.inspected(), "nano_tower": formats.nano_tower()}
+    write("formats.json", content)
+
+
 def record_times(scratch: Path) -> None:
     """Seconds and modules of an import and of a help text."""
     from net import times
@@ -173,6 +192,7 @@ PARTS = {
     "replies": record_replies,
     "runs": record_runs,
     "figures": record_figures,
+    "formats": record_formats,
     "times": record_times,
 }
 

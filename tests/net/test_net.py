@@ -16,8 +16,8 @@ import pytest
 import mme_vla
 from helpers import REPOSITORY
 from mme_vla.config.trees import library_files
-from net import models, replies, runs, times
-from net.archives import unpack
+from net import formats, models, replies, runs, times
+from net.archives import command, unpack
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 NET = REPOSITORY / "tests" / "data" / "net"
@@ -30,8 +30,8 @@ def read(name: str) -> Any:
     return json.loads(lzma.decompress(data) if name.endswith(".xz") else data)
 
 
-MODELS, REPLIES, RUNS, TIMES = (read(f"{name}.json{end}") for name, end in (
-    ("models", ".xz"), ("replies", ""), ("runs", ".xz"), ("times", ""),
+MODELS, REPLIES, RUNS, FORMATS, TIMES = (read(f"{name}.json{end}") for name, end in (
+    ("models", ".xz"), ("replies", ""), ("runs", ".xz"), ("formats", ""), ("times", ""),
 ))  # fmt: skip
 
 
@@ -140,6 +140,18 @@ def test_results_have_the_same_figures(at_runs: Path) -> None:
     assert_close(runs.result_rows(), RUNS["results"])
 
 
+def test_finished_evaluation_is_recognised(at_runs: Path) -> None:
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    before = {path: path.read_bytes() for path in Path("evaluation").iterdir()}
+    command("evaluate", *runs.EVALUATE)
+    assert {path: path.read_bytes() for path in Path("evaluation").glob("[!.]*")} == before
+
+
+@pytest.mark.parametrize("run", runs.RUNS)
+def test_run_is_inspected(run: str, at_runs: Path) -> None:
+    assert "step_000002" in command("inspect", f"checkpoint=training/{run}")
+
+
 def test_receipt_is_verified(at_runs: Path) -> None:
     assert not runs.verified()
 
@@ -155,6 +167,30 @@ def test_report_card_is_the_same(at_runs: Path) -> None:
 
 def test_board_ranks_the_rows_as_before(at_runs: Path) -> None:
     assert runs.board() == RUNS["board"]
+
+
+# Formats of others, and videos
+
+
+@pytest.fixture
+def at_formats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A copy of the recorded exports and videos, as the current folder."""
+    monkeypatch.chdir(unpack(NET / "formats.tar.xz", tmp_path))
+
+
+@pytest.mark.parametrize("target", formats.FORMATS)
+def test_export_converts_back_to_the_same_weights(target: str, at_formats: None) -> None:
+    if target == "released":
+        pytest.importorskip("tensorstore", reason="needs the extra orbax")
+    assert not formats.converted_back(target)
+
+
+def test_dataset_of_videos_is_intact_and_begins_where_it_began(at_formats: None) -> None:
+    assert formats.inspected() == FORMATS["inspected"]
+
+
+def test_vision_tower_of_nano_is_the_same() -> None:
+    assert formats.nano_tower() == FORMATS["nano_tower"]
 
 
 @pytest.mark.parametrize("name", times.COMMANDS)
