@@ -24,7 +24,6 @@ from mme_vla.data.lerobot_files import (
     EpisodeTable,
     Info,
     VideoSpans,
-    read_index_columns,
     read_records,
     read_tasks,
     video_file,
@@ -98,11 +97,13 @@ class Description:
         return f"row {row}, frame {row - int(self.starts[episode])} of episode {episode}"
 
 
-def check_consistency(dataset: Description, table: Any) -> FrameTasks:
+def check_consistency(
+    dataset: Description, rows: Mapping[str, np.ndarray], table: Any
+) -> FrameTasks:
     """Compare everything that a dataset says twice.
 
     Args:
-        table: of `open_table`; only first pictures are read from it.
+        rows: of `read_index_columns`. table: of `open_table`; only first pictures are read from it.
 
     Returns:
         The task of every frame.
@@ -111,7 +112,6 @@ def check_consistency(dataset: Description, table: Any) -> FrameTasks:
         UserError: two places contradict each other; it names both, and the first episode or row.
     """
     _check_totals(dataset)
-    rows = read_index_columns(dataset.root, ("exec_start_idx", "is_demo"))
     _check_rows(dataset, rows)
     _check_phases(dataset, rows)
     _check_side_file(dataset, rows)
@@ -156,12 +156,24 @@ def _first(wrong: np.ndarray) -> int | None:
 
 
 def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
-    """Make sure that rows lie in the order of time, none missing and none twice, and that time is
-    frame / fps.
+    """Make sure that rows lie in the order of episodes and of time, none missing and none twice,
+    and that time is frame / fps.
     """
-    places = np.arange(dataset.lengths.sum())
-    frames = places - np.repeat(dataset.starts, dataset.lengths)
-    root, fps = dataset.root, dataset.fps
+    root, fps, lengths = dataset.root, dataset.fps, dataset.lengths
+    total = int(lengths.sum())
+    index = rows.get("episode_index", np.zeros(0))
+    # The sizes first: a damaged length may be larger than memory.
+    is_complete = len(index) == total
+    if is_complete:
+        is_complete = np.array_equal(index, np.repeat(np.arange(len(lengths)), lengths))
+    require(
+        is_complete,
+        f"{root}: the tables hold {len(index)} rows where meta/episodes describes {total} in"
+        f" {len(lengths)} episodes (episode_index); the dataset is incomplete or mixed up. Copy,"
+        " download or convert it again.",
+    )
+    places = np.arange(total)
+    frames = places - np.repeat(dataset.starts, lengths)
     if "frame_index" in rows:
         row = _first(rows["frame_index"] != frames)
         if row is not None:

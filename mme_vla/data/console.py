@@ -13,8 +13,8 @@ from functools import partialmethod
 def quiet_libraries() -> Iterator[None]:
     """Surround work whose progress this library shows itself.
 
-    Notes go that are no warnings; bars of tqdm appear on terminals alone, those of `datasets` not
-    at all.
+    Log records below warnings are dropped. Bars of tqdm appear on terminals alone, those of
+    `datasets` never.
     """
     import av.logging
     import tqdm
@@ -63,9 +63,8 @@ def progress(
         # FORCE_COLOR makes the first true, in notebooks too
         begun = reported = time.monotonic()
         count = done
-        first: tuple[float, int] | None = (
-            None  # time and count after start-up, with what was there before
-        )
+        # Time and count after the first steps, which also took what was needed to start.
+        first: tuple[float, int] | None = None
 
         def count_up(steps: int) -> None:
             nonlocal reported, count, first
@@ -75,11 +74,11 @@ def progress(
             if count < total and now - reported < LINE_SECONDS:
                 return
             reported = now
-            remaining, n_new = "", count - first[1]
+            remaining = ""
+            n_new = count - first[1]
             if n_new and count < total:
-                remaining = (
-                    f", about {_duration_text((now - first[0]) / n_new * (total - count))} left"
-                )
+                seconds = (now - first[0]) / n_new * (total - count)
+                remaining = f", about {_duration_text(seconds)} left"
             so_far = f"{count:,} of {total:,} {unit}".rstrip()
             console.print(f"{description}: {so_far} in {_duration_text(now - begun)}{remaining}")
 

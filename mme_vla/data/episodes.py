@@ -6,7 +6,7 @@ data except for a few numbers an episode.
 
 import io
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -37,13 +37,14 @@ from mme_vla.data.lerobot_files import (
     open_table,
     read_episode_table,
     read_exec_starts,
+    read_index_columns,
     read_info,
     read_records,
     resolve_root,
     video_file,
 )
 from mme_vla.data.video import VideoReader
-from mme_vla.data.waypoints import Motions, find_choices, find_motions
+from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.action_space import numbered, read_options
 from mme_vla.errors import UserError, brief, did_you_mean, listed, require
@@ -141,10 +142,26 @@ class EpisodeSource:
         self._starts = self._episodes.starts
         self.lengths = self._episodes.lengths
         self._video_path = info.video_path
-        self._table = open_table(self.root, columns, features)
         self._reader = VideoReader(max_open_videos)
         self._motions: dict[int, Motions] = {}
-        self._check_rows()
+        image_columns = tuple(dict.fromkeys(images))
+        flags = ["is_demo", "exec_start_idx"]
+        flags += [f"{camera}{RENDERED_SUFFIX}" for camera in self.columns]
+        rows = read_index_columns(self.root, [name for name in flags if name in features])
+        self._table = open_table(self.root, columns, features)
+        self.tasks = check_consistency(
+            Description(self.root, info, self._episodes, video_columns, image_columns),
+            rows,
+            self._table,
+        )
+        side_file = None if exec_starts is None else Path(exec_starts)
+        self.exec_starts = self._read_exec_starts(rows, side_file)
+        self._rendered: dict[str, np.ndarray] = {}
+        for camera in self.columns:
+            if f"{camera}{RENDERED_SUFFIX}" in rows:
+                self._rendered[camera] = rows[f"{camera}{RENDERED_SUFFIX}"].astype(bool)
+
+        # The greatest sizes of numbers, and whether they fit their units.
         self.scales: dict[str, np.ndarray] = {}
         for kind, vectors in self._vectors_of.items():
             sizes = []
@@ -156,17 +173,6 @@ class EpisodeSource:
                 self.scales[kind] = np.concatenate(sizes)
         action = self.robot.action
         compare_units(self.root, action.names, action.units, self.scales["action"])
-        image_columns = tuple(dict.fromkeys(images))
-        self.tasks = check_consistency(
-            Description(self.root, info, self._episodes, video_columns, image_columns), self._table
-        )
-        self._rendered: dict[str, np.ndarray] = {}
-        for camera in self.columns:
-            if f"{camera}{RENDERED_SUFFIX}" in columns:
-                rendered = self._column(f"{camera}{RENDERED_SUFFIX}")
-                self._rendered[camera] = rendered.astype(bool)
-        side_file = None if exec_starts is None else Path(exec_starts)
-        self.exec_starts = self._read_exec_starts(columns, side_file)
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -365,12 +371,8 @@ class EpisodeSource:
     def _motions_of(self, episode: int) -> Motions:
         if episode not in self._motions:
             first = int(self.exec_starts[episode])
-            rows = self.actions(episode, first)
             letters = self.robot.action.choice
-            if letters:
-                self._motions[episode] = find_choices(rows, first, letters)
-            else:
-                self._motions[episode] = find_motions(rows, first)
+            self._motions[episode] = find_motions(self.actions(episode, first), first, letters)
         return self._motions[episode]
 
     def subgoals(self, episode: int, step: int) -> dict[str, str]:
@@ -419,14 +421,14 @@ class EpisodeSource:
             return self._reader.read(path, timestamps, self.fps)
         from PIL import Image
 
-        cells = []
-        for row in self.rows(episode, indices).tolist():
-            cells.append(self._table[row : row + 1][column][0].as_py())
+        pixels = []
         with decoding(f"{self.root}, episode {episode}, {column}", "pictures", REMEDY):
-            pictures = [Image.open(io.BytesIO(cell["bytes"])) for cell in cells]
-            for picture in pictures:
+            for row in self.rows(episode, indices).tolist():
+                cell = self._table[row : row + 1][column][0].as_py()
+                picture = Image.open(io.BytesIO(cell["bytes"]))
                 check_mode(self.root, column, picture)
-            return np.stack([np.asarray(picture.convert("RGB")) for picture in pictures])
+                pixels.append(np.asarray(picture.convert("RGB")))
+            return np.stack(pixels)
 
     def _rows(self, episode: int, start: int, stop: int | None) -> Any:
         length = int(self.lengths[episode])
@@ -440,11 +442,11 @@ class EpisodeSource:
 
     def _vectors(self, kind: str, episode: int, start: int, stop: int | None) -> np.ndarray:
         rows = self._rows(episode, start, stop)
-        parts = [
-            flat(rows[name]).to_numpy(zero_copy_only=False).astype(np.float32).reshape(-1, width)
-            for name, width in self._vectors_of[kind].items()
-        ]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        parts = []
+        for name, width in self._vectors_of[kind].items():
+            numbers = flat(rows[name]).to_numpy(zero_copy_only=False)
+            parts.append(numbers.astype(np.float32).reshape(-1, width))
+        return np.concatenate(parts, axis=1)
 
     def _compare_names(self, robot: Embodiment) -> None:
         """Compare the names of numbers: the dataset's with the robot's, and of states with actions
@@ -474,38 +476,25 @@ class EpisodeSource:
             " one order, or set embodiment.action.relative=[].",
         )
 
-    def _check_rows(self) -> None:
-        """The tables hold the episodes back to back, as the metadata say."""
-        index = self._column("episode_index")
-        total = int(self.lengths.sum())
-        # The sizes first: a damaged length may be larger than memory.
-        is_complete = len(index) == total
-        if is_complete:
-            is_complete = np.array_equal(index, np.repeat(np.arange(len(self)), self.lengths))
-        require(
-            is_complete,
-            f"{self.root}: the tables hold {len(index)} rows where meta/episodes describes {total}"
-            f" in {len(self)} episodes; the dataset is incomplete or mixed up. Copy, download or"
-            " convert it again.",
-        )
-
-    def _read_exec_starts(self, columns: Sequence[str], side_file: Path | None) -> np.ndarray:
+    def _read_exec_starts(
+        self, rows: Mapping[str, np.ndarray], side_file: Path | None
+    ) -> np.ndarray:
         if side_file is not None:
             starts = read_exec_starts(side_file, len(self))
-        elif "is_demo" in columns:
-            demo = self._column("is_demo").astype(bool)
+        elif "is_demo" in rows:
+            demo = rows["is_demo"].astype(bool)
             starts = np.add.reduceat(demo, self._starts, dtype=np.int64)
             frame = np.arange(len(demo)) - np.repeat(self._starts, self.lengths)
             if not np.array_equal(demo, frame < np.repeat(starts, self.lengths)):
                 raise UserError(
                     f"{self.root}: is_demo must be true for an episode's first frames only."
                 )
-        elif "exec_start_idx" in columns:
+        elif "exec_start_idx" in rows:
             log.warning(
                 "%s has no is_demo; its exec_start_idx says where the conditioning video ends.",
                 self.root,
             )
-            starts = self._column("exec_start_idx")[self._starts].astype(np.int64)
+            starts = rows["exec_start_idx"][self._starts]
         elif not self.robot.conditioning_video:
             starts = np.zeros(len(self), np.int64)
         else:
@@ -525,9 +514,6 @@ class EpisodeSource:
                 f" {starts[episode]}, but has {self.lengths[episode]} frames."
             )
         return starts
-
-    def _column(self, name: str) -> np.ndarray:
-        return flat(self._table.select_columns(name)[:][name]).to_numpy(zero_copy_only=False)
 
 
 def check_episode(source: EpisodeSource, episode: Any) -> None:

@@ -28,7 +28,6 @@ from mme_vla.utils.validation import validated
 
 SIDE_FILE = "meta/robomme_episodes.json"
 """What LeRobot's columns have no place for: task, seed, difficulty, options of a choice."""
-OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
 RENDERED_SUFFIX = "_drawn"
 """After a camera's name: the column that says which frames it was rendered at, where not at all."""
 NAMES: Mapping[str, Mapping[str, str]] = {
@@ -120,8 +119,8 @@ class Columns:
     and the action.
 
     pose: the same of the tool's pose, where actions are differences to it.
-    tables: the columns that are read from the tables; images are among them only where they are
-    stored there.
+    tables: the columns that are read frame by frame; images are among them only where they are
+    stored in the tables.
     """
 
     cameras: Mapping[str, str]
@@ -195,11 +194,8 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
                 f" {robot.name!r}."
             )
 
-    tables = ["episode_index", *state, *action, *pose]
-    tables += [name for name in OPTIONAL if name in features]
-    for name in cameras:
-        if f"{name}{RENDERED_SUFFIX}" in features:
-            tables.append(f"{name}{RENDERED_SUFFIX}")
+    tables = [*state, *action, *pose]
+    tables += [name for name in SUBGOALS if name in features]
     tables += [column for column in cameras.values() if features[column].dtype == "image"]
     return Columns(cameras, state, action, pose, tuple(dict.fromkeys(tables)))
 
@@ -234,11 +230,12 @@ def resolve_root(root: str | Path) -> Path:
         f" command: `python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={path.name}"
         f" --root={path} --push-to-hub=false`.",
     )
-    missing = [
-        f"{part}/*/*.parquet" for part in ("meta/episodes", "data") if not _tables(path, part)
-    ]
+    missing = []
     if not (path / TASKS).exists():
-        missing.insert(0, TASKS)
+        missing.append(TASKS)
+    for part in ("meta/episodes", "data"):
+        if not parquet_files(path, part):
+            missing.append(f"{part}/*/*.parquet")
     require(
         not missing,
         f"{path} has no {listed(missing)}: the dataset is incomplete. Copy, download or convert it"
@@ -283,8 +280,10 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
     rows: list[tuple[Any, Any]] = []
     if file.suffix == ".json":
         for key, value in read_json(file, "first execution frames").items():
-            is_number = key.isdecimal() and len(key) < 10
-            rows.append((int(key) if is_number else key, value))
+            if key.isdecimal() and len(key) < 10:
+                rows.append((int(key), value))
+            else:
+                rows.append((key, value))
     else:
         import pyarrow.parquet as pq
 
@@ -322,14 +321,11 @@ def content_fingerprint(
         place = root / part
         files = [place] if place.is_file() else sorted(place.rglob("*"))
         for file in files:
-            if file.suffix not in (".parquet", ".mp4") or _is_hidden(file):
+            if file.suffix not in (".parquet", ".mp4") or file.name.startswith(_HIDDEN):
                 continue
-            size = (
-                require_file(inside(root, file.relative_to(root).as_posix()), "a part of a dataset")
-                .stat()
-                .st_size
-            )
-            digest.update(f"{file.relative_to(root).as_posix()} {size}\n".encode())
+            name = file.relative_to(root).as_posix()
+            size = require_file(inside(root, name), "a part of a dataset").stat().st_size
+            digest.update(f"{name} {size}\n".encode())
             with file.open("rb") as handle:
                 for offset in (0, size // 2, max(size - 65536, 0)):
                     handle.seek(offset)
@@ -338,39 +334,30 @@ def content_fingerprint(
 
 
 _MOST_FRAMES = 2**40  # of a dataset; a larger number is damage
-_INTEGER_COLUMNS = ("episode_index", "is_demo", "exec_start_idx")
 _FIELDS = {"video_key": ("",), "chunk_index": ("", "d", "03d"), "file_index": ("", "d", "03d")}
 
 
-def _is_hidden(file: Path) -> bool:
-    """Whether a file is not the dataset's: macOS leaves `._<name>` beside what it copies to other
-    disks.
-    """
-    return file.name.startswith(".")
-
-
-def _tables(root: Path, folder: str) -> list[Path]:
-    return [path for path in (root / folder).glob("*/*.parquet") if not _is_hidden(path)]
-
-
-def _in_order(path: Path) -> list[str | int]:
-    """Sorts by the numbers in a path: file-1000 comes after file-999, where texts would put it
-    after file-100.
-    """
-    parts: list[str | int] = []
-    for part in re.split(r"(\d+)", f"{path.parent.name}/{path.name}"):
-        parts.append(int(part) if part.isdecimal() else part)
-    return parts
+_HIDDEN = "."
+"""Begins the names of files that are not the dataset's: macOS leaves `._<name>` beside what it
+copies to other disks.
+"""
 
 
 def parquet_files(root: Path, folder: str) -> list[Path]:
     """The parquet files of `folder`, two levels down as in LeRobot v3.0, in the order of their
     numbers.
     """
-    return [
-        require_file(path, "a parquet table")
-        for path in sorted(_tables(root, folder), key=_in_order)
-    ]
+
+    def numbers(path: Path) -> tuple[list[int], str]:
+        # file-1000 comes after file-999, where texts would put it after file-100
+        name = f"{path.parent.name}/{path.name}"
+        return [int(number) for number in re.findall(r"\d+", name)], name
+
+    files = []
+    for path in (root / folder).glob("*/*.parquet"):
+        if not path.name.startswith(_HIDDEN):
+            files.append(require_file(path, "a parquet table"))
+    return sorted(files, key=numbers)
 
 
 @dataclass(frozen=True)
@@ -423,13 +410,12 @@ def read_episode_table(root: Path, video_columns: Sequence[str]) -> EpisodeTable
         files = [pq.ParquetFile(file) for file in parquet_files(root, "meta/episodes")]
         present = set.intersection(*(set(file.schema_arrow.names) for file in files))
     missing = [name for name in kinds if name not in present]
-    plural = "" if len(missing) == 1 else "s"
-    require(
-        not missing,
-        f"{meta} lacks the column{plural} {listed(missing)}; LeRobot writes them in every dataset"
-        " of version v3.0. It has"
-        f" {listed(sorted(name for name in present if not name.startswith('stats/')))}.",
-    )
+    if missing:
+        others = sorted(name for name in present if not name.startswith("stats/"))
+        raise UserError(
+            f"{meta} lacks {listed(missing)}, which LeRobot writes in every dataset of version"
+            f" v3.0. It has {listed(others)}."
+        )
     kinds |= {name: kind for name, kind in optional.items() if name in present}
 
     parts = []
@@ -576,13 +562,6 @@ def open_table(root: Path, columns: Sequence[str], features: Mapping[str, Featur
 
     from datasets import Dataset, Features
 
-    for name in _INTEGER_COLUMNS:
-        if name in columns:
-            kind = features[name].dtype
-            require(
-                kind.startswith(("int", "uint", "bool")),
-                f"{root}: {name} is {brief(kind)}; expected whole numbers. {REMEDY}",
-            )
     with decoding(root / "meta" / "info.json", "a description of features", REMEDY):
         target = Features({name: _kind(features[name]) for name in columns})
     large = any(features[name].dtype == "image" for name in columns)

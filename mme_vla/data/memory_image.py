@@ -7,7 +7,8 @@ from PIL import Image, ImageDraw
 
 from mme_vla.utils.media import FAINT, GAP, INK, LABEL, TILE, Tile, contact_sheet, font, thumbnail
 
-COLUMNS, MOST = 8, 47  # tiles a row, remembered frames shown at most
+COLUMNS = 8  # tiles a row
+MOST = 47  # remembered frames that are shown
 TIMELINE = 90  # pixels
 VIDEO, EXECUTION, NOW = (122, 162, 205), (233, 148, 62), (200, 40, 40)
 
@@ -36,20 +37,20 @@ def memory_sheet(
     tiles = []
     for frame in displayed.tolist():
         patches = selected[selected[:, 0] == frame, 1]
-        kind, colour = ("video", VIDEO) if frame < exec_start else ("execution", EXECUTION)
+        kind, colour = "execution", EXECUTION
+        if frame < exec_start:
+            kind, colour = "video", VIDEO
         label = f"{frame} {kind} {len(patches)}/{grid**2}"
         tiles.append(Tile(np.asarray(_highlighted(frames[frame], patches, grid)), label, colour))
     tiles.append(Tile(frames[step], f"now: frame {step}", NOW))
-    header = Image.new(
-        "RGB",
-        (max(min(COLUMNS, len(tiles)), 6) * (TILE + GAP) - GAP, TIMELINE + 2 * LABEL),
-        "white",
-    )
+    columns = max(min(COLUMNS, len(tiles)), 6)
+    header = Image.new("RGB", (columns * (TILE + GAP) - GAP, TIMELINE + 2 * LABEL), "white")
     draw = ImageDraw.Draw(header)
     _timeline(draw, counts, grid**2, exec_start, step, (0, 0, header.width, TIMELINE))
     hidden = len(remembered) - len(displayed)
     note = "In colour: remembered patches. Dimmed: the rest of those frames."
-    note += f" {hidden} more frames are remembered in part." if hidden else ""
+    if hidden:
+        note += f" {hidden} more frames are remembered in part."
     draw.text((0, header.height - LABEL - 4), note, FAINT, font(13))
     return contact_sheet(tiles, COLUMNS, title, header)
 
@@ -95,15 +96,13 @@ def _timeline(
     split = left + exec_start * scale
     for begin, end, colour in ((left, split, VIDEO), (split, right, EXECUTION)):
         if end > begin:
-            draw.rectangle(
-                (begin, top, end, bottom), fill=tuple(235 + (c - 235) // 8 for c in colour)
-            )
+            pale = tuple(235 + (c - 235) // 8 for c in colour)
+            draw.rectangle((begin, top, end, bottom), fill=pale)
     for frame in np.flatnonzero(counts):
         x = left + frame * scale
         y = bottom - max(3, counts[frame] / full * (bottom - top))
-        draw.rectangle(
-            (x, y, x + max(scale, 2), bottom), fill=VIDEO if frame < exec_start else EXECUTION
-        )
+        colour = VIDEO if frame < exec_start else EXECUTION
+        draw.rectangle((x, y, x + max(scale, 2), bottom), fill=colour)
     draw.line((left, bottom, right, bottom), fill=INK)
     phases = {0: "0 · conditioning video", exec_start: f"{exec_start} · execution", step: str(step)}
     for frame, text in phases.items():

@@ -10,7 +10,6 @@ import numpy as np
 
 from mme_vla.data.consistency import compare_names
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, did_you_mean, require
 
@@ -79,13 +78,6 @@ def split_episodes(
             "The split leaves no episode to train on; lower val_fraction or shorten val_episodes."
         )
     return split
-
-
-def default_val_episodes(sources: Sequence[EpisodeSource]) -> list[str]:
-    """Episodes held out where `data.val_episodes` is null: the sample's episode 3, and none of any
-    other dataset.
-    """
-    return [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
 
 
 _KEYS = ("root", "name", "exec_starts")

@@ -17,9 +17,8 @@ import numpy as np
 from mme_vla.errors import UserError, require
 from mme_vla.utils import decoding, files_to_hold
 
-_SEEK_BEYOND = (
-    64  # images: a target further ahead than this is sought, a nearer one is decoded up to
-)
+# images: a target further ahead than this is sought, a nearer one is decoded up to
+_SEEK_BEYOND = 64
 
 
 class VideoReader:
@@ -44,15 +43,13 @@ class VideoReader:
         """
         order = np.argsort(np.asarray(timestamps), kind="stable")
         targets = np.asarray(timestamps, np.float64)[order]
-        images: list[np.ndarray] = []
         require(
             path.is_file(),
             f"{path} is missing: the dataset is incomplete. Copy or download it again.",
         )
         try:
             with decoding(path, "a video", "Copy or convert it again."):
-                for image in self._decode(self._container(path), targets, fps):
-                    images.append(image)
+                images = list(self._decode(self._container(path), targets, fps))
                 if len({image.shape for image in images}) > 1:
                     raise ValueError("its images are not of one size")
         except UserError:
@@ -77,17 +74,18 @@ class VideoReader:
         time, image = -np.inf, None
         ahead: Any = None  # the image after `image`, where it was decoded already
         for target in targets:
-            if target > time + near or target < time - tolerance or image is None:
+            is_behind = image is None or target < time - tolerance
+            if is_behind or target > time + near:
                 # One tick early, so that rounding never lands behind the image's own key frame.
                 container.seek(max(round(target / stream.time_base) - 1, 0), stream=stream)
                 frames = container.decode(stream)
                 time, image, ahead = -np.inf, None, None
             while time < target - tolerance:
-                frame = next(frames, None) if ahead is None else ahead
+                image = next(frames, None) if ahead is None else ahead
                 ahead = None
-                if frame is None:
+                if image is None:
                     return
-                time, image = float(frame.pts * stream.time_base), frame
+                time = float(image.pts * stream.time_base)
             while target - time > tolerance / 2:
                 # of a video with more images a second, the next may be nearer
                 ahead = next(frames, None) if ahead is None else ahead

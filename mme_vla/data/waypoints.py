@@ -37,25 +37,30 @@ class Motions:
         return self.targets[max(stop - most, 0) : stop]
 
 
-def find_motions(rows: np.ndarray, first: int) -> Motions:
-    """Take apart a column that holds, for every frame, the target of the motion under way.
+def find_motions(rows: np.ndarray, first: int, letters: Sequence[int] = ()) -> Motions:
+    """Take apart a column of planned motions: targets of the motion under way at every frame, or
+    choices at the frames where they began.
 
     A motion begins where its target first is in the column: that frame was seen when it had already
     begun, so it was decided one frame before. The first one was decided at the first execution
-    frame.
+    frame. Unlike a target, a choice may be made twice in a row.
 
     Args:
-        rows: [t, w] of the execution frames; NaN where no motion was noted yet. first: number of
-            their first frame.
+        rows: [t, w] of the execution frames; targets are NaN where no motion was noted yet.
+        first: number of their first frame. letters: of choices, which numbers are letters; a row
+            without one is no choice.
     """
-    noted = np.flatnonzero(np.isfinite(rows).all(1))
-    targets = rows[noted]
-    new = np.ones(len(noted), bool)
-    new[1:] = (targets[1:] != targets[:-1]).any(1)
-    begun = noted[new]
+    if letters:
+        begun: Any = np.flatnonzero(rows[:, list(letters)].any(1))
+    else:
+        noted = np.flatnonzero(np.isfinite(rows).all(1))
+        targets = rows[noted]
+        new = np.ones(len(noted), bool)
+        new[1:] = (targets[1:] != targets[:-1]).any(1)
+        begun = noted[new]
     decisions = np.maximum(begun - 1, np.arange(len(begun)))
     decisions[:1] = 0
-    return Motions(decisions.astype(np.int64) + first, targets[new].astype(np.float32))
+    return Motions(decisions.astype(np.int64) + first, rows[begun].astype(np.float32))
 
 
 def known_poses(
@@ -91,32 +96,14 @@ def row_of(text: str) -> np.ndarray | None:
     """
     try:
         choice = parse_json(text, "a recorded choice")
-        letter, point = (
-            choice["choice"].strip().lower(),
-            np.asarray(choice.get("point") or (), np.float64),
-        )
+        letter = choice["choice"].strip().lower()
+        point = np.asarray(choice.get("point") or (), np.float64)
+        is_valid = point.shape in ((0,), (2,)) and bool(np.isfinite(point).all())
     except (UserError, ValueError, TypeError, KeyError, AttributeError):
-        letter, point = None, np.zeros(0)
-    right = letter == "" or (letter is not None and len(letter) == 1 and letter in LETTERS)
-    if not right or point.shape not in ((0,), (2,)) or not np.isfinite(point).all():
+        is_valid = False
+    if not is_valid or letter not in ("", *LETTERS):
         raise UserError(
             f'{brief(text)} is no choice; expected {{"choice": "A", "point": [y, x]}}, letters A'
             " to H."
         )
     return choice_row(letter, point.tolist()) if letter else None
-
-
-def find_choices(rows: np.ndarray, first: int, letters: Sequence[int]) -> Motions:
-    """The choices of an execution, each decided on the frame before the one it began at, the first
-    one at the start.
-
-    Unlike a waypoint a choice may be made twice in a row.
-
-    Args:
-        rows: [t, w] of the execution frames. first: number of their first frame. letters: which
-            numbers are letters.
-    """
-    begun: Any = np.flatnonzero(rows[:, list(letters)].any(1))
-    decisions = np.maximum(begun - 1, np.arange(len(begun)))
-    decisions[:1] = 0
-    return Motions(decisions.astype(np.int64) + first, rows[begun].astype(np.float32))

@@ -45,8 +45,8 @@ from mme_vla.training.parallel import full_state, like
 from mme_vla.training.settings import KeepRule
 from mme_vla.training.shards import (
     MOMENTS,
+    SHARDS,
     ShardWriter,
-    fresh_folder,
     read_shards,
     read_weights,
     shard_files,
@@ -130,7 +130,8 @@ def save_shards(
         averaged = full_state(policy)
     about: list[str] = []
     if first:
-        fresh_folder(draft)
+        shutil.rmtree(draft, ignore_errors=True)
+        (draft / SHARDS).mkdir(parents=True)
         about = [*save_settings(policy, draft, facts), STATE]
 
     def finish() -> None:
@@ -190,14 +191,13 @@ def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
     `<name>/<key>`.
     """
     parameters = trainable(policy)
-    averaged, raw, moments = load_tensors(folder), _read(folder / RAW), _read(folder / OPTIMIZER)
+    averaged = load_tensors(folder)
+    raw = _read(folder / RAW)
+    moments = _read(folder / OPTIMIZER)
     state = policy.state_dict()
-    # frozen, and stored in float32
-    low = {name for name, tensor in state.items() if tensor.dtype == torch.bfloat16}
-    averaged = {
-        name: cast(tensor, torch.bfloat16) if name in low else tensor
-        for name, tensor in averaged.items()
-    }
+    for name, tensor in state.items():
+        if tensor.dtype == torch.bfloat16 and name in averaged:  # frozen, and stored in float32
+            averaged[name] = cast(averaged[name], torch.bfloat16)
     _check_fit(folder / "model.safetensors", averaged, state)
     _check_fit(folder / RAW, raw, parameters)
     required = {}
@@ -209,9 +209,8 @@ def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
     for path, tensors in ((folder, averaged), (folder / RAW, raw), (folder / OPTIMIZER, moments)):
         check_values(tensors, str(path))
     ema.load(averaged)
-    policy.load_state_dict(
-        {name: like(state[name], tensor) for name, tensor in {**averaged, **raw}.items()}
-    )
+    tensors = {**averaged, **raw}
+    policy.load_state_dict({name: like(state[name], tensors[name]) for name in tensors})
     return moments
 
 
@@ -232,8 +231,9 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
         )
     section_keys(state, str(path), _STATE_KEYS)
     step = state.get("step")
-    sections = isinstance(state.get("config"), dict) and isinstance(state.get("versions"), dict)
-    if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < 2**53 or not sections:
+    is_step = type(step) is int and 0 <= step < 2**53
+    has_sections = isinstance(state.get("config"), dict) and isinstance(state.get("versions"), dict)
+    if not is_step or not has_sections:
         raise UserError(
             f"{path} is damaged: it lacks a step, a configuration or versions. Resume from an older"
             " one."
@@ -245,8 +245,8 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
         " processes wrote: it is incomplete. Copy the whole folder again, or resume from an older"
         " checkpoint.",
     )
-    for name in () if shards else (RAW, OPTIMIZER):
-        if not (checkpoint / name).is_file():
+    for name in (RAW, OPTIMIZER):
+        if not shards and not (checkpoint / name).is_file():
             raise UserError(
                 f"{checkpoint} lacks {name}: it is incomplete. Resume from an older checkpoint."
             )
@@ -297,10 +297,8 @@ def _write_state(draft: Path, step: int, config: Mapping[str, Any], **more: Any)
 
 
 def _publish(draft: Path, target: Path) -> Path:
-    for path in (
-        *draft.rglob("*"),
-        draft,
-    ):  # the disk holds all of it before the folder gets its final name
+    # The disk holds all of it before the folder gets its final name.
+    for path in (*draft.rglob("*"), draft):
         handle = os.open(path, os.O_RDONLY)
         try:
             os.fsync(handle)
@@ -324,14 +322,13 @@ def _read(path: Path) -> dict[str, Tensor]:
 def _check_fit(
     path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], scalar: str = ""
 ) -> None:
-    names = set(tensors) ^ set(expected)
-    wrong = sorted(names) + [
-        f"{name}: {tuple(tensors[name].shape)} {tensors[name].dtype}"
-        for name in sorted(set(tensors) & set(expected))
-        if not (scalar and name.endswith(scalar))
-        and (tensors[name].shape, tensors[name].dtype)
-        != (expected[name].shape, expected[name].dtype)
-    ]
+    wrong = sorted(tensors.keys() ^ expected.keys())
+    for name in sorted(tensors.keys() & expected.keys()):
+        if scalar and name.endswith(scalar):
+            continue
+        tensor, target = tensors[name], expected[name]
+        if tensor.shape != target.shape or tensor.dtype != target.dtype:
+            wrong.append(f"{name}: {tuple(tensor.shape)} {tensor.dtype}")
     require(
         not wrong,
         f"{path} does not fit this policy: {len(wrong):,} tensors differ, such as"

@@ -13,7 +13,8 @@ from mme_vla.data.cache import COMMAND
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.dataset import GroupDataset, TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.sources import Split, default_val_episodes, open_sources, split_episodes
+from mme_vla.data.lerobot_files import SAMPLE
+from mme_vla.data.sources import Split, open_sources, split_episodes
 from mme_vla.data.statistics import check_ranges, compute_norm_stats
 from mme_vla.errors import UserError, require
 from mme_vla.memory.perturbation import build_transforms
@@ -65,7 +66,12 @@ def prepare_data(
             default asked here.
     """
     check_changes(policy, data)
-    sources, split = open_split(policy, data)
+    sources = open_sources(data.sources, policy.embodiment)
+    val_episodes: Sequence[int | str] | None = data.val_episodes
+    if val_episodes is None:  # of the sample, episode 3; of any other dataset, none
+        val_episodes = [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
+    split = split_episodes(sources, data.val_fraction, val_episodes)
+
     processor = policy.require_processor()
     if stats_from is None:
         processor.stats = compute_statistics(policy, data, sources, split, seed)
@@ -99,15 +105,6 @@ def check_changes(policy: Policy, data: DataSettings) -> None:
         f"data.history_transforms changes frames, and this policy learns from {kind}: leave it"
         " empty.",
     )
-
-
-def open_split(policy: Policy, data: DataSettings) -> tuple[list[EpisodeSource], Split]:
-    """Open the datasets, and choose the episodes of both sides."""
-    sources = open_sources(data.sources, policy.embodiment)
-    val_episodes: Sequence[int | str] | None = data.val_episodes
-    if val_episodes is None:
-        val_episodes = default_val_episodes(sources)
-    return sources, split_episodes(sources, data.val_fraction, val_episodes)
 
 
 def compute_statistics(
@@ -150,9 +147,11 @@ def read_statistics(
     processor = policy.require_processor()
     spec = processor.stats_spec
     stats = NormStats.load(checked_file(folder, STATS_FILE))
-    narrow: str = "warn" if data.narrow_ranges == "warn" else "refuse"
+    narrow = "refuse"
     if spec.bounds == "extremes":
         narrow = "ignore"
+    elif data.narrow_ranges == "warn":
+        narrow = "warn"
     try:
         check_ranges(
             stats,

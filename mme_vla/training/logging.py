@@ -35,8 +35,8 @@ from mme_vla.utils import read_lines, write_atomically
 
 
 class Window:
-    """Sums what updates report, on their device, and the time they take; reading it waits for the
-    device once.
+    """Sums of what updates report, on their device, and the time they take. Reading them waits for
+    the device once.
 
     A number that only some updates report is averaged over those.
     """
@@ -81,13 +81,17 @@ class Window:
         Args:
             step: updates done. reduce: averages a tensor over all processes (`Accelerator.reduce`).
         """
-        averages = {name: total / self._counts[name] for name, total in self._sums.items()}
-        measured = {
-            name: average for name, average in averages.items() if isinstance(average, Tensor)
-        }
+        values: dict[str, float] = {}
+        measured: dict[str, Tensor] = {}
+        for name, total in self._sums.items():
+            average = total / self._counts[name]
+            if isinstance(average, Tensor):
+                measured[f"train/{name}"] = average
+            else:
+                values[f"train/{name}"] = average
+        # One transfer from the device for all of them.
         means = reduce(torch.stack(list(measured.values())), reduction="mean").tolist()
-        known = averages | dict(zip(measured, means, strict=True))
-        values = {f"train/{name}": float(mean) for name, mean in known.items()}
+        values |= zip(measured, means, strict=True)
         seconds = time.perf_counter() - self._begun - self._paused
         values["speed/samples_per_s"] = self._updates * self._batch_size / seconds
         values["speed/waiting_for_data"] = self._waited / seconds
@@ -151,19 +155,10 @@ class ProgressLine:
         self.console.print(text, markup=False)
 
 
-def memory_gib(device: torch.device) -> float:
-    """Most memory used so far: allocated on a GPU, else this process's resident memory."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device) / 2**30
-    return resident_gib()
-
-
 def resident_gib() -> float:
-    """Most resident memory this process has had, or, where the system does not say so, it or its
-    parent before it.
-    """
+    """Peak resident memory of this process; without /proc it may include the parent's."""
     with suppress(OSError):
-        # on Linux; getrusage begins with what the parent had when it started this process
+        # getrusage begins with what the parent had when it started this process
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 2**20
@@ -250,10 +245,13 @@ def mlflow_tracker(
     """
     import mlflow
 
-    mlflow.set_tracking_uri(tracking_uri or f"sqlite:///{(folder / 'mlflow.db').absolute()}")
+    artifacts = None
+    if tracking_uri is None:
+        tracking_uri = f"sqlite:///{(folder / 'mlflow.db').absolute()}"
+        artifacts = (folder / "mlflow").absolute().as_uri()
+    mlflow.set_tracking_uri(tracking_uri)
     record = folder / "mlflow_id"
     run_id = record.read_text() if record.is_file() else None
-    artifacts = None if tracking_uri else (folder / "mlflow").absolute().as_uri()
     return MLflowTracker(project, artifacts, run_id=run_id, run_name=_run_name(folder))
 
 
@@ -308,16 +306,19 @@ def check_logger(config: Mapping[str, Any]) -> None:
     names is missing.
     """
     name = (config.get("logger") or {}).get("name")
+    if name not in ("wandb", "trackio", "mlflow"):
+        return
     try:
-        is_installed = name not in ("wandb", "trackio", "mlflow") or find_spec(name) is not None
+        is_installed = find_spec(name) is not None
     except ValueError:  # a module without a specification
         is_installed = False
-    if not is_installed:
-        if name == "wandb":
-            raise missing_extra("logger=wandb", "wandb")
-        raise UserError(
-            f"logger={name} needs the package {name}: pip install -c constraints.txt {name}"
-        )
+    if is_installed:
+        return
+    if name == "wandb":
+        raise missing_extra("logger=wandb", "wandb")
+    raise UserError(
+        f"logger={name} needs the package {name}: pip install -c constraints.txt {name}"
+    )
 
 
 def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Loggers:

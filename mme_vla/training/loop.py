@@ -26,7 +26,7 @@ from mme_vla.training.checkpoint import (
     trainable,
 )
 from mme_vla.training.data import SplitData
-from mme_vla.training.logging import Loggers, ProgressLine, Window, memory_gib, read_metrics
+from mme_vla.training.logging import Loggers, ProgressLine, Window, read_metrics, resident_gib
 from mme_vla.training.open_loop import OpenLoop, error_lines, open_loop, plot_open_loop
 from mme_vla.training.optim import EMA, clip_gradients, lr_factors, make_optimizer, scheduled_rate
 from mme_vla.training.order import (
@@ -316,7 +316,11 @@ class Trainer:
 
     def _log(self, step: int, window: Window, line: ProgressLine, loggers: Loggers) -> None:
         values = window.close(step, self.accelerator.reduce)
-        values["memory/gib"] = memory_gib(self.accelerator.device)
+        device = self.accelerator.device
+        if device.type == "cuda":
+            values["memory/gib"] = torch.cuda.max_memory_allocated(device) / 2**30
+        else:
+            values["memory/gib"] = resident_gib()
         loggers.write(step, values)
         line.numbers(step, values)
 

@@ -39,27 +39,26 @@ class OpenLoop:
     still: np.ndarray | None
     space: ActionSpace
 
-    def error(self, predicted: np.ndarray | None = None) -> np.ndarray:
-        """Mean absolute error [w] in the units of the actions."""
-        difference = np.abs((self.predicted if predicted is None else predicted) - self.recorded)
+    def error(self, predicted: np.ndarray) -> np.ndarray:
+        """Mean absolute error [w] of chunks [n, h, w] in the units of the actions."""
+        difference = np.abs(predicted - self.recorded)
         return (difference * self.valid[..., None]).sum((0, 1)) / self.valid.sum()
 
     def summary(self) -> dict[str, Any]:
         """The errors, plain: physical and normalised (1 = half the range of the training data's
         deltas).
         """
-        physical = self.error()
-        still = {}
-        if self.still is not None:
-            still_error = self.error(np.broadcast_to(self.still[:, None], self.recorded.shape))
-            still = {"mean_abs_error_holding_still": still_error.round(5).tolist()}
-        return {
+        physical = self.error(self.predicted)
+        summary: dict[str, Any] = {
             "names": list(self.space.names),
             "mean_abs_error": physical.round(5).tolist(),
             "mean_abs_error_normalised": (physical / self.scale).round(5).tolist(),
-            **still,
             "chunks": len(self.steps),
         }
+        if self.still is not None:
+            still_error = self.error(np.broadcast_to(self.still[:, None], self.recorded.shape))
+            summary["mean_abs_error_holding_still"] = still_error.round(5).tolist()
+        return summary
 
 
 @torch.compiler.set_stance("force_eager")  # a few chunks are not worth compiling for
@@ -77,19 +76,20 @@ def open_loop(
     horizon = policy.horizon
     source, episode, _ = samples.locate(0)
     count = len(samples.decisions(source, episode))
-    starts = np.arange(0, count, horizon)
-    starts = starts[
-        np.linspace(0, len(starts) - 1, min(chunks, len(starts))).round().astype(int)
-    ].tolist()
+    tiles = np.arange(0, count, horizon)
+    places = np.linspace(0, len(tiles) - 1, min(chunks, len(tiles))).round().astype(int)
+    starts = tiles[places].tolist()
+    recorded = [samples.step(start) for start in starts]
+    all_states = np.stack([step.state for step in recorded])
     predicted = []
     generator = generator_for(seed, "open loop")
-    for place in (starts[i : i + 8] for i in range(0, len(starts), 8)):
-        batch = processor.collate([samples.observation(i) for i in place])
-        states = torch.from_numpy(np.stack([samples.step(i).state for i in place]))
-        draws = stack_noise([policy.sampling_noise(generator) for _ in place], policy.device)
+    for first in range(0, len(starts), 8):
+        group = starts[first : first + 8]
+        batch = processor.collate([samples.observation(start) for start in group])
+        draws = stack_noise([policy.sampling_noise(generator) for _ in group], policy.device)
         chunk = policy.sample_actions(batch.to(policy.device), draws).float().cpu()
+        states = torch.from_numpy(all_states[first : first + 8])
         predicted.append(processor.absolute_actions(chunk, states))
-    recorded = [samples.step(i) for i in starts]
     stats = processor.stats
     assert stats is not None
     half_range = (stats.actions.q99 - stats.actions.q01) / 2
@@ -104,7 +104,7 @@ def open_loop(
         recorded=np.stack([step.actions for step in recorded]),
         valid=np.stack([step.recorded for step in recorded]),
         scale=np.where(half_range > 0, half_range, 1),
-        still=np.stack([step.state for step in recorded]) if state_is_command else None,
+        still=all_states if state_is_command else None,
         space=data.robot.action,
     )
 
@@ -121,7 +121,8 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
     # Margins in inches: laying them out by the texts' extents would draw everything twice.
     figure.subplots_adjust(0.06, 0.75 / height, 0.99, 1 - 0.7 / height, wspace=0.14, hspace=0.25)
     panels = figure.subplots(rows, 2, sharex=True, squeeze=False).flatten()
-    errors, scaled = result.error(), result.error() / result.scale
+    errors = result.error(result.predicted)
+    scaled = errors / result.scale
     time = result.steps[:, None] + np.arange(result.recorded.shape[1])
     for joint, panel in enumerate(panels[: result.space.width]):
         panel.plot(

@@ -64,7 +64,7 @@ class ParallelSettings:
         nodes = max(world // int(os.environ.get("LOCAL_WORLD_SIZE", world)), 1)
         copies = nodes if self.replicate is None else self.replicate
         require(
-            not (world % copies),
+            world % copies == 0,
             f"train.parallel.replicate={copies} must divide the number of processes, {world}.",
         )
         if copies == 1:
@@ -85,9 +85,10 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
         compiled: groups are compiled whole, so nothing inside one is gathered apart: its norms are
             in `dtype` too.
     """
-    full = dict(policy.state_dict()) if distributed.get_rank() == 0 else {}
-    full = {name: tensor.detach().cpu() for name, tensor in full.items()}
-    if distributed.get_rank() != 0:
+    full: dict[str, Tensor] = {}
+    if distributed.get_rank() == 0:
+        full = {name: tensor.detach().cpu() for name, tensor in policy.state_dict().items()}
+    else:
         recompute_buffers(policy)
     low = None if dtype == torch.float32 else dtype
 
@@ -102,10 +103,12 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
     else:
         groups = [ShardGroup(layer) for layer in stacked_layers(policy)]
     for group in groups:
-        exact = [] if group.full or low is None or compiled else float32_modules(group.module)
-        if exact:
-            wrap(exact, None)
-        wrap(group.module, None if group.full else low)
+        kind = None if group.full else low
+        if kind is not None and not compiled:
+            exact = float32_modules(group.module)
+            if exact:
+                wrap(exact, None)
+        wrap(group.module, kind)
         if isinstance(group.module, nn.Embedding):  # its gradient needs the words alone
             cast(FSDPModule, group.module).set_unshard_in_backward(False)
     wrap(policy, None)
@@ -115,10 +118,9 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
 
 def _materialise(policy: Policy, mesh: DeviceMesh) -> None:
     """Give what is on meta memory, and what no checkpoint holds the first process's values."""
-    kind = mesh.device_type
-    device = (
-        torch.device(kind, torch.cuda.current_device()) if kind == "cuda" else torch.device(kind)
-    )
+    device = torch.device(mesh.device_type)
+    if device.type == "cuda":
+        device = torch.device("cuda", torch.cuda.current_device())
     for module in policy.modules():
         tensors = [*module.parameters(recurse=False), *module.buffers(recurse=False)]
         if any(tensor.is_meta for tensor in tensors):
@@ -134,17 +136,15 @@ def full_state(policy: Policy) -> dict[str, Tensor]:
     processes call it.
     """
     full = cast(dict[str, Tensor], get_model_state_dict(policy, options=FULL_STATE))
-    # Trained on the CPU they may lie in what training continues with, or in the middle of what was
-    # gathered.
-    return (
-        {name: tensor.clone() for name, tensor in full.items()}
-        if policy.device.type == "cpu"
-        else full
-    )
+    if policy.device.type != "cpu":
+        return full
+    # On the CPU they may be the storage that training continues with, or lie in the middle of what
+    # was gathered.
+    return {name: tensor.clone() for name, tensor in full.items()}
 
 
 def reshard(module: nn.Module) -> None:
-    """Let go of gathered weights, so that the next pass gathers what the shards now hold."""
+    """Release gathered weights, so that the next pass gathers what the shards now hold."""
     for part in _sharded_parts(module):
         part.reshard()
         # A pass that used only some of a group's norms left the group waiting for the others.
@@ -156,7 +156,7 @@ def gathered(policy: Policy) -> Iterator[None]:
     """Within this context every process holds all weights of a sharded policy, and any of its
     methods may be called.
 
-    For sampling and looking, without gradients. All processes enter it; inside nothing is
+    For sampling and inspection, without gradients. All processes enter it; inside nothing is
     collective.
     """
     parts = _sharded_parts(policy)

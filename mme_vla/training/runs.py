@@ -59,13 +59,6 @@ are open (`check_content`). A run's statistics stay what they are: `data.narrow_
 whether it continues with narrow ones.
 """
 
-ONLY_CHOICES = {
-    "backbone.head.name": "flow",
-    "data.history_transforms": [],
-    "learning.history_transforms": [],
-}
-"""Keys that checkpoints do not name where there was no other choice yet, and that choice."""
-
 
 @dataclass(frozen=True)
 class Run:
@@ -199,9 +192,6 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
     """Dotted keys that a run may not change, with their values in two plain configurations."""
     before = flat(to_json(old))
     after = flat(to_json(new))
-    for key, value in ONLY_CHOICES.items():
-        if key in after:
-            before.setdefault(key, value)
     differing: dict[str, tuple[Any, Any]] = {}
     for key in sorted(before.keys() | after.keys()):
         may_differ = any(f"{key}.".startswith(f"{free}.") for free in MAY_DIFFER)

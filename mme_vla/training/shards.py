@@ -11,7 +11,6 @@ them reads it again.
 `torch.distributed.checkpoint` writes and reads them. They are safetensors too: nothing is pickled.
 """
 
-import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -115,16 +114,18 @@ def training_tensors(
             there were none.
     """
     tensors = {f"{RAW}/{name}": tensor for name, tensor in policy.state_dict().items()}
-    tensors |= {f"{AVERAGE}/{name}": tensor for name, tensor in averages.items()}
+    for name, tensor in averages.items():
+        tensors[f"{AVERAGE}/{name}"] = tensor
     counts = torch.full((len(trained),), -1.0)
     for i, (name, parameter) in enumerate(trained.items()):
         state = optimizer.state.get(parameter, {})
-        tensors |= {
-            f"{key}/{name}": state.get(key, torch.zeros_like(parameter)).detach() for key in MOMENTS
-        }
+        for key in MOMENTS:
+            moment = state.get(key, torch.zeros_like(parameter))
+            tensors[f"{key}/{name}"] = moment.detach()
         if "step" in state:
             counts[i] = float(state["step"])
-    return tensors | {STEPS: counts}
+    tensors[STEPS] = counts
+    return tensors
 
 
 def read_shards(
@@ -141,18 +142,16 @@ def read_shards(
         Adam's moments and counts as `<name>/<key>`, of those parameters that had any.
     """
     tensors = training_tensors(policy, averages, optimizer, trained)
-    _load(
-        checkpoint,
-        tensors,
-        alone=not any(isinstance(tensor, DTensor) for tensor in tensors.values()),
-    )
+    is_sharded = any(isinstance(tensor, DTensor) for tensor in tensors.values())
+    _load(checkpoint, tensors, alone=not is_sharded)
     reshard(policy)
     moments: dict[str, Tensor] = {}
     for name, count in zip(trained, tensors[STEPS], strict=True):
-        if count >= 0:
-            moments |= {f"{name}/{key}": tensors[f"{key}/{name}"] for key in MOMENTS} | {
-                f"{name}/step": count
-            }
+        if count < 0:
+            continue
+        for key in MOMENTS:
+            moments[f"{name}/{key}"] = tensors[f"{key}/{name}"]
+        moments[f"{name}/step"] = count
     return moments
 
 
@@ -169,14 +168,16 @@ def read_weights(checkpoint: Path, policy: nn.Module) -> dict[str, Tensor]:
 
 
 def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: bool = False) -> None:
+    """Read tensors in place.
+
+    Args:
+        alone: this process reads all of them by itself. others: the checkpoint may hold more.
+    """
     folder = checkpoint / SHARDS
     files = shard_files(checkpoint)
-    rank = 0 if alone else distributed.get_rank()
-    world = 1 if alone else distributed.get_world_size()
-    sums: dict[Path, Sums] = {}
     if any(name.startswith(f"{SHARDS}/") for name in Sums(checkpoint).table):
-        # checkpoints of the first version list none
         check_sums(checkpoint, shard_notes(checkpoint))
+    sums: dict[Path, Sums] = {}
     for file in files:
         note = file.with_suffix(".sha256")
         for path in (file, note):
@@ -187,22 +188,25 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
             f"{note} with the checksum of {file.name} is missing. {_REMEDY}",
         )
         check_header(file)
-    for file in files[rank::world]:  # all together compare each file once
+    # All processes together compare each file once.
+    share = files if alone else files[distributed.get_rank() :: distributed.get_world_size()]
+    for file in share:
         sums[file].check(file.name)
     reader = dcp.HuggingFaceStorageReader(str(folder))
     with _decoding(folder):
         metadata = reader.read_metadata().state_dict_metadata
         stored = {name: about.size for name, about in metadata.items()}  # type: ignore[union-attr]
-    shapes = {name: tensor.shape for name, tensor in tensors.items()}
-    names = set(shapes) - set(stored) if others else set(shapes) ^ set(stored)
-    wrong = sorted(
-        names | {name for name in shapes.keys() & stored.keys() if shapes[name] != stored[name]}
-    )
+    wrong = []
+    for name, tensor in tensors.items():
+        if stored.get(name) != tensor.shape:
+            wrong.append(name)
+    if not others:
+        wrong += stored.keys() - tensors.keys()
     require(
         not wrong,
         f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as"
-        f" {listed(wrong, 4)}. It belongs to another model or other settings, or a file of it is"
-        " missing.",
+        f" {listed(sorted(wrong), 4)}. It belongs to another model or other settings, or a file of"
+        " it is missing.",
     )
     try:
         with _quiet():
@@ -210,17 +214,14 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     except CheckpointException as error:  # what the processes met with, by their numbers
         with _decoding(folder):
             raise next(iter(error.failures.values()))[0] from error
-    local = {name: t.to_local() if isinstance(t, DTensor) else t for name, t in tensors.items()}
+    local = {}
+    for name, tensor in tensors.items():
+        local[name] = tensor.to_local() if isinstance(tensor, DTensor) else tensor
     check_values(local, str(folder))
 
 
 def _decoding(folder: Path) -> AbstractContextManager[None]:
     return decoding(folder, "shards of a checkpoint", _REMEDY)
-
-
-def fresh_folder(draft: Path) -> None:
-    shutil.rmtree(draft, ignore_errors=True)
-    (draft / SHARDS).mkdir(parents=True)
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.statistics import compute_norm_stats
-from mme_vla.data.waypoints import find_choices, row_of
+from mme_vla.data.waypoints import find_motions, row_of
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option, read_options
 from mme_vla.embodiment.robomme import benchmark_action, choice_row
@@ -112,13 +112,13 @@ def test_every_choice_is_decided_on_one_frame_before_it_begins_even_the_same_twi
     rows = np.zeros((12, 10), np.float32)
     for frame, letter in ((2, "a"), (5, "b"), (9, "b")):
         rows[frame] = choice_row(letter, [])
-    choices = find_choices(rows, 50, SPACE.choice)
+    choices = find_motions(rows, 50, SPACE.choice)
     assert choices.decisions.tolist() == [50, 54, 58] and choices.targets[:, 1].tolist() == [
         0,
         1,
         1,
     ]
-    assert find_choices(np.zeros((3, 10), np.float32), 0, SPACE.choice).decisions.tolist() == []
+    assert find_motions(np.zeros((3, 10), np.float32), 0, SPACE.choice).decisions.tolist() == []
 
 
 def test_recorded_choices_are_converted_and_read_as_decisions(folder: Path) -> None:
@@ -324,7 +324,7 @@ def test_choices_of_real_episodes_are_those_of_the_official_files(h5_folder: Pat
             EpisodeRef(h5_folder / f"record_dataset_{task}.h5", number, task)
         ) as episode:
             rows, first = episode.choice_actions()[episode.exec_start :], episode.exec_start
-            motions = find_choices(rows, first, SPACE.choice)
+            motions = find_motions(rows, first, SPACE.choice)
             actions = [benchmark_action(SPACE, row) for row in motions.targets]
             counts[task] = (
                 motions.decisions.tolist(),

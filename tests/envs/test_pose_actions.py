@@ -20,7 +20,7 @@ from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.statistics import compute_norm_stats
-from mme_vla.data.waypoints import find_choices, find_motions
+from mme_vla.data.waypoints import find_motions
 from mme_vla.envs.vector.messages import Command
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.rollout.environment import make_rollout_env
@@ -212,7 +212,7 @@ def test_recorded_actions_of_a_real_episode_succeed_in_the_environment(
         rows, recorded_options = rows[episode.exec_start :], episode.options
     actions = rows
     if chooses:
-        actions = find_choices(rows, 0, panda.action.choice).targets
+        actions = find_motions(rows, 0, panda.action.choice).targets
     elif panda.action.frames != 1:
         actions = find_motions(rows, 0).targets
     env = make_rollout_env(

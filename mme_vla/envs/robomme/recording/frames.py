@@ -11,7 +11,6 @@ import numpy as np
 from mme_vla.data.waypoints import (
     CHOICE_NUMBERS,
     Motions,
-    find_choices,
     find_motions,
     known_poses,
     row_of,
@@ -125,7 +124,7 @@ def choices_of(steps: Sequence["RecordedStep"]) -> Motions:
             row = row_of(step.action["choice_action"])
             if row is not None:
                 rows[k] = row
-    return find_choices(rows[video:], video, range(len(LETTERS)))
+    return find_motions(rows[video:], video, range(len(LETTERS)))
 
 
 def _video(steps: Sequence["RecordedStep"]) -> int:
