@@ -131,8 +131,6 @@ class VisionCache:
         self.folder = folder
         self.spec = StorageSpec(**expected["storage"])
         self._source = source
-        self._lengths = source.lengths
-        self._exec_starts = source.exec_starts
         self._dtype = DTYPES[expected["dtype"]]
         self._command = command
         missing = []
@@ -159,14 +157,13 @@ class VisionCache:
         """The stored tokens of a whole episode."""
         if episode not in self._histories:
             self.verify(episode)
-            length = int(self._lengths[episode])
             self._histories[episode] = CachedHistory(
                 self.spec,
                 self._tokens(episode),
                 stored_frames(self._source, episode, self.spec),
-                length,
+                int(self._source.lengths[episode]),
                 self._scores(episode),
-                int(self._exec_starts[episode]),
+                int(self._source.exec_starts[episode]),
             )
             while len(self._histories) > self.max_open:
                 self._histories.popitem(last=False)
@@ -210,7 +207,7 @@ class VisionCache:
             np.load(path) as stored,
         ):
             frames, values = stored["frames"], stored["values"]
-        length = int(self._lengths[episode])
+        length = int(self._source.lengths[episode])
         patches = self.spec.grid**2
         is_frames = frames.dtype == np.int64 and frames.ndim == 1
         require(

@@ -373,14 +373,18 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         """
         source = self.sources[step.source]
         samples = self.processor.samples
-        # The frames of the window, and those of the history that the memory camera shows, as they
-        # are recorded.
-        start = int(source.exec_starts[step.episode]) if frames is None else frames.exec_start
+        # The recorded frames of the window, and of the history that the memory camera shows.
+        start = step.exec_start
+        if frames is not None:
+            start = frames.exec_start
         window = np.arange(now - samples.window + 1, now + 1).clip(min=min(start, now))
-        past = None if samples.history is None else samples.history(now)
+        past = None
+        if samples.history is not None:
+            past = samples.history(now)
         if frames is not None:
             window = frames.real[window]
-            past = None if past is None else frames.real[past]
+            if past is not None:
+                past = frames.real[past]
         first = int(window[0])
         states = source.states(step.episode, first, step.index + 1)
         views = {}

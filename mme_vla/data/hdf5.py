@@ -422,7 +422,9 @@ def recorded_options(refs: Sequence[EpisodeRef]) -> dict[str, Any]:
         whether all have the tool's poses, options and choices. `partly`: whether one of them has
         images of selected frames alone.
     """
-    poses, tool_pose, choices, partly = list(POSE_ACTIONS), True, True, False
+    poses = list(POSE_ACTIONS)
+    tool_pose = choices = True
+    partly = False
     for file in dict.fromkeys(ref.file for ref in refs):
         with _open(file) as handle:
             for group in (ref.group for ref in refs if ref.file == file):

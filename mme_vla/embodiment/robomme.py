@@ -72,10 +72,11 @@ def benchmark_action(
     """
     if space.of_pose and pose is not None:
         action = space.beside_pose(action, pose)
-    if not space.choice:
-        return action[: space.width - stick]
-    letter = ascii_uppercase[int(np.argmax(action[list(space.choice)]))]
-    return {"choice": letter, "point": [float(share) * SIDE for share in action[list(space.point)]]}
+    if space.choice:
+        letter = ascii_uppercase[int(np.argmax(action[list(space.choice)]))]
+        point = [float(share) * SIDE for share in action[list(space.point)]]
+        return {"choice": letter, "point": point}
+    return action[:-1] if stick else action
 
 
 def choice_row(letter: str, point: Sequence[float]) -> np.ndarray:
@@ -98,7 +99,8 @@ def benchmark_state(
     """The state [8] float32 that RoboMME's robots have for a policy: the arm's joint angles and the
     first finger.
     """
-    arm, gripper = np.asarray(joints, np.float32)[:ARM_JOINTS], np.asarray(fingers, np.float32)[:1]
+    arm = np.asarray(joints, np.float32)[:ARM_JOINTS]
+    gripper = np.asarray(fingers, np.float32)[:1]
     return np.concatenate([arm, gripper])
 
 
@@ -110,12 +112,12 @@ def check_benchmark(robot: Embodiment, spaces: Sequence[str]) -> None:
         f"{robot.action.space!r}, not one of {', '.join(spaces)} (embodiment.action.space).",
     )
     other = [name for name in robot.camera_names if name not in CAMERAS]
-    if other or robot.state.width != ROBOMME_JOINT.state.width:
-        difference = (
-            f"the cameras {', '.join(other)}"
-            if other
-            else f"a state of {robot.state.width} numbers"
-        )
+    difference = None
+    if other:
+        difference = f"the cameras {', '.join(other)}"
+    elif robot.state.width != ROBOMME_JOINT.state.width:
+        difference = f"a state of {robot.state.width} numbers"
+    if difference is not None:
         raise UserError(
             f"The robot {robot.name!r} cannot be evaluated on the benchmark: it has {difference},"
             f" and the benchmark gives the cameras {', '.join(CAMERAS)} and"

@@ -38,7 +38,9 @@ class Camera:
 
         The pose is from the world to the camera, in OpenCV's axes.
         """
-        return (f"{self.name}_depth", f"{self.name}_camera_extrinsic") if self.depth else ()
+        if not self.depth:
+            return ()
+        return f"{self.name}_depth", f"{self.name}_camera_extrinsic"
 
 
 @checked_dataclass(frozen=True, config=_STRICT)

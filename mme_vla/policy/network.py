@@ -15,7 +15,6 @@ from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.processing.base import HasMemoryImages
 from mme_vla.speed import Recomputes
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -152,7 +151,6 @@ class NetworkPolicy(Policy, Recomputes):
         source = self.memory_tower
         device = self.device
         processor = self.require_processor()
-        assert isinstance(processor, HasMemoryImages)
         empty = torch.zeros(
             0, storage.grid**2, source.width, dtype=self.info.history_dtype, device=device
         )

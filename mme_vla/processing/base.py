@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -162,6 +162,14 @@ class PolicyProcessor:
         """
         raise NotImplementedError
 
+    def memory_images(
+        self, frames: np.ndarray | Tensor, device: torch.device | str | None = None
+    ) -> Tensor:
+        """Resize memory frames [n, H, W, 3] uint8 for the vision tower, on `device` if one is
+        given. Needed only by networks whose memory stores vision tokens.
+        """
+        raise NotImplementedError
+
     @property
     def prompt_spec(self) -> PromptSpec:
         """What the prompts consist of."""
@@ -232,19 +240,6 @@ class PolicyProcessor:
             tokenizer: in place of the one that `processor.json` names.
         """
         raise NotImplementedError
-
-
-@runtime_checkable
-class HasMemoryImages(Protocol):
-    """A processor for networks whose memory stores vision tokens."""
-
-    def memory_images(
-        self, frames: np.ndarray | Tensor, device: torch.device | str | None = None
-    ) -> Tensor:
-        """Resize memory frames [n, H, W, 3] uint8 for the vision tower, on `device` if one is
-        given.
-        """
-        ...
 
 
 def motion_rows(

@@ -321,7 +321,10 @@ class RunningStats:
         elif (low < self._low).any() or (high > self._high).any():
             self._low = np.minimum(low, self._low)
             self._high = np.maximum(high, self._high)
-            self._rebin()
+            edges = np.linspace(self._low, self._high, self._bins + 1, axis=1)
+            for i, (old, new) in enumerate(zip(self._edges, edges, strict=True)):
+                self._counts[i] = np.histogram(old[:-1], new, weights=self._counts[i])[0]
+            self._edges = edges
         self._count += len(rows)
         weight = len(rows) / self._count
         self._mean = self._mean + (rows.mean(0) - self._mean) * weight
@@ -347,12 +350,6 @@ class RunningStats:
         if extremes:
             return replace(stats, min=self._low.copy(), max=self._high.copy())
         return stats
-
-    def _rebin(self) -> None:
-        edges = np.linspace(self._low, self._high, self._bins + 1, axis=1)
-        for i, (old, new) in enumerate(zip(self._edges, edges, strict=True)):
-            self._counts[i] = np.histogram(old[:-1], new, weights=self._counts[i])[0]
-        self._edges = edges
 
     def _quantile(self, q: float) -> np.ndarray:
         below = self._counts.cumsum(1) < q * self._count

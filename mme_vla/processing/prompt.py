@@ -206,7 +206,6 @@ def encode_prompt(
     Returns:
         ids [l] int64, padded on the right with 0; mask [l] bool, False on the padding.
     """
-    checked_text(inputs.goal, "the goal")
     tokens: list[int] = []
     for text, bos in prompt_format.pieces(inputs):
         tokens += tokenizer.encode(text, bos=bos)
@@ -224,7 +223,6 @@ def encode_prompt(
 
 def shorten(text: str, tokenizer: Tokenizer, length: int | None) -> str:
     """Cut a text to its first `length` tokens, with one warning; None leaves it as it is."""
-    checked_text(text, "the subgoal")
     tokens = tokenizer.encode(text, bos=False)
     if length is None or len(tokens) <= length:
         return text

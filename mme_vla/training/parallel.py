@@ -85,7 +85,7 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
         compiled: groups are compiled whole, so nothing inside one is gathered apart: its norms are
             in `dtype` too.
     """
-    full: dict[str, Tensor] = {}
+    full: dict[str, Any] = {}
     if distributed.get_rank() == 0:
         full = {name: tensor.detach().cpu() for name, tensor in policy.state_dict().items()}
     else:

@@ -25,7 +25,7 @@ from mme_vla.weights.orbax import (
     variant_of,
 )
 from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
-from mme_vla.weights.torch_files import SUFFIXES, find_torch_files, read_torch_file
+from mme_vla.weights.torch_files import SUFFIXES, read_torch_file
 
 FORMATS = {
     "ours": "save_pretrained() of this library",
@@ -254,10 +254,10 @@ def open_source(
         )
         return _of_files(path, tuple(weight_files(path)))
     if params is not None:
-        return Source(
-            "released", params.parent if params.name == "params" else params, params=params
-        )
-    if (zipped := find_archive(path)) is not None:
+        folder = params.parent if params.name == "params" else params
+        return Source("released", folder, params=params)
+    zipped = find_archive(path)
+    if zipped is not None:
         return _of_archive(zipped)
     adapters = _adapters_in(path)
     if adapters is not None:
@@ -266,7 +266,8 @@ def open_source(
             f" ({brief(adapters.base)}): name it, load_weights(policy, run, base=…), or mme-vla"
             " weights <run> <new folder> --base …"
         )
-    if len(files := find_torch_files(path)) == 1:
+    files = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES and file.is_file())
+    if len(files) == 1:
         return _of_torch_file(files[0])
     require(
         not files, f"{path} holds {listed(file.name for file in files)}: name the one you mean."
@@ -303,9 +304,10 @@ def _of_archive(file: Path) -> Source:
 def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
     names = [name for file in files for name in _names(file)]
     if is_port(names):
-        lerobot = any(name.startswith(LEROBOT_PREFIX) for name in names)
-        described = Source("lerobot", folder).config.get("type") is not None
-        return Source("lerobot" if lerobot or described else "openpi", folder, files)
+        if "type" in Source("lerobot", folder).config:
+            return Source("lerobot", folder, files)
+        is_prefixed = any(name.startswith(LEROBOT_PREFIX) for name in names)
+        return Source("lerobot" if is_prefixed else "openpi", folder, files)
     # Not every kind of policy has a backbone among its modules; each has one in its configuration.
     if "backbone" in Source("ours", folder).config:
         return Source("ours", folder, files)

@@ -15,10 +15,6 @@ MODEL = ("model", "state_dict", "model_state_dict", "model_state")
 """Where files keep their tensors, if they hold more than these."""
 
 
-def find_torch_files(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix in SUFFIXES and file.is_file())
-
-
 _REMEDY = (
     "It is damaged, or holds objects, which are code and are not run. Download or copy it again."
 )
@@ -47,18 +43,20 @@ def read_torch_file(path: Path, mapped: bool = False) -> dict[str, Tensor]:
     `load_torch_file`.
     """
     content = load_torch_file(path, "weights", mapped)
-    for key in MODEL:
-        if isinstance(content, dict) and isinstance(content.get(key), dict):
-            content = content[key]
-            break
     if not isinstance(content, dict):
         raise UserError(f"{path} holds no table of tensors, but {type(content).__name__}.")
-    tensors = content
-    if content and all(isinstance(part, dict) for part in content.values()):
-        tensors = {}
-        for part, of_part in content.items():
-            for name, tensor in of_part.items():
-                tensors[f"{part}.{name}"] = tensor
+    for key in MODEL:
+        if isinstance(content.get(key), dict):
+            content = content[key]
+            break
+    tensors: dict[str, Tensor] = {}
+    is_by_part = all(isinstance(part, dict) for part in content.values())
+    for name, value in content.items():
+        if is_by_part:
+            for inner, tensor in value.items():
+                tensors[f"{name}.{inner}"] = tensor
+        else:
+            tensors[str(name)] = value
     if not tensors or not all(isinstance(value, Tensor) for value in tensors.values()):
-        raise UserError(f"{path} holds no table of tensors, but {listed(tensors)}.")
-    return {str(name): tensor for name, tensor in tensors.items()}
+        raise UserError(f"{path} holds no table of tensors, but {listed(content)}.")
+    return tensors
