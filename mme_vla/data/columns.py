@@ -94,17 +94,6 @@ def weight_column(source: EpisodeSource, name: str) -> np.ndarray:
     return weights
 
 
-def text_column(source: EpisodeSource, name: str, key: str) -> pa.ChunkedArray:
-    """The text of every frame of a dataset; `key` names the column in messages."""
-    column = _read(source, name, key)
-    require(
-        pa.types.is_string(column.type) or pa.types.is_large_string(column.type),
-        f"{key}: the column {name!r} of {source.name} holds {column.type}, no texts.",
-    )
-    _check(source, name, key, column.is_null().to_numpy(zero_copy_only=False), "has no value")
-    return column
-
-
 def _read(source: EpisodeSource, name: str, key: str) -> Any:
     files = parquet_files(source.root, "data")
     schemas = [set(pq.read_schema(file).names) for file in files]
@@ -113,7 +102,15 @@ def _read(source: EpisodeSource, name: str, key: str) -> Any:
 
 
 def _boundaries(source: EpisodeSource, label: str) -> np.ndarray:
-    subgoals = text_column(source, "simple_subgoal", f"the label {label}")
+    """The first frames of sub-tasks, [rows] float32: where the text of `simple_subgoal` changes."""
+    name = "simple_subgoal"
+    key = f"the label {label}"
+    subgoals = _read(source, name, key)
+    require(
+        pa.types.is_string(subgoals.type) or pa.types.is_large_string(subgoals.type),
+        f"{key}: the column {name!r} of {source.name} holds {subgoals.type}, no texts.",
+    )
+    _check(source, name, key, subgoals.is_null().to_numpy(zero_copy_only=False), "has no value")
     codes = subgoals.combine_chunks().dictionary_encode().indices.to_numpy()
     begins = np.concatenate([[True], np.diff(codes) != 0])
     begins[np.cumsum(source.lengths) - source.lengths] = True

@@ -80,11 +80,12 @@ class FurtherColumns:
 
     def of_memory(self, episode: int) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
         """The labels that the memory reads, by name: values of an episode's frames [n]."""
-        return {name: partial(self._values, name, episode) for name in self._memory_labels}
 
-    def _values(self, name: str, episode: int, frames: np.ndarray) -> np.ndarray:
-        values: np.ndarray = self._labels[name][self._source.rows(episode, frames)]
-        return values
+        def read(name: str, frames: np.ndarray) -> np.ndarray:
+            values: np.ndarray = self._labels[name][self._source.rows(episode, frames)]
+            return values
+
+        return {name: partial(read, name) for name in self._memory_labels}
 
 
 class TrainingDataset(Dataset[dict[str, Any]]):

@@ -213,7 +213,9 @@ def _samples(
         build = TRAINING_SETS[kind]
         return build(sources, processor, policy, episodes, seed=seed, sampled=not held_out)
     # A memory has labels of its own: they are not the network's.
-    memory_parts = set() if policy.memory is None else set(policy.memory.modules())
+    memory_parts: set[Any] = set()
+    if policy.memory is not None:
+        memory_parts = set(policy.memory.modules())
     dataset = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
     return dataset(
         sources,
