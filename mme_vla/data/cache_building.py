@@ -178,12 +178,14 @@ def _chunks(
         if not len(required):
             continue
         images = source.frames(episode, required)
-        frames, values = [], []
-        for frame, image in zip(required.tolist(), images, strict=True):
-            row = None if scorer is None else scorer(frame, image)
-            if row is not None:
-                frames.append(frame)
-                values.append(np.asarray(row, np.float32))
+        frames: list[int] = []
+        values: list[np.ndarray] = []
+        if scorer is not None:
+            for frame, image in zip(required.tolist(), images, strict=True):
+                row = scorer(frame, image)
+                if row is not None:
+                    frames.append(frame)
+                    values.append(np.asarray(row, np.float32))
         yield _Chunk(stop - start, images[np.isin(required, in_chunk)], frames, values)
 
 

@@ -284,9 +284,13 @@ def _convert(
     for leftover in (partial / _WRITING, partial / _MERGED):
         shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
     (partial / _PARTS).mkdir(exist_ok=True)
-    names = [f"{i:06d}-{ref.task}-{ref.group}" for i, ref in enumerate(episodes)]
-    parts = [partial / _PARTS / name for name in names]
-    missing = [i for i, part in enumerate(parts) if not part.is_dir()]
+    parts = []
+    missing = []
+    for i, ref in enumerate(episodes):
+        part = partial / _PARTS / f"{i:06d}-{ref.task}-{ref.group}"
+        parts.append(part)
+        if not part.is_dir():
+            missing.append(i)
     with progress("convert", len(parts), len(parts) - len(missing), "episodes") as advance:
         for i in missing:
             with quiet_libraries():
@@ -399,7 +403,6 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
 def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
     from lerobot.datasets.aggregate import aggregate_datasets
 
-    sides = [read_json(part / SIDE_FILE, "the facts of a converted episode") for part in parts]
     with episodes_without_statistics():
         aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
     for video in merged.glob("videos/**/*.mp4"):
@@ -407,11 +410,13 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
     # LeRobot writes its keys in the order of a set, another in each process
     stats = merged / "meta" / "stats.json"
     stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
+    episodes = []
     for i, part in enumerate(parts):
+        facts = read_json(part / SIDE_FILE, "the facts of a converted episode")
+        episodes.append({"episode_index": i, **facts})
         if (part / _KEYFRAMES).is_file():
             side_file = SIDE_FILES["keyframes"].file_of(merged, i)
             side_file.parent.mkdir(exist_ok=True)
             shutil.copy(part / _KEYFRAMES, side_file)
-    episodes = [{"episode_index": i, **side} for i, side in enumerate(sides)]
     (merged / SIDE_FILE).write_text(json.dumps({"plan": plan, "episodes": episodes}, indent=1))
     write_sums(merged)  # LeRobot's format has none: damage would be read as data

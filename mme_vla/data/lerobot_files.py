@@ -139,9 +139,8 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
     spellings: dict[str, list[str]] = {}
     for camera in robot.cameras:
         spellings[camera.name] = []
-        for name in (camera.key, camera.name):
-            if name:
-                spellings[camera.name] += [name, f"observation.images.{name}"]
+        for name in (camera.key or camera.name, camera.name):
+            spellings[camera.name] += [name, f"observation.images.{name}"]
     for key in (*robot.state.key, *robot.action.pose_key):
         spellings[key] = [key, f"observation.{key}"]
     for key in robot.action.key:
@@ -155,13 +154,12 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
 
     columns: dict[str, str] = {}
     missing = []
-    keys = {camera.name: camera.key or camera.name for camera in robot.cameras}
     for name, candidates in spellings.items():
-        present = [candidate for candidate in candidates if candidate in features]
-        if present:
-            columns[name] = present[0]
+        column = next((candidate for candidate in candidates if candidate in features), None)
+        if column is None:
+            missing.append(candidates[0])
         else:
-            missing.append(keys.get(name, name))
+            columns[name] = column
     plural = "" if len(missing) == 1 else "s"
     require(
         not missing,
