@@ -98,31 +98,22 @@ def build_cache(
     remove_drafts(folder)
     share = list(range(rank, len(source), world))
     missing = [episode for episode in share if not token_file(folder, episode).is_file()]
+    for episode in missing:
+        require(
+            len(stored_frames(source, episode, memory.storage)),
+            f"{source.name}, episode {episode}: none of the frames that the memory stores was"
+            " rendered.",
+        )
     total = int(source.lengths[share].sum())
     left = int(source.lengths[missing].sum())
     with (
         progress(f"vision cache {source.name}", total, total - left, "frames") as advance,
         # Images are decoded in a thread while the ones before them are encoded.
-        closing(ahead(_of_all(source, missing, memory, batch_size), CHUNKS_AHEAD)) as chunks,
+        closing(ahead(_chunks(source, missing, memory, batch_size), CHUNKS_AHEAD)) as chunks,
     ):
-        for episode, of_episode in groupby(chunks, lambda chunk: chunk[0]):
-            parts = (chunk for _, chunk in of_episode)
-            _build_episode(
-                source, episode, parts, memory, encode, folder, expected["dtype"], advance
-            )
+        for episode, parts in groupby(chunks, lambda chunk: chunk.episode):
+            _build_episode(episode, parts, memory, encode, folder, expected["dtype"], advance)
     return len(missing)
-
-
-def _of_all(
-    source: EpisodeSource, episodes: Sequence[int], memory: Memory, batch_size: int
-) -> Iterator[tuple[int, "_Chunk"]]:
-    """The chunks of all episodes, one after the other; an episode of which nothing was rendered has
-    an empty one.
-    """
-    for episode in episodes:
-        yield episode, _Chunk(0, np.zeros((0, 1, 1, 3), np.uint8), [], [])
-        for chunk in _chunks(source, episode, memory, batch_size):
-            yield episode, chunk
 
 
 def estimate(
@@ -136,11 +127,11 @@ def estimate(
     n_stored = sum(
         len(stored_frames(source, episode, memory.storage)) for episode in range(len(source))
     )
-    chunk = next(_chunks(source, 0, memory, batch_size))
+    chunk = next(_chunks(source, [0], memory, batch_size))
     encode(chunk.stored_images[:1])  # the first call pays for warming up
     started = time.perf_counter()
     n_frames, bytes_per_frame = 0, 0
-    for chunk in _chunks(source, 0, memory, batch_size):
+    for chunk in _chunks(source, [0], memory, batch_size):
         tokens = encode(chunk.stored_images)
         bytes_per_frame = tokens[0].numel() * np.dtype(DTYPES[dtype]).itemsize
         n_frames += chunk.length
@@ -156,6 +147,7 @@ class _Chunk:
     came up.
     """
 
+    episode: int
     length: int
     stored_images: np.ndarray
     score_frames: list[int]
@@ -163,34 +155,37 @@ class _Chunk:
 
 
 def _chunks(
-    source: EpisodeSource, episode: int, memory: Memory, batch_size: int
+    source: EpisodeSource, episodes: Sequence[int], memory: Memory, batch_size: int
 ) -> Iterator[_Chunk]:
+    """The chunks of episodes, one after the other."""
     spec = memory.storage
-    length = int(source.lengths[episode])
-    stored = stored_frames(source, episode, spec)
-    scorer = memory.make_scorer()
-    scored = np.zeros(0, np.int64) if scorer is None else scorer.frames_scored(length)
     span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
-    for start in range(0, length, span):
-        stop = min(start + span, length)
-        in_chunk = stored[(stored >= start) & (stored < stop)]
-        required = np.union1d(in_chunk, scored[(scored >= start) & (scored < stop)])
-        if not len(required):
-            continue
-        images = source.frames(episode, required)
-        frames: list[int] = []
-        values: list[np.ndarray] = []
+    for episode in episodes:
+        length = int(source.lengths[episode])
+        stored = stored_frames(source, episode, spec)
+        scorer = memory.make_scorer()
+        scored = np.zeros(0, np.int64)
         if scorer is not None:
-            for frame, image in zip(required.tolist(), images, strict=True):
-                row = scorer(frame, image)
-                if row is not None:
-                    frames.append(frame)
-                    values.append(np.asarray(row, np.float32))
-        yield _Chunk(stop - start, images[np.isin(required, in_chunk)], frames, values)
+            scored = scorer.frames_scored(length)
+        for start in range(0, length, span):
+            stop = min(start + span, length)
+            in_chunk = stored[(stored >= start) & (stored < stop)]
+            required = np.union1d(in_chunk, scored[(scored >= start) & (scored < stop)])
+            if not len(required):
+                continue
+            images = source.frames(episode, required)
+            stored_images = images[np.isin(required, in_chunk)]
+            chunk = _Chunk(episode, stop - start, stored_images, [], [])
+            if scorer is not None:
+                for frame, image in zip(required.tolist(), images, strict=True):
+                    row = scorer(frame, image)
+                    if row is not None:
+                        chunk.score_frames.append(frame)
+                        chunk.score_values.append(np.asarray(row, np.float32))
+            yield chunk
 
 
 def _build_episode(
-    source: EpisodeSource,
     episode: int,
     chunks: Iterable[_Chunk],
     memory: Memory,
@@ -214,11 +209,6 @@ def _build_episode(
                 )
             rows.append(_to_numpy(tokens, dtype))
         advance(chunk.length)
-    require(
-        rows,
-        f"{source.name}, episode {episode}: none of the frames that the memory stores was"
-        " rendered.",
-    )
     drafts: dict[Path, Path] = {}
     if memory.storage.scorer:
         stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)
