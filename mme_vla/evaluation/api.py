@@ -4,7 +4,7 @@ would set.
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from mme_vla.config.sections import read_section
 from mme_vla.envs.base import environment
@@ -19,8 +19,7 @@ from mme_vla.evaluation.rollout.evaluation import (
     facts_of,
     predictor_of,
 )
-from mme_vla.evaluation.rollout.events import event_arms
-from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings, event_arms
 from mme_vla.policy.base import Policy
 from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.subgoal import SubgoalPredictor
@@ -39,7 +38,7 @@ def evaluate(
     show_progress: bool = True,
     recordings: Any = None,
     event: str | Sequence[str] | None = None,
-    **settings: Any,
+    **settings: Unpack[RolloutKeywords],
 ) -> Evaluation:
     """Run a policy on episodes of the benchmark; what `output` holds already is not run again.
 
@@ -59,9 +58,8 @@ def evaluate(
         recordings: datasets whose first episodes `split="stress:sessions=2"` shows before each.
         event: what happens in every episode, such as `"pause:100@subtask:2"`; of a list each by
             itself. Every episode runs without it too, in `output` itself.
-        show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as
-            `workers=4` or
-        `render=False`.
+        show_progress: whether a progress bar is shown.
+        settings: of `RolloutSettings`, such as `workers=4` or `render=False`.
 
     Returns:
         The records of these episodes, and `success_rate`; of those with events, `matched` are the

@@ -77,10 +77,8 @@ class InlineEnvs:
 def use_inline_envs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `evaluate` step its environments in this process."""
 
-    def inline(
-        jobs: Any, workers: int, factory: Any, options: dict[str, Any], timeout: Any
-    ) -> InlineEnvs:
-        return InlineEnvs(workers, **options)
+    def inline(jobs: Any, workers: int, factory: Any, timeout: Any) -> InlineEnvs:
+        return InlineEnvs(workers, **factory.keywords)
 
     monkeypatch.setattr(evaluation, "VecEnv", inline)
 

@@ -7,9 +7,9 @@ here.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,14 +18,13 @@ import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state, choice_row
-from mme_vla.envs.base import Hold, open_episode
+from mme_vla.envs.base import Hold, environment, open_episode
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
 from mme_vla.envs.metadata import BASE, DEFAULT_STEPS, STICK_TASKS
-from mme_vla.envs.observations import RenderRequest
+from mme_vla.envs.observations import Include, RenderRequest
 from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.envs.subtasks import Progress, process_score
-from mme_vla.envs.vector.messages import Command, Report
 from mme_vla.errors import require
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
@@ -47,6 +46,56 @@ The robot's `readings`, if it has any, are lists of all frames.
 """
 
 
+@dataclass(frozen=True)
+class Command:
+    """What an environment executes next: actions, or a time for which the robot stays where it is.
+
+    actions: [n, w], executed one after the other; None with `hold`. hold: control steps for which
+    the robot stays where it is. subgoal: text in the video meanwhile. draw: the images that are
+    requested, by default all. Frames are counted from the reset on, and the newest is the last.
+    """
+
+    actions: np.ndarray | None = None
+    hold: int = 0
+    subgoal: str | None = None
+    draw: RenderRequest | None = None
+
+
+@dataclass(frozen=True)
+class Report:
+    """What an environment says of a reset or of a command, beside its frames.
+
+    status: `ongoing`, `success`, `fail`, `timeout` or `error`; None of an environment that gives
+    none. goal: the instruction; None if the environment named none yet. error: why the episode
+    failed, where the environment says so. info: what the environment itself reports, for subgoal
+    predictors. options: of a robot that chooses, what there is to choose. scene: digest of the
+    scene.
+    executed: actions. steps: frames. held: the action [w] that keeps the robot where it is after a
+    command to hold it; None before the first action. subtask: number of the execution's current
+    sub-task from 1; 0 where the environment tells none. began: frames at which sub-tasks began.
+    process: where the chain of sub-tasks broke, for the record. oracle: the action [w] that the
+    task's script takes next, if it was asked for. video: name of the finished video's file.
+    simulated_s, rendered_s: seconds since the last report.
+    """
+
+    status: str | None = None
+    goal: str | None = None
+    error: str | None = None
+    info: Mapping[str, Any] = field(default_factory=dict)
+    options: Sequence[Mapping[str, Any]] | None = None
+    scene: str = NOT_BUILT
+    executed: int = 0
+    steps: int = 0
+    held: np.ndarray | None = None
+    subtask: int = 0
+    began: Sequence[int] = ()
+    process: dict[str, Any] | None = None
+    oracle: np.ndarray | None = None
+    video: str | None = None
+    simulated_s: float = 0.0
+    rendered_s: float = 0.0
+
+
 class RenderClock:
     """Adds up what the simulator spends on taking images, where its scene is within reach."""
 
@@ -62,10 +111,8 @@ class RenderClock:
             return
         scene.update_render = self._timed(scene.update_render)
         for sensor in scene.sensors.values():
-            sensor.capture, sensor.get_obs = (
-                self._timed(sensor.capture),
-                self._timed(sensor.get_obs),
-            )
+            sensor.capture = self._timed(sensor.capture)
+            sensor.get_obs = self._timed(sensor.get_obs)
 
     def _timed(self, call: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*args: Any, **kwargs: Any) -> Any:
@@ -364,6 +411,32 @@ class _Frames:
         }
 
 
+def base_env(
+    env: str,
+    robot: Embodiment,
+    render: bool = True,
+    reward: str = "none",
+    only_possible: bool = False,
+) -> Callable[..., Any]:
+    """What makes an episode of an environment for a robot, from `task`, `split`, `episode` and
+    `max_steps`; importable by worker processes.
+
+    env: its name; `reward` and `only_possible` have an effect on RoboMME alone.
+    """
+    environment(env).check_embodiment(robot)
+    if env != ROBOMME:
+        return partial(open_episode, env, action_space=robot.action.space, render=render)
+    assert robot.action.space is not None  # a robot of the benchmark has one
+    readings = dict.fromkeys(robot.readings, True)
+    return partial(
+        make_env,
+        action_space=robot.action.space,
+        render=render,
+        reward=reward,
+        include=Include(**readings, possible=only_possible),
+    )
+
+
 def make_rollout_env(
     task: str,
     split: str,
@@ -375,15 +448,12 @@ def make_rollout_env(
     robot: Embodiment = ROBOMME_JOINT,
     max_actions: int | None = None,
     oracle: bool = False,
-    env: str = ROBOMME,
     sessions: int = 0,
-    **options: Any,
 ) -> ChunkEnv:
     """What every worker builds for an episode.
 
-    base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`.
-    env: the environment of the user's own that is opened instead; of the options it has `render`
-    and `action_space`. sessions: unrelated episodes that the caller shows the policy before, as
+    base: makes the environment itself from `task`, `split`, `episode` and `max_steps`
+    (`base_env`). sessions: unrelated episodes that the caller shows the policy before, as
     `split=stress:sessions=<n>` requires; the scenes of such a split are those of the test split.
     videos: folder, and which outcomes are kept: `all`, `success` or `failure`. robot, max_actions:
     the policy's. oracle: see `ChunkEnv`.
@@ -391,18 +461,18 @@ def make_rollout_env(
     if sessions:
         check_sessions(split, sessions)
         split = BASE
-    if env != ROBOMME:
-        base = partial(open_episode, env)
-        options = {name: options[name] for name in ("render", "action_space") if name in options}
     video = None
     if videos is not None:
         folder, save_on = videos
         video = EpisodeVideo(
             lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal), save_on
         )
+    stick = task in STICK_TASKS
+    if task in TASKS:  # once its module is imported
+        stick = stick or bool(getattr(TASKS[task], "stick", False))
     return ChunkEnv(
-        lambda: base(task=task, split=split, episode=episode, max_steps=max_steps, **options),
-        stick=task in STICK_TASKS or (task in TASKS and bool(getattr(TASKS[task], "stick", False))),
+        lambda: base(task=task, split=split, episode=episode, max_steps=max_steps),
+        stick=stick,
         max_steps=max_steps,
         video=video,
         robot=robot,

@@ -9,15 +9,15 @@ import numpy as np
 
 from mme_vla.embodiment.action_space import read_options
 from mme_vla.envs.scene_hash import NOT_BUILT
-from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds
-from mme_vla.evaluation.rollout.environment import Observation
-from mme_vla.evaluation.rollout.events import Event, EventCourse
+from mme_vla.evaluation.rollout.environment import Observation, Report
+from mme_vla.evaluation.rollout.settings import Event
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.memory.perturbation import Perturbation
 from mme_vla.policy.base import Policy
+from mme_vla.policy.episode import Episode
 from mme_vla.subgoal import Subgoal, SubgoalPredictor
 
 _NONE = np.zeros((0, 1, 1, 3), np.uint8)
@@ -29,6 +29,55 @@ def episode_seed(seed: int, task: str, episode: int) -> int:
     """
     digest = hashlib.sha256(f"{seed}/{task}/{episode}".encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1  # a signed 64-bit integer
+
+
+class EventCourse:
+    """The events of one running episode.
+
+    log: of each its text as `event`, and as `step` the control step at which it acted; None while
+    it has not. hold_steps: control steps for which events held the robot. holding: what holds it,
+    if its frames come next.
+    """
+
+    def __init__(self, events: Sequence[Event]) -> None:
+        self._events = events
+        self.log: list[dict[str, Any]] = [{"event": event.text, "step": None} for event in events]
+        self.hold_steps = 0
+        self.holding: Perturbation | None = None
+
+    def video(self, length: int) -> np.ndarray:
+        """Which of the video's `length` frames are observed, in order, int64 [n]."""
+        real = np.arange(length)
+        for event, entry in zip(self._events, self.log, strict=True):
+            if event.resamples_video and length:
+                real = np.repeat(real, event.perturbation.repeats(len(real), len(real)))
+                entry["step"] = 0
+        return real
+
+    def next(self, episode: Episode, step: int, subtask: int) -> Perturbation | None:
+        """Let events take place that are due at this decision, up to one that holds the robot,
+        which is returned.
+
+        Args:
+            step: control steps so far. subtask: number of the current sub-task, 0 where the
+                environment tells none.
+        """
+        self.holding = None
+        for event, entry in zip(self._events, self.log, strict=True):
+            if entry["step"] is not None or event.resamples_video:
+                continue
+            if event.unit == "subtask" and not subtask:
+                raise UserError(
+                    f"event={event.text}: this environment tells no sub-tasks; place it by"
+                    " @step:<n>."
+                )
+            if event.reached(step - self.hold_steps, subtask):
+                entry["step"] = step - self.hold_steps
+                event.perturbation.act(episode)
+                if event.perturbation.hold:
+                    self.holding = event.perturbation
+                    return event.perturbation
+        return None
 
 
 class RunningEpisode:

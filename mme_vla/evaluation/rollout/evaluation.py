@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,16 +14,14 @@ from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
-from mme_vla.envs.observations import Include
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
-from mme_vla.evaluation.rollout.environment import make_rollout_env
-from mme_vla.evaluation.rollout.events import folder_of, read_events
+from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Waiting, Workload
-from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutSettings, read_events
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import (
     INDIFFERENT,
@@ -139,8 +138,10 @@ def evaluate_events(
     how["times_from"] = how.get("times_from") or output
     records: list[EpisodeRecord] = []
     for event in events:
-        folder, named = output / folder_of(event), replace(facts, event=event)
-        run = evaluate(policy, jobs, folder, named, replace(settings, event=event), **how)
+        folder = output / ("event-" + re.sub(r"[^\w.+-]", "-", event))
+        run = evaluate(
+            policy, jobs, folder, replace(facts, event=event), replace(settings, event=event), **how
+        )
         records += run.records
     return Evaluation(records, run.workload, matched.records)
 
@@ -227,22 +228,23 @@ def _environments(
     policy: Policy, output: Path, settings: RolloutSettings, base: Callable[..., Any], workers: int
 ) -> VecEnv:
     robot = policy.embodiment
-    options: dict[str, Any] = {
-        "base": base,
-        "max_steps": settings.max_steps,
-        "robot": robot,
-        "max_actions": settings.max_actions or policy.info.max_actions,
-    }
+    sessions = 0
     if base is make_env:
-        options["env"] = settings.env
-        options["render"] = settings.render
-        options["action_space"] = robot.action.space
-        options["sessions"] = policy.info.n_distractor_episodes
-        readings = dict.fromkeys(robot.readings, True)
-        options["include"] = Include(**readings, possible=settings.only_possible)
+        base = base_env(settings.env, robot, settings.render, only_possible=settings.only_possible)
+        sessions = policy.info.n_distractor_episodes
+    videos = None
     if settings.video != "none":
-        options["videos"] = (str(output / VIDEOS), settings.video)
-    return VecEnv([], workers, make_rollout_env, options, settings.timeout_s)
+        videos = (str(output / VIDEOS), settings.video)
+    make = partial(
+        make_rollout_env,
+        base=base,
+        max_steps=settings.max_steps,
+        videos=videos,
+        robot=robot,
+        max_actions=settings.max_actions or policy.info.max_actions,
+        sessions=sessions,
+    )
+    return VecEnv([], workers, make, settings.timeout_s)
 
 
 def run_settings(
