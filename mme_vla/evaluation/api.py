@@ -13,6 +13,7 @@ from mme_vla.envs.metadata import read_variant
 from mme_vla.errors import require
 from mme_vla.evaluation.rollout.evaluation import (
     Evaluation,
+    RunOptions,
     choose_episodes,
     default_output,
     evaluate_events,
@@ -76,11 +77,8 @@ def evaluate(
         environment(run_settings.env).check_installed()
     loaded, source = load(policy)
     predictor = predictor_of(loaded, subgoal)
-    if subgoal is None or isinstance(subgoal, str):
-        subgoal_label = subgoal
-    else:
-        subgoal_label = type(subgoal).__name__
-    facts = facts_of(loaded, name, source, run_settings, subgoal_label)
+    label = type(subgoal).__name__ if isinstance(subgoal, SubgoalPredictor) else subgoal
+    facts = facts_of(loaded, name, source, run_settings, label)
     folder = default_output(facts) if output is None else Path(output).expanduser()
     wrapped = policy_of_split(loaded.eval(), run_settings.split, recordings)
     return evaluate_events(
@@ -90,10 +88,7 @@ def evaluate(
         facts,
         run_settings,
         arms,
-        subgoals=predictor,
-        source=source,
-        base=base,
-        show_progress=show_progress,
+        RunOptions(subgoals=predictor, source=source, base=base, show_progress=show_progress),
     )
 
 

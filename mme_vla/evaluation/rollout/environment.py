@@ -151,15 +151,21 @@ class ChunkEnv:
         max_actions: int | None = None,
         oracle: bool = False,
     ) -> None:
-        self._robot, self._stick, self._oracle = robot, stick, oracle
-        self._max_actions, self._executed = max_actions, 0
-        self._max_steps, self._video = max_steps, video
+        self._robot = robot
+        self._stick = stick
+        self._oracle = oracle
+        self._max_actions = max_actions
+        self._max_steps = max_steps
+        self._video = video
         self._clock = RenderClock()
-        self._simulating = self._rendered = 0.0
-        self._steps = self._returned = 0
+        self._simulating = self._rendered = 0.0  # seconds since the last report
+        self._executed = 0  # actions
+        self._steps = 0
+        self._returned = 0  # frames
         self._pose: np.ndarray | None = None
         self._last: np.ndarray | None = None
-        self._subgoal, self._n_subgoals = "", 0
+        self._subgoal = ""
+        self._n_subgoals = 0
         self._goal: str | None = None
         self._scene = NOT_BUILT
         with self._simulation():
@@ -191,23 +197,33 @@ class ChunkEnv:
             The frames of the executed actions, the sum of their rewards, terminated, truncated, and
             the report. After `hold` no action counts as executed.
         """
-        self._max_steps += command.hold
-        actions = [Hold(command.hold)] if command.hold else list(np.asarray(command.actions))
-        frames, executed, n_frames, total_reward = _Frames(self._robot), 0, 0, 0.0
+        actions: list[Any]
+        if command.hold:
+            actions = [Hold(command.hold)]
+            self._max_steps += command.hold
+        else:
+            actions = list(np.asarray(command.actions))
+        frames = _Frames(self._robot)
+        executed = n_frames = 0
+        total_reward = 0.0
         terminated = truncated = False
         info: dict[str, Any] = {}
         draw = command.draw
         for number, action in enumerate(actions, 1):
-            # Only the chunk's last frame is the newest when the policy reads it.
-            is_last = number == len(actions)
-            self._ask(draw if draw is None or is_last else replace(draw, now=()))
+            request = draw
+            if draw is not None and number < len(actions):
+                # Only the chunk's last frame is the newest when the policy reads it.
+                request = replace(draw, now=())
+            self._ask(request)
             with self._simulation():
                 observation, reward, ended, cut, info = self._env.step(self._command(action))
-            terminated, truncated = bool(ended), bool(cut)
+            terminated = bool(ended)
+            truncated = bool(cut)
             total_reward += float(reward)
             if info.get("status") == "error":
                 terminated = True
-                if _is_unreachable(observation, info):
+                # Where no joints or no motion reach a pose the policy failed, not the machine.
+                if observation == {} or info.get("exception_type") == "PlanningError":
                     info = {**info, "status": "fail"}
                 break
             if not isinstance(action, Hold):
@@ -220,10 +236,11 @@ class ChunkEnv:
             # A choice that moves nothing takes time too, or it could continue for ever.
             self._steps += max(count, 1)
             self._draw(frames, count, caption=command.subgoal)
-            spent = self._executed == self._max_actions
-            if not (terminated or truncated) and (spent or self._steps > self._max_steps):
-                truncated, info = True, {**info, "status": "timeout"}
             if terminated or truncated:
+                break
+            if self._executed == self._max_actions or self._steps > self._max_steps:
+                truncated = True
+                info = {**info, "status": "timeout"}
                 break
         self._returned = frames.leave(draw, self._returned)
         report = replace(self._report(info), executed=executed, steps=n_frames)
@@ -231,7 +248,8 @@ class ChunkEnv:
             report = replace(report, held=self._hold_action())
         if (terminated or truncated) and self._video is not None:
             path = self._video.finish(str(report.status), report.goal or "")
-            report = replace(report, video=None if path is None else path.name)
+            if path is not None:
+                report = replace(report, video=path.name)
         return frames.observation(), total_reward, terminated, truncated, report
 
     def close(self) -> None:
@@ -281,7 +299,8 @@ class ChunkEnv:
 
     @contextmanager
     def _simulation(self) -> Iterator[None]:
-        begun, rendered = time.perf_counter(), self._clock.seconds
+        begun = time.perf_counter()
+        rendered = self._clock.seconds
         try:
             yield
         finally:
@@ -293,15 +312,16 @@ class ChunkEnv:
         status = info.get("status")
         if goals := info.get("task_goal"):
             self._goal = str(goals[0])
-        subtask, process = self._n_subgoals, None
+        subtask = self._n_subgoals
+        process = None
         progress = getattr(getattr(self._env, "task", None), "progress", None)
         if isinstance(progress, Progress):
             score = process_score(progress, str(status))
             process = score.to_dict()
             subtask = min(score.done + 1, score.of)
         oracle = None
-        if self._oracle and status == "ongoing":
-            oracle = self._oracle_action()
+        if self._oracle and status == "ongoing" and (choice := oracle_of(self._env)) is not None:
+            oracle = choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
         report = Report(
             status=status,
             goal=self._goal,
@@ -319,25 +339,12 @@ class ChunkEnv:
         self._simulating = self._rendered = 0.0
         return report
 
-    def _oracle_action(self) -> np.ndarray | None:
-        choice = oracle_of(self._env)
-        if choice is None:
-            return None
-        return choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
-
     def _draw(
         self, frames: "_Frames", count: int, demo: int = 0, caption: str | None = None
     ) -> None:
         if self._video is not None:
             for index, views in enumerate(frames.newest(count)):
                 self._video.add(views, caption, demo=index < demo)
-
-
-def _is_unreachable(observation: Any, info: dict[str, Any]) -> bool:
-    """Whether no joints or no motion reach an action's pose: the policy's failure, not the
-    machine's.
-    """
-    return observation == {} or info.get("exception_type") == "PlanningError"
 
 
 MISSING = "which this environment does not deliver"
@@ -354,7 +361,8 @@ class _Frames:
     """Collects frames in the policy's form; the benchmark's own cameras too, for the video."""
 
     def __init__(self, robot: Embodiment) -> None:
-        self._cameras, self._width = robot.camera_names, robot.state.width
+        self._cameras = robot.camera_names
+        self._width = robot.state.width
         # the benchmark's videos show both of its cameras
         beside = CAMERAS if robot.action.space else ()
         self._images: dict[str, list[np.ndarray | None]] = {
@@ -368,7 +376,8 @@ class _Frames:
         if "state_list" in observation:  # an environment of the user's own
             states = observation["state_list"]
         else:
-            joints, fingers = observation["joint_state_list"], observation["gripper_state_list"]
+            joints = observation["joint_state_list"]
+            fingers = observation["gripper_state_list"]
             states = [benchmark_state(q, f) for q, f in zip(joints, fingers, strict=True)]
         self._states += states
         blind = not any(key.endswith("_rgb_list") for key in observation)  # it does not render
@@ -398,12 +407,13 @@ class _Frames:
         """The last frames before any was left out, each as its images: the robot's cameras, then
         the benchmark's.
         """
-        return zip(
-            *(images[len(self._states) - count :] for images in self._images.values()), strict=True
-        )
+        first = len(self._states) - count
+        return zip(*(images[first:] for images in self._images.values()), strict=True)
 
     def observation(self) -> Observation:
-        state = np.stack(self._states) if self._states else np.zeros((0, self._width), np.float32)
+        state = np.zeros((0, self._width), np.float32)
+        if self._states:
+            state = np.stack(self._states)
         return {
             **{name: self._images[name] for name in self._cameras},
             **self._readings,
