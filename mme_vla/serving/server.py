@@ -9,6 +9,7 @@ import asyncio
 import hmac
 import logging
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -386,7 +387,7 @@ class PolicyServer:
             coming.cancel()
 
     async def _reply(
-        self, session: Session, event: dict[str, Any], place: "Place"
+        self, session: Session, event: Mapping[str, Any], place: "Place"
     ) -> dict[str, Any] | str:
         """The reply to a message, or the reason why there is none; then the connection closes."""
         try:
