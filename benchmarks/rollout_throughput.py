@@ -13,12 +13,13 @@ whatever it does.
 import argparse
 import time
 from dataclasses import dataclass
+from functools import partial
 
 from timing import machine
 
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.environment import make_rollout_env
+from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.mme import MMEPolicy
@@ -73,10 +74,11 @@ def measure(
     settings = RolloutSettings(
         max_steps=args.steps, workers=workers, max_batch=max_batch, render=not args.no_render
     )
-    options = {"max_steps": args.steps, "render": not args.no_render}
+    base = base_env("mme_vla", policy.embodiment, render=not args.no_render)
+    make = partial(make_rollout_env, base=base, max_steps=args.steps)
     facts = RunFacts(args.model, "untrained", settings.seed, max_steps=args.steps)
     records: list[EpisodeRecord] = []
-    with VecEnv([], workers, make_rollout_env, options) as envs:
+    with VecEnv([], workers, make) as envs:
         short = [Job("StopCube", "test", 40 + worker) for worker in range(workers)]
         Rollout(policy, envs, facts, settings, lambda record: None).run(short)
         rollout = Rollout(policy, envs, facts, settings, records.append)

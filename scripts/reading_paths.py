@@ -1,8 +1,8 @@
-"""Files and lines that a reader needs for six questions about the library
+"""Files and lines that a reader needs for seven questions about the library
 (docs/extend/architecture.md).
 
-(a) and (e) follow imports from a starting point; (b) to (d) and (f) list the files on the way.
-Every file is checked to exist, and every call of (d) and (f) to be defined where it is listed.
+(a) and (e) follow imports from a starting point; the others list the files on the way. Every file
+is checked to exist, and every call of (d), (f) and (g) to be defined where it is listed.
 
     python scripts/reading_paths.py
 """
@@ -42,6 +42,18 @@ TRAINING = [
 """From the command line to the last checkpoint of one process; `training/parallel.py` and
 `training/shards.py` are for several.
 """
+EVALUATION = [
+    ("cli/evaluate.py", "evaluate_one"), ("evaluation/rollout/settings.py", "from_config"),
+    ("evaluation/rollout/evaluation.py", "evaluate"), ("evaluation/store.py", "claim_run"),
+    ("evaluation/rollout/runner.py", "rounds"), ("envs/vector/pool.py", "recv"),
+    ("envs/vector/worker.py", "serve"), ("evaluation/rollout/environment.py", "step"),
+    ("evaluation/rollout/episode.py", "read"), ("evaluation/rollout/render_plan.py", "of_chunk"),
+    ("policy/scheduler.py", "next_steps"), ("evaluation/records.py", "to_json"),
+]  # fmt: skip
+"""From the command line to the line of an episode's record. Beside it: what a terminal shows
+(`rollout/progress.py`), the run's receipt (`receipts.py`), and, where they are asked for, subgoals
+(`rollout/subgoals.py`) and videos (`rollout/video.py`).
+"""
 ALONE = "README.md"
 QUESTIONS = (
     "How does FrameSamp + Modulator work, image to loss?",
@@ -50,8 +62,9 @@ QUESTIONS = (
     "Where is an action chunk sampled?",
     "Backbone, memory and integration alone in your own training loop",
     "What does `mme_vla.train` do, from the command line to a checkpoint?",
+    "What happens to an episode, from `mme_vla.evaluate` to its record?",
 )
-"""(a) to (f), as docs/extend/layout.md has them."""
+"""(a) to (g), as docs/extend/layout.md has them."""
 
 
 def path_of(module: str) -> Path | None:
@@ -92,7 +105,7 @@ def check(files: list[Path]) -> list[Path]:
 
 
 def defining(calls: list[tuple[str, str]]) -> list[Path]:
-    """The files of (d) or (f), each of which must define its call."""
+    """The files of (d), (f) or (g), each of which must define its call."""
     files = check([PACKAGE / name for name, _ in calls])
     for file, (_, call) in zip(files, calls, strict=True):
         functions = {
@@ -133,16 +146,18 @@ def count(files: list[Path]) -> str:
 
 
 def answers() -> list[tuple[str, list[Path]]]:
-    """What (a) to (f) take, and the files."""
+    """What (a) to (g) take, and the files."""
     lines, modules = example()
     sampled = defining(SAMPLING)
     trained = defining(TRAINING)
+    evaluated = defining(EVALUATION)
     read = [closure(MODEL), *(check([PACKAGE / n for n in names]) for names in (SELECTION, HEAD))]
     return [
         *((count(files), files) for files in read),
         (f"{len(SAMPLING)} calls, {count(sampled)}", sampled),
         (f"{lines} lines, {modules} modules imported", [ROOT / ALONE]),
         (count(trained), trained),
+        (count(evaluated), evaluated),
     ]
 
 

@@ -30,6 +30,7 @@ from mme_vla.evaluation.results.report import policy_facts
 from mme_vla.evaluation.results.tables import print_table
 from mme_vla.evaluation.rollout.evaluation import (
     Evaluation,
+    RunOptions,
     check_subgoals,
     choose_episodes,
     choose_shard,
@@ -38,8 +39,7 @@ from mme_vla.evaluation.rollout.evaluation import (
     facts_of,
     kind_section,
 )
-from mme_vla.evaluation.rollout.events import event_arms
-from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutSettings, event_arms
 from mme_vla.evaluation.rollout.subgoals import total_score
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import policy_config
@@ -141,6 +141,13 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
         "policy": policy_facts(policy.config),
         "composition": facts.composition,
     }
+    options = RunOptions(
+        subgoals=subgoals,
+        shard=shard,
+        source=source,
+        notes=notes,
+        times_from=None if run.times_from is None else Path(run.times_from).expanduser(),
+    )
     if multiprocessing.get_start_method() == "loky":
         # a job of joblib: a worker of ours cannot look that way up
         multiprocessing.set_start_method("spawn", force=True)
@@ -152,11 +159,7 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
             facts,
             settings,
             events,
-            subgoals=subgoals,
-            shard=shard,
-            source=source,
-            notes=notes,
-            times_from=None if run.times_from is None else Path(run.times_from).expanduser(),
+            options,
         )
     finally:
         if subgoals is not None:

@@ -338,16 +338,16 @@ class EpisodeEnv:
                 return
 
     def _lists(self, frames: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-        lists: dict[str, list[Any]] = {
-            "state_list": [np.asarray(frame["state"], np.float32) for frame in frames]
-        }
-        if not frames:
-            return lists
-        cameras = [name for name in frames[0] if name != "state"]
-        for name in cameras:
-            lists[f"{name}_rgb_list"] = [np.asarray(frame[name]) for frame in frames]
-        if self._by_choice and cameras:
-            lists.setdefault("front_rgb_list", lists[f"{cameras[0]}_rgb_list"])  # what `play` shows
+        lists: dict[str, list[Any]] = {"state_list": []}
+        for frame in frames:
+            for name, value in frame.items():
+                if name == "state":
+                    lists["state_list"].append(np.asarray(value, np.float32))
+                else:
+                    lists.setdefault(f"{name}_rgb_list", []).append(np.asarray(value))
+        if self._by_choice and len(lists) > 1:
+            first_camera = next(images for name, images in lists.items() if name != "state_list")
+            lists.setdefault("front_rgb_list", first_camera)  # what `play` shows
         return lists
 
     def _info(self, info: Mapping[str, Any], terminated: bool, truncated: bool) -> dict[str, Any]:

@@ -110,7 +110,8 @@ def spans(value: Any, key: str, grammar: str) -> list[range]:
         match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))
         if match is None or isinstance(part, bool | float):
             raise UserError(f"{key}={value!r} is not understood; write {grammar}.")
-        first, last = int(match[1]), int(match[2] or match[1])
+        first = int(match[1])
+        last = int(match[2] or match[1])
         require(first <= last, f"{key}={value}: the range {part} ends before it begins.")
         ranges.append(range(first, last + 1))
     return ranges

@@ -95,9 +95,11 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         high = np.array([_POSITION] * 3 + [_ANGLE] * 3, np.float32)
         low = -high
         if action_space == "joint_angle":
-            low, high = np.array(_LOWEST, np.float32), np.array(_HIGHEST, np.float32)
+            low = np.array(_LOWEST, np.float32)
+            high = np.array(_HIGHEST, np.float32)
         if not self._stick:  # the gripper closes at -1 and opens at 1
-            low, high = np.append(low, np.float32(-1)), np.append(high, np.float32(1))
+            low = np.append(low, np.float32(-1))
+            high = np.append(high, np.float32(1))
         self.action_space = gymnasium.spaces.Box(low, high)
         spaces: dict[str, gymnasium.Space[Any]] = {}
         if self.images:
@@ -118,9 +120,8 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
             number = int(self.np_random.integers(self._count))
         frames, info = self._open(number).reset()
         self._take(frames)
-        video = tuple(
-            np.asarray(image, np.uint8) for image in frames.get("front_rgb_list", [])[:-1]
-        )
+        images = frames.get("front_rgb_list", [])[:-1]
+        video = tuple(np.asarray(image, np.uint8) for image in images)
         return self._copy(), {**self._info(info), "episode": number, "video": video}
 
     def step(
@@ -155,9 +156,8 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         """The environment of an episode; the last one stays open."""
         if self._env is None or number != self._number:
             self.close()
-            env: Any = make_env(self.task, self.split, number, render=self.images, **self._options)
-            self._env, self._number = env, number
-        assert self._env is not None
+            self._env = make_env(self.task, self.split, number, render=self.images, **self._options)
+            self._number = number
         return self._env
 
     def _take(self, frames: Mapping[str, Sequence[Any]]) -> None:
@@ -165,8 +165,9 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         if self.images:
             for name in CAMERAS:
                 self._observation[name] = np.asarray(frames[f"{name}_rgb_list"][-1], np.uint8)
-        joints, fingers = frames["joint_state_list"][-1], frames["gripper_state_list"][-1]
-        self._observation["state"] = benchmark_state(joints, fingers)
+        self._observation["state"] = benchmark_state(
+            frames["joint_state_list"][-1], frames["gripper_state_list"][-1]
+        )
 
     def _copy(self) -> dict[str, np.ndarray]:
         return {name: value.copy() for name, value in self._observation.items()}

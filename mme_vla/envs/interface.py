@@ -78,10 +78,11 @@ class EpisodeState:
     def check(self, other: "EpisodeState") -> None:
         """Make sure that an environment whose own state is `other` can continue from here."""
         differences = []
-        for name in (entry.name for entry in fields(self)):
-            value, present = getattr(self, name), getattr(other, name)
-            if name not in ("options", "actions") and value != present:
-                differences.append(f"{name} {value!r} (here {present!r})")
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            present = getattr(other, entry.name)
+            if entry.name not in ("options", "actions") and value != present:
+                differences.append(f"{entry.name} {value!r} (here {present!r})")
         require(
             not differences,
             f"This state is of another environment: {', '.join(differences)}. Make one of the same"
@@ -300,19 +301,23 @@ class RoboMMEEnv(gymnasium.Env):
             them, images of the newest frame alone.
         """
         state.check(self._state({}, ()))
-        hook, request = self.on_frame, self.render_request
+        hook = self.on_frame
+        request = self.render_request
         grounded = request is None or request.grounded
         hidden = RenderRequest({}, now=(), grounded=grounded)
         newest = RenderRequest({}, grounded=grounded)
+        # What is rendered of the reset and of each action: the newest frame is the last one's.
+        requests = [hidden] * len(state.actions) + [newest]
         self.on_frame = None
         try:
-            self.render_request = hidden if state.actions else newest
+            self.render_request = requests[0]
             observation, info = self.reset(options=state.options)
-            for number, action in enumerate(state.actions, 1):
-                self.render_request = hidden if number < len(state.actions) else newest
+            for action, rendered in zip(state.actions, requests[1:], strict=True):
+                self.render_request = rendered
                 observation, _, _, _, info = self.step(action)
         finally:
-            self.on_frame, self.render_request = hook, request
+            self.on_frame = hook
+            self.render_request = request
         return observation, info
 
     def render(self) -> np.ndarray | None:

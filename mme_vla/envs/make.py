@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 from mme_vla.envs import metadata
 from mme_vla.envs.metadata import TASK_NAMES, check_task_name, read_variant
 from mme_vla.envs.observations import Include
-from mme_vla.envs.rows import DIFFICULTIES
+from mme_vla.envs.rows import DIFFICULTIES, TaskOptions
 from mme_vla.errors import check_known, missing_extra, require
 from mme_vla.registry import TASKS
 
@@ -72,7 +72,6 @@ def make_env(
     check_sessions(split, 0)
     if max_steps is None:
         max_steps = metadata.step_limit(split)
-    scene: dict[str, Any] = {"seed": seed, "difficulty": difficulty}
     if row is not None:
         spec = metadata.read_row(row)
         require(
@@ -80,7 +79,9 @@ def make_env(
             f"row is a scene of {spec.task} with its own seed: name that task, and leave out seed.",
         )
         scene = spec.options
-    elif seed is None:
+    elif seed is not None:
+        scene = {"seed": seed, "difficulty": difficulty}
+    else:
         scene = metadata.episode(task, split, episode).options
     if recovery is not None:
         scene["recovery"] = recovery
@@ -145,14 +146,16 @@ def load_tasks(*tasks: str) -> None:
         import_module(f"mme_vla.envs.robomme.tasks.{module_name(task)}")
 
 
-def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any) -> Any:
+def make_task(
+    task: str, *, render: bool, obs_mode: str = "none", **options: Unpack[TaskOptions]
+) -> Any:
     """Build one task as a bare ManiSkill environment.
 
     Args:
         task: its registered name.
         render: build what is there to be seen; otherwise no Vulkan is needed.
         obs_mode: ManiSkill's observation mode.
-        options: `seed`, `difficulty`, `recovery`, and what ManiSkill's `BaseEnv` takes.
+        options: of the scene, such as `seed` and `difficulty`.
     """
     if task in TASK_NAMES:
         load_tasks(task)

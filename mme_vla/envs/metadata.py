@@ -17,7 +17,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from mme_vla.envs.rows import DIFFICULTIES, OOD, check_row, is_row_split, rows_of, task_options
+from mme_vla.envs.rows import (
+    DIFFICULTIES,
+    OOD,
+    TaskOptions,
+    check_row,
+    is_row_split,
+    rows_of,
+    task_options,
+)
 from mme_vla.errors import UserError, brief, check_known, did_you_mean, require
 from mme_vla.registry import TASKS
 from mme_vla.utils import read_json
@@ -93,9 +101,9 @@ class Variant:
     """The split whose scenes are varied."""
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> TaskOptions:
         """Keyword arguments of the task."""
-        options: dict[str, Any] = {}
+        options: TaskOptions = {}
         if self.turned and self.dial != SESSIONS:
             options["stress"] = {self.dial: self.turned}
         if self.twin:
@@ -115,9 +123,12 @@ class Variant:
             " none.",
         )
         if self.dial and self.dial != SESSIONS:
-            dials = ", ".join(dial for dial, tasks in DIALS.items() if task in tasks) or "none"
-            which = f"it has {dials}. {self.dial} is for {', '.join(DIALS[self.dial])}."
-            require(task in DIALS[self.dial], f"{task} has no dial {self.dial!r}; {which}")
+            dials = [dial for dial, tasks in DIALS.items() if task in tasks]
+            require(
+                self.dial in dials,
+                f"{task} has no dial {self.dial!r}; it has {', '.join(dials) or 'none'}."
+                f" {self.dial} is for {', '.join(DIALS[self.dial])}.",
+            )
 
 
 def read_variant(split: str) -> Variant | None:
@@ -130,7 +141,8 @@ def read_variant(split: str) -> Variant | None:
         return replace(varied, twin=True)
     if not str(split).startswith(STRESS):
         return None
-    match, known = _STRESS.fullmatch(split), (*DIALS, SESSIONS)
+    match = _STRESS.fullmatch(split)
+    known = (*DIALS, SESSIONS)
     if match is None:
         raise UserError(
             f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are"
@@ -191,9 +203,9 @@ class EpisodeSpec:
     """The scene's values, where they are not sampled from the seed."""
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> TaskOptions:
         """Keyword arguments of the task that make this episode's scene."""
-        options: dict[str, Any] = {"seed": self.seed, "difficulty": self.difficulty}
+        options: TaskOptions = {"seed": self.seed, "difficulty": self.difficulty}
         if self.row is not None:
             options = task_options(self.row)
         variant = read_variant(self.split)
@@ -227,14 +239,15 @@ def formula(task: str, split: str, episode: int) -> tuple[int, str]:
 
 def _further_place(split: str, episode: int) -> int:
     """Index, in the rule of seeds and difficulties, of an episode beyond the test split."""
-    first, level = SPLITS["test"], split.removeprefix(FURTHER).removeprefix("_")
+    first = SPLITS["test"]
+    level = split.removeprefix(FURTHER).removeprefix("_")
     if not level:
         return first + episode
-    round_, index = divmod(episode, _CYCLE.count(level))
-    places = [
-        place for place in range(first, first + len(_CYCLE)) if _CYCLE[place % len(_CYCLE)] == level
-    ]
-    return places[index] + round_ * len(_CYCLE)
+    # The places of this difficulty in the first cycle beyond the test split
+    cycle = range(first, first + len(_CYCLE))
+    places = [place for place in cycle if _CYCLE[place % len(_CYCLE)] == level]
+    n_cycles, index = divmod(episode, len(places))
+    return places[index] + n_cycles * len(_CYCLE)
 
 
 def check_task_name(task: str) -> None:
@@ -242,7 +255,7 @@ def check_task_name(task: str) -> None:
     check_known("task", task, dict.fromkeys([*TASK_NAMES, *TASKS]))
 
 
-def episodes(task: str, split: str = "test", folder: str | Path | None = None) -> list[EpisodeSpec]:
+def episodes(task: str, split: str = "test") -> list[EpisodeSpec]:
     """The episodes of a task in a split, in order.
 
     Args:
@@ -254,36 +267,49 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
             number 50 would be; no seed was raised), or `further_easy`, `further_medium`,
             `further_hard`, 400 of one difficulty by the same rule, or `reserved`, 100 with seeds of
             their own from 5,010,000 on.
-        folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by
-            default the one that `MME_VLA_ROBOMME_METADATA` names, then the installed official
-            package's, then the shipped table.
     """
     check_task_name(task)
     variant = check_split(split)
     if variant is not None:
         variant.check(task)
-        return [replace(spec, split=split) for spec in episodes(task, variant.base, folder)]
+        return [replace(spec, split=split) for spec in episodes(task, variant.base)]
     if split == HARD:
-        hard = [spec for spec in episodes(task, BASE, folder) if spec.difficulty == HARD]
+        hard = [spec for spec in episodes(task, BASE) if spec.difficulty == HARD]
         return [replace(spec, split=split, episode=i) for i, spec in enumerate(hard)]
     if is_row_split(split):
-        return [_spec_of(row, split, i) for i, row in enumerate(rows_of(task, split, all_tasks()))]
-    if split == CHALLENGE and task in TASK_NAMES:
+        rows = rows_of(task, split, all_tasks())
+        return [_spec_of(row, split, i) for i, row in enumerate(rows)]
+    if split == CHALLENGE:
+        require(
+            task in TASK_NAMES,
+            f"split={CHALLENGE} has the benchmark's tasks alone, and {task} is none.",
+        )
         return list(_table(split)[task])
     if task not in TASK_NAMES or split not in SPLITS:
         return [
             EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(_COUNTS[split])
         ]
-    folder = folder or os.environ.get(FOLDER_VARIABLE)
-    if folder:
-        return read_official(Path(folder) / split / file_name(task), task, split)
-    official = find_spec("robomme")
+    official = _official_file(task, split)
     if official is not None:
-        for place in official.submodule_search_locations or ():
-            installed = Path(place) / "env_metadata" / split / file_name(task)
-            if installed.is_file():
-                return read_official(installed, task, split)
+        return read_official(official, task, split)
     return list(_table(split)[task])
+
+
+def _official_file(task: str, split: str) -> Path | None:
+    """The file that describes a task's episodes in the official layout: in the folder that
+    `MME_VLA_ROBOMME_METADATA` names, else in the installed official package; None without both.
+    """
+    name = Path(split, file_name(task))
+    folder = os.environ.get(FOLDER_VARIABLE)
+    if folder:
+        return Path(folder) / name
+    package = find_spec("robomme")
+    if package is not None:
+        for place in package.submodule_search_locations or ():
+            installed = Path(place, "env_metadata") / name
+            if installed.is_file():
+                return installed
+    return None
 
 
 def check_split(split: str) -> Variant | None:
@@ -316,11 +342,9 @@ def _spec_of(row: Mapping[str, Any], split: str, number: int) -> EpisodeSpec:
     return EpisodeSpec(row["task"], split, number, row["seed"], difficulty, row)
 
 
-def episode(
-    task: str, split: str = "test", index: int = 0, folder: str | Path | None = None
-) -> EpisodeSpec:
+def episode(task: str, split: str = "test", index: int = 0) -> EpisodeSpec:
     """One episode of a split."""
-    known = episodes(task, split, folder)
+    known = episodes(task, split)
     require(known, f"{task} has no episodes in split {split!r}.")
     exists = type(index) is int and 0 <= index < len(known)
     require(
@@ -351,23 +375,25 @@ def file_name(task: str) -> str:
 def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
     """The episodes that an official metadata file describes, in order."""
     records = read_json(path, f"official metadata of {task}, split {split!r}").get("records")
-    again = f"{path} is not official metadata: it has no list of records. Get the file again."
-    require(isinstance(records, list) and records, again)
+    require(
+        isinstance(records, list) and records,
+        f"{path} is not official metadata: it has no list of records. Get the file again.",
+    )
     specs = []
     for record in records:
         fields: dict[str, Any] = record if isinstance(record, dict) else {}
         number: Any = fields.get("episode")
         seed: Any = fields.get("seed")
         difficulty: Any = fields.get("difficulty")
-        full = all(type(n) is int and 0 <= n < 2**31 for n in (number, seed))
-        require(
-            full and difficulty in list(_CYCLE),
-            f"{path} is not official metadata: a record has episode {brief(number)}, seed"
-            f" {brief(seed)} and difficulty {brief(difficulty)}; expected two whole numbers and one"
-            f" of {', '.join(sorted(set(_CYCLE)))}. Get the file again.",
-        )
+        are_numbers = all(type(value) is int and 0 <= value < 2**31 for value in (number, seed))
+        if not are_numbers or difficulty not in DIFFICULTIES:
+            raise UserError(
+                f"{path} is not official metadata: a record has episode {brief(number)}, seed"
+                f" {brief(seed)} and difficulty {brief(difficulty)}; expected two whole numbers"
+                f" and one of {', '.join(DIFFICULTIES)}. Get the file again."
+            )
         specs.append(EpisodeSpec(task, split, number, seed, difficulty))
     specs.sort(key=lambda spec: spec.episode)
-    in_order = [spec.episode for spec in specs] == list(range(len(specs)))
-    require(in_order, f"{path} does not number its episodes 0, 1, 2, …; get the file again.")
+    is_complete = [spec.episode for spec in specs] == list(range(len(specs)))
+    require(is_complete, f"{path} does not number its episodes 0, 1, 2, …; get the file again.")
     return specs

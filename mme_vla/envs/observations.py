@@ -264,7 +264,10 @@ def _front_extrinsic() -> np.ndarray:
 
 def as_lists(frames: Sequence[dict[str, Any]], keys: Sequence[str]) -> dict[str, list[Any]]:
     """The benchmark's observation: for each key the values of all frames, in time order."""
-    return {list_key(key): [frame[key] for frame in frames] for key in keys}
+    lists = {}
+    for key in keys:
+        lists[list_key(key)] = [frame[key] for frame in frames]
+    return lists
 
 
 def list_key(key: str) -> str:

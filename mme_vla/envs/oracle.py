@@ -35,17 +35,16 @@ def oracle_choice(task: Any) -> tuple[dict[str, Any], str]:
         _stuck(
             f"the conditioning video did not succeed ({subtask.text!r}), so the task cannot be done"
         )
-    choice = {choice.label: choice for choice in task.choices()}.get(subtask.choice)
-    if choice is None:
+    choices = [choice for choice in task.choices() if choice.label == subtask.choice]
+    if not choices:
         _stuck(f"the sub-task {subtask.text!r} has no option")
+    choice = choices[-1]
     if choice.candidates is None:
         return {"choice": choice.label, "point": None}, subtask.text
-    candidates = list(choice.candidates)
     # A sub-task may name the button it ends at as well: the point is of what the option chooses
     # among.
-    targets = [
-        thing for thing in subtask.targets if any(thing is candidate for candidate in candidates)
-    ]
+    candidates = {id(candidate) for candidate in choice.candidates}
+    targets = [thing for thing in subtask.targets if id(thing) in candidates]
     if not targets:
         _stuck(f"the sub-task {subtask.text!r} is about nothing that its option can choose")
     pixel = np.clip(np.rint(project(targets[0].position)), 0, SIDE - 1)

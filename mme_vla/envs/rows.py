@@ -14,9 +14,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean, require
+from mme_vla.utils import parse_json, read_text
 
 Row = dict[str, Any]
 OOD = "ood"
@@ -56,11 +57,13 @@ def rows_of(task: str, split: str, known: tuple[str, ...]) -> list[Row]:
                 " line."
             )
         return list(_read_file(str(path), path.stat().st_mtime_ns, known).get(task, []))
-    if match[1] not in (None, *TIERS):
-        raise UserError(
-            f"split={split!r}: there is no tier {match[1]!r}. {did_you_mean(match[1], TIERS)}"
-        )
-    return [row for row in _ood().get(task, []) if match[1] in (None, row["tier"])]
+    tier = match[1]
+    rows = _ood().get(task, [])
+    if tier is None:
+        return list(rows)
+    if tier not in TIERS:
+        raise UserError(f"split={split!r}: there is no tier {tier!r}. {did_you_mean(tier, TIERS)}")
+    return [row for row in rows if row["tier"] == tier]
 
 
 @cache
@@ -72,15 +75,14 @@ def _ood() -> dict[str, list[Row]]:
 @cache
 def _read_file(path: str, modified: int, known: tuple[str, ...]) -> dict[str, list[Row]]:
     """Rows by task. modified: time of the last change, so that a changed file is read again."""
-    try:
-        # values may hold other separators
-        lines = Path(path).read_text(encoding="utf-8").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read as text: {error}.") from error
-    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    if not numbered:
-        raise UserError(f"{path} has no scenes: write one JSON object a line.")
-    return _by_task(_read_line(line, f"{path}, line {number}", known) for number, line in numbered)
+    rows = []
+    # Not splitlines(): the values may hold other separators of lines.
+    for number, line in enumerate(read_text(Path(path), "scenes").split("\n"), start=1):
+        if line.strip():
+            where = f"{path}, line {number}"
+            rows.append(check_row(parse_json(line, where, object), where, known))
+    require(rows, f"{path} has no scenes: write one JSON object a line.")
+    return _by_task(rows)
 
 
 def _by_task(rows: Iterable[Row]) -> dict[str, list[Row]]:
@@ -88,14 +90,6 @@ def _by_task(rows: Iterable[Row]) -> dict[str, list[Row]]:
     for row in rows:
         tasks.setdefault(row["task"], []).append(row)
     return tasks
-
-
-def _read_line(line: str, where: str, known: tuple[str, ...]) -> Row:
-    try:
-        value = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise UserError(f"{where} is not JSON: {error}.") from error
-    return check_row(value, where, known)
 
 
 def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
@@ -109,10 +103,11 @@ def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
     """
     if not isinstance(value, Mapping):
         raise UserError(f"{where} is {brief(value)}; expected an object with task and spec.")
-    row = dict(value)
-    task, spec, seed = row.get("task"), row.get("spec"), row.setdefault("seed", 0)
+    row = {"seed": 0, **value}
+    task = row.get("task")
     if not isinstance(task, str) or task not in known:
         raise UserError(f"{where}: task is {brief(task)}. {did_you_mean(str(task), known)}")
+    spec = row.get("spec")
     if not isinstance(spec, Mapping):
         raise UserError(
             f"{where}: spec is {brief(spec)}; expected the values as an object of"
@@ -124,13 +119,14 @@ def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
             raise UserError(
                 f"{where}: spec.{part} is {brief(values)}; the parts are {', '.join(_PARTS)}."
             )
+    seed = row["seed"]
     if type(seed) is not int or not 0 <= seed < 2**31:
         raise UserError(f"{where}: seed is {brief(seed)}; expected a whole number from 0.")
-    for name, known in _OPTIONAL.items():
-        if name in row and row[name] not in known:
+    for name, allowed in _OPTIONAL.items():
+        if name in row and row[name] not in allowed:
             raise UserError(
                 f"{where}: {name} is {brief(row[name])}; expected one of"
-                f" {', '.join(map(str, known))}."
+                f" {', '.join(map(str, allowed))}."
             )
     if not isinstance(row.get("tier", ""), str):
         raise UserError(
@@ -139,8 +135,19 @@ def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
     return row | {"where": where}
 
 
-def task_options(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Keyword arguments of the task whose scene a row describes."""
+class TaskOptions(TypedDict, total=False):
+    """Keyword arguments of a task that make a scene (`envs/task.py`)."""
+
+    seed: int
+    difficulty: str | None
+    recovery: str | None
+    row: Mapping[str, Any]
+    in_view: bool
+    stress: Mapping[str, int]
+
+
+def task_options(row: Mapping[str, Any]) -> TaskOptions:
+    """The scene that a row describes."""
     return {
         "seed": row["seed"],
         "difficulty": row.get("difficulty", "hard"),

@@ -4,7 +4,7 @@ would set.
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from mme_vla.config.sections import read_section
 from mme_vla.envs.base import environment
@@ -13,14 +13,14 @@ from mme_vla.envs.metadata import read_variant
 from mme_vla.errors import require
 from mme_vla.evaluation.rollout.evaluation import (
     Evaluation,
+    RunOptions,
     choose_episodes,
     default_output,
     evaluate_events,
     facts_of,
     predictor_of,
 )
-from mme_vla.evaluation.rollout.events import event_arms
-from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings, event_arms
 from mme_vla.policy.base import Policy
 from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.subgoal import SubgoalPredictor
@@ -39,7 +39,7 @@ def evaluate(
     show_progress: bool = True,
     recordings: Any = None,
     event: str | Sequence[str] | None = None,
-    **settings: Any,
+    **settings: Unpack[RolloutKeywords],
 ) -> Evaluation:
     """Run a policy on episodes of the benchmark; what `output` holds already is not run again.
 
@@ -59,9 +59,8 @@ def evaluate(
         recordings: datasets whose first episodes `split="stress:sessions=2"` shows before each.
         event: what happens in every episode, such as `"pause:100@subtask:2"`; of a list each by
             itself. Every episode runs without it too, in `output` itself.
-        show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as
-            `workers=4` or
-        `render=False`.
+        show_progress: whether a progress bar is shown.
+        settings: of `RolloutSettings`, such as `workers=4` or `render=False`.
 
     Returns:
         The records of these episodes, and `success_rate`; of those with events, `matched` are the
@@ -78,11 +77,8 @@ def evaluate(
         environment(run_settings.env).check_installed()
     loaded, source = load(policy)
     predictor = predictor_of(loaded, subgoal)
-    if subgoal is None or isinstance(subgoal, str):
-        subgoal_label = subgoal
-    else:
-        subgoal_label = type(subgoal).__name__
-    facts = facts_of(loaded, name, source, run_settings, subgoal_label)
+    label = type(subgoal).__name__ if isinstance(subgoal, SubgoalPredictor) else subgoal
+    facts = facts_of(loaded, name, source, run_settings, label)
     folder = default_output(facts) if output is None else Path(output).expanduser()
     wrapped = policy_of_split(loaded.eval(), run_settings.split, recordings)
     return evaluate_events(
@@ -92,10 +88,7 @@ def evaluate(
         facts,
         run_settings,
         arms,
-        subgoals=predictor,
-        source=source,
-        base=base,
-        show_progress=show_progress,
+        RunOptions(subgoals=predictor, source=source, base=base, show_progress=show_progress),
     )
 
 

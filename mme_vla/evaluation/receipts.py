@@ -4,7 +4,7 @@ import hashlib
 import platform
 import re
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import cache
@@ -12,13 +12,15 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict
 
+from pydantic import StrictInt
+
 from mme_vla.config.naming import digest, flat
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import UserError, brief
 from mme_vla.evaluation.records import EpisodeRecord, count_outcomes
-from mme_vla.evaluation.rollout.events import read_events
+from mme_vla.evaluation.rollout.settings import read_events
 from mme_vla.evaluation.store import RUN_FILE, read_records, read_run
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE
@@ -96,10 +98,8 @@ _Section = dict[str, Any] | None
 class _Settings(TypedDict, total=False):
     env: str | None
     event: str | None
-
-
-class _Records(TypedDict, total=False):
-    file: str | None
+    subgoal: _Section
+    max_steps: StrictInt
 
 
 class _Files(TypedDict, total=False):
@@ -118,8 +118,7 @@ class _Conditions(TypedDict, total=False):
 class _Receipt(TypedDict):
     settings: _Settings
     conditions: list[_Conditions]
-    records: _Records
-    scenes: str
+    records: dict[str, str | None]
     score: dict[str, Any]
 
 
@@ -191,7 +190,9 @@ def receipt(
     path = receipt_file(records)
     here = _conditions(policy.device.type == "cuda", renders, _extras_of(policy))
     here["checkpoint"] = _checkpoint(source)
-    conditions = read_receipt(path)["conditions"] if path.exists() else []
+    conditions: list[dict[str, Any]] = []
+    if path.exists():
+        conditions = read_receipt(path)["conditions"]
     if to_json(here) not in conditions:
         conditions.append(here)
     trained = identity_of(policy.config)
@@ -200,12 +201,16 @@ def receipt(
         "training": None if trained is None else asdict(trained),
         "conditions": conditions,
     }
-    # Before as well: a process that is killed has named its conditions.
-    write_json(path, with_checksum(to_json({**facts, **_score(records, run["settings"])})))
+
+    def write() -> None:
+        done = read_records(records) if records.exists() else []
+        write_json(path, with_checksum(to_json(facts | _score(records, done))))
+
+    write()  # before as well: a process that is killed has named its conditions
     try:
         yield
     finally:
-        write_json(path, with_checksum(to_json({**facts, **_score(records, run["settings"])})))
+        write()
 
 
 def read_receipt(path: Path) -> dict[str, Any]:
@@ -252,10 +257,11 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
             missing = f"records: neither {name} nor {name}.xz is beside the receipt."
             result.differences.append(missing)
         for file in present[:1]:
-            for key, value in to_json(_score(file, content["settings"])).items():
+            records = read_records(file)
+            for key, value in to_json(_score(file, records)).items():
                 result.compare(key, content.get(key, {}), value)
-            _compare_records(result, read_records(file), content)
-            _compare_scenes(result, read_records(file), content, build)
+            _compare_records(result, records, content)
+            _compare_scenes(result, records, content, build)
 
     for part in content["conditions"] or [{}]:
         _compare_conditions(result, part, checkpoint)
@@ -265,36 +271,33 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
 # The records --------------------------------------------------------------------------------------
 
 
-def _score(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Outcomes of each task, digests of the records, uncompressed, and of their scenes, and those
-    scenes built.
+def _score(path: Path, records: Sequence[EpisodeRecord]) -> dict[str, Any]:
+    """Outcomes of each task, the digest of the file of records, uncompressed, and the digests of
+    the scenes that were built.
     """
-    records, total = list[EpisodeRecord](), None
+    digest_of_file = None
     if path.exists():
-        records = read_records(path)
-        total = hashlib.sha256(read_unpacked(path, "episode records")).hexdigest()
-    split = str(settings.get("split"))
-    if Path(split).is_file():  # a split may be a file of rows, which then names the scenes
-        split = file_sum(Path(split))
-    seeds = {f"{r.task} {r.episode}": [r.seed, r.difficulty] for r in records}
-    tasks = dict.fromkeys(record.task for record in records)
+        digest_of_file = hashlib.sha256(read_unpacked(path, "episode records")).hexdigest()
+    scenes: dict[str, str] = {}
+    tasks: dict[str, list[EpisodeRecord]] = {}
+    for record in records:
+        tasks.setdefault(record.task, []).append(record)
+        if record.scene:
+            scenes[f"{record.task} {record.episode}"] = record.scene
     return {
-        "records": {"file": path.name.removesuffix(".xz"), "sha256": total},
-        "scenes": digest({"split": split, "scenes": seeds}, 64),
-        "scene_digests": {f"{r.task} {r.episode}": r.scene for r in records if r.scene},
-        "score": {task: count_outcomes(r for r in records if r.task == task) for task in tasks},
+        "records": {"file": path.name.removesuffix(".xz"), "sha256": digest_of_file},
+        "scene_digests": scenes,
+        "score": {task: count_outcomes(members) for task, members in tasks.items()},
     }
 
 
 def _compare_records(
-    result: Verification, records: list[EpisodeRecord], content: Mapping[str, Any]
+    result: Verification, records: Sequence[EpisodeRecord], content: Mapping[str, Any]
 ) -> None:
     """Whether every record is of the settings and of the training, and no longer than its limit."""
     settings = content["settings"]
-    subgoal = settings.get("subgoal")
-    if isinstance(subgoal, Mapping):
-        subgoal = subgoal.get("name")
-    expected = {"event": settings.get("event"), "subgoal": subgoal, "env": settings.get("env")}
+    expected: dict[str, Any] = {name: settings.get(name) for name in ("event", "env")}
+    expected["subgoal"] = (settings.get("subgoal") or {}).get("name")
     for key, field in _IDENTITY.items():
         if key in settings:
             expected[field] = settings[key]
@@ -302,13 +305,15 @@ def _compare_records(
             result.not_compared.append(f"settings.{key}: the receipt does not name it.")
     if "training" in content:
         expected["training"] = content["training"]
-    limit = float("inf")
+
+    limit = settings.get("max_steps", float("inf")) + _MARGIN
     try:
         # The time for which events hold the robot counts as well.
-        hold_steps = sum(event.perturbation.hold for event in read_events(settings.get("event")))
-        limit = int(settings["max_steps"]) + _MARGIN + hold_steps
-    except (KeyError, TypeError, ValueError) as error:  # UserError is a ValueError
+        limit += sum(event.perturbation.hold for event in read_events(expected["event"]))
+    except UserError as error:
+        limit = float("inf")
         result.not_compared.append(f"steps: the settings name no limit of them ({error}).")
+
     for record in records:
         values = asdict(record)
         values["env"] = record.env or expected["env"]  # not every record names its own
@@ -317,24 +322,28 @@ def _compare_records(
         for field, value in expected.items():
             result.compare(f"records.{field}", str(value), str(values[field]))
         # A motion of RoboMME may end beyond the limit.
-        is_motion = settings.get("env") == ROBOMME and record.action_space in MOTIONS
+        is_motion = expected["env"] == ROBOMME and record.action_space in MOTIONS
         if record.steps < 0 or (record.steps > limit and not is_motion):
             result.compare("records.steps", f"0 to {limit}", record.steps)
 
 
 def _compare_scenes(
-    result: Verification, records: list[EpisodeRecord], content: Mapping[str, Any], build: bool
+    result: Verification,
+    records: Sequence[EpisodeRecord],
+    content: Mapping[str, Any],
+    build: bool,
 ) -> None:
     """Seeds and difficulties of the episodes, and the scenes' digests, for which they are built."""
+    if not records:
+        result.not_compared.append("scenes: there is no record.")
     try:
-        require(records, "there is no record.")
         env = environment(str(content["settings"].get("env")))
         for record in records:
             env.check_task(record.task)
             spec = env.episode(record.task, record.split, record.episode)
             name = f"scene {record.task} {record.episode}"
-            then, here = f"{record.seed}, {record.difficulty}", f"{spec.seed}, {spec.difficulty}"
-            result.compare(name, then, here)
+            then = f"{record.seed}, {record.difficulty}"
+            result.compare(name, then, f"{spec.seed}, {spec.difficulty}")
             if record.scene in _UNNAMED_SCENES:
                 result.not_compared.append(_UNNAMED_SCENES[record.scene])
             elif build:
@@ -355,10 +364,14 @@ def _conditions(on_gpu: bool, renders: bool, folders: Iterable[str]) -> dict[str
     """
     import torch
 
-    cpu, renderer = platform.processor() or platform.machine(), None
+    cpu = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file() and (model := re.search(r"model name\s*:\s*(.+)", info.read_text())):
         cpu = model[1]
+    gpu = None
+    if on_gpu and torch.cuda.is_available():
+        gpu = torch.cuda.get_device_name()
+    renderer = None
     if renders and _version("sapien") is not None:
         import sapien
 
@@ -366,7 +379,6 @@ def _conditions(on_gpu: bool, renders: bool, folders: Iterable[str]) -> dict[str
 
         devices = re.findall(r"GPU:\s*(.+?)\s*\n", str(sapien.render.get_device_summary()))
         renderer = f"{render_backend()}: {', '.join(devices)}"
-    gpu = torch.cuda.get_device_name() if on_gpu and torch.cuda.is_available() else None
     return {
         "code": {"mme-vla": version("mme-vla"), **_code(frozenset({*CODE, *folders}))},
         "simulator": {name: _version(name) for name in SIMULATOR},

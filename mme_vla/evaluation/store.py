@@ -157,7 +157,7 @@ class RecordLog:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file: IO[bytes] = path.open("ab+")
         try:
-            _lock(self._file, path)
+            self._lock()
             self._repair()
         except BaseException:
             self._file.close()
@@ -187,6 +187,18 @@ class RecordLog:
         except OSError:  # what a full disk did not take is tried once more on closing
             if error is None:
                 raise
+
+    def _lock(self) -> None:
+        # The records themselves are locked, so that no other file lies beside them.
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(
+                f"{self.path} is being written by another process; give every shard a file of its"
+                " own, episodes-<shard>.jsonl."
+            ) from None
+        except OSError:  # a file system without locks
+            return
 
     def _repair(self) -> None:
         self._file.seek(0)
@@ -237,18 +249,6 @@ def find_records(paths: Iterable[Path]) -> list[Path]:
             )
         files += below
     return list({path.resolve(): path for path in files}.values())
-
-
-def _lock(file: IO[bytes], path: Path) -> None:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise UserError(
-            f"{path} is being written by another process; give every shard a file of its own,"
-            " episodes-<shard>.jsonl."
-        ) from None
-    except OSError:  # a file system without locks
-        return
 
 
 CLAIMS = "claims"  # Folder of a run's claims
@@ -342,14 +342,13 @@ class Claims:
         """Write a claim; False where another process was first, whose claim is noted."""
         path = self.folder / CLAIMS / f"{quote(key.task, safe='')}-{key.episode}.{number}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
-        is_first = not path.exists()
-        if is_first:
-            try:
-                _write_new(path, json.dumps(asdict(claim)) + "\n")
-            except FileExistsError:
-                is_first = False
-        self._newest[key] = number, claim if is_first else _read_claim(path)
-        return is_first
+        try:
+            _write_new(path, json.dumps(asdict(claim)) + "\n")
+        except FileExistsError:
+            self._newest[key] = number, _read_claim(path)
+            return False
+        self._newest[key] = number, claim
+        return True
 
 
 def _read_claim(path: Path) -> Claim:
@@ -374,15 +373,12 @@ def _is_held(path: Path, claim: Claim) -> bool:
     others are alive.
     """
     try:
-        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except FileNotFoundError:
         return False
-    try:
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     except OSError:
         return claim.host != socket.gethostname() or is_alive(claim.process)
-    finally:
-        os.close(file)
     return False

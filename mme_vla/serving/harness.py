@@ -173,17 +173,18 @@ class MMEVLAModelServer(PredictModelServer):
     def _caught_up(self, obs: dict[str, Any], ctx: SessionContext) -> Episode:
         """A session's episode, after it has taken the frames since its last chunk."""
         running = self.sessions[ctx.session_id]
-        images, states = running.images, running.states
-        running.images, running.states = [], []
         episode = running.episode
         episode.goal = str(obs["task_description"])
         episode.subgoal = obs.get("subgoal") or None
         video = obs.get("video_history")
         if video is not None and len(video):
             episode.add_frames(np.stack(video), is_demo=True)
-        episode.observe(
-            {name: np.stack([p[name] for p in images]) for name in images[0]}, np.stack(states)
-        )
+        views = {}
+        for name in running.images[0]:
+            views[name] = np.stack([images[name] for images in running.images])
+        episode.observe(views, np.stack(running.states))
+        running.images.clear()
+        running.states.clear()
         return episode
 
 
@@ -224,14 +225,16 @@ def run_server(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     level = logging.DEBUG if options.verbose else logging.INFO
     logging.basicConfig(level=level, format="%(asctime)s %(name)s: %(message)s")
-    host, port = options.host, options.port
+    host = options.host
+    port = options.port
     if options.address:
         name, _, number = options.address.rpartition(":")
         require(
             number.isdecimal(),
             f"--address={options.address!r} must be host:port, such as 127.0.0.1:8000.",
         )
-        host, port = name or host, int(number)
+        host = name or host
+        port = int(number)
     server = MMEVLAModelServer(**options.args.as_dict())
     if not is_local(host):
         logger.warning(

@@ -372,7 +372,8 @@ class RequestReader:
             f"The robot {self._robot.name!r} is not the benchmark's: send observation/… messages.",
         )
         challenge: Any = validated(self._challenge, message, "The request")
-        joints, grippers = challenge.joint_state_list, challenge.gripper_state_list
+        joints = challenge.joint_state_list
+        grippers = challenge.gripper_state_list
         views = self._views(challenge)
         lengths = {}
         for name, view in views.items():

@@ -9,6 +9,7 @@ import asyncio
 import hmac
 import logging
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -57,7 +58,7 @@ KEEP_ALIVE_S = 75  # seconds from a reply to the end of the next request's heade
 MIN_BYTES_S = 2**16  # bytes a second of a body, beside limits.receive_s
 MAX_IDLE_CONNECTIONS = 64  # connections that are between two requests
 SMALL = 2**16  # bytes decoded on the event loop; larger messages are decoded in a thread
-BUSY = "The server is full (limits.connections), and every client waits for a reply.\n"
+BUSY = "The server is full (limits.connections), and every client waits for a reply."
 FULL = "The server is full and this client was silent longest; begin the episode again."
 IDLE = "This connection was silent for limits.idle_s; connect and begin the episode again."
 STOPPING = "The server is stopping."
@@ -80,7 +81,8 @@ class PolicyServer:
     ) -> None:
         policy.require_processor().require_stats()
         settings.check_robot(policy.embodiment, policy.require_processor().prompt_spec.past_actions)
-        self.settings, self.stats = settings, ServerStats()
+        self.settings = settings
+        self.stats = ServerStats()
         self.engine = Engine(policy, settings.max_batch, settings.flow_steps, self.stats)
         self.reader = RequestReader(policy.embodiment, settings.limits.frames)
         self.sessions = HttpSessions(self.engine, settings)
@@ -182,7 +184,8 @@ class PolicyServer:
             Route(path, handler, methods=[METHODS[path]]) for path, handler in handlers.items()
         ]
         routes.append(WebSocketRoute("/{path:path}", self.websocket))
-        app = Starlette(routes=routes, exception_handlers={HTTPException: self._refuse})
+        refused = (HTTPException, UserError, BusyError)
+        app = Starlette(routes=routes, exception_handlers=dict.fromkeys(refused, self._refuse))
 
         async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
             """Check the key before anything of the body is read."""
@@ -197,10 +200,10 @@ class PolicyServer:
                 else:
                     await WebSocket(scope, receive, send).send_denial_response(refusal)
             finally:
-                ends_soon = refusal is not None or scope["path"] in OPEN
-                if scope["type"] == "websocket":
-                    ends_soon = True
-                self.places.end_request(address, BRIEF_S if ends_soon else KEEP_ALIVE_S)
+                seconds = KEEP_ALIVE_S
+                if refusal or scope["path"] in OPEN or scope["type"] == "websocket":
+                    seconds = BRIEF_S
+                self.places.end_request(address, seconds)
 
         return guarded
 
@@ -226,14 +229,22 @@ class PolicyServer:
         return right and scheme.lower() == "api-key"
 
     async def _refuse(self, request: Request, error: Exception) -> Response:
-        assert isinstance(error, HTTPException)
-        path = request.url.path
-        known = {
-            404: f"There is no {path[:80]!r}; known: {', '.join(METHODS)}.",
-            405: f"{path} takes {METHODS.get(path, 'another method')}.",
-        }
+        """The reply to a request that is wrong, or that there is no place for."""
         self.stats.count("refused")
-        text = known.get(error.status_code, error.detail)
+        if not isinstance(error, HTTPException):
+            logger.info("%s: refused: %s", _client(request), error)
+            status = 400
+            if isinstance(error, NoEpisodeError):
+                status = 409
+            elif isinstance(error, BusyError):
+                status = 503
+            return PlainTextResponse(f"{error_text(error)}\n", status)
+        path = request.url.path
+        text = error.detail
+        if error.status_code == 404:
+            text = f"There is no {path[:80]!r}; known: {', '.join(METHODS)}."
+        elif error.status_code == 405:
+            text = f"{path} takes {METHODS.get(path, 'another method')}."
         return PlainTextResponse(f"{text}\n", error.status_code, error.headers)
 
     # HTTP.
@@ -249,10 +260,10 @@ class PolicyServer:
 
     async def infer(self, request: Request) -> Response:
         """Reply to a request of a session that begins with `reset` or `is_first_step`."""
-        name = (request.client.host if request.client else "", request.headers.get("x-session", ""))
+        name = (_client(request), request.headers.get("x-session", ""))
         place = self.places.take(request.scope["client"])
         if place is None:
-            raise HTTPException(503, BUSY.strip())
+            raise HTTPException(503, BUSY)
         try:
             body = await self._body(request)
             if place.ended:
@@ -267,14 +278,7 @@ class PolicyServer:
             del body
             reply = await self.sessions.respond(name, message, begun)
             return Response(pack(reply), media_type=MSGPACK)
-        except NoEpisodeError as error:
-            raise HTTPException(409, error_text(error)) from None
-        except BusyError as error:
-            raise HTTPException(503, error_text(error)) from None
-        except UserError as error:
-            logger.info("%s: refused: %s", name[0], error)
-            raise HTTPException(400, error_text(error)) from None
-        except HTTPException:
+        except (HTTPException, UserError, BusyError):
             raise
         except Exception as error:
             self.stats.count("failed")
@@ -327,17 +331,31 @@ class PolicyServer:
     # Websocket.
 
     async def websocket(self, socket: WebSocket) -> None:
-        """Send the metadata, then reply to one request after the other."""
+        """Give a client a place, and reply to it until one of the two closes the connection."""
         place = self.places.take(socket.scope["client"], socket)
         if place is None:
             self.stats.count("refused")
-            return await socket.send_denial_response(PlainTextResponse(BUSY, 503))
-        coming: asyncio.Future[Any] | None = None
+            await socket.send_denial_response(PlainTextResponse(f"{BUSY}\n", 503))
+            return
         try:
             await socket.accept()
-            await self._send(socket, self.metadata)
-            session = Session(self.engine, self.settings)
-            coming = asyncio.ensure_future(socket.receive())
+            await self._converse(socket, place)
+        except WebSocketDisconnect as gone:
+            if gone.code == 1009:
+                self.stats.count("refused")
+                logger.info("%s: message too large (limits.message_mib)", place.name)
+        except TimeoutError:
+            self.stats.count("too_slow")
+            logger.info("%s: took no reply for limits.send_s", place.name)
+        finally:
+            self.places.leave(place)
+
+    async def _converse(self, socket: WebSocket, place: "Place") -> None:
+        """Send the metadata, then reply to one request after the other."""
+        await self._send(socket, self.metadata)
+        session = Session(self.engine, self.settings)
+        coming = asyncio.ensure_future(socket.receive())
+        try:
             while True:
                 await asyncio.wait([coming], timeout=self.settings.limits.idle_s)
                 if not coming.done():
@@ -345,13 +363,12 @@ class PolicyServer:
                 event = await coming
                 if event["type"] == "websocket.disconnect":
                     raise WebSocketDisconnect(event["code"])
-                if place.ended:  # the client sent this before it knew
-                    coming = asyncio.ensure_future(socket.receive())
-                    continue
-                place.work()
                 # Reading continues while the policy computes, so that a client that leaves is
                 # noticed.
                 coming = asyncio.ensure_future(socket.receive())
+                if place.ended:  # the client sent this before it knew
+                    continue
+                place.work()
                 computing = asyncio.ensure_future(self._reply(session, event, place))
                 del event  # hundreds of megabytes that need not wait for the next request
                 await asyncio.wait([computing, coming], return_when=asyncio.FIRST_COMPLETED)
@@ -361,25 +378,16 @@ class PolicyServer:
                 reply = await computing  # another request may have come; it waits for its turn
                 await self._send(socket, reply)
                 if isinstance(reply, str):
-                    return await _close(socket, 1011, reply)
+                    await _close(socket, 1011, reply)
+                    return
                 place.wait()
                 if self.places.stopping:
                     self.places.end(place, STOPPING)
-        except WebSocketDisconnect as gone:
-            if gone.code == 1009:
-                self.stats.count("refused")
-                logger.info("%s: message too large (limits.message_mib)", place.name)
-        except TimeoutError:
-            self.stats.count("too_slow")
-            logger.info("%s: took no reply for limits.send_s", place.name)
         finally:
-            if coming is not None:
-                coming.cancel()
-            self.places.leave(place)
-        return None
+            coming.cancel()
 
     async def _reply(
-        self, session: Session, event: dict[str, Any], place: "Place"
+        self, session: Session, event: Mapping[str, Any], place: "Place"
     ) -> dict[str, Any] | str:
         """The reply to a message, or the reason why there is none; then the connection closes."""
         try:
@@ -446,7 +454,8 @@ class Places:
     """
 
     def __init__(self, limits: Limits, stats: ServerStats) -> None:
-        self._limits, self._stats = limits, stats
+        self._limits = limits
+        self._stats = stats
         self.taken: list[Place] = []
         self.closing: set[asyncio.Task[None]] = set()
         """Closing frames that are being sent."""
@@ -462,7 +471,9 @@ class Places:
             waiting = self.waiting()
             if not waiting:
                 return None
-            longest = min(waiting, key=lambda place: (place.socket is not None, _since(place)))
+            longest = min(
+                waiting, key=lambda place: (place.socket is not None, place.waiting_since or 0.0)
+            )
             self._stats.count("let_go")
             self.end(longest, FULL)
         place = Place(address, socket)
@@ -516,15 +527,15 @@ class Places:
                 transports[address].abort()
 
 
-def _since(place: Place) -> float:
-    return place.waiting_since or 0.0
-
-
 async def _close(socket: WebSocket, code: int, reason: str) -> None:
     short = reason.encode()[:120].decode(errors="ignore")  # a close frame takes no more
     with suppress(TimeoutError, RuntimeError, WebSocketDisconnect):  # the client has left
         async with asyncio.timeout(BRIEF_S):
             await socket.close(code, short)
+
+
+def _client(request: Request) -> str:
+    return request.client.host if request.client else ""
 
 
 def error_text(error: Exception) -> str:

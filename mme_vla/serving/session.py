@@ -32,7 +32,8 @@ class Session:
     """
 
     def __init__(self, engine: Engine, settings: ServeSettings) -> None:
-        self._engine, self._settings = engine, settings
+        self._engine = engine
+        self._settings = settings
         self._begin()
 
     def _begin(self) -> None:
@@ -219,7 +220,8 @@ class HttpSessions:
     """The sessions of HTTP clients, at most `limits.connections` of them."""
 
     def __init__(self, engine: Engine, settings: ServeSettings) -> None:
-        self._engine, self._settings = engine, settings
+        self._engine = engine
+        self._settings = settings
         self.entries: dict[Name, SessionEntry] = {}
 
     async def respond(self, name: Name, request: Request, begun: float) -> dict[str, Any]:

@@ -61,11 +61,14 @@ def test_a_damaged_reply_is_requested_again(tmp_path: Path, damage: str, caplog)
 @pytest.mark.parametrize(
     "record", ['"x"', '{"episode": 0}', '{"episode": 0, "seed": 1e3, "difficulty": "easy"}']
 )
-def test_metadata_of_another_form_is_refused(tmp_path: Path, record: str) -> None:
+def test_metadata_of_another_form_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: str
+) -> None:
+    monkeypatch.setenv(metadata.FOLDER_VARIABLE, str(tmp_path))
     artefacts.write_metadata(tmp_path)
     next(tmp_path.rglob("*.json")).write_text(f'{{"records": [{record}]}}')
     with pytest.raises(UserError, match="not official metadata"):
-        metadata.episodes("PickXtimes", "test", tmp_path)
+        metadata.episodes("PickXtimes", "test")
 
 
 def test_states_well_beyond_the_statistics_are_a_broken_driver() -> None:

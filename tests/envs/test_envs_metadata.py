@@ -109,13 +109,14 @@ def test_official_metadata_overrules_the_table(
         episode("BinFill", "test", 0)
 
 
-def test_a_broken_official_file_is_refused(tmp_path: Path) -> None:
+def test_a_broken_official_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(metadata.FOLDER_VARIABLE, str(tmp_path))
     (tmp_path / "test").mkdir()
     (tmp_path / "test" / "record_dataset_StopCube_metadata.json").write_text(
         '{"records": [{"episode": 0}]}'
     )
     with pytest.raises(UserError, match="not official metadata"):
-        episodes("StopCube", "test", tmp_path)
+        episodes("StopCube", "test")
 
 
 @pytest.mark.parametrize(
@@ -149,3 +150,11 @@ def test_a_seed_lies_close_above_the_formulas_and_has_its_difficulty(split: str)
             assert ahead == 0 or (
                 split == "val" and task in ("StopCube", "VideoPlaceButton") and 0 < ahead <= 2
             )
+
+
+def test_a_task_of_the_users_own_has_no_episodes_in_the_challenge(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(metadata, "TASKS", {"Own": None})
+    with pytest.raises(UserError, match="the benchmark's tasks alone, and Own is none"):
+        episodes("Own", metadata.CHALLENGE)

@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from mme_vla.errors import SceneError, UserError
 @pytest.fixture(scope="module")
 def shared_envs() -> Iterator[VecEnv]:
     """Two workers for all tests, since a process takes seconds to start."""
-    with VecEnv([], 2, make_light_env, {"video": 20}) as envs:
+    with VecEnv([], 2, partial(make_light_env, video=20)) as envs:
         yield envs
 
 
@@ -170,7 +171,11 @@ def test_misuse_is_refused(envs: VecEnv) -> None:
 
 def test_closing_ends_all_processes_even_busy_ones() -> None:
     before = {child.pid for child in multiprocessing.active_children()}
-    envs = make_vec_env("StopCube", [0, 1], 2, factory=make_light_env, video=20)
+    envs = VecEnv(
+        [Job("StopCube", "test", 0), Job("StopCube", "test", 1)],
+        2,
+        partial(make_light_env, video=20),
+    )
     with pytest.raises(UserError, match="runs no episode"):
         envs.send(0, "go")
     for worker in range(2):

@@ -230,7 +230,9 @@ def test_objects_that_overlap_are_refused_with_both_names() -> None:
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("{", "line 1 is not JSON"),
+        ("{", "line 1 is not valid JSON"),
+        ("[" * 100_000, "line 1 is nested too deeply"),
+        ('{"task": "PickXtimes", "spec": {}, "seed": ' + "9" * 5000 + "}", "line 1 is not valid"),
         ("[]", "expected an object"),
         ('{"task": "PickXtime", "spec": {}}', "task is 'PickXtime'"),
         ('{"task": "PickXtimes"}', "spec is None"),

@@ -39,9 +39,9 @@ from mme_vla.evaluation.results.events import (
 )
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import Interval, wilson
-from mme_vla.evaluation.rollout.evaluation import evaluate_events
-from mme_vla.evaluation.rollout.events import EventCourse, event_arms, read_events
-from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.episode import EventCourse
+from mme_vla.evaluation.rollout.evaluation import RunOptions, evaluate_events
+from mme_vla.evaluation.rollout.settings import RolloutSettings, event_arms, read_events
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.processing.normalise import NormStats
 from mme_vla.registry import PERTURBATIONS
@@ -328,9 +328,10 @@ def test_every_event_run_has_its_matched_arm(
 ) -> None:
     use_inline_envs(monkeypatch)
     settings = RolloutSettings(max_steps=24, flow_steps=2, workers=2, max_batch=1)
-    jobs, how = JOBS[2:4], {"base": make_slow_env, "show_progress": False}
+    jobs = JOBS[2:4]
+    options = RunOptions(base=make_slow_env, show_progress=False)
     done = evaluate_events(
-        memoryless, jobs, tmp_path, FACTS, settings, ["pause:9@subtask:30", "pause:9"], **how
+        memoryless, jobs, tmp_path, FACTS, settings, ["pause:9@subtask:30", "pause:9"], options
     )
     assert [r.event for r in done.records] == ["pause:9@subtask:30"] * 2 + ["pause:9"] * 2
     baseline = {r.key: facts(r) for r in done.matched}
@@ -340,7 +341,7 @@ def test_every_event_run_has_its_matched_arm(
     assert all(
         r.steps != baseline[r.key][1] or facts(r) != baseline[r.key] for r in done.records[2:]
     )
-    again = evaluate_events(memoryless, jobs, tmp_path, FACTS, settings, ["pause:9"], **how)
+    again = evaluate_events(memoryless, jobs, tmp_path, FACTS, settings, ["pause:9"], options)
     assert again.workload.chunks == 0 and [facts(r) for r in again.records] == [
         facts(r) for r in done.records[2:]
     ]

@@ -31,7 +31,7 @@ def test_the_video_is_the_one_that_is_compressed_at_once(
         recorder.add(views, "a caption")
     path = recorder.finish("success", "")
     assert path == tmp_path / "success.mp4"
-    assert len(threads) == len(VIEWS) and all(thread.startswith("film") for thread in threads)
+    assert len(threads) == len(VIEWS) and all(thread.startswith("video") for thread in threads)
     assert path.read_bytes() == video_bytes(video_frame(views, "a caption") for views in VIEWS)
 
 
@@ -54,4 +54,4 @@ def test_a_discarded_video_leaves_nothing(tmp_path: Path) -> None:
         recorder.add(views)
     assert recorder.finish("success", "") is None
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("film")]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("video")]

@@ -21,7 +21,7 @@ from mme_vla import UserError
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import Shard, choose_shard, evaluate
+from mme_vla.evaluation.rollout.evaluation import RunOptions, Shard, choose_shard, evaluate
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import Claims, find_records, read_records
@@ -144,9 +144,7 @@ def test_shards_side_by_side_make_the_full_run(
             tmp_path,
             FACTS,
             settings,
-            shard=shard,
-            base=make_moving_env,
-            show_progress=False,
+            RunOptions(shard=shard, base=make_moving_env, show_progress=False),
         )
         assert len(mine.records) == 2
     assert sorted(path.name for path in find_records([tmp_path])) == [

@@ -17,7 +17,7 @@ from mme_vla.errors import UserError
 from mme_vla.evaluation.api import policy_of_split
 from mme_vla.evaluation.results.curves import stress_curves
 from mme_vla.evaluation.rollout.environment import make_rollout_env
-from mme_vla.evaluation.rollout.evaluation import evaluate
+from mme_vla.evaluation.rollout.evaluation import RunOptions, evaluate
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.arms import read_arm
 from mme_vla.extras.probing.offline import OfflineSettings
@@ -52,7 +52,8 @@ def test_a_split_with_sessions_shows_them_first_and_its_records_are_on_the_curve
 def test_nobody_evaluates_such_a_split_without_showing_them(tmp_path: Path) -> None:
     policy = quick_policy("framesamp_modul").eval()
     with pytest.raises(UserError, match="2 unrelated episodes come before each, and 0 are shown"):
-        evaluate(policy, JOBS, tmp_path, FACTS, RolloutSettings(split=SPLIT), base=make_moving_env)
+        options = RunOptions(base=make_moving_env)
+        evaluate(policy, JOBS, tmp_path, FACTS, RolloutSettings(split=SPLIT), options)
     with pytest.raises(UserError, match="2 unrelated episodes come before each, and 0 are shown"):
         make_env("StopCube", SPLIT)
     with pytest.raises(UserError, match="2 recorded episodes to take from, and there are 1"):

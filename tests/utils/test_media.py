@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mme_vla.embodiment import ROBOMME_JOINT, Camera
-from mme_vla.envs.vector.messages import Command
-from mme_vla.evaluation.rollout.environment import ChunkEnv
+from mme_vla.evaluation.rollout.environment import ChunkEnv, Command
 from mme_vla.evaluation.rollout.video import EpisodeVideo
 from mme_vla.utils.media import (
     BORDER,

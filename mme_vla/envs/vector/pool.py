@@ -27,11 +27,10 @@ import numpy as np
 from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.base import environment, open_episode
 from mme_vla.envs.make import ROBOMME, check_names, make_env
-from mme_vla.envs.observations import RenderRequest
+from mme_vla.envs.observations import Include, RenderRequest
 from mme_vla.envs.vector import worker as protocol
-from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import check_choice, require
+from mme_vla.errors import require
 from mme_vla.utils.processes import signals_deferred
 
 
@@ -58,7 +57,7 @@ class Reply:
     terminated: bool
     truncated: bool
     info: Any
-    """What the environment says: a dictionary, or the `Report` of one that takes chunks."""
+    """What the environment says: a dictionary, or a report with a `status`."""
     error: Exception | None = None
     """Why there is no result of the policy: the environment raised it, or the worker died or hung
     and was replaced.
@@ -72,11 +71,8 @@ class Reply:
     @property
     def done(self) -> bool:
         """Whether the episode is over."""
-        if self.terminated or self.truncated:
-            return True
-        if isinstance(self.info, Report):
-            return self.info.status == "error"
-        return self.info.get("status") == "error"
+        status = self.info.get("status") if isinstance(self.info, dict) else self.info.status
+        return self.terminated or self.truncated or status == "error"
 
     @classmethod
     def of_outcome(cls, worker: int, job: Job, resetting: bool, outcome: tuple) -> "Reply":
@@ -131,9 +127,8 @@ class VecEnv:
     Args:
         jobs: the episodes, in the order `start_next` hands them out.
         workers: number of processes.
-        factory: makes an environment from `task`, `split`, `episode` and `options`; importable by
-            name.
-        options: further arguments of `factory`.
+        factory: makes an environment from `task`, `split` and `episode`; importable by name, or a
+            `partial` of such a function with its further arguments.
         timeout: seconds after which a command without result counts as hung, and its worker is
             replaced.
     """
@@ -143,7 +138,6 @@ class VecEnv:
         jobs: Iterable[Job],
         workers: int,
         factory: Callable[..., Any] = make_env,
-        options: dict[str, Any] | None = None,
         timeout: float = 600.0,
     ) -> None:
         require(
@@ -154,7 +148,7 @@ class VecEnv:
         self.jobs = deque(jobs)
         """Episodes that no worker has begun yet."""
         self.timeout = timeout
-        self._factory, self._options = factory, options or {}
+        self._factory = factory
         self._context = simulating_processes()
         self._closed = False
         self._workers: list[_Worker] = []
@@ -269,8 +263,8 @@ class VecEnv:
     def _spawn(self) -> _Worker:
         connection, remote = self._context.Pipe()
         block = self._context.RawArray("B", protocol.BLOCK_BYTES)
-        work = (imported_plugins(), remote, block, self._factory, self._options)
-        process = self._context.Process(target=begin, args=(settings(), _work, *work), daemon=True)
+        work = (_work, imported_plugins(), remote, block, self._factory)
+        process = self._context.Process(target=begin, args=(settings(), *work), daemon=True)
         with signals_deferred():
             process.start()
         remote.close()
@@ -350,10 +344,12 @@ def make_vec_env(
     split: str = "test",
     action_space: str = "joint_angle",
     *,
+    max_steps: int | None = None,
+    render: bool = True,
+    reward: str = "none",
+    include: Include | None = None,
     timeout: float = 600.0,
-    factory: Callable[..., Any] = make_env,
     env: str = ROBOMME,
-    **options: Any,
 ) -> VecEnv:
     """Environments for all given episodes of all given tasks.
 
@@ -362,30 +358,40 @@ def make_vec_env(
         episodes: episode numbers of every task; by default all of the split.
         workers: number of processes; more than the machine has cores is of no use.
         split: `train`, `val` or `test`.
-        action_space: as for `make_env`.
+        action_space, max_steps, render, reward, include: as for `make_env`; the last two are for
+            RoboMME alone.
         timeout: seconds after which a command without result counts as hung.
-        factory: what makes an environment, importable by name.
-        env: the environment whose tasks these are; another one than RoboMME is opened itself.
-        options: further arguments of `make_env`, such as `max_steps`, `render` and `include`;
-            `max_steps` and `render` alone for another environment.
+        env: the environment whose tasks these are.
     """
     names = [tasks] if isinstance(tasks, str) else list(tasks)
     require(names, "No task given; expected a task name or several.")
     source = environment(env)
-    if factory is make_env:
-        source.check_installed()
+    source.check_installed()
+    # A process would end with a traceback.
+    require(
+        env == ROBOMME or (reward == "none" and include is None),
+        f"env={env} takes no reward and no include: they are for env={ROBOMME}.",
+    )
     chosen = None if episodes is None else list(episodes)
     jobs = []
     for name in names:
-        if factory is make_env and env == ROBOMME:
+        if env == ROBOMME:
             check_names(name, action_space, None, None)
         numbers = chosen
         if numbers is None:
             numbers = list(range(len(source.episodes(name, split))))
         for number in numbers:
             jobs.append(Job(name, split, source.episode(name, split, number).episode))
-    if factory is make_env and env != ROBOMME:
-        for option in options:  # a process would end with a traceback
-            check_choice(f"options of env={env}", option, ("max_steps", "render"))
-        factory = partial(open_episode, env)
-    return VecEnv(jobs, workers, factory, {"action_space": action_space, **options}, timeout)
+    make: Callable[..., Any] = partial(
+        open_episode, env, action_space=action_space, max_steps=max_steps, render=render
+    )
+    if env == ROBOMME:
+        make = partial(
+            make_env,
+            action_space=action_space,
+            max_steps=max_steps,
+            render=render,
+            reward=reward,
+            include=include,
+        )
+    return VecEnv(jobs, workers, make, timeout)

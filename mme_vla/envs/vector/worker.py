@@ -112,9 +112,7 @@ def restore(value: Any, arrays: list[np.ndarray]) -> Any:
     return value
 
 
-def serve(
-    connection: Any, block: Any, factory: Callable[..., Any], options: dict[str, Any]
-) -> None:
+def serve(connection: Any, block: Any, factory: Callable[..., Any]) -> None:
     """Run commands until `CLOSE`, until the connection ends, or until the renderer has failed."""
     end_with_parent()
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
@@ -131,7 +129,7 @@ def serve(
                     if env is not None:
                         env.close()
                         env = None
-                    env = factory(**arguments[0], **options)
+                    env = factory(**arguments[0])
                     outcome: Any = env.reset(**arguments[1])
                 elif command == STEP:
                     outcome = env.step(arguments[0])

@@ -46,17 +46,11 @@ def record_table(records: Sequence[EpisodeRecord]) -> pd.DataFrame:
     Columns: `run`, `task`, `episode`, `difficulty`, `outcome`, `success` (0 or 1), and `record`,
     the record itself. Figures, comparisons and curves are made of it by grouping.
     """
-    columns = {
-        "run": [record.run for record in records],
-        "task": [record.task for record in records],
-        "episode": [record.episode for record in records],
-        "difficulty": [record.difficulty for record in records],
-        "outcome": [record.outcome for record in records],
-        "success": [float(record.success) for record in records],
-    }
-    table = pd.DataFrame(columns)
-    table["record"] = pd.Series(list(records), index=table.index, dtype=object)
-    return table
+    rows = [
+        (r.run, r.task, r.episode, r.difficulty, r.outcome, float(r.success), r) for r in records
+    ]
+    columns = ["run", "task", "episode", "difficulty", "outcome", "success", "record"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 @dataclass(frozen=True)
@@ -90,6 +84,11 @@ class Run:
     protocol: Protocol
 
     @property
+    def episodes(self) -> dict[EpisodeKey, list[EpisodeRecord]]:
+        """The records in order, as `pair` takes them."""
+        return {key: [record] for key, record in sorted(self.records.items())}
+
+    @property
     def averaged(self) -> list[EpisodeRecord]:
         """The records that the average is over."""
         return [
@@ -110,10 +109,13 @@ class Run:
 
     def successes(self, task: str) -> list[bool] | None:
         """Outcomes of a task's episodes in order, or None if some are missing."""
-        keys = [EpisodeKey(task, episode) for episode in range(self.protocol.episodes)]
-        if any(key not in self.records for key in keys):
-            return None
-        return [self.records[key].success for key in keys]
+        outcomes = []
+        for episode in range(self.protocol.episodes):
+            record = self.records.get(EpisodeKey(task, episode))
+            if record is None:
+                return None
+            outcomes.append(record.success)
+        return outcomes
 
 
 @dataclass
@@ -174,9 +176,11 @@ def over_trainings(success: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
 
     success: columns are numbers in `runs`.
     """
-    seeds = [_training_seed(runs[number]) for number in success.columns]
-    names = {seed: name for name, seed in enumerate(dict.fromkeys(seeds))}
-    groups = [names[seed] for seed in seeds]
+    names: dict[int | None, int] = {}
+    groups = []
+    for number in success.columns:
+        seed = _training_seed(runs[number])
+        groups.append(names.setdefault(seed, len(names)))
     return success.T.groupby(groups).mean().T
 
 
@@ -242,11 +246,9 @@ def aggregate(
             f"These are results of several splits ({', '.join(splits)}): choose one with --split."
         )
     selected = [r for r in merged if split in (None, r.split)]
-    require(
-        selected,
-        f"There is no record{f' of split {split!r}' if split else ''}; there are:"
-        f" {splits or 'none'}.",
-    )
+    if not selected:
+        of_split = f" of split {split!r}" if split else ""
+        raise UserError(f"There is no record{of_split}; there are: {splits or 'none'}.")
     inside = [r for r in selected if protocol.expects(r.key)]
     counted = [r for r in inside if not (protocol.errors == "missing" and r.outcome == "error")]
     require(
@@ -304,14 +306,20 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
     }
     notes = []
     counts = Counter(method.label for method in methods)
-    for label in [label for label, count in counts.items() if count > 1]:
+    for label, count in counts.items():
+        if count == 1:
+            continue
         same = [method for method in methods if method.label == label]
-        names = [name for name in kinds if len({getattr(m, name) for m in same}) > 1]
+        names = []
+        for name in kinds:
+            if len({getattr(method, name) for method in same}) > 1:
+                names.append(name)
         lacking = False
         for method in same:
-            digests = [getattr(method, name) for name in names]
-            lacking = lacking or None in digests
-            method.label = "#".join([label, *((d or "unrecorded")[:10] for d in digests)])
+            for name in names:
+                digest = getattr(method, name)
+                lacking = lacking or digest is None
+                method.label += f"#{(digest or 'unrecorded')[:10]}"
         if "composition" in names:
             what = kinds["composition"]
         else:
@@ -476,7 +484,7 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
                 f" same weights and seed; {method.flipped:,} of them did not always end alike"
                 " (deterministic=true repeats runs)."
             )
-        limits = {record.max_steps for run in method.runs for record in run.records.values()}
+        limits = {record.max_steps for record in method.table["record"]}
         if method.paper and limits != {MAX_STEPS}:
             limit_text = ", ".join(map(str, sorted(limits)))
             notes.append(
@@ -484,16 +492,17 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
                 f" {MAX_STEPS}."
             )
         if len(method.runs) > 1:
-            same = pair(
-                [{key: [record] for key, record in run.records.items()} for run in method.runs]
-            )
+            same = pair([run.episodes for run in method.runs])
             if same.left_out:
                 notes.append(
                     f"{method.label}: its runs are not known to be of the same scenes in"
                     f" {same.left_out} episodes, whose scenes differ or are named in some runs"
                     " only; its mean is over all of them."
                 )
-    for split in sorted({run.key.split for method in methods for run in method.runs}):
+    splits: set[str] = set()
+    for method in methods:
+        splits.update(run.key.split for run in method.runs)
+    for split in sorted(splits):
         if is_other(split):
             notes.append(
                 f"Split {split!r}: scenes beyond the benchmark's own; figures of it are none of the"

@@ -77,10 +77,10 @@ class Comparison:
             first_is_better = self.difference > 0
             if self.paired:
                 first_is_better = self.wins > self.losses
-            better, worse = self.first, self.second
+            names = [self.first, self.second]
             if not first_is_better:
-                better, worse = worse, better
-            text = f"{better} is significantly better than {worse} ({p})"
+                names.reverse()
+            text = f"{names[0]} is significantly better than {names[1]} ({p})"
         elif not self.testable:
             text = f"{self.first} against {self.second}: too few episodes to tell ({p})"
         else:
@@ -119,8 +119,7 @@ def compare_all(
 
 def pair_methods(first: Method, second: Method) -> Pairing[EpisodeKey]:
     """The episodes that every run of both methods has, of the same scenes."""
-    runs = [run for method in (first, second) for run in method.runs]
-    return pair([{key: [record] for key, record in sorted(run.records.items())} for run in runs])
+    return pair([run.episodes for run in (*first.runs, *second.runs)])
 
 
 def common_episodes(first: Method, second: Method) -> set[EpisodeKey]:
@@ -132,9 +131,9 @@ def why_unpaired(first: Method, second: Method) -> str:
     """Why no episode of two methods can be paired, in a sentence or two."""
     what = f"{first.label} and {second.label}"
     notes = pair_methods(first, second).notes(what)
-    return (
-        " ".join(notes) if notes else f"{what} have no episode in common: there is nothing to pair."
-    )
+    if notes:
+        return " ".join(notes)
+    return f"{what} have no episode in common: there is nothing to pair."
 
 
 def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
@@ -145,24 +144,23 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     shared = {key.task for key in pairing.keys}
     tasks = [task for task in protocol.averaged if task in shared]
     tasks = tasks or [task for task in protocol.tasks if task in shared]
-    common = pd.MultiIndex.from_tuples([key for key in pairing.keys if key.task in tasks])
-    # Episodes × trainings of each side, in the order of the protocol's tasks.
-    first_rates, second_rates = (
-        method.rates.loc[common.set_names(["task", "episode"])].loc[tasks]
-        for method in (first, second)
+    common = pd.MultiIndex.from_tuples(
+        [key for key in pairing.keys if key.task in tasks], names=["task", "episode"]
     )
+    # Episodes × trainings of each side, in the order of the protocol's tasks.
+    first_rates = first.rates.loc[common].loc[tasks]
+    second_rates = second.rates.loc[common].loc[tasks]
     gaps = (first_rates.mean(axis=1) - second_rates.mean(axis=1)).round(9)
-    first_rate, second_rate = (
-        round(100 * float(rates.groupby(level="task").mean().mean(axis=1).mean()), 9)
-        for rates in (first_rates, second_rates)
-    )  # rounded: equal counts, equal figures
+    first_rate = _score(first_rates)
+    second_rate = _score(second_rates)
     trained = len(first_rates.columns) > 1 or len(second_rates.columns) > 1
 
     def interval(tasks: Sequence[str]) -> Interval:
         of_tasks = paired_interval(by_task(gaps.loc[tasks]), protocol.confidence)
         if trained:
-            losing = by_task(-second_rates.loc[tasks])
-            sides = {t: [won, losing[t]] for t, won in by_task(first_rates.loc[tasks]).items()}
+            gains = by_task(first_rates.loc[tasks])
+            losses = by_task(-second_rates.loc[tasks])
+            sides = {task: [gains[task], losses[task]] for task in gains}
             sampled = bootstrap(sides, protocol.confidence, protocol.samples, protocol.seed)
             of_tasks = of_tasks.widen(sampled)
         return of_tasks.percent
@@ -200,27 +198,34 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     return _noted(comparison, pairing)
 
 
+def _score(rates: pd.DataFrame) -> float:
+    """The mean over the tasks in percent, rounded: equal counts, equal figures."""
+    tasks = rates.groupby(level="task").mean()
+    return round(100 * float(tasks.mean(axis=1).mean()), 9)
+
+
 def compare_unpaired(first: Method, second: Method, protocol: Protocol) -> Comparison:
     """Compare the scores of two methods whose scenes are not known to be the same."""
     # Each scene is worth the mean of its trainings.
-    sides = [by_task(method.rates.mean(axis=1)) for method in (first, second)]
-    tasks = [task for task in protocol.averaged if all(task in side for side in sides)]
+    first_scenes = by_task(first.rates.mean(axis=1))
+    second_scenes = by_task(second.rates.mean(axis=1))
+    tasks = [task for task in protocol.averaged if task in first_scenes and task in second_scenes]
     require(
         tasks,
         f"{first.label} and {second.label} have no task in common: there is nothing to compare.",
     )
-    scenes = [[side[task][:, None] for task in tasks] for side in sides]
-    first_rate, second_rate = (
-        100 * float(np.mean([values.mean() for values in side])) for side in scenes
-    )
-    interval, p = unpaired_difference(scenes[0], scenes[1], protocol.confidence)
-    all_solved = [np.ones_like(values) for values in scenes[0]]
-    none_solved = [np.zeros_like(values) for values in scenes[1]]
+    first_values = [first_scenes[task][:, None] for task in tasks]
+    second_values = [second_scenes[task][:, None] for task in tasks]
+    first_rate = 100 * float(np.mean([values.mean() for values in first_values]))
+    second_rate = 100 * float(np.mean([values.mean() for values in second_values]))
+    interval, p = unpaired_difference(first_values, second_values, protocol.confidence)
+    all_solved = [np.ones_like(values) for values in first_values]
+    none_solved = [np.zeros_like(values) for values in second_values]
     smallest_p = unpaired_difference(all_solved, none_solved, protocol.confidence).p
     comparison = Comparison(
         first.label,
         second.label,
-        min(len(method.rates) for method in (first, second)),
+        min(len(first.rates), len(second.rates)),
         len(protocol.averaged) * protocol.episodes,
         first_rate,
         second_rate,

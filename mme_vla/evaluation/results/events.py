@@ -35,11 +35,11 @@ def matched_methods(results: Results) -> list[tuple[Method, Method]]:
         return tuple(getattr(method, name) for name in names)
 
     baseline = {identity(method): method for method in results.methods if method.event is None}
-    return [
-        (m, baseline[identity(m)])
-        for m in results.methods
-        if m.event is not None and identity(m) in baseline
-    ]
+    matched = []
+    for method in results.methods:
+        if method.event is not None and identity(method) in baseline:
+            matched.append((method, baseline[identity(method)]))
+    return matched
 
 
 def matched_pairs(records: Sequence[EpisodeRecord]) -> tuple[dict[RunKey, list[Pair]], list[str]]:
@@ -54,7 +54,8 @@ def matched_pairs(records: Sequence[EpisodeRecord]) -> tuple[dict[RunKey, list[P
     for record in records:
         if record.outcome != "error":
             runs.setdefault(record.run, {})[record.key] = [record]
-    pairs, notes = dict[RunKey, list[Pair]](), list[str]()
+    pairs: dict[RunKey, list[Pair]] = {}
+    notes: list[str] = []
     for run, mine in runs.items():
         baseline = runs.get(run._replace(event=None), {})
         if run.event is None or not baseline:
@@ -75,9 +76,10 @@ def did_not_act(record: EpisodeRecord) -> list[str]:
 
 def idle_events(records: Sequence[EpisodeRecord]) -> list[str]:
     """A line for each event that did not act in some episodes."""
-    counts = Counter(
-        event for record in records if record.outcome != "error" for event in did_not_act(record)
-    )
+    counts: Counter[str] = Counter()
+    for record in records:
+        if record.outcome != "error":
+            counts.update(did_not_act(record))
     return [
         f"event={event} did not act in {count} episodes: its place never came."
         for event, count in counts.items()
@@ -97,27 +99,21 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
     matched, notes = matched_pairs(merged)
     for run, pairs in matched.items():
         groups.setdefault(run._replace(training=_recipe(run.training)), []).extend(pairs)
-    rows, rules = [], set()
+    rows: list[list[str]] = []
+    rules: set[int] = set()
     for run, pairs in groups.items():
-        tasks = list(dict.fromkeys(record.task for record, _ in pairs))
-        for task in [*tasks, *(["all"] if len(tasks) > 1 else [])]:
-            there = [pair for pair in pairs if task in ("all", pair[0].task)]
-            rows.append([str(run._replace(event=None)), str(run.event), task, *_counts(there)])
+        tasks: dict[str, list[Pair]] = {}
+        for record, baseline in pairs:
+            tasks.setdefault(record.task, []).append((record, baseline))
+        if len(tasks) > 1:
+            tasks["all"] = pairs
+        for task, members in tasks.items():
+            rows.append([str(run._replace(event=None)), str(run.event), task, *_counts(members)])
         rules.add(len(rows))
     columns = [
-        "run",
-        "event",
-        "task",
-        "trainings",
-        "pairs",
-        "without (%)",
-        "with (%)",
-        "kept",
-        "lost",
-        "gained",
-        "p",
-        "did not act",
-    ]
+        "run", "event", "task", "trainings", "pairs", "without (%)", "with (%)", "kept", "lost",
+        "gained", "p", "did not act",
+    ]  # fmt: skip
     return Table(
         "Events beside their matched arms", columns, rows, rules - {len(rows)}, notes=notes
     )
@@ -129,29 +125,30 @@ def _recipe(training: TrainingIdentity | None) -> TrainingIdentity | None:
 
 
 def _counts(pairs: Sequence[Pair]) -> list[str]:
+    """The cells of one row from "trainings" on."""
+    changes: Counter[tuple[bool, bool]] = Counter()  # success without, and with the event
     trainings: dict[TrainingIdentity | None, list[tuple[bool, bool]]] = {}
+    scenes: Counter[EpisodeKey] = Counter()  # trainings that lost it, less those that gained it
+    n_idle = 0
     for record, baseline in pairs:
-        trainings.setdefault(record.training, []).append((baseline.success, record.success))
-    outcomes = [outcome for part in trainings.values() for outcome in part]
-    retained, lost, gained = (
-        outcomes.count(outcome) for outcome in ((True, True), (True, False), (False, True))
-    )
-    rates = 100 * np.array([np.mean(part, axis=0) for part in trainings.values()])
-    texts = [f"{rate:.1f}" for rate in rates.mean(0)]
-    if len(rates) > 1:
-        texts = [
-            f"{text} ± {std:.1f}" for text, std in zip(texts, rates.std(0, ddof=1), strict=True)
-        ]
-    idle = sum(bool(did_not_act(record)) for record, _ in pairs)
-    counts = [str(len(trainings)), str(len(pairs)), *texts, str(retained), str(lost), str(gained)]
-    scenes: Counter[EpisodeKey] = Counter()
-    for record, baseline in pairs:
+        change = (baseline.success, record.success)
+        changes[change] += 1
+        trainings.setdefault(record.training, []).append(change)
         scenes[record.key] += baseline.success - record.success
-    p = sign_test(
-        sum(balance > 0 for balance in scenes.values()),
-        sum(balance < 0 for balance in scenes.values()),
-    )
-    return [*counts, show_p(p), str(idle)]
+        n_idle += bool(did_not_act(record))
+
+    cells = [str(len(trainings)), str(len(pairs))]
+    rates = 100 * np.array([np.mean(part, axis=0) for part in trainings.values()])
+    for side in rates.T:  # without, and with the event
+        cell = f"{side.mean():.1f}"
+        if len(side) > 1:
+            cell += f" ± {side.std(ddof=1):.1f}"
+        cells.append(cell)
+    for change in ((True, True), (True, False), (False, True)):
+        cells.append(str(changes[change]))
+    balances = np.array(list(scenes.values()))
+    p = sign_test(int((balances > 0).sum()), int((balances < 0).sum()))
+    return [*cells, show_p(p), str(n_idle)]
 
 
 def event_curves(

@@ -48,8 +48,9 @@ episodes.
 def base_of(split: str) -> str:
     """The split whose scenes a split varies, tiers counting as `ood`."""
     variant = read_variant(split)
-    base = split if variant is None else variant.base
-    return OOD if base.startswith(f"{OOD}:") else base
+    if variant is not None:
+        split = variant.base
+    return OOD if split.startswith(f"{OOD}:") else split
 
 
 def tier_tables(
@@ -72,8 +73,11 @@ def tier_tables(
     ]
     tables = []
     for run, members in record_table(merged).groupby("run", sort=False):
-        parts = {task: members[members["task"] == task] for task in PAPER_ORDER}
-        parts = {task: part for task, part in parts.items() if not part.empty}
+        parts = {}
+        for task in PAPER_ORDER:
+            part = members[members["task"] == task]
+            if not part.empty:
+                parts[task] = part
         parts["all"] = members
         rows = []
         for task, part in parts.items():
@@ -145,19 +149,28 @@ def twin_table(
     rows = []
     notes: list[str] = []
     for run, members in runs.items():
-        twin = run._replace(split=TWIN if run.split == BASE else f"{TWIN}:{run.split}")
+        twin = run._replace(split=f"{TWIN}:{run.split}")
+        if run.split == BASE:
+            twin = run._replace(split=TWIN)
         if twin not in runs:
             continue
-        sides = [part.set_index("key", drop=False) for part in (members, runs[twin])]
-        pairing = pair([{key: [r] for key, r in side["record"].items()} for side in sides])
+        base = members.set_index("key", drop=False)
+        visible = runs[twin].set_index("key", drop=False)
+        pairing = pair(
+            [
+                {key: [record] for key, record in base["record"].items()},
+                {key: [record] for key, record in visible["record"].items()},
+            ]
+        )
         notes += pairing.notes(f"{run} and its twin")
         if not pairing.keys:
             continue
-        base, visible = (side[side["key"].isin(pairing.keys)] for side in sides)
+        base = base[base["key"].isin(pairing.keys)]
+        visible = visible[visible["key"].isin(pairing.keys)]
         gaps = visible["success"] - base["success"]
         base_share = count_successes(base, confidence)
         visible_share = count_successes(visible, confidence)
-        repeated, flipped = np.sum([repeats.get(side, (0, 0)) for side in (run, twin)], axis=0)
+        repeated, flipped = np.add(repeats.get(run, (0, 0)), repeats.get(twin, (0, 0)))
         rows.append(
             [
                 str(run),
@@ -180,8 +193,10 @@ def twin_table(
         "gained : lost",
         "flips of equal runs",
     ]
+    if not rows and not notes:
+        return None
     title = "Twins: what memory loses and what control loses"
-    return Table(title, columns, rows, notes=notes) if rows or notes else None
+    return Table(title, columns, rows, notes=notes)
 
 
 # Extrapolation ------------------------------------------------------------------------------------

@@ -22,7 +22,8 @@ FAMILIES = {
     "recurrent": "#8d5a97",
     "prior": "#b5523b",
 }
-INK, FAINT = "#2b2d42", "#8d99ae"
+INK = "#2b2d42"
+FAINT = "#8d99ae"
 MOST_BARS = 8
 SWEPT = ("framesamp_modul", "tokendrop_modul")  # Models whose memory budget the paper varies
 _STYLE = {
@@ -53,37 +54,35 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
     Whiskers are the confidence intervals; a method without a complete run has no bar. Beyond
     `MOST_BARS` methods the tables and the heat map have to do.
     """
-    having = [
-        (i, m)
-        for i, m in enumerate(results.methods)
-        if any(f.complete for f in m.figures.get(kind, {}).values())
-    ]
+    # The number of a method decides its colour, in all figures.
+    having: list[tuple[int, Method]] = []
+    for i, method in enumerate(results.methods):
+        if any(figure.complete for figure in method.figures.get(kind, {}).values()):
+            having.append((i, method))
     having = having[:MOST_BARS]
-    names = list(dict.fromkeys(name for _, method in having for name in method.figures[kind]))
+    names: dict[str, None] = {}
+    for _, method in having:
+        names |= dict.fromkeys(method.figures[kind])
+    width = 0.8 / max(len(having), 1)
     with figure((10.4, 3.8) if wide else (5.6, 3.6)) as (canvas, (axes,)):
-        width, lines = 0.8 / max(len(having), 1), []
+        lines: list[tuple[float, float]] = []  # place, and the paper's number
         for place, (i, method) in enumerate(having):
             shift = (place - (len(having) - 1) / 2) * width
-            figures = [(j + shift, method.figures[kind][name]) for j, name in enumerate(names)]
-            complete = [
-                (at, f.mean, f.interval)
-                for at, f in figures
-                if f.mean is not None and f.interval is not None
-            ]
-            xs, heights = [at for at, *_ in complete], [mean for _, mean, _ in complete]
-            gaps = [
-                [mean - of.low for _, mean, of in complete],
-                [of.high - mean for _, mean, of in complete],
-            ]
+            points: list[tuple[float, Figure]] = []
+            for j, name in enumerate(names):
+                shown = method.figures[kind][name]
+                points.append((j + shift, shown))
+                if shown.paper is not None:
+                    lines.append((j + shift, shown.paper.mean))
+            xs, heights, gaps = _with_intervals(points)
             axes.bar(xs, heights, 0.88 * width, color=_colour(i), label=method.label)
             axes.errorbar(xs, heights, np.maximum(gaps, 0), fmt="none", ecolor=INK, elinewidth=0.9)
-            lines += [(at, f.paper.mean) for at, f in figures if f.paper is not None]
         if lines:
-            ends = [(at - 0.46 * width, at + 0.46 * width) for at, _ in lines]
-            axes.hlines(
-                [y for _, y in lines], *zip(*ends, strict=True), color="black", lw=2, label="paper"
-            )
-        axes.set_xticks(range(len(names)), [_folded(name) for name in names])
+            at, means = np.array(lines).T
+            half = 0.46 * width
+            axes.hlines(means, at - half, at + half, color="black", lw=2, label="paper")
+        # A name of several words is two lines.
+        axes.set_xticks(range(len(names)), [name.replace(" ", "\n", 1) for name in names])
         axes.set_ylabel("success (%)")
         axes.set_ylim(0, 100)
         axes.tick_params(axis="x", length=0)
@@ -96,17 +95,24 @@ def heat_map(results: Results) -> str:
     tasks = results.protocol.tasks
     rows: list[tuple[str, list[float | None]]] = []
     for method in results.methods:
-        rows.append((method.label, [method.figures["task"][task].mean for task in tasks]))
+        figures = [method.figures["task"][task] for task in tasks]
+        rows.append((method.label, [shown.mean for shown in figures]))
         if method.paper is not None:
-            reported = [method.figures["task"][task].paper for task in tasks]
-            rows.append(("paper", [None if result is None else result.mean for result in reported]))
-    values = np.array([[np.nan if v is None else v for v in row] for _, row in rows], float)
+            reported: list[float | None] = []
+            for shown in figures:
+                reported.append(None if shown.paper is None else shown.paper.mean)
+            rows.append(("paper", reported))
+    values = np.array([row for _, row in rows], float)  # None is NaN
     with figure((0.62 * len(tasks) + 2.4, 0.34 * len(rows) + 1.7)) as (canvas, (axes,)):
         axes.imshow(values, cmap="GnBu", vmin=0, vmax=100, aspect="auto")
         for i, j in np.ndindex(values.shape):
-            known = not np.isnan(values[i, j])
-            colour = "white" if known and values[i, j] > 62 else (INK if known else FAINT)
-            text = f"{values[i, j]:.0f}" if known else "–"
+            text = f"{values[i, j]:.0f}"
+            colour = INK
+            if np.isnan(values[i, j]):
+                text = "–"
+                colour = FAINT
+            elif values[i, j] > 62:
+                colour = "white"
             axes.text(j, i, text, ha="center", va="center", color=colour, fontsize=8.5)
         axes.set_xticks(range(len(tasks)), tasks, rotation=40, ha="right", rotation_mode="anchor")
         axes.set_yticks(range(len(rows)), [name for name, _ in rows])
@@ -119,14 +125,16 @@ def heat_map(results: Results) -> str:
         for edge in range(1, len(rows)):
             if rows[edge][0] != "paper":
                 axes.axhline(edge - 0.5, color="white", lw=3)
-        boundary = 0
-        suites = results.protocol.suites
-        for suite in suites:
-            boundary += len(results.protocol.choose("suite", suite))
-            if 0 < boundary < len(tasks) and list(tasks) == [
-                task for s in suites for task in results.protocol.choose("suite", s)
-            ]:
-                axes.axvline(boundary - 0.5, color="white", lw=3)
+        # Between the suites, where the tasks are in their order
+        in_order: list[str] = []
+        boundaries: list[int] = []
+        for suite in results.protocol.suites:
+            in_order += results.protocol.choose("suite", suite)
+            boundaries.append(len(in_order))
+        if in_order == list(tasks):
+            for boundary in boundaries:
+                if 0 < boundary < len(tasks):
+                    axes.axvline(boundary - 0.5, color="white", lw=3)
         return svg(canvas)
 
 
@@ -139,12 +147,13 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
         named = set()
         for known in paper.paper_methods().values():
             if known.model in flops and known.subgoal != "memer":
-                x, y = flops[known.model] / 1e12, paper.average(known.name).mean
-                label = None if known.family in named else f"{_FAMILY_NAMES[known.family]} (paper)"
-                named.add(known.family)
+                label = None
+                if known.family not in named:
+                    label = f"{_FAMILY_NAMES[known.family]} (paper)"
+                    named.add(known.family)
                 axes.scatter(
-                    x,
-                    y,
+                    flops[known.model] / 1e12,
+                    paper.average(known.name).mean,
                     s=38,
                     facecolors="none",
                     edgecolors=FAMILIES[known.family],
@@ -157,15 +166,17 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
                 and method.memory_budget is None
                 and method.average.mean is not None
             ):
-                x, average = flops[method.model] / 1e12, method.average
-                style = {
-                    "color": _colour(i),
-                    "ecolor": INK,
-                    "elinewidth": 0.9,
-                    "ms": 7,
-                    "label": method.label,
-                }
-                axes.errorbar(x, method.average.mean, average.std or 0, fmt="o", **style)  # type: ignore[arg-type]
+                axes.errorbar(
+                    flops[method.model] / 1e12,
+                    method.average.mean,
+                    method.average.std or 0,
+                    fmt="o",
+                    color=_colour(i),
+                    ecolor=INK,
+                    elinewidth=0.9,
+                    ms=7,
+                    label=method.label,
+                )
         axes.set_xlabel("TFLOPs of a sampled chunk at full size (counted)")
         axes.set_ylabel("average success (%)")
         axes.set_ylim(bottom=0)
@@ -208,34 +219,23 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
                 label=f"{model} (paper)",
             )
         for model, model_points in points.items():
-            complete = [
-                (b, f.mean, f.interval)
-                for b, f in model_points
-                if f.mean is not None and f.interval is not None
-            ]
-            gaps = [
-                [mean - of.low for _, mean, of in complete],
-                [of.high - mean for _, mean, of in complete],
-            ]
-            style = {
-                "color": _colour(order.index(model)),
-                "lw": 1.8,
-                "ms": 6,
-                "capsize": 3,
-                "label": model,
-            }
+            at, means, gaps = _with_intervals(model_points)
             axes.errorbar(
-                [b for b, *_ in complete],
-                [mean for _, mean, _ in complete],
+                at,
+                means,
                 gaps,
                 fmt="-s",
-                **style,  # type: ignore[arg-type]
+                color=_colour(order.index(model)),
+                lw=1.8,
+                ms=6,
+                capsize=3,
+                label=model,
             )
         axes.set_xscale("log", base=2)
-        ticks = sorted(
-            {*budgets, *(b for model_points in points.values() for b, _ in model_points)}
-        )
-        axes.set_xticks(ticks, [f"{b:,}" for b in ticks])
+        ticks = {*budgets}
+        for model_points in points.values():
+            ticks.update(budget for budget, _ in model_points)
+        axes.set_xticks(sorted(ticks), [f"{budget:,}" for budget in sorted(ticks)])
         axes.minorticks_off()
         axes.set_xlabel("memory tokens")
         axes.set_ylabel("average success (%)")
@@ -254,11 +254,12 @@ def budget_points(methods: Sequence[Method], default: int) -> dict[str, list[tup
             points.setdefault(method.model, []).append(
                 (method.memory_budget or default, method.average)
             )
-    return {
-        model: sorted(model_points, key=lambda point: point[0])
-        for model, model_points in points.items()
-        if len({budget for budget, _ in model_points}) > 1 or model in SWEPT
-    }
+    sweeps = {}
+    for model, model_points in points.items():
+        budgets = {budget for budget, _ in model_points}
+        if len(budgets) > 1 or model in SWEPT:
+            sweeps[model] = sorted(model_points, key=lambda point: point[0])
+    return sweeps
 
 
 @contextmanager
@@ -299,6 +300,18 @@ def _colour(i: int) -> str:
     return COLOURS[i % len(COLOURS)]
 
 
-def _folded(name: str) -> str:
-    words = name.split(" ")
-    return name if len(words) == 1 else "\n".join([words[0], " ".join(words[1:])])
+def _with_intervals(
+    points: Sequence[tuple[float, Figure]],
+) -> tuple[list[float], list[float], np.ndarray]:
+    """Of the complete figures: place, mean, and how far their intervals reach below and above it
+    [2, n].
+    """
+    places = []
+    means = []
+    gaps = []
+    for at, shown in points:
+        if shown.mean is not None and shown.interval is not None:
+            places.append(at)
+            means.append(shown.mean)
+            gaps.append((shown.mean - shown.interval.low, shown.interval.high - shown.mean))
+    return places, means, np.array(gaps).reshape(-1, 2).T

@@ -10,7 +10,7 @@ from typing import Any
 
 from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.evaluation.results import plots
-from mme_vla.evaluation.results.aggregate import Method, Results
+from mme_vla.evaluation.results.aggregate import Method, Results, Run
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.curves import CAPTION, process_tables
 from mme_vla.evaluation.results.paper import chunk_flops
@@ -65,9 +65,9 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     the page.
     """
     protocol = results.protocol
-    methods, runs = len(results.methods), sum(len(method.runs) for method in results.methods)
+    runs = sum(len(method.runs) for method in results.methods)
     subtitle = (
-        f"{_count(methods, 'method')}, {_count(runs, 'run')} of"
+        f"{_count(len(results.methods), 'method')}, {_count(runs, 'run')} of"
         f" {len(protocol.averaged)} tasks × {protocol.episodes} episodes ·"
         f" {datetime.now(UTC):%Y-%m-%d}"
     )
@@ -178,27 +178,25 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
     """The section `Training details` of a submission, in Markdown."""
     policies = []
     for method in methods:
-        for checkpoint in dict.fromkeys(run.key.checkpoint for run in method.runs):
-            about = [
-                run
-                for run in runs
-                if (run["settings"].get("model"), run["settings"].get("checkpoint"))
-                == (method.model, checkpoint)
-                and method.composition in ((run.get("notes") or {}).get("composition"), None)
-            ]
-            facts = next(
-                (run["notes"]["policy"] for run in about if (run.get("notes") or {}).get("policy")),
-                None,
-            )
-            seeds = sorted(
-                {run.key.model_seed for run in method.runs if run.key.checkpoint == checkpoint}
-            )
-            record = next(
-                r
-                for run in method.runs
-                if run.key.checkpoint == checkpoint
-                for r in run.records.values()
-            )
+        checkpoints: dict[int | str, list[Run]] = {}
+        for run in method.runs:
+            checkpoints.setdefault(run.key.checkpoint, []).append(run)
+        for checkpoint, members in checkpoints.items():
+            # What the notes of a run of this policy say of it
+            facts = None
+            for content in runs:
+                settings = content["settings"]
+                notes = content.get("notes") or {}
+                is_same = (
+                    settings.get("model") == method.model
+                    and settings.get("checkpoint") == checkpoint
+                    and method.composition in (notes.get("composition"), None)
+                )
+                if is_same and notes.get("policy"):
+                    facts = notes["policy"]
+                    break
+            seeds = sorted({run.key.model_seed for run in members})
+            record = next(iter(members[0].records.values()))
             evaluation = (
                 f"split {record.split}, {record.action_space} actions, at most {record.max_steps}"
                 f" steps, model seeds {', '.join(map(str, seeds))}"
@@ -211,13 +209,16 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
 def _lines(facts: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     if facts is None:
         return [("policy", UNKNOWN), ("training", UNKNOWN)]
-    memory, integration, recipe = facts.get("memory"), facts.get("integration"), facts.get("recipe")
-    memory, integration = _section(memory), _section(integration)
-    policy = f"memory {memory.get('name', 'without a name')}" if memory else "no memory"
-    if memory and memory.get("budget") is not None:
-        policy += f", {_text(memory['budget'])} tokens"
+    memory = _section(facts.get("memory"))
+    policy = "no memory"
+    if memory:
+        policy = f"memory {memory.get('name', 'without a name')}"
+        if memory.get("budget") is not None:
+            policy += f", {_text(memory['budget'])} tokens"
+    integration = _section(facts.get("integration"))
     if integration:
         policy += f", integration {integration.get('name', 'without a name')}"
+    recipe = facts.get("recipe")
     if not recipe:
         return [("policy", policy), ("training", UNKNOWN)]
     settings = _settings(recipe) if isinstance(recipe, Mapping) else str(recipe)

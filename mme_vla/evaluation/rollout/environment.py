@@ -7,9 +7,9 @@ here.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,14 +18,13 @@ import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state, choice_row
-from mme_vla.envs.base import Hold, open_episode
+from mme_vla.envs.base import Hold, environment, open_episode
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
 from mme_vla.envs.metadata import BASE, DEFAULT_STEPS, STICK_TASKS
-from mme_vla.envs.observations import RenderRequest
+from mme_vla.envs.observations import Include, RenderRequest
 from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.envs.subtasks import Progress, process_score
-from mme_vla.envs.vector.messages import Command, Report
 from mme_vla.errors import require
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
@@ -47,6 +46,56 @@ The robot's `readings`, if it has any, are lists of all frames.
 """
 
 
+@dataclass(frozen=True)
+class Command:
+    """What an environment executes next: actions, or a time for which the robot stays where it is.
+
+    actions: [n, w], executed one after the other; None with `hold`. hold: control steps for which
+    the robot stays where it is. subgoal: text in the video meanwhile. draw: the images that are
+    requested, by default all. Frames are counted from the reset on, and the newest is the last.
+    """
+
+    actions: np.ndarray | None = None
+    hold: int = 0
+    subgoal: str | None = None
+    draw: RenderRequest | None = None
+
+
+@dataclass(frozen=True)
+class Report:
+    """What an environment says of a reset or of a command, beside its frames.
+
+    status: `ongoing`, `success`, `fail`, `timeout` or `error`; None of an environment that gives
+    none. goal: the instruction; None if the environment named none yet. error: why the episode
+    failed, where the environment says so. info: what the environment itself reports, for subgoal
+    predictors. options: of a robot that chooses, what there is to choose. scene: digest of the
+    scene.
+    executed: actions. steps: frames. held: the action [w] that keeps the robot where it is after a
+    command to hold it; None before the first action. subtask: number of the execution's current
+    sub-task from 1; 0 where the environment tells none. began: frames at which sub-tasks began.
+    process: where the chain of sub-tasks broke, for the record. oracle: the action [w] that the
+    task's script takes next, if it was asked for. video: name of the finished video's file.
+    simulated_s, rendered_s: seconds since the last report.
+    """
+
+    status: str | None = None
+    goal: str | None = None
+    error: str | None = None
+    info: Mapping[str, Any] = field(default_factory=dict)
+    options: Sequence[Mapping[str, Any]] | None = None
+    scene: str = NOT_BUILT
+    executed: int = 0
+    steps: int = 0
+    held: np.ndarray | None = None
+    subtask: int = 0
+    began: Sequence[int] = ()
+    process: dict[str, Any] | None = None
+    oracle: np.ndarray | None = None
+    video: str | None = None
+    simulated_s: float = 0.0
+    rendered_s: float = 0.0
+
+
 class RenderClock:
     """Adds up what the simulator spends on taking images, where its scene is within reach."""
 
@@ -62,10 +111,8 @@ class RenderClock:
             return
         scene.update_render = self._timed(scene.update_render)
         for sensor in scene.sensors.values():
-            sensor.capture, sensor.get_obs = (
-                self._timed(sensor.capture),
-                self._timed(sensor.get_obs),
-            )
+            sensor.capture = self._timed(sensor.capture)
+            sensor.get_obs = self._timed(sensor.get_obs)
 
     def _timed(self, call: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*args: Any, **kwargs: Any) -> Any:
@@ -104,15 +151,21 @@ class ChunkEnv:
         max_actions: int | None = None,
         oracle: bool = False,
     ) -> None:
-        self._robot, self._stick, self._oracle = robot, stick, oracle
-        self._max_actions, self._executed = max_actions, 0
-        self._max_steps, self._video = max_steps, video
+        self._robot = robot
+        self._stick = stick
+        self._oracle = oracle
+        self._max_actions = max_actions
+        self._max_steps = max_steps
+        self._video = video
         self._clock = RenderClock()
-        self._simulating = self._rendered = 0.0
-        self._steps = self._returned = 0
+        self._simulating = self._rendered = 0.0  # seconds since the last report
+        self._executed = 0  # actions
+        self._steps = 0
+        self._returned = 0  # frames
         self._pose: np.ndarray | None = None
         self._last: np.ndarray | None = None
-        self._subgoal, self._n_subgoals = "", 0
+        self._subgoal = ""
+        self._n_subgoals = 0
         self._goal: str | None = None
         self._scene = NOT_BUILT
         with self._simulation():
@@ -144,23 +197,33 @@ class ChunkEnv:
             The frames of the executed actions, the sum of their rewards, terminated, truncated, and
             the report. After `hold` no action counts as executed.
         """
-        self._max_steps += command.hold
-        actions = [Hold(command.hold)] if command.hold else list(np.asarray(command.actions))
-        frames, executed, n_frames, total_reward = _Frames(self._robot), 0, 0, 0.0
+        actions: list[Any]
+        if command.hold:
+            actions = [Hold(command.hold)]
+            self._max_steps += command.hold
+        else:
+            actions = list(np.asarray(command.actions))
+        frames = _Frames(self._robot)
+        executed = n_frames = 0
+        total_reward = 0.0
         terminated = truncated = False
         info: dict[str, Any] = {}
         draw = command.draw
         for number, action in enumerate(actions, 1):
-            # Only the chunk's last frame is the newest when the policy reads it.
-            is_last = number == len(actions)
-            self._ask(draw if draw is None or is_last else replace(draw, now=()))
+            request = draw
+            if draw is not None and number < len(actions):
+                # Only the chunk's last frame is the newest when the policy reads it.
+                request = replace(draw, now=())
+            self._ask(request)
             with self._simulation():
                 observation, reward, ended, cut, info = self._env.step(self._command(action))
-            terminated, truncated = bool(ended), bool(cut)
+            terminated = bool(ended)
+            truncated = bool(cut)
             total_reward += float(reward)
             if info.get("status") == "error":
                 terminated = True
-                if _is_unreachable(observation, info):
+                # Where no joints or no motion reach a pose the policy failed, not the machine.
+                if observation == {} or info.get("exception_type") == "PlanningError":
                     info = {**info, "status": "fail"}
                 break
             if not isinstance(action, Hold):
@@ -173,10 +236,11 @@ class ChunkEnv:
             # A choice that moves nothing takes time too, or it could continue for ever.
             self._steps += max(count, 1)
             self._draw(frames, count, caption=command.subgoal)
-            spent = self._executed == self._max_actions
-            if not (terminated or truncated) and (spent or self._steps > self._max_steps):
-                truncated, info = True, {**info, "status": "timeout"}
             if terminated or truncated:
+                break
+            if self._executed == self._max_actions or self._steps > self._max_steps:
+                truncated = True
+                info = {**info, "status": "timeout"}
                 break
         self._returned = frames.leave(draw, self._returned)
         report = replace(self._report(info), executed=executed, steps=n_frames)
@@ -184,7 +248,8 @@ class ChunkEnv:
             report = replace(report, held=self._hold_action())
         if (terminated or truncated) and self._video is not None:
             path = self._video.finish(str(report.status), report.goal or "")
-            report = replace(report, video=None if path is None else path.name)
+            if path is not None:
+                report = replace(report, video=path.name)
         return frames.observation(), total_reward, terminated, truncated, report
 
     def close(self) -> None:
@@ -234,7 +299,8 @@ class ChunkEnv:
 
     @contextmanager
     def _simulation(self) -> Iterator[None]:
-        begun, rendered = time.perf_counter(), self._clock.seconds
+        begun = time.perf_counter()
+        rendered = self._clock.seconds
         try:
             yield
         finally:
@@ -246,15 +312,16 @@ class ChunkEnv:
         status = info.get("status")
         if goals := info.get("task_goal"):
             self._goal = str(goals[0])
-        subtask, process = self._n_subgoals, None
+        subtask = self._n_subgoals
+        process = None
         progress = getattr(getattr(self._env, "task", None), "progress", None)
         if isinstance(progress, Progress):
             score = process_score(progress, str(status))
             process = score.to_dict()
             subtask = min(score.done + 1, score.of)
         oracle = None
-        if self._oracle and status == "ongoing":
-            oracle = self._oracle_action()
+        if self._oracle and status == "ongoing" and (choice := oracle_of(self._env)) is not None:
+            oracle = choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
         report = Report(
             status=status,
             goal=self._goal,
@@ -272,25 +339,12 @@ class ChunkEnv:
         self._simulating = self._rendered = 0.0
         return report
 
-    def _oracle_action(self) -> np.ndarray | None:
-        choice = oracle_of(self._env)
-        if choice is None:
-            return None
-        return choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
-
     def _draw(
         self, frames: "_Frames", count: int, demo: int = 0, caption: str | None = None
     ) -> None:
         if self._video is not None:
             for index, views in enumerate(frames.newest(count)):
                 self._video.add(views, caption, demo=index < demo)
-
-
-def _is_unreachable(observation: Any, info: dict[str, Any]) -> bool:
-    """Whether no joints or no motion reach an action's pose: the policy's failure, not the
-    machine's.
-    """
-    return observation == {} or info.get("exception_type") == "PlanningError"
 
 
 MISSING = "which this environment does not deliver"
@@ -307,7 +361,8 @@ class _Frames:
     """Collects frames in the policy's form; the benchmark's own cameras too, for the video."""
 
     def __init__(self, robot: Embodiment) -> None:
-        self._cameras, self._width = robot.camera_names, robot.state.width
+        self._cameras = robot.camera_names
+        self._width = robot.state.width
         # the benchmark's videos show both of its cameras
         beside = CAMERAS if robot.action.space else ()
         self._images: dict[str, list[np.ndarray | None]] = {
@@ -321,7 +376,8 @@ class _Frames:
         if "state_list" in observation:  # an environment of the user's own
             states = observation["state_list"]
         else:
-            joints, fingers = observation["joint_state_list"], observation["gripper_state_list"]
+            joints = observation["joint_state_list"]
+            fingers = observation["gripper_state_list"]
             states = [benchmark_state(q, f) for q, f in zip(joints, fingers, strict=True)]
         self._states += states
         blind = not any(key.endswith("_rgb_list") for key in observation)  # it does not render
@@ -351,17 +407,44 @@ class _Frames:
         """The last frames before any was left out, each as its images: the robot's cameras, then
         the benchmark's.
         """
-        return zip(
-            *(images[len(self._states) - count :] for images in self._images.values()), strict=True
-        )
+        first = len(self._states) - count
+        return zip(*(images[first:] for images in self._images.values()), strict=True)
 
     def observation(self) -> Observation:
-        state = np.stack(self._states) if self._states else np.zeros((0, self._width), np.float32)
+        state = np.zeros((0, self._width), np.float32)
+        if self._states:
+            state = np.stack(self._states)
         return {
             **{name: self._images[name] for name in self._cameras},
             **self._readings,
             "state": state,
         }
+
+
+def base_env(
+    env: str,
+    robot: Embodiment,
+    render: bool = True,
+    reward: str = "none",
+    only_possible: bool = False,
+) -> Callable[..., Any]:
+    """What makes an episode of an environment for a robot, from `task`, `split`, `episode` and
+    `max_steps`; importable by worker processes.
+
+    env: its name; `reward` and `only_possible` have an effect on RoboMME alone.
+    """
+    environment(env).check_embodiment(robot)
+    if env != ROBOMME:
+        return partial(open_episode, env, action_space=robot.action.space, render=render)
+    assert robot.action.space is not None  # a robot of the benchmark has one
+    readings = dict.fromkeys(robot.readings, True)
+    return partial(
+        make_env,
+        action_space=robot.action.space,
+        render=render,
+        reward=reward,
+        include=Include(**readings, possible=only_possible),
+    )
 
 
 def make_rollout_env(
@@ -375,15 +458,12 @@ def make_rollout_env(
     robot: Embodiment = ROBOMME_JOINT,
     max_actions: int | None = None,
     oracle: bool = False,
-    env: str = ROBOMME,
     sessions: int = 0,
-    **options: Any,
 ) -> ChunkEnv:
     """What every worker builds for an episode.
 
-    base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`.
-    env: the environment of the user's own that is opened instead; of the options it has `render`
-    and `action_space`. sessions: unrelated episodes that the caller shows the policy before, as
+    base: makes the environment itself from `task`, `split`, `episode` and `max_steps`
+    (`base_env`). sessions: unrelated episodes that the caller shows the policy before, as
     `split=stress:sessions=<n>` requires; the scenes of such a split are those of the test split.
     videos: folder, and which outcomes are kept: `all`, `success` or `failure`. robot, max_actions:
     the policy's. oracle: see `ChunkEnv`.
@@ -391,18 +471,18 @@ def make_rollout_env(
     if sessions:
         check_sessions(split, sessions)
         split = BASE
-    if env != ROBOMME:
-        base = partial(open_episode, env)
-        options = {name: options[name] for name in ("render", "action_space") if name in options}
     video = None
     if videos is not None:
         folder, save_on = videos
         video = EpisodeVideo(
             lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal), save_on
         )
+    stick = task in STICK_TASKS
+    if task in TASKS:  # once its module is imported
+        stick = stick or bool(getattr(TASKS[task], "stick", False))
     return ChunkEnv(
-        lambda: base(task=task, split=split, episode=episode, max_steps=max_steps, **options),
-        stick=task in STICK_TASKS or (task in TASKS and bool(getattr(TASKS[task], "stick", False))),
+        lambda: base(task=task, split=split, episode=episode, max_steps=max_steps),
+        stick=stick,
         max_steps=max_steps,
         video=video,
         robot=robot,

@@ -9,18 +9,16 @@ import numpy as np
 
 from mme_vla.embodiment.action_space import read_options
 from mme_vla.envs.scene_hash import NOT_BUILT
-from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds
-from mme_vla.evaluation.rollout.environment import Observation
-from mme_vla.evaluation.rollout.events import Event, EventCourse
+from mme_vla.evaluation.rollout.environment import Observation, Report
+from mme_vla.evaluation.rollout.settings import Event
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.memory.perturbation import Perturbation
 from mme_vla.policy.base import Policy
+from mme_vla.policy.episode import Episode
 from mme_vla.subgoal import Subgoal, SubgoalPredictor
-
-_NONE = np.zeros((0, 1, 1, 3), np.uint8)
 
 
 def episode_seed(seed: int, task: str, episode: int) -> int:
@@ -29,6 +27,55 @@ def episode_seed(seed: int, task: str, episode: int) -> int:
     """
     digest = hashlib.sha256(f"{seed}/{task}/{episode}".encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1  # a signed 64-bit integer
+
+
+class EventCourse:
+    """The events of one running episode.
+
+    log: of each its text as `event`, and as `step` the control step at which it acted; None while
+    it has not. hold_steps: control steps for which events held the robot. holding: what holds it,
+    if its frames come next.
+    """
+
+    def __init__(self, events: Sequence[Event]) -> None:
+        self._events = events
+        self.log: list[dict[str, Any]] = [{"event": event.text, "step": None} for event in events]
+        self.hold_steps = 0
+        self.holding: Perturbation | None = None
+
+    def video(self, length: int) -> np.ndarray:
+        """Which of the video's `length` frames are observed, in order, int64 [n]."""
+        real = np.arange(length)
+        for event, entry in zip(self._events, self.log, strict=True):
+            if event.resamples_video and length:
+                real = np.repeat(real, event.perturbation.repeats(len(real), len(real)))
+                entry["step"] = 0
+        return real
+
+    def next(self, episode: Episode, step: int, subtask: int) -> Perturbation | None:
+        """Let events take place that are due at this decision, up to one that holds the robot,
+        which is returned.
+
+        Args:
+            step: control steps so far. subtask: number of the current sub-task, 0 where the
+                environment tells none.
+        """
+        self.holding = None
+        for event, entry in zip(self._events, self.log, strict=True):
+            if entry["step"] is not None or event.resamples_video:
+                continue
+            if event.unit == "subtask" and not subtask:
+                raise UserError(
+                    f"event={event.text}: this environment tells no sub-tasks; place it by"
+                    " @step:<n>."
+                )
+            if event.reached(step - self.hold_steps, subtask):
+                entry["step"] = step - self.hold_steps
+                event.perturbation.act(episode)
+                if event.perturbation.hold:
+                    self.holding = event.perturbation
+                    return event.perturbation
+        return None
 
 
 class RunningEpisode:
@@ -51,8 +98,11 @@ class RunningEpisode:
         trace: SubgoalTrace | None = None,
         events: Sequence[Event] = (),
     ) -> None:
-        self._policy, self._subgoals, self._piece = policy, subgoals, piece
-        self.job, self.trace = job, trace
+        self._policy = policy
+        self._subgoals = subgoals
+        self._piece = piece
+        self.job = job
+        self.trace = trace
         self.episode = policy.start_episode("", seed=episode_seed(seed, job.task, job.episode))
         self.events = EventCourse(events)
         self._visible = np.zeros(0, np.int64)  # The environment's frames that the policy observes
@@ -107,8 +157,9 @@ class RunningEpisode:
         )
         self.video_frames = len(frames["state"]) - 1
         if self._subgoals is not None:
-            needs_video = self.video_frames and self._subgoals.sees_video
-            video = np.stack(frames[self._robot.memory_camera][:-1]) if needs_video else None
+            video = None
+            if self.video_frames and self._subgoals.sees_video:
+                video = np.stack(frames[self._robot.memory_camera][:-1])
             self.watched = self._subgoals.start_episode(goal, video, self.job.task)
         self._expect(frames, np.arange(self.video_frames + 1) < self.video_frames, None)
 
@@ -117,22 +168,25 @@ class RunningEpisode:
         of many.
         """
         self._count()
-        executed, length = self.report.executed, len(frames["state"])
-        if self.events.holding is not None:
+        length = len(frames["state"])
+        has_one_a_frame = self._robot.action.frames is not None
+        leading: np.ndarray | None
+        if self.events.holding is None:
+            self._observed(frames, length)
+            leading = self._sent[: self.report.executed]
+            n_frames = self.report.executed if has_one_a_frame else length
+        else:
+            # An event held the robot: the newest frames of that time are observed.
             self.events.hold_steps += length
             n_frames = min(self.events.holding.observed, length)
             frames = self._observed(frames, length, np.arange(length - n_frames, length))
-            self._expect(frames, np.zeros(n_frames, bool), self._holding_actions(n_frames))
-            return
-        n_frames = executed if self._robot.action.frames is not None else length
-        self._observed(frames, length)
-        self._expect(frames, np.zeros(n_frames, bool), self._sent[:executed])
-
-    def next_event(self) -> Perturbation | None:
-        """Let the events take place that are due; the one that holds the robot before the policy
-        acts, if there is.
-        """
-        return self.events.next(self.episode, self.steps, self.report.subtask)
+            leading = self._sent[:0]
+            if has_one_a_frame:
+                leading = None  # before the first action
+                if self.report.held is not None:
+                    held = np.asarray(self.report.held, np.float32)
+                    leading = np.repeat(held[None], n_frames, axis=0)
+        self._expect(frames, np.zeros(n_frames, bool), leading)
 
     @property
     def unobserved(self) -> int:
@@ -144,7 +198,8 @@ class RunningEpisode:
     def end(self) -> None:
         """Count the last actions; their frames are not needed any more."""
         self._count()
-        self.process, self.video = self.report.process, self.report.video
+        self.process = self.report.process
+        self.video = self.report.video
 
     @property
     def pieces(self) -> int:
@@ -187,12 +242,13 @@ class RunningEpisode:
 
     def _views(self, part: slice) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Images of every camera, and their places in this part of the frames."""
-        views, rendered = {}, {}
+        views = {}
+        rendered = {}
         for name in self._robot.camera_names:
             images = self._frames[name][part]
             places = [i for i, image in enumerate(images) if image is not None]
             rendered[name] = np.array(places, np.int64)
-            views[name] = _NONE
+            views[name] = np.zeros((0, 1, 1, 3), np.uint8)
             if places:
                 views[name] = np.stack([images[i] for i in places])
         return views, rendered
@@ -247,16 +303,6 @@ class RunningEpisode:
                 observed[name] = [values[i] for i in numbers]
         return observed
 
-    def _holding_actions(self, n_frames: int) -> np.ndarray | None:
-        """The actions that led to frames at which the robot held its pose; None before the first
-        action.
-        """
-        if self._robot.action.frames is None:
-            return self._sent[:0]
-        if self.report.held is None:
-            return None
-        return np.repeat(np.asarray(self.report.held, np.float32)[None], n_frames, 0)
-
     def _count(self) -> None:
         executed = self._sent[: self.report.executed]
         self.steps += self.report.steps
@@ -269,7 +315,9 @@ class RunningEpisode:
                 f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need"
                 " one frame an action."
             )
-        self._frames, self._demo, self._leading = frames, demo, leading
+        self._frames = frames
+        self._demo = demo
+        self._leading = leading
         self._at = 0
         began = np.searchsorted(self._visible, self.report.began)  # as numbers of observed frames
         self.episode.begun(began.tolist(), self.video_frames)

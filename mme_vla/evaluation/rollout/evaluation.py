@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,16 +14,14 @@ from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
-from mme_vla.envs.observations import Include
 from mme_vla.envs.vector.pool import Job, VecEnv
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError
 from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
-from mme_vla.evaluation.rollout.environment import make_rollout_env
-from mme_vla.evaluation.rollout.events import folder_of, read_events
+from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Waiting, Workload
-from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutSettings, read_events
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import (
     INDIFFERENT,
@@ -75,18 +74,18 @@ def choose_shard(text: str | None, environment: Mapping[str, str] | None = None)
 
     text: wins over the environment. environment: by default the process's own.
     """
-    environment = os.environ if environment is None else environment
+    if environment is None:
+        environment = os.environ
     if text is None:
         if "RANK" not in environment or "WORLD_SIZE" not in environment:
             return Shard()
         text = f"{environment['RANK']}/{environment['WORLD_SIZE']}"
     match = re.fullmatch(r"(\d+)/(\d+)", str(text))
-    shard = Shard(int(match[1]), int(match[2])) if match else Shard(1, 0)
-    require(
-        shard.index < shard.count,
-        f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.",
-    )
-    return shard
+    if match is None or int(match[1]) >= int(match[2]):
+        raise UserError(
+            f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4."
+        )
+    return Shard(int(match[1]), int(match[2]))
 
 
 VIDEOS = "videos"
@@ -114,6 +113,30 @@ class Evaluation(NamedTuple):
         return sum(record.success for record in self.records) / len(self.records)
 
 
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run needs beside its policy, episodes and settings; none of it decides an outcome but
+    the predictor.
+
+    subgoals: predicts the subgoal, where the policy reads one.
+    shard: which of how many processes this is; each takes the next episode that is free when it has
+    room (`store.Claims`).
+    source: where the weights are from; part of what makes a run the same.
+    base: makes an environment with the benchmark's interface; importable by name.
+    notes: kept in `run.json` and never compared.
+    times_from: earlier records, of any policy: the longest episodes begin first, and say how long
+    all will take; by default those in the run's folder and in the folders beside it.
+    """
+
+    subgoals: SubgoalPredictor | None = None
+    shard: Shard = Shard()
+    source: str | None = None
+    base: Callable[..., Any] = make_env
+    notes: Mapping[str, Any] | None = None
+    times_from: Path | None = None
+    show_progress: bool = True
+
+
 def evaluate_events(
     policy: Policy,
     jobs: Sequence[Job],
@@ -121,26 +144,27 @@ def evaluate_events(
     facts: RunFacts,
     settings: RolloutSettings,
     events: Sequence[str],
-    **how: Any,
+    options: RunOptions = RunOptions(),
 ) -> Evaluation:
     """Run every episode in `output`, then once more under each event, in a folder of its own below.
 
     The runs have the same scenes and the same noise, and differ in the event alone. Without events
-    it is `evaluate`, which has the other arguments.
+    it is `evaluate`.
 
     events: arms, such as `pause:100@subtask:2`.
     """
     for event in events:
         for placed in read_events(event):
             placed.perturbation.check(policy)
-    matched = evaluate(policy, jobs, output, facts, settings, **how)
+    matched = evaluate(policy, jobs, output, facts, settings, options)
     if not events:
         return matched
-    how["times_from"] = how.get("times_from") or output
+    options = replace(options, times_from=options.times_from or output)
     records: list[EpisodeRecord] = []
     for event in events:
-        folder, named = output / folder_of(event), replace(facts, event=event)
-        run = evaluate(policy, jobs, folder, named, replace(settings, event=event), **how)
+        folder = output / ("event-" + re.sub(r"[^\w.+-]", "-", event))
+        named = replace(facts, event=event)
+        run = evaluate(policy, jobs, folder, named, replace(settings, event=event), options)
         records += run.records
     return Evaluation(records, run.workload, matched.records)
 
@@ -151,62 +175,54 @@ def evaluate(
     output: Path,
     facts: RunFacts,
     settings: RolloutSettings,
-    *,
-    subgoals: SubgoalPredictor | None = None,
-    shard: Shard | None = None,
-    source: str | None = None,
-    base: Callable[..., Any] = make_env,
-    notes: dict[str, Any] | None = None,
-    times_from: Path | None = None,
-    show_progress: bool = True,
+    options: RunOptions = RunOptions(),
 ) -> Evaluation:
     """Run every episode that `output` has no result of yet.
 
     Args:
         policy: in eval mode, on its device, with statistics.
-        jobs: the episodes of the run. shard: which of how many processes this is; each takes the
-            next episode that is free when it has room (`store.Claims`).
+        jobs: the episodes of the run, of all its processes.
         output: the run's folder; one that holds a part of the same run is gone on with.
         facts: what the records say of the policy.
-        subgoals: predicts the subgoal, where the policy reads one.
-        source: where the weights are from; part of what makes a run the same.
-        base: makes an environment with the benchmark's interface; importable by name.
-        notes: kept in `run.json` and never compared.
-        times_from: earlier records, of any policy: the longest episodes begin first, and say how
-            long all will take; by default those in `output` and in the folders beside it.
     """
+    # Everything that can be refused is, before the folder is claimed.
     policy.require_processor().require_stats()
-    check_subgoals(policy, subgoals)
+    check_subgoals(policy, options.subgoals)
     check_sessions(settings.split, policy.info.n_distractor_episodes)
-    if base is make_env:
+    renders = False
+    if options.base is make_env:
         environment(settings.env).check_embodiment(policy.embodiment)
-    run = claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
-    shard = shard or Shard()
+        renders = settings.env == ROBOMME and settings.render
+    decisive = run_settings(policy, facts, settings, options.subgoals, options.source)
+    run = claim_run(output, decisive, options.notes)
+
+    shard = options.shard
+    workload = Workload()
     with RecordLog(output / shard.file) as log:
         remove_drafts(output / VIDEOS)  # videos of workers that were killed
+        # Which episodes are left, the longest first
         done = _done(output, jobs, facts)
         finished_keys = finished(done)
         missing = [job for job in jobs if (job.task, job.episode) not in finished_keys]
-        durations = Durations(earlier_records(output, times_from))
+        durations = Durations(earlier_records(output, options.times_from))
         missing = durations.longest_first(missing)
+        workers = settings.worker_count(-(-len(missing) // shard.count))
+
         completed = [record for record in done if record.outcome != "error"]
-        with RolloutProgress(len(jobs), completed, show_progress) as progress:
+        with RolloutProgress(len(jobs), completed, options.show_progress) as progress:
             if completed:
                 progress.say(
                     f"{output} holds {len(completed)} of {len(jobs)} episodes: continuing with the"
                     " others"
                 )
-            workers = settings.worker_count(-(-len(missing) // shard.count))
             if forecast := durations.forecast(missing, workers, shard.count):
                 progress.say(str(forecast))
-            workload = Workload()
             if missing:
                 claims = Claims(output, shard.file) if shard.count > 1 else None
                 folder = output / SUBGOALS if settings.subgoal_log else None
-                renders = base is make_env and settings.env == ROBOMME and settings.render
                 with (
-                    _environments(policy, output, settings, base, workers) as envs,
-                    receipt(output / shard.file, policy, run, source, renders),
+                    _environments(policy, output, settings, options.base, workers) as envs,
+                    receipt(output / shard.file, policy, run, options.source, renders),
                 ):
                     rollout = Rollout(
                         policy,
@@ -214,7 +230,7 @@ def evaluate(
                         facts,
                         settings,
                         log.append,
-                        subgoals,
+                        options.subgoals,
                         folder,
                         progress,
                         workload,
@@ -227,22 +243,23 @@ def _environments(
     policy: Policy, output: Path, settings: RolloutSettings, base: Callable[..., Any], workers: int
 ) -> VecEnv:
     robot = policy.embodiment
-    options: dict[str, Any] = {
-        "base": base,
-        "max_steps": settings.max_steps,
-        "robot": robot,
-        "max_actions": settings.max_actions or policy.info.max_actions,
-    }
+    sessions = 0
     if base is make_env:
-        options["env"] = settings.env
-        options["render"] = settings.render
-        options["action_space"] = robot.action.space
-        options["sessions"] = policy.info.n_distractor_episodes
-        readings = dict.fromkeys(robot.readings, True)
-        options["include"] = Include(**readings, possible=settings.only_possible)
+        base = base_env(settings.env, robot, settings.render, only_possible=settings.only_possible)
+        sessions = policy.info.n_distractor_episodes
+    videos = None
     if settings.video != "none":
-        options["videos"] = (str(output / VIDEOS), settings.video)
-    return VecEnv([], workers, make_rollout_env, options, settings.timeout_s)
+        videos = (str(output / VIDEOS), settings.video)
+    make = partial(
+        make_rollout_env,
+        base=base,
+        max_steps=settings.max_steps,
+        videos=videos,
+        robot=robot,
+        max_actions=settings.max_actions or policy.info.max_actions,
+        sessions=sessions,
+    )
+    return VecEnv([], workers, make, settings.timeout_s)
 
 
 def run_settings(
@@ -369,8 +386,9 @@ def facts_of(
 
 def memory_budget(policy: Policy) -> int | None:
     """Memory tokens; None where they are `DEFAULT_BUDGET`."""
-    budget = None if policy.memory is None else policy.memory.budget
-    return None if budget == DEFAULT_BUDGET else budget
+    if policy.memory is None or policy.memory.budget == DEFAULT_BUDGET:
+        return None
+    return policy.memory.budget
 
 
 def default_output(facts: RunFacts) -> Path:

@@ -1,21 +1,25 @@
 """Environments of a rollout without worker processes."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import UserError
-from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
+from mme_vla.evaluation.rollout.environment import ChunkEnv
 
 
 class LocalEnvs:
-    """One environment in this process, in place of a `VecEnv`."""
+    """One environment in this process, in place of a `VecEnv`.
+
+    make: makes it from `task`, `split` and `episode` (`make_rollout_env`).
+    """
 
     workers = 1
 
-    def __init__(self, options: Mapping[str, Any]) -> None:
-        self._options, self._job = dict(options), Job("", "", 0)
+    def __init__(self, make: Callable[..., ChunkEnv]) -> None:
+        self._make = make
+        self._job = Job("", "", 0)
         self._env: ChunkEnv | None = None
         self._replies: list[Reply] = []
 
@@ -30,7 +34,7 @@ class LocalEnvs:
         self._job = job
 
         def begin() -> Any:
-            self._env = make_rollout_env(job.task, job.split, job.episode, **self._options)
+            self._env = self._make(task=job.task, split=job.split, episode=job.episode)
             return self._env.reset(draw)
 
         self._run(worker, True, begin)
@@ -60,9 +64,6 @@ class LocalEnvs:
             raise
         except Exception as error:
             reply = Reply.of_failure(worker, self._job, first, error)
-        self._add(reply)
-
-    def _add(self, reply: Reply) -> None:
         if reply.done:
             self._close()
         self._replies.append(reply)

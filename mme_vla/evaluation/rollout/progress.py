@@ -36,15 +36,17 @@ class RolloutProgress:
         self, total: int, before: Sequence[EpisodeRecord] = (), visible: bool = True
     ) -> None:
         self.console = Console(quiet=not visible, highlight=False, soft_wrap=True, stderr=True)
-        self.total, self._outcomes = total, Counter(record.outcome for record in before)
+        self.total = total
+        self._outcomes = Counter(record.outcome for record in before)
         self._bar: Progress | None = None
         if self.console.is_terminal and self.console.file.isatty() and visible:
-            clock = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
             columns = (
                 BarColumn(24),
                 MofNCompleteColumn(),
                 TextColumn("{task.description}"),
-                *clock,
+                TimeElapsedColumn(),
+                TextColumn("left"),
+                TimeRemainingColumn(),
             )
             self._bar = Progress(*columns, console=self.console)
             self._task = self._bar.add_task(self.summary, total=total, completed=self.done)
@@ -60,17 +62,20 @@ class RolloutProgress:
 
     @property
     def done(self) -> int:
-        """Episodes that are finished, for good or ill."""
+        """Number of finished episodes."""
         return sum(self._outcomes.values())
 
     @property
     def summary(self) -> str:
         """The success so far, errors counting as failures."""
-        success, errors = self._outcomes["success"], self._outcomes["error"]
-        text = f"success {success}/{self.done}" + (
-            f" = {100 * success / self.done:.1f} %" if self.done else ""
-        )
-        return f"{text} · {errors} errors" if errors else text
+        success = self._outcomes["success"]
+        errors = self._outcomes["error"]
+        text = f"success {success}/{self.done}"
+        if self.done:
+            text += f" = {100 * success / self.done:.1f} %"
+        if errors:
+            text += f" · {errors} errors"
+        return text
 
     def episode(self, record: EpisodeRecord, again: bool = False) -> None:
         """One episode ended; `again` if it will be tried once more, and does not count yet."""
@@ -82,8 +87,10 @@ class RolloutProgress:
             f" {record.steps} steps in {seconds.total:.0f} s (simulation {seconds.sim:.0f},"
             f" rendering {seconds.render:.0f}, policy {seconds.policy:.0f})"
         )
-        line += f": {record.error}" if record.error else ""
-        line += " · tried again" if again else ""
+        if record.error:
+            line += f": {record.error}"
+        if again:
+            line += " · tried again"
         if self._bar is not None:
             self._bar.update(self._task, description=self.summary, completed=self.done)
             self._bar.console.print(line, markup=False)

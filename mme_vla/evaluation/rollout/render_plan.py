@@ -15,8 +15,7 @@ import numpy as np
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.episode import RunningEpisode
-from mme_vla.evaluation.rollout.events import read_events
-from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutSettings, read_events
 from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
@@ -36,7 +35,9 @@ class RenderPlan:
     def __init__(
         self, policy: Policy, subgoals: SubgoalPredictor | None, settings: RolloutSettings
     ) -> None:
-        self._policy, self._robot, self._settings = policy, policy.embodiment, settings
+        self._policy = policy
+        self._robot = policy.embodiment
+        self._settings = settings
         self._grounded = subgoals is not None and subgoals.kind == "grounded"
         self._sees_video = subgoals is not None and subgoals.sees_video
         self._sees_passing = subgoals is not None and subgoals.sees_passing
@@ -80,12 +81,14 @@ class RenderPlan:
             return None
         if self._sees_passing:
             return self._render_request(EVERY)
-        n_observed = running.episode.n_observed_frames
-        stop = n_observed + count if self._robot.action.frames is not None else EVERY.stop
-        frames = self._within(running.video_frames, n_observed, stop)
-        return self._render_request(
-            frozenset(frame + running.unobserved + unobserved for frame in frames)
-        )
+        first = running.episode.n_observed_frames
+        stop = EVERY.stop  # of a motion it is not known how many frames it takes
+        if self._robot.action.frames is not None:
+            stop = first + count
+        observed = self._within(running.video_frames, first, stop)
+        # The environment counts the frames that events withheld as well.
+        withheld = running.unobserved + unobserved
+        return self._render_request(frozenset(frame + withheld for frame in observed))
 
     def _render_request(self, frames: Container[int]) -> RenderRequest:
         return RenderRequest(
@@ -104,8 +107,9 @@ class RenderPlan:
         most of them.
         """
         read = self._read_before(np.arange(LONGEST_VIDEO), LONGEST_VIDEO)
-        few = read is not None and len(read) < LONGEST_VIDEO / 2
-        return frozenset(read.tolist() if read is not None and few else ())
+        if read is None or len(read) >= LONGEST_VIDEO / 2:
+            return frozenset()
+        return frozenset(read.tolist())
 
     def _read_before(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """Frames that the policy reads at any of these steps, but for the current one, which is
@@ -121,11 +125,11 @@ class RenderPlan:
 
     def _reads_of(self, exec_start: int) -> np.ndarray | None:
         """Frames that the policy reads of an episode with this video, until its step limit."""
+        action = self._robot.action
+        most = self._settings.max_steps + self._hold_steps + 2
         # A motion, or an event that holds the robot, takes any number of frames: the policy may act
         # at each.
-        action, most = self._robot.action, self._settings.max_steps + self._hold_steps + 2
-        anywhere = action.frames is None or self._hold_steps
-        if anywhere:
+        if action.frames is None or self._hold_steps:
             return self._read_before(exec_start + np.arange(most + LONGEST_MOTION), exec_start)
         apart = min(self._settings.execute or action.execute, action.horizon)
         return self._policy.frames_read(exec_start + np.arange(0, most, apart), exec_start)

@@ -17,15 +17,14 @@ import numpy as np
 from mme_vla.envs.base import environment
 from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import RenderRequest
-from mme_vla.envs.vector.messages import Command
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.rollout.environment import Command
 from mme_vla.evaluation.rollout.episode import RunningEpisode
-from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.render_plan import RenderPlan
-from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutSettings, read_events
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy
@@ -42,18 +41,22 @@ class Waiting:
     """
 
     def __init__(self, jobs: Iterable[Job] = (), claims: Claims | None = None) -> None:
-        self._jobs, self._claims = list(jobs), claims
+        self._jobs = list(jobs)
+        self._claims = claims
         self._again: list[Job] = []
 
     def take(self) -> Job | None:
         """The next episode to begin, if there is one; those tried again come last."""
-        if self._claims is None:
-            job = self._jobs.pop(0) if self._jobs else None
-        else:
+        job = None
+        if self._claims is not None:
             job = self._claims.take(self._jobs)
             if job is not None:
                 self._jobs.remove(job)
-        return self._again.pop(0) if job is None and self._again else job
+        elif self._jobs:
+            job = self._jobs.pop(0)
+        if job is None and self._again:
+            job = self._again.pop(0)
+        return job
 
     def put_back(self, job: Job) -> None:
         """Have an episode run once more, by this process."""
@@ -149,9 +152,13 @@ class Rollout:
                 scores alone.
             progress: is told of every record. workload: counts what the policy does.
         """
-        self.policy, self.envs, self.facts, self.settings = policy, envs, facts, settings
+        self.policy = policy
+        self.envs = envs
+        self.facts = facts
+        self.settings = settings
         self.record = record
-        self.subgoals, self.subgoal_folder = subgoals, subgoal_folder
+        self.subgoals = subgoals
+        self.subgoal_folder = subgoal_folder
         self.progress = progress or RolloutProgress(0, visible=False)
         self.workload = workload or Workload()
         self._waiting = Waiting()
@@ -191,11 +198,15 @@ class Rollout:
         wait.
         """
         begun = time.perf_counter()
-        self._waiting = jobs if isinstance(jobs, Waiting) else Waiting(jobs)
+        if not isinstance(jobs, Waiting):
+            jobs = Waiting(jobs)
+        self._waiting = jobs
         for worker in range(self.envs.workers):
             self._start(worker)
         while self.envs.busy or self._scheduler:
-            for reply in self.envs.recv(0 if self._scheduler else None):
+            # While the policy has work, take what is there; else wait for the next environment.
+            timeout = 0 if self._scheduler else None
+            for reply in self.envs.recv(timeout):
                 self._take(reply)
             self._run_scheduler()
             yield
@@ -206,16 +217,16 @@ class Rollout:
         if job is None:
             return
         self._tries[job] += 1
-        settings, memory = self.settings, self.policy.memory
-        # Of some memories most frames are never encoded.
-        piece = settings.encode_chunk * (1 if memory is None else memory.storage.keep_every)
+        piece = self.settings.encode_chunk
+        if self.policy.memory is not None:  # of some memories most frames are never encoded
+            piece *= self.policy.memory.storage.keep_every
         trace = None
         if self.subgoals is not None:
             trace = SubgoalTrace(
                 self.subgoals.kind, self.subgoal_folder, f"{job.task}_ep{job.episode}"
             )
         running = RunningEpisode(
-            self.policy, job, settings.seed, self.subgoals, piece, trace, self._events
+            self.policy, job, self.settings.seed, self.subgoals, piece, trace, self._events
         )
         running.worker = worker
         self._running[worker] = running
@@ -244,9 +255,11 @@ class Rollout:
         """Finish an episode that is over, or that an error ended."""
         if reply.error is None:
             running.end()
-            status, message = str(running.report.status), running.report.error
+            status = str(running.report.status)
+            message = running.report.error
         else:
-            status, message = "error", f"{reply.job}: {reply.error}"
+            status = "error"
+            message = f"{reply.job}: {reply.error}"
         if isinstance(reply.error, UserError):
             raise UserError(message)
         # A scene in which an object finds no place finds none again, and says nothing of the
@@ -263,13 +276,14 @@ class Rollout:
 
     def _restarts(self, running: RunningEpisode, reply: Reply) -> bool:
         """Restart the episode if required video frames were not rendered."""
-        missing = self._render_plan.missing(reply.observation)
-        first, length = running.first_video_frames, len(reply.observation["state"]) - 1
+        length = len(reply.observation["state"]) - 1
+        first = running.first_video_frames
         if first not in (None, length):
             raise UserError(
                 f"{reply.job}: its conditioning video had {first} frames, and {length} when"
                 " it was simulated again: the environment does not repeat itself. Set draw=all."
             )
+        missing = self._render_plan.missing(reply.observation)
         if missing is None:
             return False
         running.first_video_frames = length
@@ -292,7 +306,7 @@ class Rollout:
 
     def _proceed(self, running: RunningEpisode) -> None:
         """Have the policy act, unless an event holds the robot first; every frame is read."""
-        event = running.next_event()
+        event = running.events.next(running.episode, running.steps, running.report.subtask)
         if event is None:
             self._scheduler.acting.append(running)
             return
@@ -311,9 +325,10 @@ class Rollout:
         self.workload.batches += 1
         self.workload.chunks += len(batch)
         share = (time.perf_counter() - begun) / len(batch)
+        execute = self.settings.execute or self.policy.embodiment.action.execute
         for running, chunk in zip(batch, chunks, strict=True):
             running.add_policy_seconds(share)
-            actions = chunk[: self.settings.execute or self.policy.embodiment.action.execute]
+            actions = chunk[:execute]
             if not np.isfinite(actions).all():
                 self._finish(
                     running, "error", "the policy's actions are not finite numbers", retry=False
@@ -341,7 +356,8 @@ class Rollout:
         self._start(running.worker)
 
     def _record_of(self, running: RunningEpisode, ending: Ending) -> EpisodeRecord:
-        job, robot = running.job, self.policy.embodiment
+        job = running.job
+        robot = self.policy.embodiment
         source = environment(self.settings.env)
         spec = source.episode(job.task, job.split, job.episode)
         failed = ending.outcome == "error"

@@ -82,11 +82,12 @@ class SubgoalScore:
 
     def show(self) -> tuple[str, str]:
         """Accuracy and distance with their units, for a terminal."""
-        accuracy, distance = self.accuracy, self.mean_distance
-        return (
-            "–" if accuracy is None else f"{accuracy:.1f} %",
-            "–" if distance is None else f"{distance:.1f} px",
-        )
+        accuracy = distance = "–"
+        if self.accuracy is not None:
+            accuracy = f"{self.accuracy:.1f} %"
+        if self.mean_distance is not None:
+            distance = f"{self.mean_distance:.1f} px"
+        return accuracy, distance
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for a record."""
@@ -105,15 +106,13 @@ class SubgoalScore:
             raise UserError(f"subgoals of a record is not a score of subgoals: {error}") from None
 
 
-def score_of(record: EpisodeRecord) -> SubgoalScore | None:
-    """The score of a record's subgoals; None for an episode without a predictor."""
-    return None if record.subgoals is None else SubgoalScore.from_dict(record.subgoals)
-
-
 def total_score(records: Iterable[EpisodeRecord]) -> SubgoalScore | None:
-    """The sum over the episodes that have a score; None if none has."""
-    scores = [score for record in records if (score := score_of(record)) is not None]
-    return sum(scores, SubgoalScore()) if scores else None
+    """The sum over the episodes that had a predictor; None if none had."""
+    total = None
+    for record in records:
+        if record.subgoals is not None:
+            total = (total or SubgoalScore()) + SubgoalScore.from_dict(record.subgoals)
+    return total
 
 
 def point_distances(predicted: str | None, meant: str) -> list[float] | None:
@@ -122,41 +121,34 @@ def point_distances(predicted: str | None, meant: str) -> list[float] | None:
     """
     if predicted is None:
         return None
-    (predicted_words, predicted_points), (meant_words, meant_points) = (
-        mark_points(predicted),
-        mark_points(meant),
-    )
-    if _normalised(predicted_words) != _normalised(meant_words) or len(predicted_points) != len(
-        meant_points
-    ):
+    words, points = mark_points(predicted)
+    meant_words, meant_points = mark_points(meant)
+    if _normalised(words) != _normalised(meant_words) or len(points) != len(meant_points):
         return None
-    return [
-        float(np.hypot(a - c, b - d))
-        for (a, b), (c, d) in zip(predicted_points, meant_points, strict=True)
-    ]
+    distances = []
+    for (x, y), (meant_x, meant_y) in zip(points, meant_points, strict=True):
+        distances.append(float(np.hypot(x - meant_x, y - meant_y)))
+    return distances
 
 
 def subgoal_tables(results: Results) -> list[Table]:
     """Subgoals of every method that has a predictor, per task, over all its runs."""
     columns = [
-        "",
-        "episodes",
-        "subgoals",
-        "right words (%)",
-        "distance (pixels)",
-        "asked",
+        "", "episodes", "subgoals", "right words (%)", "distance (pixels)", "asked",
         "unusable answers",
-    ]
+    ]  # fmt: skip
     return task_tables(results, "subgoals", "subgoals beside the environment's own", columns, _row)
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:
     total = total_score(records) or SubgoalScore()
-    problems = ", ".join(f"{count} {kind}" for kind, count in sorted(total.problems.items())) or "0"
-    figures = [
-        "–" if value is None else f"{value:.1f}" for value in (total.accuracy, total.mean_distance)
-    ]
-    return [name, str(len(records)), str(total.judged), *figures, str(total.asked), problems]
+    cells = [name, str(len(records)), str(total.judged)]
+    for value in (total.accuracy, total.mean_distance):
+        cells.append("–" if value is None else f"{value:.1f}")
+    cells.append(str(total.asked))
+    problems = [f"{count} {kind}" for kind, count in sorted(total.problems.items())]
+    cells.append(", ".join(problems) or "0")
+    return cells
 
 
 def _normalised(words: str) -> str:
@@ -179,7 +171,9 @@ class SubgoalTrace:
 
     def __init__(self, kind: str, folder: Path | None, name: str) -> None:
         self.score = SubgoalScore()
-        self._kind, self._name, self._folder = kind, name, folder
+        self._kind = kind
+        self._name = name
+        self._folder = folder
         self._meant: str | None = None
         self._begun = time.perf_counter()
         if folder is not None:

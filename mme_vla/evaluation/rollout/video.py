@@ -29,7 +29,8 @@ class EpisodeVideo:
     """
 
     def __init__(self, path: Callable[[str, str], Path], save_on: str = "all") -> None:
-        self._path, self._save_on = path, save_on
+        self._path = path
+        self._save_on = save_on
         self._video: VideoWriter | None = None
         self._draft = Path()
         self._thread: ThreadPoolExecutor | None = None
@@ -40,7 +41,8 @@ class EpisodeVideo:
     ) -> None:
         """Append the images [H, W, 3] uint8 that all cameras took at one step."""
         if self._video is None:
-            self._video, self._thread = self._open(), ThreadPoolExecutor(1, "film")
+            self._video = self._open()
+            self._thread = ThreadPoolExecutor(1, "video")
         assert self._thread is not None
         self._waiting.append(
             self._thread.submit(self._video.add, video_frame(views, caption, demo))
@@ -50,10 +52,8 @@ class EpisodeVideo:
 
     def finish(self, outcome: str, goal: str) -> Path | None:
         """Close the video under its name; None if this outcome is not kept."""
-        if self._video is None or self._save_on not in (
-            "all",
-            "success" if outcome == "success" else "failure",
-        ):
+        kind = "success" if outcome == "success" else "failure"
+        if self._video is None or self._save_on not in ("all", kind):
             self.discard()
             return None
         self._compressed()
@@ -77,9 +77,12 @@ class EpisodeVideo:
         """Wait for the thread; with `complete`, what went wrong in it is raised."""
         if self._thread is not None:
             self._thread.shutdown()
-        waiting, self._waiting, self._thread = self._waiting, deque(), None
-        for frame in waiting if complete else ():
-            frame.result()
+            self._thread = None
+        waiting = self._waiting
+        self._waiting = deque()
+        if complete:
+            for frame in waiting:
+                frame.result()
 
     def _open(self) -> VideoWriter:
         folder = self._path("", "").parent
@@ -93,4 +96,5 @@ def video_name(task: str, episode: int, outcome: str, goal: str) -> str:
     words = re.sub(r"[^a-z0-9]+", "_", goal.lower()).strip("_")
     if len(words) > _LONGEST_GOAL:
         words = words[:_LONGEST_GOAL].rpartition("_")[0]
-    return "_".join(part for part in (task, f"ep{episode}", outcome, words) if part) + ".mp4"
+    parts = (task, f"ep{episode}", outcome, words)
+    return "_".join(part for part in parts if part) + ".mp4"

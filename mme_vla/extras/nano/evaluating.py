@@ -23,6 +23,7 @@ from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import (
     VIDEOS,
+    RunOptions,
     choose_shard,
     evaluate,
     facts_of,
@@ -269,11 +270,8 @@ def run_episodes(
         policy = ProbedPolicy(policy, arm).eval()
         facts = replace(facts, model=named(facts.model, arm))
     jobs = [Job(spec.task, spec.split, spec.episode) for spec in specs]
-    done = evaluate(
-        policy, jobs, folder, facts, settings, subgoals=subgoals, shard=choose_shard(rules.shard),
-        source=str(checkpoint),
-    )  # fmt: skip
-    return done.records
+    options = RunOptions(subgoals=subgoals, shard=choose_shard(rules.shard), source=str(checkpoint))
+    return evaluate(policy, jobs, folder, facts, settings, options).records
 
 
 def evaluate_row(

@@ -18,7 +18,7 @@ from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import percentiles, resampled_means
 from mme_vla.evaluation.results.tables import Table, to_markdown
-from mme_vla.evaluation.rollout.evaluation import evaluate
+from mme_vla.evaluation.rollout.evaluation import RunOptions, evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
@@ -177,13 +177,27 @@ def run_card(
     others = {name: _reference(name, place, plan) for name, place in (references or {}).items()}
 
     # In closed loop: every arm, then the matched run again with other noise.
-    how: dict[str, Any] = {"subgoals": subgoals, "base": base, "show_progress": show_progress}
     plan = replace(plan, arms=[ARMS[label] for label in possible], events=())
-    run_probe(policy, replace(plan, recordings=()), folder, facts, settings, **how)
+    run_probe(
+        policy,
+        replace(plan, recordings=()),
+        folder,
+        facts,
+        settings,
+        subgoals=subgoals,
+        base=base,
+        show_progress=show_progress,
+    )
     again = replace(settings, seed=settings.seed + 1)
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
-    how |= {"shard": plan.shard, "source": plan.source}
-    evaluate(policy, plan.jobs, folder / AGAIN, renamed, again, **how)
+    options = RunOptions(
+        subgoals=subgoals,
+        shard=plan.shard,
+        source=plan.source,
+        base=base,
+        show_progress=show_progress,
+    )
+    evaluate(policy, plan.jobs, folder / AGAIN, renamed, again, options)
 
     # On recorded episodes: how long a wrong scene has an effect.
     recovered = None

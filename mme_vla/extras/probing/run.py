@@ -22,6 +22,7 @@ from mme_vla.evaluation.results.compare import Comparison, common_episodes, comp
 from mme_vla.evaluation.results.events import idle_events
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import (
+    RunOptions,
     Shard,
     choose_episodes,
     evaluate,
@@ -29,9 +30,8 @@ from mme_vla.evaluation.rollout.evaluation import (
     facts_of,
     predictor_of,
 )
-from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.runner import RunFacts
-from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.settings import RolloutSettings, event_arms
 from mme_vla.evaluation.store import RUN_FILE, claim_run, find_records, fingerprint, read_folders
 from mme_vla.extras.probing import lines
 from mme_vla.extras.probing.arms import UNPROBED, Arm, choose_arms, options_of, slug
@@ -115,21 +115,23 @@ def run_probe(
         )
         notes += [f"In closed loop {note}" for note in left_out if note not in notes]
         donors = DonorEpisodes(policy, channel, plan.lend) if plan.lend else None
-        how: dict[str, Any] = {
-            "subgoals": subgoals,
-            "shard": plan.shard,
-            "source": plan.source,
-            "base": base,
-            "show_progress": show_progress,
-        }
+        options = RunOptions(
+            subgoals=subgoals,
+            shard=plan.shard,
+            source=plan.source,
+            base=base,
+            notes={"arm": UNPROBED.name},
+            show_progress=show_progress,
+        )
         # The unprobed run, with its events; then every arm on the same scenes.
-        output, how["notes"] = folder / ONLINE / slug(UNPROBED.name), {"arm": UNPROBED.name}
-        evaluate_events(policy, plan.jobs, output, facts, settings, plan.events, **how)
+        output = folder / ONLINE / slug(UNPROBED.name)
+        evaluate_events(policy, plan.jobs, output, facts, settings, plan.events, options)
         for arm in arms:
             probed = ProbedPolicy(policy, arm, plan.lend, donors).eval()
-            output, how["notes"] = folder / ONLINE / slug(arm.name), {"arm": arm.name}
+            output = folder / ONLINE / slug(arm.name)
             named_facts = replace(facts, model=named(facts.model, arm))
-            evaluate(probed, plan.jobs, output, named_facts, settings, **how)
+            noted = replace(options, notes={"arm": arm.name})
+            evaluate(probed, plan.jobs, output, named_facts, settings, noted)
 
     # The page on all that the folder holds.
     findings = Findings.of(lines.read_all(folder / OFFLINE))

@@ -5,6 +5,7 @@ came of it.
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,9 @@ from torch.nn import functional
 from mme_vla.backbone.choice import ChoiceHead
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.config.sections import read_section
-from mme_vla.envs.make import make_env
-from mme_vla.envs.observations import Include
-from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import UserError, check_known, require
-from mme_vla.evaluation.rollout.environment import make_rollout_env
+from mme_vla.evaluation.rollout.environment import Report, base_env, make_rollout_env
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.local import LocalEnvs
 from mme_vla.evaluation.rollout.runner import Ending, Rollout, RunFacts
@@ -136,12 +134,21 @@ def rollouts(
         not oracle or policy.embodiment.action.choice,
         "The oracle chooses among options: use embodiment=robomme_choice, or keep no oracle.",
     )
-    options = _env_options(policy, env, run_settings, reward, oracle) | dict(env_options or {})
-    envs: Any = (
-        VecEnv([], workers, make_rollout_env, options, run_settings.timeout_s)
-        if workers
-        else LocalEnvs(options)
+    if callable(env):
+        base = env
+    else:
+        check_known("reward", reward, REWARDS)
+        base = base_env(env, policy.embodiment, run_settings.render, reward)
+    make = partial(
+        make_rollout_env,
+        base=partial(base, **(env_options or {})),
+        max_steps=run_settings.max_steps,
+        robot=policy.embodiment,
+        oracle=oracle,
     )
+    envs: VecEnv | LocalEnvs = LocalEnvs(make)
+    if workers:
+        envs = VecEnv([], workers, make, run_settings.timeout_s)
     collector = _Collector(policy, envs, run_settings, tuple(keep), oracle_share)
     with envs:
         for _ in collector.rounds(list(jobs)):
@@ -231,24 +238,6 @@ def with_view_tokens(policy: MMEPolicy, batch: Batch, size: int = 32) -> Batch:
             encoded = policy.backbone.encode_images(images.flatten(0, 1))
             tokens.append(encoded.unflatten(0, images.shape[:2]))
     return replace(batch, view_tokens=torch.cat(tokens))
-
-
-def _env_options(
-    policy: MMEPolicy,
-    env: str | Callable[..., Any],
-    settings: RolloutSettings,
-    reward: str,
-    oracle: bool,
-) -> dict[str, Any]:
-    robot = policy.embodiment
-    options: dict[str, Any] = {"max_steps": settings.max_steps, "robot": robot, "oracle": oracle}
-    if callable(env):
-        return options | {"base": env}
-    check_known("reward", reward, REWARDS)
-    options |= {"base": make_env, "env": env, "render": settings.render, "reward": reward}
-    options["action_space"] = robot.action.space
-    options["include"] = Include(**dict.fromkeys(robot.readings, True))
-    return options
 
 
 @dataclass

@@ -17,9 +17,9 @@ from mme_vla.config.composition import compose, resolved
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs import metadata
-from mme_vla.envs.vector.messages import Report
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
+from mme_vla.evaluation.rollout.environment import Report
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.extras.nano import evaluating
 from mme_vla.extras.nano.cli.nano import with_settings

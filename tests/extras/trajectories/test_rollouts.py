@@ -15,9 +15,8 @@ from helpers import REPOSITORY
 from helpers.scripted_env import ScriptedEnv
 from mme_vla import MMEPolicy, UserError, build_policy, register
 from mme_vla.embodiment.robomme import ROBOMME_JOINT
-from mme_vla.envs.vector.messages import Command
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollout.environment import ChunkEnv
+from mme_vla.evaluation.rollout.environment import ChunkEnv, Command
 from mme_vla.extras.trajectories.log_prob import SamplePath, log_prob, path_log_prob
 from mme_vla.extras.trajectories.rollouts import join, rollouts
 from mme_vla.processing.normalise import NormStats

@@ -96,7 +96,8 @@ def in_words(coverage: Mapping[str, TaskCoverage], split: str) -> str:
     """A line a task, and the missing goals under it."""
     lines = []
     for name, task in coverage.items():
-        covered, episodes = task.goals - len(task.missing), task.episodes - task.missing_episodes
+        covered = task.goals - len(task.missing)
+        episodes = task.episodes - task.missing_episodes
         lines.append(
             f"{name}: {covered} of {task.goals} goals of {split!r}, {episodes} of {task.episodes}"
             " episodes"

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from mme_vla.envs.robomme.recording.recorder import RecordedStep
     from mme_vla.memory.base import Memory
 
-DECISIONS, CHOICES = "decisions", "choices"
+DECISIONS = "decisions"
+CHOICES = "choices"
 GRAMMAR = (
     "decisions, choices, a number n for every n-th frame of the execution, or numbers and ranges"
     " such as [0-9,40]"
@@ -65,8 +66,10 @@ class FrameChoice:
         """
         if isinstance(self.at, int) or self.at in (DECISIONS, CHOICES) or self.memory is not None:
             return None
-        numbers = frozenset(k for span in spans(self.at, "frames", GRAMMAR) for k in span)
-        return RenderRequest(dict.fromkeys(CAMERAS, numbers), now=())
+        numbers: set[int] = set()
+        for span in spans(self.at, "frames", GRAMMAR):
+            numbers.update(span)
+        return RenderRequest(dict.fromkeys(CAMERAS, frozenset(numbers)), now=())
 
     def render_request(self, steps: Sequence["RecordedStep"]) -> RenderRequest:
         """The request for a demonstration whose steps are known from a recording without images."""
@@ -103,7 +106,10 @@ class FrameChoice:
         if self.at == CHOICES:
             choices: list[int] = choices_of(steps).decisions.tolist()
             return choices
-        return [k for span in spans(self.at, "frames", GRAMMAR) for k in span if k < len(steps)]
+        numbers: list[int] = []
+        for span in spans(self.at, "frames", GRAMMAR):
+            numbers += [number for number in span if number < len(steps)]
+        return numbers
 
 
 def motions_of(steps: Sequence["RecordedStep"]) -> Motions:

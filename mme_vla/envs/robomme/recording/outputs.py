@@ -17,7 +17,6 @@ from mme_vla.utils import read_json, remove_drafts, write_atomically
 
 if TYPE_CHECKING:
     from mme_vla.data.convert import ConvertOptions
-    from mme_vla.envs.robomme.recording.frames import FrameChoice
     from mme_vla.envs.robomme.recording.recorder import RecordedStep
     from mme_vla.envs.task import Task
 
@@ -36,7 +35,7 @@ class EpisodeWriter:
     """
 
     def __init__(
-        self, path: Path, index: int, task: "Task", frames: "FrameChoice | None" = None
+        self, path: Path, index: int, task: "Task", frames: FrameChoice | None = None
     ) -> None:
         self._file = h5py.File(path, "w")
         self._episode = self._file.create_group(f"episode_{index}")
@@ -139,8 +138,8 @@ class Job:
         """Whether an episode of this seed, difficulty and rendered frames can be what this job
         records.
         """
-        right = seed is not None and self.seed <= seed < self.seed + self.retries
-        return right and difficulty == self.difficulty and frames == self.frame_selection
+        is_tried = seed is not None and self.seed <= seed < self.seed + self.retries
+        return is_tried and difficulty == self.difficulty and frames == self.frame_selection
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import UserError
 from mme_vla.utils import write_atomically
 
-STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
-
-
+STATE = "observation.state"
+ACTION = "action"
+IMAGES = "observation.images."
 DRAFT = "dataset"
 
 
@@ -46,7 +46,8 @@ def record_own(
     episodes = {work / episode_file(spec): spec for spec in specs}
     shutil.rmtree(draft, ignore_errors=True)
     dataset: Any = None
-    failures, frames = [], 0
+    failures = []
+    frames = 0
     with quiet_libraries(), progress("record", len(specs), unit="episodes") as advance:
         for path, spec in episodes.items():
             if not path.is_file():

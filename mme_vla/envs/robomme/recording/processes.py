@@ -11,7 +11,7 @@ from mme_vla.utils.processes import end_with_parent, signals_deferred
 
 
 def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> Iterator[R]:
-    """Do work that simulates, in so many processes; what came of it, as it is done.
+    """Do work that simulates, in so many processes; yields each result when it is there.
 
     work: importable by name, or a partial of such, where there are several processes.
     """

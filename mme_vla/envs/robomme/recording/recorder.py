@@ -60,11 +60,12 @@ def _ended(env: "Task") -> bool:
     return env.progress.succeeded or env.progress.failed
 
 
-MAX_STEPS, MAX_STEPS_OOD = 2000, 4000
-"""Control steps after which a recording is given up: the benchmark's, and of the longer scenes of
-RoboMME-OOD.
-"""
-SEAM, AT_REST = 5e-8, 1e-5  # rad
+MAX_STEPS = 2000
+"""Control steps after which a recording is given up, as in the benchmark."""
+MAX_STEPS_OOD = 4000
+"""The same for the longer scenes of RoboMME-OOD."""
+SEAM = 5e-8  # rad
+AT_REST = 1e-5  # rad
 GRIPPER_CLOSED = 0.03
 """Finger position below which the gripper counts as closed, metres."""
 
@@ -212,20 +213,25 @@ class Recorder:
         return frame | {"is_gripper_close": closed}
 
     def _actions(self, planned: "SubTask") -> dict[str, Any]:
-        task, action = self._task, self._action
+        action = self._action
         pose = self._demonstrator.arm.forward(action[:ARM_JOINTS])
-        gripper = -1.0 if task.stick else float(action[ARM_JOINTS])
+        gripper = -1.0
+        if not self._task.stick:
+            gripper = float(action[ARM_JOINTS])
         angles = self._action_angles.follow(pose.q)
         if self._roll_shift is None:
-            # a gripper begins straight down, which the official files have at +pi
-            self._roll_shift = 2 * np.pi if abs(angles[0] + np.pi) < AT_REST else 0.0
+            self._roll_shift = 0.0
+            if abs(angles[0] + np.pi) < AT_REST:
+                # a gripper begins straight down, which the official files have at +pi
+                self._roll_shift = 2 * np.pi
         angles[0] += self._roll_shift
         waypoint = self._waypoint
         if waypoint is None:
             waypoint = np.full(len(POSE) + 1, np.nan, np.float32)
         point: list[int] = []
         if planned.choice and planned.targets:
-            point = [round(float(v)) for v in project(planned.targets[0].position)]
+            pixel = project(planned.targets[0].position)
+            point = [round(float(coordinate)) for coordinate in pixel]
         return {
             "joint_action": np.append(action[:ARM_JOINTS], gripper),
             "eef_action": np.concatenate([pose.p, angles, [gripper]]).astype(np.float64),
@@ -234,14 +240,20 @@ class Recorder:
         }
 
     def _texts(self, planned: "SubTask") -> dict[str, Any]:
-        progress, displayed = self._task.progress, self._displayed
-        completed = progress.succeeded
-        segmentation = self._observer.segmentation if self._render else None
-        now = "completed" if completed else progress.planned
+        completed = self._task.progress.succeeded
+        text = planned.text
+        now: str | int = self._task.progress.planned
+        if completed:
+            text = COMPLETED
+            now = "completed"
         boundary = now != self._last_stored
         self._last_stored = now
+        segmentation = None
+        if self._render:
+            segmentation = self._observer.segmentation
+        displayed = self._displayed
         return {
-            "simple_subgoal": COMPLETED if completed else planned.text,
+            "simple_subgoal": text,
             "grounded_subgoal": self._planned.update(planned, segmentation),
             "simple_subgoal_online": displayed.text,
             "grounded_subgoal_online": self._online.update(displayed, segmentation),

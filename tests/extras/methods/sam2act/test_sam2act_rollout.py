@@ -8,10 +8,9 @@ import torch
 
 from helpers.depth_env import MOTION, DepthEnv, make_depth_env
 from helpers.rollout_fakes import InlineEnvs, roll
-from mme_vla.envs.vector.messages import Command
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.rollout.environment import ChunkEnv
+from mme_vla.evaluation.rollout.environment import ChunkEnv, Command
 from mme_vla.extras.methods.sam2act.policy import SAM2ActPolicy
 from mme_vla.policy.build import build_policy
 
