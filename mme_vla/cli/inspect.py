@@ -97,10 +97,12 @@ def show_checkpoint(folder: Path, console: Console, trust_plugins: bool = False)
     for name, parameter in policy.named_parameters():
         parts.setdefault(policy.finetune_spec.component_of(name), []).append(parameter)
     for part, tensors in parts.items():
-        dtypes = ", ".join(sorted({str(t.dtype).removeprefix("torch.") for t in tensors}))
-        table.add_row(part, str(len(tensors)), f"{sum(t.numel() for t in tensors):,}", dtypes)
+        dtypes = sorted({str(t.dtype).removeprefix("torch.") for t in tensors})
+        count = sum(t.numel() for t in tensors)
+        table.add_row(part, str(len(tensors)), f"{count:,}", ", ".join(dtypes))
     total = list(policy.parameters())
-    table.add_row("all", str(len(total)), f"{sum(t.numel() for t in total):,}", "", style="bold")
+    count = sum(t.numel() for t in total)
+    table.add_row("all", str(len(total)), f"{count:,}", "", style="bold")
     _show(table, console)
     settings = _table("configuration", "section", "values")
     for name, section in policy.config.items():
@@ -124,12 +126,13 @@ def show_checkpoint(folder: Path, console: Console, trust_plugins: bool = False)
             (action, stats.actions, space.names),
         ):
             # Extremes are kept where a policy normalises by them.
-            bounds = [
-                bound for bound in ("min", "q01", "q99", "max") if getattr(of, bound) is not None
-            ]
+            bounds = {}
+            for bound in ("min", "q01", "q99", "max"):
+                if getattr(of, bound) is not None:
+                    bounds[bound] = getattr(of, bound)
             numbers = _table(f"normalisation of the {title}", "number", *bounds)
             for i, name in enumerate(names):
-                numbers.add_row(name, *(f"{getattr(of, bound)[i]:.3f}" for bound in bounds))
+                numbers.add_row(name, *(f"{values[i]:.3f}" for values in bounds.values()))
             _show(numbers, console)
 
 

@@ -121,15 +121,16 @@ class Episode:
                 has begun.
         """
         # All checks come first: after an error the same frames can be observed again.
-        images = {name: self._checked_view(frames, name) for name in self._robot.camera_names}
+        images = {}
         states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
         count = len(states) if states.ndim else 0
         width = self._robot.state.width
         is_even = True
-        for name, view in images.items():
+        for name in self._robot.camera_names:
+            images[name] = self._checked_view(frames, name)
             n_rendered = count if rendered is None else len(rendered[name])
-            if len(view) != n_rendered:
+            if len(images[name]) != n_rendered:
                 is_even = False
         if states.shape != (count, width) or not is_even or demo.shape not in ((), (count,)):
             counts = ", ".join(f"{len(view)} {name}" for name, view in images.items())

@@ -244,10 +244,10 @@ def merge_state(
 def _targets(policy: "Policy", targets: Sequence[str]) -> list[str]:
     """Full names of the layers that the targets mean (what is the memory's learns in full)."""
     spec = policy.finetune_spec
-    linear = [
-        name for name, module in policy.named_modules() if isinstance(module, nn.Linear | nn.Conv2d)
-    ]
-    layers = [name for name in linear if spec.component_of(f"{name}.") != "memory"]
+    layers = []
+    for name, module in policy.named_modules():
+        if isinstance(module, nn.Linear | nn.Conv2d) and spec.component_of(f"{name}.") != "memory":
+            layers.append(name)
     selected: list[str] = []
     for target in targets:
         matching = [name for name in layers if f".{name}".endswith(f".{target}")]
