@@ -10,8 +10,7 @@ from torch import Tensor
 
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError, require
-from mme_vla.memory.base import start_history
-from mme_vla.memory.history import History, OnlineHistory
+from mme_vla.memory.history import History, LazyHistory, OnlineHistory
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.images import PastImages
 from mme_vla.processing.normalise import QuantileStats, check_reach, finite_array
@@ -79,7 +78,10 @@ class Episode:
         """Rows [w], one a frame, if the memory reads motion."""
         memory = policy.memory
         if memory is not None:
-            self.history = start_history(memory, policy.encode_frames)
+            scorer = memory.make_scorer()
+            self.history = OnlineHistory(memory.storage, scorer)
+            if memory.lazy:
+                self.history = LazyHistory(memory.storage, policy.encode_frames, scorer)
             self.stream = memory.start_stream()
             if memory.uses_proprio:
                 self.history.motion = lambda frames: torch.stack(

@@ -3,7 +3,6 @@
 import inspect
 import json
 import re
-import tempfile
 from collections.abc import Mapping
 from operator import attrgetter
 from pathlib import Path
@@ -249,20 +248,6 @@ def save_settings(
     if policy.processor is None:
         return [CONFIG]
     return [CONFIG, *policy.processor.save(folder)]
-
-
-def push_to_hub(
-    policy: "Policy",
-    repo_id: str,
-    *,
-    dtype: str = "float32",
-    card: Mapping[str, Any] | None = None,
-    **options: Any,
-) -> str:
-    """Store a policy on the hub; see `Policy.push_to_hub`."""
-    with tempfile.TemporaryDirectory() as folder:
-        save_policy(policy, Path(folder), dtype=dtype, card=card)
-        return push_folder(Path(folder), repo_id, **options)
 
 
 def load_policy[P: "Policy"](

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from mme_vla.config.composition import compose
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.memory.base import padded_length
-from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
+from mme_vla.memory.history import CachedHistory, FrameScores
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.processing.images import full_past
@@ -203,15 +203,3 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
     if values:
         scores = FrameScores(np.array(scored_frames), np.stack(values).astype(np.float32))
     return CachedHistory(storage, tokens.numpy(), stored_frames, len(frames), scores, exec_start)
-
-
-def online_history(
-    policy: MMEPolicy, frames: np.ndarray, chunk: int, exec_start: int = 0
-) -> OnlineHistory:
-    """The same episode as an environment would deliver it, `chunk` frames at a time."""
-    memory = policy.require_memory()
-    history = OnlineHistory(memory.storage, memory.make_scorer(), exec_start)
-    for start in range(0, len(frames), chunk):
-        part = frames[start : start + chunk]
-        history.append(part, policy.encode_frames(part[history.to_encode(len(part))]))
-    return history
