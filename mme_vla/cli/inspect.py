@@ -136,8 +136,11 @@ def show_checkpoint(folder: Path, console: Console, trust_plugins: bool = False)
             _show(numbers, console)
 
 
-def show_dataset(source: EpisodeSource, console: Console, most: int = 40) -> None:
-    """Print a dataset's episodes, at most `most` of them, and its totals."""
+MOST_EPISODES = 40  # in the table of a dataset
+
+
+def show_dataset(source: EpisodeSource, console: Console) -> None:
+    """Print a dataset's episodes, at most `MOST_EPISODES` of them, and its totals."""
     compared = source.verify()
     table = _table(
         f"{source.name} ({source.root})",
@@ -148,15 +151,20 @@ def show_dataset(source: EpisodeSource, console: Console, most: int = 40) -> Non
         "seconds",
         "goal",
     )
-    for episode in range(min(len(source), most)):
-        frames, video = int(source.lengths[episode]), int(source.exec_starts[episode])
-        goal, seconds = printable(" → ".join(source.goals(episode))), f"{frames / source.fps:.1f}"
+    for episode in range(min(len(source), MOST_EPISODES)):
+        frames = int(source.lengths[episode])
         table.add_row(
-            str(episode), printable(source.task(episode)), str(frames), str(video), seconds, goal
+            str(episode),
+            printable(source.task(episode)),
+            str(frames),
+            str(source.exec_starts[episode]),
+            f"{frames / source.fps:.1f}",
+            printable(" → ".join(source.goals(episode))),
         )
-    if len(source) > most:
-        table.add_row("…", f"{len(source) - most} more")
-    frames, video = int(source.lengths.sum()), int(source.exec_starts.sum())
+    if len(source) > MOST_EPISODES:
+        table.add_row("…", f"{len(source) - MOST_EPISODES} more")
+    frames = int(source.lengths.sum())
+    video = int(source.exec_starts.sum())
     table.add_row(
         "all", "", str(frames), str(video), f"{frames / source.fps:.1f}", "", style="bold"
     )

@@ -169,14 +169,15 @@ def record(
 
 
 def report_coverage(
-    tasks: str | Sequence[str], plan: RecordingPlan, file: Path, workers: int, split: str = "test"
+    tasks: str | Sequence[str], plan: RecordingPlan, file: Path, workers: int
 ) -> None:
-    """Say which goals of a split the recorded episodes lack, and write it as JSON.
+    """Say which goals of the test split the recorded episodes lack, and write it as JSON.
 
     plan: a recording that is there. workers: processes that build the split's scenes, which tell
     their goals.
     """
-    specs, goals = choose_episodes(tasks, None, split), []
+    specs = choose_episodes(tasks, None, "test")
+    goals = []
     with progress("goals", len(specs), unit="episodes") as advance, ExitStack() as stack:
         with signals_deferred():
             run = map if workers == 1 else stack.enter_context(simulation_pool(workers)).map
@@ -189,7 +190,7 @@ def report_coverage(
     write_json(
         file, {task: episode_goals.to_dict() for task, episode_goals in coverage.items()}, indent=1
     )
-    print(f"{in_words(coverage, split)}\n{file}")
+    print(f"{in_words(coverage, 'test')}\n{file}")
 
 
 def plan(run: RecordRun) -> list[Job]:

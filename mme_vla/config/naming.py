@@ -18,9 +18,12 @@ _SEVERAL = re.compile(r"/?memory=(\[.*\])")
 
 def words(key: str, value: Any) -> list[str]:
     """Write a keyword argument as overrides."""
-    if isinstance(value, Mapping):
-        return [word for inner, v in value.items() for word in words(f"{key}.{inner}", v)]
-    return [f"{key}={literal(value)}"]
+    if not isinstance(value, Mapping):
+        return [f"{key}={literal(value)}"]
+    result: list[str] = []
+    for name, inner in value.items():
+        result += words(f"{key}.{name}", inner)
+    return result
 
 
 def literal(value: Any) -> str:
@@ -46,7 +49,10 @@ def several_memories(overrides: Iterable[str]) -> list[str]:
     result: list[str] = []
     for word in overrides:
         several = _SEVERAL.fullmatch(word)
-        result += [f"memory={JOINED}", f"memory.members={several[1]}"] if several else [word]
+        if several:
+            result += [f"memory={JOINED}", f"memory.members={several[1]}"]
+        else:
+            result.append(word)
     return result
 
 

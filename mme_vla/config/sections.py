@@ -182,9 +182,13 @@ def _section_of(kind: Any) -> Any:
 
 
 def _choices(kind: Any) -> Sequence[Any]:
+    if get_origin(kind) is Literal:
+        return get_args(kind)
+    choices: list[Any] = []
     if get_origin(kind) in (Union, UnionType):
-        return [choice for part in get_args(kind) for choice in _choices(part)]
-    return get_args(kind) if get_origin(kind) is Literal else ()
+        for part in get_args(kind):
+            choices += _choices(part)
+    return choices
 
 
 def _expected(kind: Any) -> str:

@@ -69,7 +69,7 @@ class Scheduler[R: Reading, A, L]:
         begun = time.perf_counter()
         for short in [work for work in self.reading if work.pieces <= 1]:
             yield from self._piece(short)
-        batch = []
+        batch: list[A] = []
         while self.acting and len(batch) < self.max_batch:
             batch.append(self.acting.popleft())
         if batch:

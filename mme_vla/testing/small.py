@@ -53,7 +53,6 @@ BEYOND = [
     "keyframes_modul",
 ]
 """Of each memory beyond the paper one composition, for tests that go through all models."""
-MODELS = ["pi05", *NEURAL]
 # The first four are one network; hybrid is framesamp_modul with a subgoal in its prompt.
 ALL_MODELS = ["pi05", "pi05_past_actions", "simplesg", "groundsg", *NEURAL, "hybrid"]
 SMALL_VISION = {

@@ -114,10 +114,10 @@ def png_bytes(image: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def bordered(image: np.ndarray, pixels: int = BORDER) -> np.ndarray:
+def bordered(image: np.ndarray) -> np.ndarray:
     """The image in a red border: it belongs to a conditioning video."""
     framed = image.copy()
-    for edge in (np.s_[:pixels], np.s_[-pixels:], np.s_[:, :pixels], np.s_[:, -pixels:]):
+    for edge in (np.s_[:BORDER], np.s_[-BORDER:], np.s_[:, :BORDER], np.s_[:, -BORDER:]):
         framed[edge] = RED
     return framed
 
