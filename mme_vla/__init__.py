@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from mme_vla.integration.base import Integration
     from mme_vla.memory.base import Memory, PerceptualMemory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
-    from mme_vla.memory.perturbation import HistoryTransform as HistoryTransform
     from mme_vla.memory.perturbation import Perturbation
     from mme_vla.memory.recurrent import RecurrentMemory
     from mme_vla.policy.base import Policy
@@ -50,7 +49,7 @@ _MODULES = {
     "memory.base": ["Memory", "PerceptualMemory"],
     "memory.history": ["CachedHistory", "History", "OnlineHistory", "StorageSpec"],
     "memory.recurrent": ["RecurrentMemory"],
-    "memory.perturbation": ["HistoryTransform", "Perturbation"],
+    "memory.perturbation": ["Perturbation"],
     "policy.base": ["Policy"],
     "policy.build": ["build_policy"],
     "policy.episode": ["Episode"],

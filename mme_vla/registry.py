@@ -182,19 +182,19 @@ class Registry[T]:
 
         def decorate(entry: Any) -> Any:
             taken = self._entries.get(name)
-            # A module imported twice (once as __main__) registers an equal twin: that is no clash.
-            require(
-                not (
-                    taken is not None
-                    and getattr(taken, "__qualname__", None) != getattr(entry, "__qualname__", None)
-                ),
-                f"{self.kind} {name!r} is already registered by {taken!r}; choose another name.",
-            )
             module = self._module_of(name)
-            require(
-                taken is not None or module in (None, getattr(entry, "__module__", None)),
-                f"{self.kind} {name!r} ships with the library ({module}); choose another name.",
-            )
+            if taken is None:
+                require(
+                    module in (None, getattr(entry, "__module__", None)),
+                    f"{self.kind} {name!r} ships with the library ({module}); choose another name.",
+                )
+            else:
+                # A module imported twice (once as __main__) registers an equal twin.
+                require(
+                    getattr(taken, "__qualname__", None) == getattr(entry, "__qualname__", None),
+                    f"{self.kind} {name!r} is already registered by {taken!r}; choose another"
+                    " name.",
+                )
             self._entries[name] = entry
             return entry
 
@@ -218,22 +218,23 @@ class Registry[T]:
             section: `name`, and the options. args, fixed: what the caller adds; no option may say
                 the same.
         """
-        options = {key: value for key, value in section.items() if key != "name"}
-        if not isinstance(section.get("name"), str):
+        options = dict(section)
+        name = options.pop("name", None)
+        if not isinstance(name, str):
             raise UserError(
                 f"The section of the {self.kind} needs a name. {did_you_mean('', self)}"
             )
-        entry: Any = self[section["name"]]
+        entry: Any = self[name]
         if twice := sorted(set(options) & set(fixed)):
-            name = f"{self.kind} {section['name']!r}"
             raise UserError(
-                f"{name}: {twice[0]} is not an option; it follows from the other parts."
+                f"{self.kind} {name!r}: {twice[0]} is not an option; it follows from the other"
+                " parts."
             )
         signature = inspect.signature(entry)
         try:
             signature.bind(*args, **fixed, **options)
         except TypeError as error:
-            raise self._refused(section, fixed, len(args), str(error)) from None
+            raise self._refused(name, options, fixed, len(args), str(error)) from None
         try:
             return entry(*args, **fixed, **options)
         except TypeError as error:
@@ -241,39 +242,38 @@ class Registry[T]:
             unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
             if unknown is None or unknown[1] not in options:
                 raise
-            raise self._refused(section, fixed, len(args), str(error)) from error
+            raise self._refused(name, options, fixed, len(args), str(error)) from error
 
     def _refused(
-        self, section: Mapping[str, Any], fixed: Mapping[str, Any], n_args: int, reason: str
+        self,
+        name: str,
+        options: Mapping[str, Any],
+        fixed: Mapping[str, Any],
+        n_args: int,
+        reason: str,
     ) -> UserError:
         """The error about a section's options, with those that its constructor and its base
         classes' take.
         """
-        options = {key: value for key, value in section.items() if key != "name"}
-        entry: Any = self[section["name"]]
+        entry: Any = self[name]
         makers = list(entry.__mro__ if isinstance(entry, type) else (entry,))
         for maker in list(makers):
             makers += vars(maker).get("option_types", ())  # structs that it builds from options
-        kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-        parameters = [
-            p
-            for maker in makers
-            for p in inspect.signature(maker).parameters.values()
-            if p.kind in kinds
-        ]
-        takes = [name for name in dict.fromkeys(p.name for p in parameters) if name not in fixed][
-            n_args:
-        ]
-        unknown = [name for name in options if name not in takes]
-        hint = (
-            did_you_mean(unknown[0], takes) if unknown else f"Known: {', '.join(takes) or 'none'}."
-        )
-        text = (
-            ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
-        )
+        parameters: dict[str, None] = {}  # in order, each once
+        for maker in makers:
+            for parameter in inspect.signature(maker).parameters.values():
+                if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
+                    parameters[parameter.name] = None
+        known = [parameter for parameter in parameters if parameter not in fixed][n_args:]
+        hint = f"Known: {', '.join(known) or 'none'}."
+        for option in options:
+            if option not in known:
+                hint = did_you_mean(option, known)
+                break
+        text = ", ".join(f"{option}={brief(value)}" for option, value in options.items())
         return UserError(
-            f"{self.kind} {section['name']!r} does not take these options: {text} ({reason})."
-            f" {hint}"
+            f"{self.kind} {name!r} does not take these options: {text or 'no options'}"
+            f" ({reason}). {hint}"
         )
 
     def __contains__(self, name: object) -> bool:
@@ -286,39 +286,40 @@ class Registry[T]:
 MEMORIES: Registry[Any] = Registry(
     "memory",
     {
-        **{
-            name: f"mme_vla.memory.{name}"
-            for name in ("framesamp", "tokendrop", "ttt", "rmt", "joined")
-        },
-        **{
-            name: f"mme_vla.memory.extensions.{name}"
-            for name in (
-                "actions",
-                "anchors",
-                "bank",
-                "events",
-                "gist",
-                "keyframes",
-                "learned_topk",
-                "moment",
-                "present",
-                "pyramid",
-                "retrieval",
-                "spacetime",
-            )
-        },
+        "framesamp": "mme_vla.memory.framesamp",
+        "tokendrop": "mme_vla.memory.tokendrop",
+        "ttt": "mme_vla.memory.ttt",
+        "rmt": "mme_vla.memory.rmt",
+        "joined": "mme_vla.memory.joined",
+        "actions": "mme_vla.memory.extensions.actions",
+        "anchors": "mme_vla.memory.extensions.anchors",
+        "bank": "mme_vla.memory.extensions.bank",
+        "events": "mme_vla.memory.extensions.events",
+        "gist": "mme_vla.memory.extensions.gist",
+        "keyframes": "mme_vla.memory.extensions.keyframes",
+        "learned_topk": "mme_vla.memory.extensions.learned_topk",
+        "moment": "mme_vla.memory.extensions.moment",
+        "present": "mme_vla.memory.extensions.present",
+        "pyramid": "mme_vla.memory.extensions.pyramid",
+        "retrieval": "mme_vla.memory.extensions.retrieval",
+        "spacetime": "mme_vla.memory.extensions.spacetime",
     },
 )
 INTEGRATIONS: Registry[Any] = Registry(
     "integration",
-    {name: f"mme_vla.integration.{name}" for name in ("context", "modulator", "film")}
-    | {"expert": "mme_vla.integration.context"},
+    {
+        "context": "mme_vla.integration.context",
+        "expert": "mme_vla.integration.context",
+        "film": "mme_vla.integration.film",
+        "modulator": "mme_vla.integration.modulator",
+    },
 )
 BACKBONES: Registry[Any] = Registry("backbone", {"pi05": "mme_vla.backbone.pi05"})
 HEADS: Registry[Any] = Registry(
     "action head",
     {
-        **dict.fromkeys(("flow", "clean_flow"), "mme_vla.backbone.flow"),
+        "flow": "mme_vla.backbone.flow",
+        "clean_flow": "mme_vla.backbone.flow",
         "choice": "mme_vla.backbone.choice",
     },
     key="head",
@@ -328,8 +329,12 @@ PROCESSORS: Registry[Any] = Registry("processor", {"pi05": "mme_vla.processing.p
 SUBGOALS: Registry[Any] = Registry(
     "subgoal predictor",
     {
-        **{name: f"mme_vla.subgoal.{name}" for name in ("oracle", "qwenvl", "memer", "notebook")},
-        **dict.fromkeys(("gemini", "openai"), "mme_vla.subgoal.prompted"),
+        "oracle": "mme_vla.subgoal.oracle",
+        "qwenvl": "mme_vla.subgoal.qwenvl",
+        "memer": "mme_vla.subgoal.memer",
+        "notebook": "mme_vla.subgoal.notebook",
+        "gemini": "mme_vla.subgoal.prompted",
+        "openai": "mme_vla.subgoal.prompted",
     },
     key="subgoal",
 )

@@ -6,7 +6,6 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from itertools import zip_longest
 from pathlib import Path
 
 import hydra
@@ -17,21 +16,20 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.cli.errors import print_user_errors
-from mme_vla.cli.help import help_page, unknown_option
+from mme_vla.cli.help import help_page
 from mme_vla.config import plugins
 from mme_vla.config.composition import (
     VERSION_BASE,
     command_trees,
     compose,
-    import_plugins,
     join_plugins,
     local_hydra,
     parse,
 )
 from mme_vla.config.naming import join_memories, several_memories
-from mme_vla.config.override_errors import paths
+from mme_vla.config.override_errors import paths, unknown_option
 from mme_vla.config.trees import config_dir, library_trees
-from mme_vla.errors import UserError, printable
+from mme_vla.errors import UserError, printable, require
 
 
 def run_configured(
@@ -61,7 +59,7 @@ def run_configured(
             hydra_cfg = HydraConfig.get()
             name = str(hydra_cfg.job.config_name)
             join_plugins(cfg, name, command_trees(), hydra_cfg.overrides.task)
-            import_plugins(cfg)
+            plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
             return main(cfg)
 
     with print_user_errors():
@@ -99,21 +97,18 @@ def _check_command_line(config_name: str, tree: Path) -> None:
         with local_hydra(tree, []):
             known = list(paths(OmegaConf.to_container(hydra.compose(config_name))))
         raise unknown_option(unknown[0], sys.argv[1:], known)
-    modes = [
-        mode
-        for mode in ("run", "multirun", "cfg", "info", "shell_completion")
-        if getattr(args, mode)
-    ]
-    if len(modes) > 1:
-        raise UserError(
-            f"Use one of {' and '.join(f'--{mode}'.replace('_', '-') for mode in modes)}, not both."
-        )
+    modes = []
+    for mode in ("run", "multirun", "cfg", "info", "shell_completion"):
+        if getattr(args, mode):
+            modes.append(f"--{mode}".replace("_", "-"))
+    require(len(modes) < 2, f"Use one of {' and '.join(modes)}, not both.")
     extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     if args.help:
         # As Hydra searches them: the extras' trees come before the user's.
-        trees = [*library_trees()] if tree == config_dir() else [tree.resolve()]
-        trees += extra
-        print(help_page(args.config_name or config_name, args.overrides, trees))
+        trees = [tree.resolve()]
+        if tree == config_dir():
+            trees = list(library_trees())
+        print(help_page(args.config_name or config_name, args.overrides, [*trees, *extra]))
         raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
@@ -133,15 +128,13 @@ def check_overrides(
     (`model=a,b`) included.
     """
     columns = [_choices(override) for override in parse(overrides)]
-    for row in zip_longest(*columns) if columns else [()]:
+    columns = [column for column in columns if column]
+    n_rows = max((len(column) for column in columns), default=1)
+    for row in range(n_rows):
         # A column shorter than the longest stays at its first choice: every choice is seen once,
         # not their product.
-        combination = [
-            column[0] if value is None else value
-            for value, column in zip(row, columns, strict=True)
-            if column
-        ]
-        compose(config_name, combination, directory=directory, extra_dirs=extra_dirs)
+        words = [column[row] if row < len(column) else column[0] for column in columns]
+        compose(config_name, words, directory=directory, extra_dirs=extra_dirs)
 
 
 def _choices(override: Override) -> list[str]:

@@ -7,7 +7,6 @@ import logging
 import shutil
 import tempfile
 import webbrowser
-from itertools import islice
 from pathlib import Path
 
 from mme_vla.errors import UserError, listed, missing_extra, require
@@ -72,16 +71,20 @@ def check_site(folder: Path) -> None:
     )
     record = folder / FILES
     sums = read_json(record, "the files of a site") if record.is_file() else {}
-    folders = {parent.as_posix() for name in sums for parent in Path(name).parents}
-    # Not all of them: the folder may be somebody's home.
-    foreign = list(
-        islice((path for path in folder.rglob("*") if not _is_ours(path, folder, sums, folders)), 5)
-    )
+    folders: set[str] = set()
+    for name in sums:
+        folders.update(parent.as_posix() for parent in Path(name).parents)
+    foreign: list[str] = []
+    for path in folder.rglob("*"):
+        if not _is_ours(path, folder, sums, folders):
+            foreign.append(path.name)
+        if len(foreign) == 5:  # not all of them: the folder may be somebody's home
+            break
     require(
         not foreign,
         f"--output {folder} holds what is no site of this command, or was changed since, such as"
-        f" {listed(sorted(path.name for path in foreign))}. A new site replaces the whole folder:"
-        " choose another, or remove this one yourself.",
+        f" {listed(sorted(foreign))}. A new site replaces the whole folder: choose another, or"
+        " remove this one yourself.",
     )
 
 

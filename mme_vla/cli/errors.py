@@ -37,13 +37,22 @@ def print_user_errors() -> Iterator[None]:
         except KeyboardInterrupt as stop:
             _end_interrupted(stop)
         except Exception as error:
-            if (hidden := _interrupted(error)) is not None:
-                _end_interrupted(hidden)
-            message = str(error) if isinstance(error, UserError) else disk_trouble(error)
+            # The signal that an exception hides: a `finally` that fails on half-made objects
+            # replaces it.
+            hidden: BaseException | None = error
+            while hidden is not None:
+                if isinstance(hidden, KeyboardInterrupt):
+                    _end_interrupted(hidden)
+                hidden = hidden.__context__
+            code = DISK_TROUBLE
+            message = disk_trouble(error)
+            if isinstance(error, UserError):
+                code = MISTAKE
+                message = str(error)
             if message is None:
                 raise
             _print(f"Error: {message}", "Error: ")
-            raise SystemExit(MISTAKE if isinstance(error, UserError) else DISK_TROUBLE) from None
+            raise SystemExit(code) from None
         finally:
             try:
                 sys.stdout.flush()
@@ -51,18 +60,10 @@ def print_user_errors() -> Iterator[None]:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _interrupted(error: BaseException | None) -> KeyboardInterrupt | None:
-    """The signal that an exception hides: a `finally` that fails on half-made objects
-    replaces it.
-    """
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__context__
-    return error
-
-
 def _end_interrupted(stop: KeyboardInterrupt) -> NoReturn:
-    number = signal.SIGTERM if isinstance(stop, Terminated) else signal.SIGINT
-    name = "SIGTERM" if number == signal.SIGTERM else "Ctrl-C"
+    name, number = "Ctrl-C", signal.SIGINT
+    if isinstance(stop, Terminated):
+        name, number = "SIGTERM", signal.SIGTERM
     _print(
         f"Stopped by {name}. What was finished is kept: the same command continues from there.",
         "Stopped",
@@ -82,8 +83,8 @@ def _terminable() -> Iterator[None]:
     """Turn SIGTERM into an exception while this is open, where the process would just have died of
     it.
     """
-    main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield
         return
 

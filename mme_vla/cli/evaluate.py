@@ -24,7 +24,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
 from mme_vla.errors import check_choice
 from mme_vla.evaluation.api import policy_of_split
-from mme_vla.evaluation.records import count_outcomes
+from mme_vla.evaluation.records import EpisodeRecord, count_outcomes
 from mme_vla.evaluation.results.events import event_table, idle_events
 from mme_vla.evaluation.results.report import policy_facts
 from mme_vla.evaluation.results.tables import print_table
@@ -131,8 +131,9 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
     output = default_output(facts) if run.output is None else Path(run.output).expanduser()
     output = output / training
     count = "1 episode" if len(jobs) == 1 else f"{len(jobs)} episodes"
-    shared = f", shared as {shard.index}/{shard.count}" if shard.count > 1 else ""
-    logger.info("%s into %s%s", count, output, shared)
+    if shard.count > 1:
+        count += f", shared as {shard.index}/{shard.count},"
+    logger.info("%s into %s", count, output)
     notes = {
         "device": str(device),
         "workers": settings.workers,
@@ -202,16 +203,17 @@ def choose_subgoals(
 
 def report(done: Evaluation, output: Path) -> None:
     """Say how it went, task by task, and where the table comes from."""
-    tasks = list(dict.fromkeys(record.task for record in done.records))
     is_scored = total_score(done.records) is not None
     columns = ["task", "episodes", "success", "fail", "timeout", "error", "success rate"]
     if is_scored:
         columns += ["right subgoals", "points off by"]
     table = Table(*columns)
-    rows = [(task, [r for r in done.records if r.task == task]) for task in tasks]
+    rows: dict[str, list[EpisodeRecord]] = {}
+    for record in done.records:
+        rows.setdefault(record.task, []).append(record)
     if len(rows) > 1:
-        rows.append(("all", list(done.records)))
-    for task, records in rows:
+        rows["all"] = list(done.records)
+    for task, records in rows.items():
         counts = count_outcomes(records)
         cells = [task, str(len(records))]
         for name in ("success", "fail", "timeout", "error"):
@@ -224,7 +226,10 @@ def report(done: Evaluation, output: Path) -> None:
     # Piped into a file there is no terminal to fit: as wide as the table is.
     console = Console(width=None if sys.stdout.isatty() else 160, soft_wrap=True, highlight=False)
     if done.matched:
-        report_events(done, console.width)
+        # What events changed, and where one did not act.
+        print_table(event_table([*done.records, *done.matched], "first"), console.width)
+        for line in idle_events(done.records):
+            logger.warning(line)
     elif rows:
         console.print(table)
     work = done.workload
@@ -238,20 +243,16 @@ def report(done: Evaluation, output: Path) -> None:
     logger.info("python -m mme_vla.results %s", output)
 
 
-def report_events(done: Evaluation, width: int) -> None:
-    """Say what events changed, and where one did not act."""
-    print_table(event_table([*done.records, *done.matched], "first"), width)
-    for line in idle_events(done.records):
-        logger.warning(line)
-
-
 def report_usage(usage: Usage) -> None:
     """Say in one line what a predictor did, as far as it did anything."""
     counts = {
-        "calls": usage.calls, "answers from the cache": usage.cached,
-        "tokens read": usage.input_tokens, "tokens written": usage.output_tokens,
-        **{f"{problem} answers": count for problem, count in usage.problems.items()},
-    }  # fmt: skip
+        "calls": usage.calls,
+        "answers from the cache": usage.cached,
+        "tokens read": usage.input_tokens,
+        "tokens written": usage.output_tokens,
+    }
+    for problem, count in usage.problems.items():
+        counts[f"{problem} answers"] = count
     words = [f"{count:,} {what}" for what, count in counts.items() if count]
     if words:
         logger.info("subgoals: %s", ", ".join(words))

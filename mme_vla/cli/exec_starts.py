@@ -63,24 +63,30 @@ def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> 
     matches = []
     for episode in range(len(source)):
         goal, joints = source.goal(episode), source.states(episode)[:, :ARM_JOINTS]
-        alike = [one for one in annotated if len(one.joints) == len(joints) and goal in one.goals]
-        apart = [float(np.abs(one.joints - joints).mean()) for one in alike]
-        nearest = min(apart, default=np.inf)
-        starts = sorted(
-            {
-                one.start
-                for one, distance in zip(alike, apart, strict=True)
-                if distance <= nearest + 1e-6
-            }
-        )
-        near = f"the nearest is {nearest:.2f} rad away" if alike else "none has its goal and length"
+        nearest = np.inf
+        starts: list[int] = []  # of the nearest ones
+        for one in annotated:
+            if len(one.joints) != len(joints) or goal not in one.goals:
+                continue
+            distance = float(np.abs(one.joints - joints).mean())
+            if distance < nearest - 1e-6:
+                starts = []
+            if distance <= nearest + 1e-6 and one.start not in starts:
+                starts.append(one.start)
+            nearest = min(nearest, distance)
+        near = "none has its goal and length"
+        if starts:
+            near = f"the nearest is {nearest:.2f} rad away"
         place = f"{source.root}, episode {episode}"
         require(
             nearest <= NEAR,
             f"{place} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} episodes"
             f" given: {near}. Give the recordings that the dataset was made from, all of them.",
         )
-        require(len(starts) <= 1, f"{place}: recordings that fit alike begin at {listed(starts)}.")
+        require(
+            len(starts) <= 1,
+            f"{place}: recordings that fit alike begin at {listed(sorted(starts))}.",
+        )
         matches.append(starts[0])
     return matches
 
@@ -90,11 +96,9 @@ def main(cfg: DictConfig) -> None:
     output = Path(cfg.output)
     require(not output.exists(), f"{output} exists: name a new file, nothing is ever written over.")
     episodes = annotated_episodes([cfg.input] if isinstance(cfg.input, str) else list(cfg.input))
-    starts = (
-        [one.start for one in episodes]
-        if cfg.dataset is None
-        else first_frames(cfg.dataset, episodes)
-    )
+    starts = [one.start for one in episodes]
+    if cfg.dataset is not None:
+        starts = first_frames(cfg.dataset, episodes)
     write_json(output, {str(episode): start for episode, start in enumerate(starts)})
     videos = sum(start > 0 for start in starts)
     print(f"{output}: {len(starts)} episodes, {videos} of them with a conditioning video.")

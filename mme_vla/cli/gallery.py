@@ -71,12 +71,13 @@ def strip(snapshots: Sequence[Snapshot], tiles: int) -> Image:
     """Some of the snapshots side by side, spread evenly, each with its step; video frames have a
     red border.
     """
-    selected = [snapshots[i] for i in evenly_spaced(len(snapshots), tiles)]
-    labels = [f"{'video, ' if shot.video else ''}step {shot.step}" for shot in selected]
-    images = [
-        Tile(shot.image, label, RED if shot.video else None)
-        for shot, label in zip(selected, labels, strict=True)
-    ]
+    images = []
+    for i in evenly_spaced(len(snapshots), tiles):
+        shot = snapshots[i]
+        if shot.video:
+            images.append(Tile(shot.image, f"video, step {shot.step}", RED))
+        else:
+            images.append(Tile(shot.image, f"step {shot.step}"))
     return contact_sheet(images, COLUMNS)
 
 

@@ -5,8 +5,6 @@ files of a group, `--help model=framesamp_modul` one of them. Nothing here impor
 """
 
 import argparse
-import difflib
-import re
 import sys
 import textwrap
 from collections.abc import Sequence
@@ -30,21 +28,7 @@ def configured_commands() -> dict[str, str]:
     return usages
 
 
-_KEY = re.compile(
-    r"^(?P<indent> *(?:- )?)(?P<key>[\w/]+):(?: +(?P<value>[^#]*?))?(?: +# (?P<comment>.*))?$"
-)
 _PACKAGE = "# @package"
-
-
-@dataclass(frozen=True)
-class Key:
-    """One key of a file. name: dotted, within the file. default, comment: as they are written;
-    empty where not.
-    """
-
-    name: str
-    default: str
-    comment: str
 
 
 @dataclass(frozen=True)
@@ -53,23 +37,6 @@ class Defaults:
 
     files: Sequence[str]
     groups: dict[str, str]
-
-
-def keys(file: Path) -> list[Key]:
-    """Every key of a file in its order; the lists `defaults` and `hydra` are left out."""
-    result: list[Key] = []
-    path: list[str] = []
-    for line in file.read_text().splitlines():
-        match = _KEY.match(line)
-        if not match:
-            continue
-        depth = len(match["indent"]) // 2
-        path = [*path[:depth], match["key"]]
-        if path[0] not in ("defaults", "hydra"):
-            result.append(
-                Key(".".join(path), (match["value"] or "").strip(), match["comment"] or "")
-            )
-    return result
 
 
 def heading(file: Path) -> tuple[list[str], str]:
@@ -83,23 +50,24 @@ def heading(file: Path) -> tuple[list[str], str]:
         if not line.startswith(_PACKAGE):
             lines.append(line.lstrip("# "))
     examples = [line for line in lines if line.startswith(("python -m ", "mme-vla "))]
-    return examples, " ".join(line for line in lines if line not in examples)
+    text = [line for line in lines if line not in examples]
+    return examples, " ".join(text)
 
 
 def defaults(file: Path) -> Defaults:
     """What a file is composed of; overrides of Hydra's own groups are left out."""
     content = yaml.safe_load(file.read_text()) or {}
     listed: list[Any] = content.get("defaults", []) if isinstance(content, dict) else []
-    files = [entry for entry in listed if isinstance(entry, str) and entry != "_self_"]
-    groups = {
-        str(group): "null" if name is None else str(name)
-        for entry in listed
-        if isinstance(entry, dict)
-        for group, name in entry.items()
-    }
-    return Defaults(
-        files, {group: name for group, name in groups.items() if not group.startswith("override ")}
-    )
+    files = []
+    groups = {}
+    for entry in listed:
+        if isinstance(entry, dict):
+            for group, name in entry.items():
+                if not str(group).startswith("override "):
+                    groups[str(group)] = "null" if name is None else str(name)
+        elif isinstance(entry, str) and entry != "_self_":
+            files.append(entry)
+    return Defaults(files, groups)
 
 
 OPTIONS = """\
@@ -178,7 +146,9 @@ def _group_page(word: str, groups: dict[str, str], trees: Sequence[Path]) -> str
     if name and name not in files:
         raise UserError(f"Unknown {group} {name!r}. {did_you_mean(name, files)}")
     parts = [f"Group {group}, by default {group}={groups[group]}"]
-    for stem in [name] if name else files:
+    for stem in files:
+        if name and stem != name:
+            continue
         parts.append(f"{group}={stem}\n{textwrap.indent(files[stem].read_text().rstrip(), '  ')}")
     return "\n\n".join(parts)
 
@@ -193,41 +163,6 @@ def _body(file: Path) -> str:
         if is_printed and (lines or not line.startswith("#")):
             lines.append(line)
     return "\n".join(lines).strip()
-
-
-def unknown_option(option: str, words: Sequence[str], paths: Sequence[str]) -> UserError:
-    """What to type instead of an option that there is not: settings are `key=value` words here.
-
-    option: as it was typed, `--steps` or `--steps=10`. words: the command line. paths: dotted keys
-    of the configuration.
-    """
-    name, _, value = option.lstrip("-").partition("=")
-    after = words[words.index(option) + 1 :][:1] if option in words else []
-    value = value or "".join(word for word in after if "=" not in word and not word.startswith("-"))
-    near = near_keys(name.replace("-", "_"), paths)
-    words = " or ".join(f"{key}={value or '…'}" for key in near)
-    hint = f"write {words}." if near else "--help lists them."
-    return UserError(
-        f"There is no option {option!r}. Settings are words of the form key=value, without dashes:"
-        f" {hint}"
-    )
-
-
-def near_keys(name: str, paths: Sequence[str], most: int = 3) -> list[str]:
-    """The dotted keys that `name` may mean: those that end in it, then those it is a word of, then
-    the like ones.
-    """
-    last = {path: path.rpartition(".")[2] for path in paths}
-    word = name.rpartition(".")[2]
-    equal = [path for path in paths if path == name or last[path] == word]
-    parts = [path for path in paths if word in last[path].split("_")]
-    like = [
-        path
-        for near in difflib.get_close_matches(word, set(last.values()))
-        for path in paths
-        if last[path] == near
-    ]
-    return list(dict.fromkeys(equal or parts or like))[:most]
 
 
 def argument_parser(

@@ -97,10 +97,12 @@ def show_checkpoint(folder: Path, console: Console, trust_plugins: bool = False)
     for name, parameter in policy.named_parameters():
         parts.setdefault(policy.finetune_spec.component_of(name), []).append(parameter)
     for part, tensors in parts.items():
-        dtypes = ", ".join(sorted({str(t.dtype).removeprefix("torch.") for t in tensors}))
-        table.add_row(part, str(len(tensors)), f"{sum(t.numel() for t in tensors):,}", dtypes)
+        dtypes = sorted({str(t.dtype).removeprefix("torch.") for t in tensors})
+        count = sum(t.numel() for t in tensors)
+        table.add_row(part, str(len(tensors)), f"{count:,}", ", ".join(dtypes))
     total = list(policy.parameters())
-    table.add_row("all", str(len(total)), f"{sum(t.numel() for t in total):,}", "", style="bold")
+    count = sum(t.numel() for t in total)
+    table.add_row("all", str(len(total)), f"{count:,}", "", style="bold")
     _show(table, console)
     settings = _table("configuration", "section", "values")
     for name, section in policy.config.items():
@@ -124,17 +126,21 @@ def show_checkpoint(folder: Path, console: Console, trust_plugins: bool = False)
             (action, stats.actions, space.names),
         ):
             # Extremes are kept where a policy normalises by them.
-            bounds = [
-                bound for bound in ("min", "q01", "q99", "max") if getattr(of, bound) is not None
-            ]
+            bounds = {}
+            for bound in ("min", "q01", "q99", "max"):
+                if getattr(of, bound) is not None:
+                    bounds[bound] = getattr(of, bound)
             numbers = _table(f"normalisation of the {title}", "number", *bounds)
             for i, name in enumerate(names):
-                numbers.add_row(name, *(f"{getattr(of, bound)[i]:.3f}" for bound in bounds))
+                numbers.add_row(name, *(f"{values[i]:.3f}" for values in bounds.values()))
             _show(numbers, console)
 
 
-def show_dataset(source: EpisodeSource, console: Console, most: int = 40) -> None:
-    """Print a dataset's episodes, at most `most` of them, and its totals."""
+MOST_EPISODES = 40  # in the table of a dataset
+
+
+def show_dataset(source: EpisodeSource, console: Console) -> None:
+    """Print a dataset's episodes, at most `MOST_EPISODES` of them, and its totals."""
     compared = source.verify()
     table = _table(
         f"{source.name} ({source.root})",
@@ -145,15 +151,20 @@ def show_dataset(source: EpisodeSource, console: Console, most: int = 40) -> Non
         "seconds",
         "goal",
     )
-    for episode in range(min(len(source), most)):
-        frames, video = int(source.lengths[episode]), int(source.exec_starts[episode])
-        goal, seconds = printable(" → ".join(source.goals(episode))), f"{frames / source.fps:.1f}"
+    for episode in range(min(len(source), MOST_EPISODES)):
+        frames = int(source.lengths[episode])
         table.add_row(
-            str(episode), printable(source.task(episode)), str(frames), str(video), seconds, goal
+            str(episode),
+            printable(source.task(episode)),
+            str(frames),
+            str(source.exec_starts[episode]),
+            f"{frames / source.fps:.1f}",
+            printable(" → ".join(source.goals(episode))),
         )
-    if len(source) > most:
-        table.add_row("…", f"{len(source) - most} more")
-    frames, video = int(source.lengths.sum()), int(source.exec_starts.sum())
+    if len(source) > MOST_EPISODES:
+        table.add_row("…", f"{len(source) - MOST_EPISODES} more")
+    frames = int(source.lengths.sum())
+    video = int(source.exec_starts.sum())
     table.add_row(
         "all", "", str(frames), str(video), f"{frames / source.fps:.1f}", "", style="bold"
     )

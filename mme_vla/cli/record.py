@@ -4,7 +4,7 @@ import glob
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -61,8 +61,7 @@ class RecordRun:
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read a composed configuration, plain and resolved."""
-        run = read_section(cls, config, others=True, tasks=named_tasks(config))
-        return replace(run, memory=config["memory"])
+        return read_section(cls, config, others=True, tasks=named_tasks(config))
 
 
 FAILED = "the demonstration did not end in success"
@@ -89,7 +88,8 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
             "difficulty": job.difficulty,
             "recovery": job.recovery,
         }
-        scene |= {} if job.row is None else task_options(job.row)
+        if job.row is not None:
+            scene |= task_options(job.row)
         blind: Recording | None = None
         try:
             request = None if job.frames is None else job.frames.beforehand()
@@ -169,14 +169,15 @@ def record(
 
 
 def report_coverage(
-    tasks: str | Sequence[str], plan: RecordingPlan, file: Path, workers: int, split: str = "test"
+    tasks: str | Sequence[str], plan: RecordingPlan, file: Path, workers: int
 ) -> None:
-    """Say which goals of a split the recorded episodes lack, and write it as JSON.
+    """Say which goals of the test split the recorded episodes lack, and write it as JSON.
 
     plan: a recording that is there. workers: processes that build the split's scenes, which tell
     their goals.
     """
-    specs, goals = choose_episodes(tasks, None, split), []
+    specs = choose_episodes(tasks, None, "test")
+    goals = []
     with progress("goals", len(specs), unit="episodes") as advance, ExitStack() as stack:
         with signals_deferred():
             run = map if workers == 1 else stack.enter_context(simulation_pool(workers)).map
@@ -189,7 +190,7 @@ def report_coverage(
     write_json(
         file, {task: episode_goals.to_dict() for task, episode_goals in coverage.items()}, indent=1
     )
-    print(f"{in_words(coverage, split)}\n{file}")
+    print(f"{in_words(coverage, 'test')}\n{file}")
 
 
 def plan(run: RecordRun) -> list[Job]:
@@ -202,21 +203,18 @@ def plan(run: RecordRun) -> list[Job]:
     frames = None if run.frames == "all" else FrameChoice(run.frames, run.memory)
     jobs = []
     for spec in specs:
-        recovery = spec.recovery if run.recovery else None
-        # A row describes one scene: another seed would be another row.
-        retries = run.retries if spec.row is None else 1
-        jobs.append(
-            Job(
-                spec.task,
-                spec.episode,
-                spec.seed,
-                spec.difficulty,
-                recovery,
-                retries,
-                frames,
-                spec.row,
-            )
+        job = Job(
+            spec.task,
+            spec.episode,
+            spec.seed,
+            spec.difficulty,
+            spec.recovery if run.recovery else None,
+            # A row describes one scene: another seed would be another row.
+            run.retries if spec.row is None else 1,
+            frames,
+            spec.row,
         )
+        jobs.append(job)
     return jobs
 
 
@@ -262,15 +260,20 @@ def main(cfg: DictConfig) -> None:
             done = record(jobs, work / "episodes", run.workers, previews)
             seconds = time.perf_counter() - begun
             recording_plan.write(missing, work / "episodes", options)
-            steps = sum(d["stored"] for d in done)
-            again = sum(len(d["failed_seeds"]) for d in done)
+            n_steps, n_failed = 0, 0
+            n_new, n_new_steps = 0, 0
+            for job, recorded in zip(jobs, done, strict=True):
+                n_steps += recorded["stored"]
+                n_failed += len(recorded["failed_seeds"])
+                if job.name not in there:
+                    n_new += 1
+                    n_new_steps += recorded["stored"]
             print(
-                f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were"
+                f"{places}: {len(done)} episodes, {n_steps} steps; {n_failed} seeds failed and were"
                 " replaced by the next."
             )
-            new = [d for job, d in zip(jobs, done, strict=True) if job.name not in there]
-            if new:
-                print(_throughput(len(new), sum(d["stored"] for d in new), seconds, run.workers))
+            if n_new:
+                print(_throughput(n_new, n_new_steps, seconds, run.workers))
         else:
             print(f"{places}: {len(jobs)} episodes, all there already.")
         recording_plan.tidy()

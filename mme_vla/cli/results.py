@@ -76,12 +76,12 @@ DIFFERS, NOT_COMPARED = 1, 3  # exit codes of `verify`; 2 is a mistake in the co
 def main(arguments: Sequence[str] | None = None) -> None:
     """Read, aggregate, compare, print, write; or check receipts."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    checks = words[:1] == ["verify"]
-    args = (
-        _verify_parser().parse_args(words[1:]) if checks else _parser().parse_intermixed_args(words)
-    )
+    if words[:1] == ["verify"]:
+        command, args = verify, _verify_parser().parse_args(words[1:])
+    else:
+        command, args = run, _parser().parse_intermixed_args(words)
     with print_user_errors():
-        (verify if checks else run)(args)
+        command(args)
 
 
 def verify(args: argparse.Namespace) -> None:
@@ -91,21 +91,24 @@ def verify(args: argparse.Namespace) -> None:
     """
     from mme_vla.evaluation import receipts
 
-    paths = (
-        [args.receipt] if args.receipt.is_file() else sorted(args.receipt.rglob("receipt*.json"))
-    )
+    paths = sorted(args.receipt.rglob("receipt*.json"))
+    if args.receipt.is_file():
+        paths = [args.receipt]
     require(
         paths,
         f"{args.receipt} holds no receipt: name a receipt.json, or a folder with one in it or"
         " below.",
     )
-    results = {path: receipts.verify(path, args.checkpoint, not args.no_scenes) for path in paths}
-    for path, result in results.items():
+    words = set()
+    for path in paths:
+        result = receipts.verify(path, args.checkpoint, not args.no_scenes)
+        words.add(result.word)
         print(f"{path}: {result.word}")
-        lines = [*result.differences, *(f"not compared: {line}" for line in result.not_compared)]
+        lines = list(result.differences)
+        lines += [f"not compared: {line}" for line in result.not_compared]
         lines += [f"note: {line}" for line in result.notes]
-        print("".join(f"  {printable(line)}\n" for line in lines), end="")
-    words = {result.word for result in results.values()}
+        for line in lines:
+            print(f"  {printable(line)}")
     if "differs" in words:
         raise SystemExit(DIFFERS)
     if "not compared" in words:
@@ -180,12 +183,12 @@ def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
     """Episodes of a task in the split that the records are of; of other environments as many as
     there are records.
     """
-    custom = [r.episode for r in records if split in (None, r.split) and r.suite]
+    of_split = [record for record in records if split in (None, record.split)]
+    custom = [record.episode for record in of_split if record.suite]
     if custom and not any(record.task in TASK_FACTS for record in records):
         return 1 + max(custom)
-    splits = {record.split for record in records if split in (None, record.split)}
     known = {**FURTHER_SPLITS, HARD: HARD_EPISODES}
-    counts = {known.get(str(name), TEST_EPISODES) for name in splits}
+    counts = {known.get(str(record.split), TEST_EPISODES) for record in of_split}
     return counts.pop() if len(counts) == 1 else TEST_EPISODES
 
 
@@ -235,17 +238,21 @@ def show_tables(
     from mme_vla.evaluation.results.report import Section, html_page
 
     texts: dict[Path, str] = {}
-    notes = [note for table in tables for note in table.notes]
-    tables = [table for table in tables if table.rows]
+    notes: list[str] = []
+    blocks: list[str] = []
+    sections = [Section(name, figure, caption=caption) for name, figure in figures.items()]
     for table in tables:
-        print_table(table, 200)
-    print("".join(f"• {printable(note)}\n" for note in notes), end="")
+        notes += table.notes
+        if table.rows:
+            print_table(table, 200)
+            blocks.append(to_markdown(table))
+            sections.append(Section(table.title, tables=[table]))
+    for note in notes:
+        print(f"• {printable(note)}")
     if args.markdown:
         lines = [f"- {escape_markdown(note)}\n" for note in notes]
-        texts[args.markdown] = "\n".join([*map(to_markdown, tables), "".join(lines)])
+        texts[args.markdown] = "\n".join([*blocks, "".join(lines)])
     if args.html:
-        boxes = [Section(name, figure, caption=caption) for name, figure in figures.items()]
-        sections = [*boxes, *(Section(table.title, tables=[table]) for table in tables)]
         texts[args.html] = html_page(args.title, sections, notes=notes)
     _write(texts)
 
@@ -315,9 +322,15 @@ def _pairs(
     """
     if requested is not None:
         return [(results.method(first), results.method(second)) for first, second in requested]
-    if pairs := matched_methods(results):
-        results.notes += [why_unpaired(*pair) for pair in pairs if not common_episodes(*pair)]
-        return [pair for pair in pairs if common_episodes(*pair)]
+    matched = matched_methods(results)
+    pairs = []
+    for pair in matched:
+        if common_episodes(*pair):
+            pairs.append(pair)
+        else:
+            results.notes.append(why_unpaired(*pair))
+    if matched:
+        return pairs
     if len(results.methods) != 2:
         return []
     first, second = results.methods

@@ -35,9 +35,11 @@ def main(cfg: DictConfig) -> dict[str, int]:
     )
     inputs = (settings.input,) if isinstance(settings.input, str) else settings.input
     tasks = None if settings.tasks is None else Path(settings.tasks)
-    episodes = [episode for entry in inputs for episode in open_input(entry, tasks)]
-    if settings.episodes is not None:
-        episodes = [episode for episode in episodes if episode.number in settings.episodes]
+    episodes = []
+    for entry in inputs:
+        for episode in open_input(entry, tasks):
+            if settings.episodes is None or episode.number in settings.episodes:
+                episodes.append(episode)
     output = Path(settings.output)
     counts = build(episodes, output, settings.sets, options)
     for name, count in counts.items():

@@ -34,11 +34,13 @@ def print_mapping(policy: Policy, source: Source, to: str, console: Console | No
     layers are one row.
     """
     console = console or Console(width=None if sys.stdout.isatty() else 200)
-    read, target_format = f"{source.folder} ({formats()[source.format]})", formats()[to]
-    console.print(f"{read} → {target_format}; every tensor fits.", soft_wrap=True)
-    sides = {
-        fmt: title for fmt, title in ((source.format, "read"), (to, "written")) if fmt != "ours"
-    }
+    names = formats()
+    console.print(
+        f"{source.folder} ({names[source.format]}) → {names[to]}; every tensor fits.",
+        soft_wrap=True,
+    )
+    sides = {source.format: "read", to: "written"}
+    sides.pop("ours", None)
     if not sides:
         console.print("Both sides have the same names.")
     for fmt, title in sides.items():
@@ -49,30 +51,24 @@ def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: st
     state = policy.state_dict()
     shapes = adapter.shapes(state)
     table = _table(f"{title}: {len(adapter.needed())} tensors ↔ {len(adapter.table)} of ours")
-    for column in ("theirs", "shape", "layout", "ours", "tensors"):
-        table.add_column(
-            column, overflow="fold", justify="right" if column == "tensors" else "left"
-        )
+    for column in ("theirs", "shape", "layout", "ours"):
+        table.add_column(column, overflow="fold")
+    table.add_column("tensors", overflow="fold", justify="right")
     rows: dict[tuple[str, ...], int] = {}
     for target, pieces in adapter.table.items():
         for piece in pieces:
             # A pattern with the same two sides only says how many rows there are.
-            left, _, right = (side.strip() for side in piece.pattern.partition("->"))
-            layout = "" if left == right else piece.pattern
+            left, _, right = piece.pattern.partition("->")
+            layout = "" if left.strip() == right.strip() else piece.pattern
             cells = (_starred(piece.path), _shape(shapes[piece.path]), layout, _starred(target))
             rows[cells] = rows.get(cells, 0) + 1
     for row, count in rows.items():
         table.add_row(*row, str(count))
     console.print(table)
-    gaps = [
-        (
-            gap.path,
-            "whole" if gap.layer is None else f"layer {gap.layer}",
-            _shape(gap.shape),
-            str(math.prod(gap.shape)),
-        )
-        for gap in adapter.unread
-    ]
+    gaps = []
+    for gap in adapter.unread:
+        part = "whole" if gap.layer is None else f"layer {gap.layer}"
+        gaps.append((gap.path, part, _shape(gap.shape), str(math.prod(gap.shape))))
     about = "no action depends on them (dropped when read, zeros when written)"
     _print_list(
         console, f"{title}, unread: {about}", gaps, ("tensor", "part", "shape", "parameters")
@@ -231,7 +227,8 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
                 f"{opened.folder} brings its own configuration: {' '.join(overrides)} would"
                 " contradict it."
             )
-        config = {key: value for key, value in opened.config.items() if key != "adapters"}
+        config = dict(opened.config)
+        config.pop("adapters", None)  # they are merged when the weights are read
         require(
             "backbone" in config,
             f"{opened.folder} holds our weights but no config.json that describes them.",
@@ -241,28 +238,37 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
         policy.processor = load_processor(opened.folder)
         check_processor(policy, str(opened.folder))
         return policy
-    words, variants = list(overrides), opened.variants
-    named = [word.partition("=")[2] for word in words if word.startswith("model=")]
-    if variants and named and named[-1] not in variants:
-        raise UserError(
-            f"{opened.folder} says it is {listed(variants)}, but model={named[-1]} was given."
-        )
-    if not named:
+    from mme_vla.policy.build import build_from_config
+
+    # The model: the one that is named, else the one that the source is of.
+    words = list(overrides)
+    chosen = {}
+    for word in words:
+        key, _, value = word.partition("=")
+        chosen[key] = value
+    variants = opened.variants
+    model = chosen.get("model")
+    if model is None:
+        model = variants[0] if variants else "pi05"
         require(
             len(variants) < 2,
             f"history_config.txt beside {opened.folder} names no variant of the released code, and"
             f" its tensors are those of {listed(variants)}: name one of these, such as"
-            f" model={variants[0] if variants else ''}.",
+            f" model={model}.",
         )
-        words.insert(0, f"model={variants[0] if variants else 'pi05'}")
-    if opened.lacks_positions and not any(word.startswith("memory.positions=") for word in words):
+        words.insert(0, f"model={model}")
+    if variants and model not in variants:
+        raise UserError(
+            f"{opened.folder} says it is {listed(variants)}, but model={model} was given."
+        )
+    if opened.lacks_positions and "memory.positions" not in chosen:
         words.append("memory.positions=none")
     print(f"Reading {opened.label} as {' '.join(words)}", file=sys.stderr)
-    if not any(word.startswith("backbone=") for word in words):
-        words.append(f"backbone={compose('policy', words).full_size}")
-    from mme_vla.policy.build import build_from_config
-
     composed = compose("policy", words)
-    if (of := method_formats().get(opened.format)) is not None and of.configure is not None:
-        composed = of.function("configure")(composed, opened.config, opened.folder)
+    if "backbone" not in chosen:
+        composed = compose("policy", [*words, f"backbone={composed.full_size}"])
+
+    method = method_formats().get(opened.format)
+    if method is not None and method.configure is not None:
+        composed = method.function("configure")(composed, opened.config, opened.folder)
     return build_from_config(composed, device="meta")

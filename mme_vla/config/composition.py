@@ -170,21 +170,18 @@ def join_plugins(
     with local_hydra(trees[0], trees[1:]) as engine:
         loader = engine.config_loader
         parts = loader.compute_defaults_list(config_name, list(overrides), RunMode.RUN).defaults
-        repository = loader.repository  # type: ignore[attr-defined]
-        loaded = [repository.load_config(part.config_path) for part in parts if not part.package]
-        lists = [plugins.plugins_of(part.config, part.path) for part in loaded if part is not None]
-    if names := list(dict.fromkeys(name for names in lists for name in names)):
+        names: dict[str, None] = {}  # in order, each once
+        for part in parts:
+            if part.package:
+                continue
+            loaded = loader.repository.load_config(part.config_path)  # type: ignore[attr-defined]
+            if loaded is not None:
+                names |= dict.fromkeys(plugins.plugins_of(loaded.config, loaded.path))
+    if names:
         with open_dict(cfg):
-            cfg.plugins = names
+            cfg.plugins = list(names)
 
 
 def resolved(cfg: DictConfig) -> dict[str, Any]:
     """A configuration as resolved plain values."""
     return {str(key): value for key, value in OmegaConf.to_container(cfg, resolve=True).items()}  # type: ignore[union-attr]
-
-
-def import_plugins(cfg: DictConfig) -> None:
-    """Import the modules that the user's configuration names under `plugins`; see
-    `mme_vla.config.plugins`.
-    """
-    plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))

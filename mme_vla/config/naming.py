@@ -18,9 +18,12 @@ _SEVERAL = re.compile(r"/?memory=(\[.*\])")
 
 def words(key: str, value: Any) -> list[str]:
     """Write a keyword argument as overrides."""
-    if isinstance(value, Mapping):
-        return [word for inner, v in value.items() for word in words(f"{key}.{inner}", v)]
-    return [f"{key}={literal(value)}"]
+    if not isinstance(value, Mapping):
+        return [f"{key}={literal(value)}"]
+    result: list[str] = []
+    for name, inner in value.items():
+        result += words(f"{key}.{name}", inner)
+    return result
 
 
 def literal(value: Any) -> str:
@@ -46,7 +49,10 @@ def several_memories(overrides: Iterable[str]) -> list[str]:
     result: list[str] = []
     for word in overrides:
         several = _SEVERAL.fullmatch(word)
-        result += [f"memory={JOINED}", f"memory.members={several[1]}"] if several else [word]
+        if several:
+            result += [f"memory={JOINED}", f"memory.members={several[1]}"]
+        else:
+            result.append(word)
     return result
 
 
@@ -64,17 +70,8 @@ def join_memories(cfg: DictConfig) -> DictConfig:
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
-POLICY, DEFAULT_POLICY = "policy.name", "mme"
-
-Sections = dict[str, Any]  # Flat dotted keys
-
-
-def of_policy(section: Mapping[str, Any]) -> Sections:
-    """The kind of policy, where it is not the usual one, which configurations did not
-    use to name.
-    """
-    name = section.get("name", DEFAULT_POLICY)
-    return {} if name == DEFAULT_POLICY else {POLICY: name}
+DEFAULT_POLICY = "mme"
+"""The policy of configurations that name none: backbone × memory × integration."""
 
 
 def digest(values: Mapping[str, Any], letters: int) -> str:
@@ -83,13 +80,12 @@ def digest(values: Mapping[str, Any], letters: int) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:letters]
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> Sections:
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested sections as one, under dotted keys."""
-    result: Sections = {}
+    result: dict[str, Any] = {}
     for key, value in values.items():
-        result |= (
-            flat(value, f"{prefix}{key}.")
-            if isinstance(value, Mapping)
-            else {f"{prefix}{key}": value}
-        )
+        if isinstance(value, Mapping):
+            result |= flat(value, f"{prefix}{key}.")
+        else:
+            result[f"{prefix}{key}"] = value
     return result

@@ -3,7 +3,7 @@ kind.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cached_property
 from typing import Any
@@ -32,10 +32,14 @@ class ConfigTree:
     def __init__(
         self, loader: ConfigLoader, config_name: str, overrides: Sequence[Override]
     ) -> None:
-        self.loader, self.config_name = loader, config_name
-        names = [o for o in overrides if "." not in o.key_or_group]  # a key with dots is no group
-        self.choices = [o for o in names if loader.get_group_options(o.key_or_group)]
-        self.values = [o for o in overrides if o not in self.choices]
+        self.loader = loader
+        self.config_name = config_name
+        self.choices: list[Override] = []
+        self.values: list[Override] = []
+        for override in overrides:
+            name = override.key_or_group
+            is_choice = "." not in name and loader.get_group_options(name)
+            (self.choices if is_choice else self.values).append(override)
 
     @cached_property
     def defaults(self) -> Any:
@@ -50,9 +54,7 @@ class ConfigTree:
             group, _, name = error.missing_cfg_file.rpartition("/")
             if group == "hydra/launcher":
                 return str(missing_extra(f"launcher={name}", "sweep"))
-            options = error.options or [
-                n for n in self.loader.get_group_options(group) if not n.startswith("_")
-            ]
+            options = error.options or self.loader.get_group_options(group)
             return f"Unknown {group or 'config'} {name!r}. {did_you_mean(name, options)}"
         for choice in self.choices:
             if not isinstance(choice.value(), str | list | None):
@@ -68,27 +70,25 @@ class ConfigTree:
             defaults = self.defaults
         except COMPOSITION_ERRORS:  # it is a choice that does not fit
             return text
-        memory_lines = [
-            o.input_line for o in self.values if str(o.key_or_group).startswith("memory.")
-        ]
-        if memory_lines and isinstance(members := defaults.get("memory"), list):
-            names = ", ".join(str(m.get("name") if isinstance(m, Mapping) else m) for m in members)
-            return (
-                f"{memory_lines[0]!r}: the model's file gives memory as the list [{names}], without"
-                " keys. In that file write `/memory: joined` under defaults and `memory:"
-                f" {{members: [{names}]}}`: the same memory with keys. Or choose it on the command"
-                f" line, memory=[{names.replace(' ', '')}], for a model with a memory."
-            )
+        members = defaults.get("memory")
+        for override in self.values:
+            if isinstance(members, list) and override.key_or_group.startswith("memory."):
+                return _keys_of_a_list(str(override.input_line), members)
         unknown = _BAD_KEY.match(text)
-        key = (unknown[1] or unknown[2]) if unknown else ""
-        if not key or key.startswith("hydra."):
+        if unknown is None:
             return text
-        for value in (o.value() for o in self.values if o.key_or_group == key):
-            known = _select(defaults, key)
-            if isinstance(value, Mapping) and isinstance(known, Mapping):
-                key = next(
-                    (f"{key}.{name}" for name in paths(value) if _select(known, name) is None), key
-                )
+        key = unknown[1] or unknown[2]
+        if key.startswith("hydra."):
+            return text
+        known = _select(defaults, key)
+        for override in self.values:
+            value = override.value()
+            is_section = isinstance(value, Mapping) and isinstance(known, Mapping)
+            if override.key_or_group == key and is_section:
+                for name in paths(value):
+                    if _select(known, name) is None:
+                        key = f"{key}.{name}"
+                        break
                 return _unknown_key(key, defaults, ()) + f" To add it: +{key}=…"
         return _unknown_key(key, defaults, self.loader.list_groups(""))
 
@@ -106,6 +106,20 @@ class ConfigTree:
                     f"{override.input_line!r} does not fit: {override.key_or_group!r} is"
                     f" {expected}."
                 )
+
+
+def _keys_of_a_list(word: str, members: Sequence[Any]) -> str:
+    """The message for `memory.budget=…` where a model's file gives memory as a list."""
+    names = []
+    for member in members:
+        names.append(str(member.get("name") if isinstance(member, Mapping) else member))
+    listing = ", ".join(names)
+    return (
+        f"{word!r}: the model's file gives memory as the list [{listing}], without keys. In that"
+        f" file write `/memory: joined` under defaults and `memory: {{members: [{listing}]}}`: the"
+        " same memory with keys. Or choose it on the command line,"
+        f" memory=[{','.join(names)}], for a model with a memory."
+    )
 
 
 def _expected(default: Any, value: Any) -> str:
@@ -133,7 +147,9 @@ def _unknown_key(key: str, defaults: Any, groups: Sequence[str]) -> str:
     """Walk down `key` as far as it exists and name what is near there, or the same word elsewhere
     in the tree.
     """
-    section, parents, remaining = defaults, [], key.split(".")
+    section = defaults
+    parents: list[str] = []
+    remaining = key.split(".")
     while len(remaining) > 1 and isinstance(section, Mapping) and remaining[0] in section:
         parents.append(remaining[0])
         section = section[remaining.pop(0)]
@@ -142,26 +158,56 @@ def _unknown_key(key: str, defaults: Any, groups: Sequence[str]) -> str:
         return f"Unknown config key {key!r}: {where!r} has no keys under these choices."
     if not isinstance(section, Mapping):
         return f"Unknown config key {key!r}: {where!r} is a value ({section!r}), not a section."
-    options = {str(name) for name in section} | (set() if parents else set(groups) - {"hydra"})
+    options = {str(name) for name in section}
+    if not parents:
+        options |= set(groups) - {"hydra"}
     everywhere = list(paths(defaults))
-    other_paths = [path for path in everywhere if path.split(".")[-1] == remaining[0]]
+    other_paths = [path for path in everywhere if path.rpartition(".")[2] == remaining[0]]
     if not other_paths and not parents:
         # `train.device` where there is `device`, `mode` where there is `subgoal_mode`.
-        last = remaining[-1]
-        other_paths = [
-            p for p in everywhere if last == p.split(".")[-1] or last in p.split(".")[-1].split("_")
-        ]
-        other_paths += [
-            name
-            for name in get_close_matches(remaining[0], options)
-            if other_paths and len(remaining) == 1
-        ]
+        other_paths = _keys_with_word(remaining[-1], everywhere)
+        if other_paths and len(remaining) == 1:
+            other_paths += get_close_matches(remaining[0], options)
     if other_paths:
         return (
             f"Unknown config key {key!r}. Did you mean {' or '.join(map(repr, other_paths[:3]))}?"
         )
     within = f" In {where!r}:" if where else ""
     return f"Unknown config key {key!r}.{within} {did_you_mean(remaining[0], options)}"
+
+
+def _keys_with_word(word: str, keys: Iterable[str]) -> list[str]:
+    """The dotted keys that end in this word; else those whose last part has it, as `max_batch` has
+    `batch`.
+    """
+    last = {key: key.rpartition(".")[2] for key in keys}
+    equal = [key for key, name in last.items() if name == word]
+    return equal or [key for key, name in last.items() if word in name.split("_")]
+
+
+def unknown_option(option: str, words: Sequence[str], keys: Sequence[str]) -> UserError:
+    """What to type instead of an option that there is not: settings are `key=value` words here.
+
+    option: as it was typed, `--steps` or `--steps=10`. words: the command line. keys: dotted ones
+    of the configuration.
+    """
+    name, _, value = option.lstrip("-").partition("=")
+    following = words[words.index(option) + 1 :] if option in words else []
+    if not value and following and "=" not in following[0] and not following[0].startswith("-"):
+        value = following[0]
+    word = name.replace("-", "_").rpartition(".")[2]
+    near = _keys_with_word(word, keys)
+    if not near:
+        last_parts = {key.rpartition(".")[2] for key in keys}
+        alike = get_close_matches(word, last_parts)
+        near = [key for key in keys if key.rpartition(".")[2] in alike]
+    hint = "--help lists them."
+    if near:
+        hint = f"write {' or '.join(f'{key}={value or "…"}' for key in near[:3])}."
+    return UserError(
+        f"There is no option {option!r}. Settings are words of the form key=value, without dashes:"
+        f" {hint}"
+    )
 
 
 def paths(tree: Any, prefix: str = "") -> Iterator[str]:

@@ -91,15 +91,17 @@ def _installed_parts(config: Any) -> list[str]:
 
     Every text counts, wherever it is: the kind of a part is known only when it is built.
     """
-    modules = {
-        name: module
-        for extension in installed_extensions()
-        for parts in extension.parts.values()
-        for name, module in parts.items()
-    }
+    modules: dict[str, str] = {}
+    for extension in installed_extensions():
+        for parts in extension.parts.values():
+            modules.update(parts)
     if not modules:
         return []
-    return list(dict.fromkeys(modules[text] for text in _texts(config) if text in modules))
+    named: dict[str, None] = {}  # in order, each once
+    for text in _texts(config):
+        if text in modules:
+            named[modules[text]] = None
+    return list(named)
 
 
 def _texts(values: Any) -> Iterator[str]:

@@ -111,10 +111,8 @@ _ADAPTERS: dict[Any, TypeAdapter[Any]] = {}
 """pydantic's readers of the dataclasses that were read before."""
 
 
-def section_keys(
-    values: Any, where: str, known: Iterable[str], required: Iterable[str] = ()
-) -> dict[str, Any]:
-    """A mapping with no unknown key, and with a value for every required one."""
+def section_keys(values: Any, where: str, known: Iterable[str]) -> dict[str, Any]:
+    """A mapping with no unknown key."""
     if not isinstance(values, Mapping):
         raise UserError(
             f"{where or 'the configuration'} must be a section of keys, got {brief(values)}."
@@ -122,9 +120,6 @@ def section_keys(
     for key in values:
         if key not in known:
             raise _unknown(where, key, list(known))
-    for key in required:
-        if values.get(key) is None:
-            raise _lacking(where, key, values)
     return {str(key): value for key, value in values.items()}
 
 
@@ -133,12 +128,6 @@ def _unknown(where: str, key: Any, known: Sequence[str]) -> UserError:
     if where:
         name = f"{where}.{name}"
     return UserError(f"Unknown key {name}. {did_you_mean(str(key), known)}")
-
-
-def _lacking(where: str, key: str, keys: Iterable[Any]) -> UserError:
-    return UserError(
-        f"{where or 'the configuration'} lacks the key {key!r}; it has {listed(keys) or 'none'}."
-    )
 
 
 def _mistake(error: ValidationError, kind: Any, value: Any, where: str) -> UserError:
@@ -164,7 +153,10 @@ def _mistake(error: ValidationError, kind: Any, value: Any, where: str) -> UserE
             if part not in names:
                 continue  # pydantic's name of an alternative
             if part not in value:
-                return _lacking(key, str(part), value)
+                return UserError(
+                    f"{key or 'the configuration'} lacks the key {part!r}; it has"
+                    f" {listed(value) or 'none'}."
+                )
             kind = get_type_hints(section, include_extras=True)[str(part)]
             is_secret = not names[str(part)].repr
         elif part in value:
@@ -190,9 +182,13 @@ def _section_of(kind: Any) -> Any:
 
 
 def _choices(kind: Any) -> Sequence[Any]:
+    if get_origin(kind) is Literal:
+        return get_args(kind)
+    choices: list[Any] = []
     if get_origin(kind) in (Union, UnionType):
-        return [choice for part in get_args(kind) for choice in _choices(part)]
-    return get_args(kind) if get_origin(kind) is Literal else ()
+        for part in get_args(kind):
+            choices += _choices(part)
+    return choices
 
 
 def _expected(kind: Any) -> str:

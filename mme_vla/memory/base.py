@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import check_choice, require
-from mme_vla.memory.history import FrameScorer, History, LazyHistory, OnlineHistory, StorageSpec
+from mme_vla.memory.history import FrameScorer, History, StorageSpec
 from mme_vla.types import HistoryTokens, Labels, MemoryTokens
 
 POSITION_GRID = 16
@@ -220,16 +220,6 @@ def take_options[T](kind: type[T], options: dict[str, Any]) -> T:
 
 NEVER = 1_000_000
 """Frames between two whose tokens are stored, of memories that read none."""
-
-
-def start_history(memory: MemoryModule, encode: Callable[[np.ndarray], Tensor]) -> OnlineHistory:
-    """An empty history for one episode; `encode` maps frames [n, H, W, 3] uint8 to
-    stored tokens.
-    """
-    scorer = memory.make_scorer()
-    if memory.lazy:
-        return LazyHistory(memory.storage, encode, scorer)
-    return OnlineHistory(memory.storage, scorer)
 
 
 def padded_length(memory: MemoryModule, count: int) -> int:

@@ -48,10 +48,6 @@ class StorageSpec:
             " least 1.",
         )
 
-    def keeps(self, frame: int) -> bool:
-        """Whether tokens of this frame are stored."""
-        return frame == 0 or (frame + 1) % self.keep_every == 0
-
     def stored_frames(self, length: int) -> np.ndarray:
         """Ascending indices of the stored frames among the first `length`."""
         frames = np.arange(length)

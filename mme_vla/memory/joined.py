@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -53,20 +53,19 @@ class JoinedMemory(MemoryModule, ReadsLabels):
                 what the others leave.
         """
         super().__init__()
-        sections = shares(members, budget)
-        built: list[MemoryModule] = [
-            MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections
-        ]
+        built: list[MemoryModule] = []
+        names: list[str] = []
+        self.names: list[str] = []
+        for member in shares(members, budget):
+            section = {**member.options, "name": member.name, "budget": member.budget}
+            built.append(MEMORIES.build(section, d_vision=d_vision, width=width))
+            # Equal names get a number.
+            names.append(member.name)
+            count = names.count(member.name)
+            self.names.append(member.name if count == 1 else f"{member.name}_{count}")
         self.members = nn.ModuleList(built)
-        names = [section["name"] for section in sections]
-        # Equal names get a number.
-        self.names = []
-        for i, name in enumerate(names):
-            count = names[: i + 1].count(name)
-            self.names.append(name if count == 1 else f"{name}_{count}")
-        self.storage = common_storage(
-            {name: member.storage for name, member in zip(self.names, built, strict=True)}
-        )
+        by_name = dict(zip(self.names, built, strict=True))
+        self.storage = common_storage({name: one.storage for name, one in by_name.items()})
         self.budget = sum(member.budget for member in built)
         self.capacity = sum(member.capacity for member in built)
         self.pad_left = self.capacity if any(member.pad_left for member in built) else 0
@@ -75,7 +74,7 @@ class JoinedMemory(MemoryModule, ReadsLabels):
         self.reads_labels = labels_read(*built)
         self.lazy = all(member.lazy for member in built)
         self.past_view_spec = single_past_view_spec(
-            {name: member.past_view_spec for name, member in zip(self.names, built, strict=True)}
+            {name: one.past_view_spec for name, one in by_name.items()}
         )
         # Indices of the members in the order in which their selections follow one another.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
@@ -271,36 +270,49 @@ def finer(indices: np.ndarray, grid: int, fine: int) -> np.ndarray:
     return np.stack([np.repeat(indices[:, 0], times**2), patches.reshape(-1)], axis=1)
 
 
-def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict[str, Any]]:
-    """Every member's section, with a budget: its own, or an even share of what the others leave."""
+@dataclass(frozen=True)
+class Member:
+    """One of the memories that are joined; options: its own, without name and budget."""
+
+    name: str
+    budget: int | None
+    options: Mapping[str, Any]
+
+
+def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[Member]:
+    """Every member with a budget: its own, or an even share of what the others leave."""
     require(
         not isinstance(members, str | Mapping) and len(members) >= 2,
         f"memory.members={brief(members)}: name at least two, such as [framesamp, ttt].",
     )
-    sections: list[dict[str, Any]] = []
+    read: list[Member] = []
+    taken = 0
+    n_open = 0
     for member in members:
-        section: dict[str, Any] = {"name": member}
+        options: dict[str, Any] = {"name": member}
         if isinstance(member, Mapping):
-            section = dict(member)
+            options = dict(member)
+        name = options.pop("name", None)
+        own_budget = options.pop("budget", None)
         require(
-            isinstance(section.get("name"), str) and section["name"] != "joined",
-            f"memory.members: {brief(section)} is no memory to join; give a name, or {{name: …}}.",
+            isinstance(name, str) and name != "joined",
+            f"memory.members: {brief(member)} is no memory to join; give a name, or {{name: …}}.",
         )
-        sections.append(section)
-    open_sections = [section for section in sections if section.get("budget") is None]
-    taken = sum(section.get("budget") or 0 for section in sections)
-    share = (budget - taken) // max(len(open_sections), 1)
+        read.append(Member(name, own_budget, options))
+        if own_budget is None:
+            n_open += 1
+        else:
+            taken += own_budget
+    share = (budget - taken) // max(n_open, 1)
     if share >= SHARE_UNIT:
         share -= share % SHARE_UNIT
-    if taken > budget or (open_sections and share < 1):
-        requests = [f"{s['name']} {s.get('budget') or 'an even share'}" for s in sections]
+    if taken > budget or (n_open and share < 1):
+        requests = [f"{one.name} {one.budget or 'an even share'}" for one in read]
         raise UserError(
             f"memory.budget={budget} is less than its members use ({', '.join(requests)}): lower"
             " their budgets, or raise it."
         )
-    for section in open_sections:
-        section["budget"] = share
-    return sections
+    return [replace(one, budget=share) if one.budget is None else one for one in read]
 
 
 def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
@@ -320,7 +332,8 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
             f" same pooling for both, such as {{name: {name}, pooling: {first.pooling}}}.",
         )
     scorers = {name: spec.scorer for name, spec in stored.items() if spec.scorer}
-    if len(set(scorers.values())) > 1:
+    keys = set(scorers.values())
+    if len(keys) > 1:
         raise UserError(
             f"{' and '.join(scorers)} score frames differently ({', '.join(scorers.values())}), and"
             " one history keeps one set of scores: set the same grid and stride for both, or join"
@@ -330,7 +343,7 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
         grid=math.lcm(*(spec.grid for spec in stored.values())),
         pooling=first.pooling,
         keep_every=math.gcd(*(spec.keep_every for spec in stored.values())),
-        scorer=next(iter(scorers.values()), ""),
+        scorer=next(iter(keys), ""),
     )
 
 

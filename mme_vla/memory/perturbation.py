@@ -108,8 +108,6 @@ class Perturbation:
         return subgoal
 
 
-HistoryTransform = Perturbation  # its name where it is one of `data.history_transforms`
-
 TRAINING, ROLLOUT, PROBE = "data.history_transforms", "event", "with"  # options that take some
 _HOOKS = {
     TRAINING: ("repeats", "perturb"),

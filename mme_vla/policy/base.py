@@ -1,5 +1,6 @@
 """`Policy`: the interface that training, evaluation, serving and weights use."""
 
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +16,8 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.saving import load_policy, push_to_hub, save_policy
+from mme_vla.policy.saving import load_policy, push_folder, save_policy
+from mme_vla.policy.sections import PolicySections
 from mme_vla.types import Noise, stack_noise
 
 if TYPE_CHECKING:
@@ -214,7 +216,7 @@ class Policy(nn.Module):
             n_past = self.require_processor().samples.window - 1
             return np.zeros((0, self.horizon - n_past, self.embodiment.action.width), np.float32)
         if not self.info.supports_rtc and any(e.action_prefix is not None for e in episodes):
-            name = self.config.get("name", type(self).__name__)
+            name = PolicySections.of(self.config).name or type(self).__name__
             raise UserError(
                 f"{name} does not support real-time chunking, which needs a flow policy such as"
                 " π0.5. Leave out set_action_prefix()."
@@ -343,16 +345,16 @@ class Policy(nn.Module):
             revision: the branch to commit to. message: of the commit. dtype, card: as for
                 `save_pretrained`.
         """
-        return push_to_hub(
-            self,
-            repo_id,
-            dtype=dtype,
-            card=card,
-            private=private,
-            token=token,
-            revision=revision,
-            message=message,
-        )
+        with tempfile.TemporaryDirectory() as folder:
+            save_policy(self, Path(folder), dtype=dtype, card=card)
+            return push_folder(
+                Path(folder),
+                repo_id,
+                private=private,
+                token=token,
+                revision=revision,
+                message=message,
+            )
 
 
 @dataclass(frozen=True)

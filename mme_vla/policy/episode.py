@@ -10,8 +10,7 @@ from torch import Tensor
 
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError, require
-from mme_vla.memory.base import start_history
-from mme_vla.memory.history import History, OnlineHistory
+from mme_vla.memory.history import History, LazyHistory, OnlineHistory
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.images import PastImages
 from mme_vla.processing.normalise import QuantileStats, check_reach, finite_array
@@ -79,7 +78,10 @@ class Episode:
         """Rows [w], one a frame, if the memory reads motion."""
         memory = policy.memory
         if memory is not None:
-            self.history = start_history(memory, policy.encode_frames)
+            scorer = memory.make_scorer()
+            self.history = OnlineHistory(memory.storage, scorer)
+            if memory.lazy:
+                self.history = LazyHistory(memory.storage, policy.encode_frames, scorer)
             self.stream = memory.start_stream()
             if memory.uses_proprio:
                 self.history.motion = lambda frames: torch.stack(
@@ -121,15 +123,16 @@ class Episode:
                 has begun.
         """
         # All checks come first: after an error the same frames can be observed again.
-        images = {name: self._checked_view(frames, name) for name in self._robot.camera_names}
+        images = {}
         states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
         count = len(states) if states.ndim else 0
         width = self._robot.state.width
         is_even = True
-        for name, view in images.items():
+        for name in self._robot.camera_names:
+            images[name] = self._checked_view(frames, name)
             n_rendered = count if rendered is None else len(rendered[name])
-            if len(view) != n_rendered:
+            if len(images[name]) != n_rendered:
                 is_even = False
         if states.shape != (count, width) or not is_even or demo.shape not in ((), (count,)):
             counts = ", ".join(f"{len(view)} {name}" for name, view in images.items())

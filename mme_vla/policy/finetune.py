@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief, check_choice, did_you_mean, missing_extra, require
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import dtype_of
 
 if TYPE_CHECKING:
@@ -159,10 +160,9 @@ def add_adapters(
     """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load
     again.
     """
-    has_adapters = policy.config.get("adapters") and any(
-        ".lora_" in name for name, _ in policy.named_parameters()
-    )
-    require(not has_adapters, "This policy has adapters already: merge_adapters() first.")
+    has_adapters = any(".lora_" in name for name, _ in policy.named_parameters())
+    is_adapted = PolicySections.of(policy.config).adapters and has_adapters
+    require(not is_adapted, "This policy has adapters already: merge_adapters() first.")
     require(
         rank >= 1 and alpha > 0 and 0 <= dropout < 1,
         f"finetune: rank={rank}, alpha={alpha}, dropout={dropout}: need rank ≥ 1, alpha > 0,"
@@ -244,10 +244,10 @@ def merge_state(
 def _targets(policy: "Policy", targets: Sequence[str]) -> list[str]:
     """Full names of the layers that the targets mean (what is the memory's learns in full)."""
     spec = policy.finetune_spec
-    linear = [
-        name for name, module in policy.named_modules() if isinstance(module, nn.Linear | nn.Conv2d)
-    ]
-    layers = [name for name in linear if spec.component_of(f"{name}.") != "memory"]
+    layers = []
+    for name, module in policy.named_modules():
+        if isinstance(module, nn.Linear | nn.Conv2d) and spec.component_of(f"{name}.") != "memory":
+            layers.append(name)
     selected: list[str] = []
     for target in targets:
         matching = [name for name in layers if f".{name}".endswith(f".{target}")]

@@ -69,7 +69,9 @@ class Scheduler[R: Reading, A, L]:
         begun = time.perf_counter()
         for short in [work for work in self.reading if work.pieces <= 1]:
             yield from self._piece(short)
-        batch = [self.acting.popleft() for _ in range(min(len(self.acting), self.max_batch))]
+        batch: list[A] = []
+        while self.acting and len(batch) < self.max_batch:
+            batch.append(self.acting.popleft())
         if batch:
             yield Act(batch)
         until = 2 * time.perf_counter() - begun

@@ -58,9 +58,9 @@ class FlexMask(NamedTuple):
         q, k, v = (x.transpose(1, 2) for x in (q, k, v))
         # Inside a compiled layer it is part of that layer's code. The CPU runs the uncompiled
         # function.
-        flex: Any = (
-            flex_attention if torch.compiler.is_compiling() or not q.is_cuda else _compiled_flex()
-        )
+        flex: Any = flex_attention
+        if q.is_cuda and not torch.compiler.is_compiling():
+            flex = _compiled_flex()
         options = WIDE_HEAD_OPTIONS if q.is_cuda and q.shape[-1] >= WIDE_HEAD else None
         output: Tensor = flex(
             q, k, v, block_mask=self.blocks, enable_gqa=True, kernel_options=options

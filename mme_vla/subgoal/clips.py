@@ -11,6 +11,8 @@ from mme_vla.utils import decoding, require_file
 from mme_vla.utils.media import FPS
 
 VIDEO_FRAMES = 10  # of a video, at most
+SECOND_FRAMES = 2.0  # of a second of video
+LEAST_FRAMES = 4  # of a video, if it has as many
 ENCODING: dict[str, Any] = {"crf": 18, "preset": "medium"}
 """Compression of videos of training data, finer than that of videos for people."""
 
@@ -68,20 +70,16 @@ class Clip:
         return cls(np.stack(frames), indices, length)
 
 
-def sample_video(
-    length: int, fps: float = FPS, rate: float = 2.0, least: int = 4, most: int = VIDEO_FRAMES
-) -> np.ndarray:
+def sample_video(length: int, most: int = VIDEO_FRAMES) -> np.ndarray:
     """Sample an even number of frames of a video, as Qwen models do.
 
     Args:
-        length: frames of the video. fps: of the video.
-        rate: sampled frames a second.
-        least, most: bounds of their number; a shorter video has fewer.
+        length: frames of the video. most: sampled ones.
 
     Returns:
         int64 indices, evenly spaced from the first to the last frame.
     """
-    count = max(int(length / fps * rate), least)
+    count = max(int(length / FPS * SECOND_FRAMES), LEAST_FRAMES)
     count = min(count, most, length)
     count -= count % 2
     count = max(count, min(2, length))

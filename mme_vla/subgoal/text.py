@@ -125,17 +125,17 @@ class Parsed:
     points: tuple[Point, ...] = ()
 
 
-def to_pixels(value: float, side: int = SIDE) -> int:
-    """Thousandths → pixel, rounded down: 0 → 0, 1000 → `side`."""
-    return int(value * side // THOUSAND)
+def to_pixels(value: float) -> int:
+    """Thousandths → pixel, rounded down: 0 → 0, 1000 → 256."""
+    return int(value * SIDE // THOUSAND)
 
 
-def to_thousandths(pixel: int, side: int = SIDE) -> int:
+def to_thousandths(pixel: int) -> int:
     """Pixel → thousandths, rounded to the nearest, as ms-swift does in training."""
-    return round(pixel / side * THOUSAND)
+    return round(pixel / SIDE * THOUSAND)
 
 
-def write_boxes(text: str, points: Sequence[Point], side: int = SIDE) -> str:
+def write_boxes(text: str, points: Sequence[Point]) -> str:
     """Replace each `<bbox>` by its point as the model writes it.
 
     Raises:
@@ -146,13 +146,11 @@ def write_boxes(text: str, points: Sequence[Point], side: int = SIDE) -> str:
         raise ValueError(f"{len(pieces)} {BBOX} marks for {len(points)} points in {brief(text)}.")
     written = start
     for (y, x), piece in zip(points, pieces, strict=True):
-        row = to_thousandths(y, side)
-        column = to_thousandths(x, side)
-        written += f"<|box_start|>({row},{column})<|box_end|>{piece}"
+        written += f"<|box_start|>({to_thousandths(y)},{to_thousandths(x)})<|box_end|>{piece}"
     return written
 
 
-def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
+def parse_subgoal(reply: str) -> Parsed:
     """Read the answer of a fine-tuned predictor: text with `<|box_start|>(a,b)<|box_end|>` points.
 
     Raises:
@@ -168,7 +166,7 @@ def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
         x = int(match[2])
         if max(y, x) > THOUSAND:
             raise MalformedReply("a point lies outside 0…1000")
-        points.append((to_pixels(y, side), to_pixels(x, side)))
+        points.append((to_pixels(y), to_pixels(x)))
         return "<{}, {}>".format(*points[-1])
 
     display_text = _BOX.sub(pixel, text)
@@ -177,7 +175,7 @@ def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
     return Parsed(display_text, _BOX.sub(BBOX, text), tuple(points))
 
 
-def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list[int]]:
+def parse_memer(reply: str, recent: int) -> tuple[Parsed, list[int]]:
     """Read MemER's answer.
 
     Args:
@@ -197,7 +195,7 @@ def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list
         raise MalformedReply("the answer has no current_subtask")
     if not isinstance(positions, list) or any(type(position) is not int for position in positions):
         raise MalformedReply("keyframe_positions is not a list of whole numbers")
-    parsed = parse_subgoal(_writable(subtask), side)
+    parsed = parse_subgoal(_writable(subtask))
     return parsed, sorted({position for position in positions if 1 <= position <= recent})
 
 
@@ -217,21 +215,21 @@ def parse_gemini(reply: str) -> str:
     return _writable(text.strip())
 
 
-def pixels_of_pairs(text: str, side: int = SIDE) -> Parsed:
+def pixels_of_pairs(text: str) -> Parsed:
     """Convert each `<y, x>` of a prompted model's subgoal from thousandths to pixels.
 
-    Pixels are clipped to [0, side].
+    Pixels are clipped to [0, 256].
     """
     points: list[Point] = []
 
     def pixel(match: re.Match[str]) -> str:
         try:
-            y = to_pixels(float(match[1]), side)
-            x = to_pixels(float(match[2]), side)
+            y = to_pixels(float(match[1]))
+            x = to_pixels(float(match[2]))
         except (ValueError, OverflowError):
             raise MalformedReply("a point's number is too long") from None
-        y = min(max(y, 0), side)
-        x = min(max(x, 0), side)
+        y = min(max(y, 0), SIDE)
+        x = min(max(x, 0), SIDE)
         points.append((y, x))
         return f"<{y}, {x}>"
 

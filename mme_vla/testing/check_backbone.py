@@ -119,10 +119,12 @@ def check_sample(backbone: Backbone, batch: Batch) -> None:
 def check_parts(backbone: Backbone) -> None:
     """Every parameter belongs to a component; those that fine-tuning freezes have parameters."""
     spec = backbone.finetune_spec
-    try:
-        parts = {spec.component_of(name) for name, _ in backbone.named_parameters()}
-    except ValueError as error:
-        raise AssertionError(str(error)) from None
+    parts = set()
+    for name, _ in backbone.named_parameters():
+        try:
+            parts.add(spec.component_of(name))
+        except ValueError as error:
+            raise AssertionError(str(error)) from None
     assert {"vision", "action"} <= parts, (
         "the components of finetune_spec must name 'vision' and 'action'; parameters fall into"
         f" {parts}."

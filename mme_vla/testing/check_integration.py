@@ -69,20 +69,20 @@ def _loss(
     policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens
 ) -> Tensor:
     assert batch.actions is not None
-    rows = []
-    for row in (slice(i, i + 1) for i in range(len(batch.prompt))):
-        inputs = (
+    losses = []
+    for i in range(len(batch.prompt)):
+        row = slice(i, i + 1)
+        one = Batch(
             batch.images[row],
             batch.image_mask[row],
             batch.prompt[row],
             batch.prompt_mask[row],
+            actions=batch.actions[row],
         )
-        one = Batch(*inputs, history=None, actions=batch.actions[row])
-        mine = memory.rows(row)
-        rows.append(
-            policy(one, {name: value[row] for name, value in draws.items()}, memory=mine)[0]
-        )
-    return torch.stack(rows)
+        noise = {name: value[row] for name, value in draws.items()}
+        loss, _ = policy(one, noise, memory=memory.rows(row))
+        losses.append(loss)
+    return torch.stack(losses)
 
 
 def check_reach(
@@ -120,10 +120,9 @@ def check_sampling(policy: MMEPolicy, batch: Batch, memory: MemoryTokens) -> Non
         assert torch.isfinite(chunk).all(), "a sampled chunk is not finite."
         if "noise" in draws:  # Euler's way from noise at time 1, each velocity in one joint pass
             joint = draws["noise"]
-            for time in (1 - i / steps for i in range(steps)):
-                joint = (
-                    joint - policy.velocity(batch, joint, torch.full((2,), time), memory) / steps
-                )
+            for i in range(steps):
+                time = torch.full((2,), 1 - i / steps)
+                joint = joint - policy.velocity(batch, joint, time, memory) / steps
             error = float((chunk - joint).abs().max())
             assert error <= TOLERANCE, (
                 f"sampling (cached prefix) and training (one pass) differ by {error:.2g}."
@@ -135,10 +134,9 @@ def check_gradients(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor]) -
     policy.requires_grad_(True)
     loss, _ = policy(batch, draws)
     loss.backward()
-    idle = [
-        name
-        for name, parameter in policy.named_parameters()
-        if policy.finetune_spec.component_of(name) == "memory"
-        and (parameter.grad is None or not parameter.grad.any())
-    ]
+    idle = []
+    for name, parameter in policy.named_parameters():
+        is_of_memory = policy.finetune_spec.component_of(name) == "memory"
+        if is_of_memory and (parameter.grad is None or not parameter.grad.any()):
+            idle.append(name)
     assert not idle, f"no gradient reaches {', '.join(idle)}."

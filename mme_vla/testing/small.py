@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from mme_vla.config.composition import compose
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.memory.base import padded_length
-from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
+from mme_vla.memory.history import CachedHistory, FrameScores
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.processing.images import full_past
@@ -53,7 +53,6 @@ BEYOND = [
     "keyframes_modul",
 ]
 """Of each memory beyond the paper one composition, for tests that go through all models."""
-MODELS = ["pi05", *NEURAL]
 # The first four are one network; hybrid is framesamp_modul with a subgoal in its prompt.
 ALL_MODELS = ["pi05", "pi05_past_actions", "simplesg", "groundsg", *NEURAL, "hybrid"]
 SMALL_VISION = {
@@ -206,15 +205,3 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
     if values:
         scores = FrameScores(np.array(scored_frames), np.stack(values).astype(np.float32))
     return CachedHistory(storage, tokens.numpy(), stored_frames, len(frames), scores, exec_start)
-
-
-def online_history(
-    policy: MMEPolicy, frames: np.ndarray, chunk: int, exec_start: int = 0
-) -> OnlineHistory:
-    """The same episode as an environment would deliver it, `chunk` frames at a time."""
-    memory = policy.require_memory()
-    history = OnlineHistory(memory.storage, memory.make_scorer(), exec_start)
-    for start in range(0, len(frames), chunk):
-        part = frames[start : start + chunk]
-        history.append(part, policy.encode_frames(part[history.to_encode(len(part))]))
-    return history

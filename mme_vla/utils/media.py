@@ -95,15 +95,11 @@ def write_video(frames: Iterable[np.ndarray], path: Path, **options: Any) -> int
         ValueError: there is no frame.
     """
     with write_atomically(path) as draft, VideoWriter(draft, **options) as video:
-        return _fill(video, frames)
-
-
-def video_bytes(frames: Iterable[np.ndarray], **options: Any) -> bytes:
-    """The same in memory."""
-    buffer = BytesIO()
-    with VideoWriter(buffer, **options) as video:
-        _fill(video, frames)
-    return buffer.getvalue()
+        for frame in frames:
+            video.add(frame)
+        if not video.frames:
+            raise ValueError("A video needs at least one frame.")
+    return video.frames
 
 
 def png_bytes(image: np.ndarray) -> bytes:
@@ -114,10 +110,10 @@ def png_bytes(image: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def bordered(image: np.ndarray, pixels: int = BORDER) -> np.ndarray:
+def bordered(image: np.ndarray) -> np.ndarray:
     """The image in a red border: it belongs to a conditioning video."""
     framed = image.copy()
-    for edge in (np.s_[:pixels], np.s_[-pixels:], np.s_[:, :pixels], np.s_[:, -pixels:]):
+    for edge in (np.s_[:BORDER], np.s_[-BORDER:], np.s_[:, :BORDER], np.s_[:, -BORDER:]):
         framed[edge] = RED
     return framed
 
@@ -259,11 +255,3 @@ def _routines() -> dict[str, str]:
     if torch.backends.cpu.get_cpu_capability() != "AVX512":
         return {}
     return {"x264-params": "asm=MMX2,SSE2Fast,SSSE3,SSE4.2,AVX,FMA3,BMI2,AVX2"}
-
-
-def _fill(video: VideoWriter, frames: Iterable[np.ndarray]) -> int:
-    for frame in frames:
-        video.add(frame)
-    if not video.frames:
-        raise ValueError("A video needs at least one frame.")
-    return video.frames

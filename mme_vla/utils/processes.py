@@ -60,11 +60,13 @@ def files_to_hold(limit: int) -> int:
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = limit + _OTHERS
-    if soft != resource.RLIM_INFINITY and soft < needed:
-        raised = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, raised), hard))
-        soft = max(soft, raised)
-    return limit if soft == resource.RLIM_INFINITY else min(limit, max(soft - _OTHERS, 8))
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return limit
+    if hard != resource.RLIM_INFINITY:
+        needed = min(needed, hard)
+    soft = max(soft, needed)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    return min(limit, max(soft - _OTHERS, 8))
 
 
 def started_processes(environment: Mapping[str, str] | None = None) -> int:

@@ -16,19 +16,19 @@ from pydantic_core import ErrorDetails
 from mme_vla.errors import UserError, brief, did_you_mean, listed
 
 _TYPES = {
-    f"{kind}_{problem}": words
-    for kind, words in (
-        ("bool", "true or false"),
-        ("int", "a whole number"),
-        ("float", "a number"),
-        ("string", "a text"),
-    )
-    for problem in ("type", "parsing")
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "string_type": "a text",
+    "string_parsing": "a text",
+    "dataclass_type": "a section of keys",
+    "model_type": "a section of keys",
+    "dict_type": "a map of keys",
+    "tuple_type": "a list",
 }
-_TYPES["dataclass_type"] = "a section of keys"
-_TYPES["model_type"] = "a section of keys"
-_TYPES["dict_type"] = "a map of keys"
-_TYPES["tuple_type"] = "a list"
 """What a value must be, by pydantic's names of mistakes."""
 
 

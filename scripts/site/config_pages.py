@@ -1,8 +1,10 @@
 """The pages of the configuration, from the YAML files and their comments."""
 
+import re
+from dataclasses import dataclass
 from pathlib import Path
 
-from mme_vla.cli.help import heading, keys
+from mme_vla.cli.help import heading
 from mme_vla.config.trees import library_files, library_trees
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -23,6 +25,38 @@ arguments: `build_policy("framesamp_modul", backbone="pi05", memory={"budget": 2
 
 A misspelt key is an error that names the nearest keys.
 """  # noqa: E501
+
+_KEY = re.compile(
+    r"^(?P<indent> *(?:- )?)(?P<key>[\w/]+):(?: +(?P<value>[^#]*?))?(?: +# (?P<comment>.*))?$"
+)
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key of a file. name: dotted, within the file. default, comment: as they are written;
+    empty where not.
+    """
+
+    name: str
+    default: str
+    comment: str
+
+
+def keys(file: Path) -> list[Key]:
+    """Every key of a file in its order; the lists `defaults` and `hydra` are left out."""
+    result: list[Key] = []
+    path: list[str] = []
+    for line in file.read_text().splitlines():
+        match = _KEY.match(line)
+        if not match:
+            continue
+        depth = len(match["indent"]) // 2
+        path = [*path[:depth], match["key"]]
+        if path[0] not in ("defaults", "hydra"):
+            result.append(
+                Key(".".join(path), (match["value"] or "").strip(), match["comment"] or "")
+            )
+    return result
 
 
 def prose(text: str) -> str:

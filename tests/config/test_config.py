@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 
 from helpers import commands
 from mme_vla.cli.command import check_overrides, options_first, run_configured
-from mme_vla.config.composition import compose, import_plugins
+from mme_vla.config.composition import compose
+from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.config.trees import library_files, library_trees
 from mme_vla.errors import UserError
 
@@ -204,13 +205,13 @@ def test_plugins_are_imported_from_the_current_folder(
     (tmp_path / "my_broken_plugin.py").write_text("import no_such_module_here\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    import_plugins(OmegaConf.create({"plugins": ["my_plugin_module"]}))
+    import_plugins(["my_plugin_module"])
     assert sys.modules["my_plugin_module"].loaded
     with pytest.raises(UserError, match="No module named 'my_plugin'"):
-        import_plugins(OmegaConf.create({"plugins": ["my_plugin"]}))
+        import_plugins(["my_plugin"])
     with pytest.raises(ModuleNotFoundError, match="no_such_module_here"):
-        import_plugins(OmegaConf.create({"plugins": ["my_broken_plugin"]}))
-    import_plugins(OmegaConf.create({}))
+        import_plugins(["my_broken_plugin"])
+    assert plugins_of(OmegaConf.create({}), "a configuration") == []
 
 
 APP = """

@@ -8,10 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from config_pages import keys
 
 from helpers import REPOSITORY
 from mme_vla import cli
-from mme_vla.cli.help import configured_commands, defaults, help_page, keys
+from mme_vla.cli.help import configured_commands, defaults, help_page
 from mme_vla.config.composition import compose
 from mme_vla.config.trees import library_files, library_trees
 from mme_vla.errors import UserError

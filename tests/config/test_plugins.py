@@ -17,8 +17,8 @@ from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli import inspect
 from mme_vla.cli.weights import convert
 from mme_vla.config import plugins
-from mme_vla.config.composition import compose, import_plugins
-from mme_vla.config.plugins import TRUST_FLAG, TRUST_WORD
+from mme_vla.config.composition import compose
+from mme_vla.config.plugins import TRUST_FLAG, TRUST_WORD, plugins_of
 from mme_vla.config.plugins import import_plugins as import_modules
 from mme_vla.envs import metadata
 from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_episodes, evaluate
@@ -173,7 +173,7 @@ def test_plugins_are_names_of_modules(names: str) -> None:
     from omegaconf import OmegaConf
 
     with pytest.raises(UserError, match="list of modules"):
-        import_plugins(OmegaConf.create(f"plugins: {names}"))
+        plugins_of(OmegaConf.create(f"plugins: {names}"), "the configuration")
 
 
 @pytest.mark.skipif(

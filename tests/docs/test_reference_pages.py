@@ -65,7 +65,9 @@ def test_every_key_has_a_comment_in_one_file_of_its_group() -> None:
             continue
         files = list(library_files(name).values())
         for group in [files] if name else [[file] for file in files]:
-            rows = [(file, key.name, key.comment) for file in group for key in cli_help.keys(file)]
+            rows = [
+                (file, key.name, key.comment) for file in group for key in config_pages.keys(file)
+            ]
             explained = {key for _, key, comment in rows if comment}
             sections = {
                 key for _, key, _ in rows if any(other.startswith(f"{key}.") for other in explained)

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.videos import video_bytes
 from mme_vla.evaluation.rollout.video import EpisodeVideo
-from mme_vla.utils.media import VideoWriter, video_bytes, video_frame
+from mme_vla.utils.media import VideoWriter, video_frame
 
 VIEWS = [[np.full((32, 48, 3), shade, np.uint8)] * 2 for shade in range(0, 240, 3)]
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from helpers.h5_files import write_file
+from helpers.videos import video_bytes
 from mme_vla.data.cache import fingerprint
 from mme_vla.data.cache_building import build_cache
 from mme_vla.data.convert import convert
@@ -26,7 +27,7 @@ from mme_vla.subgoal.finetuning.rows import RowDataset
 from mme_vla.subgoal.models.api import Api, Settings
 from mme_vla.subgoal.models.replies import Reply
 from mme_vla.utils import write_sums
-from mme_vla.utils.media import png_bytes, video_bytes
+from mme_vla.utils.media import png_bytes
 
 
 def digest(*values: object) -> str:

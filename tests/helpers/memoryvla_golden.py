@@ -7,11 +7,11 @@ from torch import Tensor
 
 from mme_vla import build_policy
 from mme_vla.extras.methods.memoryvla.action_head import DitConfig
+from mme_vla.extras.methods.memoryvla.bank import EpisodeBank
 from mme_vla.extras.methods.memoryvla.model import MemoryVlaConfig, MemoryVlaCore
 from mme_vla.extras.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.extras.methods.memoryvla.weights import memoryvla_piece, memoryvla_table
 from mme_vla.extras.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
-from mme_vla.memory.extensions.bank import MemoryBank
 from mme_vla.testing.small import unit_stats
 from mme_vla.weights.tables import read
 
@@ -25,14 +25,14 @@ RENAMED = OPTIONS | {"use_timestep_pe": "time_code", "retrieval_layers": "retrie
 
 def bank(
     sizes: dict[str, Any], role: str, weights: dict[str, Tensor], case: dict[str, Any] | None = None
-) -> MemoryBank:
+) -> EpisodeBank:
     """A bank of one role with its parameters; a case's options replace those of the sizes."""
     options: dict[str, Any] = {
         "length": sizes["mem_length"],
         "retrieval_layers": sizes["retrieval_layers"],
     }
     options |= {RENAMED[name]: value for name, value in (case or {}).items()}
-    built = MemoryBank(sizes[role], **options)
+    built = EpisodeBank(sizes[role], **options)
     word = {"cog": "cognition_bank", "per": "perceptual_bank"}[role]
     table = memoryvla_table(f"{word}.{name}" for name in built.state_dict())
     state = {name.removeprefix(f"{word}."): value for name, value in read(table, weights).items()}

@@ -6,12 +6,12 @@ import torch
 
 from mme_vla import UserError
 from mme_vla.memory.base import stack_history
+from mme_vla.memory.history import OnlineHistory
 from mme_vla.testing.small import (
     NEURAL,
     SMALL_VISION,
     cached_history,
     moving_frames,
-    online_history,
     small_policy,
 )
 from mme_vla.types import Batch
@@ -35,6 +35,16 @@ def frames():
 def framesamp():
     """One policy, for what no memory decides."""
     return small_policy("framesamp_modul", policy={"history_dtype": "float32"}, backbone=FEW_TOKENS)
+
+
+def online_history(policy, frames: np.ndarray, chunk: int, exec_start: int = 0) -> OnlineHistory:
+    """The same episode as an environment would deliver it, `chunk` frames at a time."""
+    memory = policy.require_memory()
+    history = OnlineHistory(memory.storage, memory.make_scorer(), exec_start)
+    for start in range(0, len(frames), chunk):
+        part = frames[start : start + chunk]
+        history.append(part, policy.encode_frames(part[history.to_encode(len(part))]))
+    return history
 
 
 def feed(policy, frames, goal="pick up the cube", seed=0, chunk=16, demo=30, upto=None):

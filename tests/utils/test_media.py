@@ -7,6 +7,7 @@ import av
 import numpy as np
 import pytest
 
+from helpers.videos import video_bytes
 from mme_vla.embodiment import ROBOMME_JOINT, Camera
 from mme_vla.evaluation.rollout.environment import ChunkEnv, Command
 from mme_vla.evaluation.rollout.video import EpisodeVideo
@@ -16,7 +17,6 @@ from mme_vla.utils.media import (
     RED,
     Tile,
     contact_sheet,
-    video_bytes,
     video_frame,
     write_video,
 )

@@ -15,9 +15,9 @@ import torch
 from omegaconf import OmegaConf
 from torch.utils.flop_counter import FlopCounterMode
 
-from mme_vla.config.composition import compose, import_plugins, resolved
+from mme_vla.config.composition import compose, resolved
 from mme_vla.config.naming import digest
-from mme_vla.config.plugins import plugins_of
+from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError, brief, listed, require
@@ -68,7 +68,7 @@ def compose_policy(
     memory_words = [f"memory.{key}={value}" for key, value in settings.items()]
     composed = compose("policy", [f"model={model}", *words, *memory_words], extra_dirs=extra_dirs)
     composed.plugins = list(dict.fromkeys([*plugins, *plugins_of(composed, model)]))
-    import_plugins(composed)
+    import_plugins(composed.plugins)
     return resolved(composed)
 
 

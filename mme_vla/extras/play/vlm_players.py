@@ -49,7 +49,7 @@ def choice_text(decision: Decision) -> str:
     place = (
         ""
         if point is None
-        else " at [{}, {}]".format(*(to_thousandths(int(value), SIDE) for value in point))
+        else " at [{}, {}]".format(*(to_thousandths(int(value)) for value in point))
     )
     return f"{decision.choice}: {decision.action}{place}"
 
@@ -130,7 +130,7 @@ def parse_choice(reply: str, options: Sequence[Option]) -> dict[str, Any]:
     problem = _misfit(fields.get("point"), option)
     if problem is not None:
         raise MalformedReply(problem)
-    point = [min(to_pixels(value, SIDE), SIDE - 1) for value in fields["point"]]
+    point = [min(to_pixels(value), SIDE - 1) for value in fields["point"]]
     return {"choice": label, "point": point}
 
 

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.extras.methods.writable_memory import WritableMemory
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import FrameScores, History
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import WritableMemory
 from mme_vla.policy.episode import Episode
 from mme_vla.types import HistoryTokens
 

@@ -2,12 +2,9 @@
 merged.
 
 Unlike the memories that choose among stored vision tokens, a bank keeps tokens that the network
-itself made of a moment. The tokens of the current moment are the queries. Its state belongs to an
-episode: `init_state`, `read`, `update`.
+itself made of a moment. The tokens of the current moment are the queries.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -26,22 +23,6 @@ FUSIONS = ("gate", "add")
 CONSOLIDATIONS = ("tome", "fifo")
 LONGEST = 10_000.0  # of the time code's periods, in units of 2π
 GATE_STD = 1e-3  # of a fresh gate, which so begins at about one half
-
-
-@dataclass(frozen=True)
-class BankState:
-    """The content of a bank in one episode, in the order of time, without gradients.
-
-    entries: [t, n, d]. times: [t] int64. merged: where the last update merged two entries; −1
-    where it did not.
-    """
-
-    entries: Tensor
-    times: Tensor
-    merged: int = -1
-
-    def __len__(self) -> int:
-        return len(self.times)
 
 
 class TimeCode(nn.Module):
@@ -99,7 +80,7 @@ class RetrievalBlock(nn.Module):
 class Retrieval(nn.Module):
     """How current tokens, of width d, read entries of the past and are fused with what they read.
 
-    The entries are a bank's own (`MemoryBank`), or the tokens of any memory (`gather_selection`).
+    The entries are a bank's own (`MemoryBank`), or the tokens of any memory.
     """
 
     def __init__(
@@ -168,18 +149,9 @@ class Retrieval(nn.Module):
         share = torch.sigmoid(self.gate(torch.cat([tokens, retrieved], -1)))
         return share * tokens + (1 - share) * retrieved
 
-    def read_memory(self, memory: MemoryTokens, tokens: Tensor) -> Tensor:
-        """Fused tokens [b, k, d], from the current ones and a memory's tokens [b, n, read] in place
-        of entries.
-        """
-        # Tokens where the mask is False are undefined: a weight of 0 alone would let a nan through.
-        entries = memory.tokens.masked_fill(~memory.mask[..., None], 0).to(tokens)
-        retrieved = self.retrieve_from(tokens, entries[:, :, None], valid=memory.mask)
-        return self.fuse(tokens, retrieved)
-
 
 class MemoryBank(Retrieval):
-    """A bank of at most `length` moments, each n tokens of width d: writing, merging, retrieval."""
+    """A bank of at most `length` moments, each n tokens of width d: merging and retrieval."""
 
     def __init__(
         self,
@@ -189,7 +161,6 @@ class MemoryBank(Retrieval):
         time_code: bool = True,
         fusion: str = "gate",
         consolidation: str = "tome",
-        store_fused: bool = False,
     ) -> None:
         """Build an empty bank.
 
@@ -198,57 +169,17 @@ class MemoryBank(Retrieval):
                 holds.
             consolidation: what becomes of a moment too many: `tome` makes the two most alike
                 neighbours one, `fifo` drops the oldest.
-            store_fused: store the fused tokens instead of the current ones.
         """
         check_sizes("bank", length=length)
         check_choice("bank.consolidation", consolidation, CONSOLIDATIONS)
         super().__init__(width, retrieval_layers, time_code, fusion)
         self.length = length
         self.consolidation = consolidation
-        self.store_fused = store_fused
-
-    def init_state(self, tokens: int) -> BankState:
-        """An empty bank for moments of so many tokens."""
-        weight = next(self.parameters())
-        times = torch.zeros(0, dtype=torch.int64, device=weight.device)
-        return BankState(weight.new_zeros(0, tokens, self.width), times)
-
-    def retrieve(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
-        """Retrieve from the banks of b episodes with their current tokens [b, n, d]; an empty bank
-        returns these.
-        """
-        lengths = [len(state) for state in states]
-        longest = max(lengths)
-        if not longest:
-            return tokens
-        entries = torch.stack([_padded(state.entries, longest) for state in states])  # b t n d
-        times = torch.stack([_padded(state.times, longest) for state in states])
-        valid = None
-        if min(lengths) < longest:
-            places = torch.arange(longest, device=tokens.device)
-            valid = places < torch.tensor(lengths, device=tokens.device)[:, None]
-        return self.retrieve_from(tokens, entries.to(tokens), times.to(tokens.device), valid)
-
-    def read(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
-        """Fused tokens [b, n, d] of b episodes, from the current ones and their banks."""
-        return self.fuse(tokens, self.retrieve(states, tokens))
-
-    def update(self, state: BankState, tokens: Tensor, fused: Tensor, time: int) -> BankState:
-        """The bank after a moment [n, d] at `time` with fused tokens [n, d]; without gradients."""
-        stored = (fused if self.store_fused else tokens).detach()
-        entries = torch.cat([state.entries.to(stored), stored[None]])
-        times = torch.cat([state.times, state.times.new_tensor([time])])
-        if len(times) <= self.length:
-            return BankState(entries, times)
-        if self.consolidation == "fifo":
-            return BankState(entries[1:], times[1:])
-        return _merge(entries, times)
 
     def replay(
         self, moments: Tensor, times: Tensor, valid: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The content of banks after b sequences of moments: as `update` one by one, with fixed
-        shapes.
+        """The content of banks that took b sequences of moments one by one, with fixed shapes.
 
         Args:
             moments: [b, t, n, d]. times: [b, t] int64. valid: [b, t] bool, False on padding, which
@@ -296,58 +227,6 @@ class MemoryBank(Retrieval):
                 changed = similarity(indices.gather(1, left), indices.gather(1, left + 1))
                 alike = alike.scatter(1, left, changed)
         return entries_at(indices), times.gather(1, indices), valid.gather(1, indices)
-
-    def run(
-        self,
-        tokens: Tensor,
-        times: Tensor,
-        sequences: Sequence[Tensor],
-        states: Sequence[BankState] | None = None,
-    ) -> tuple[Tensor, list[BankState]]:
-        """Take sequences of moments side by side, each in its own bank.
-
-        Args:
-            tokens: [m, n, d], all moments. times: [m] int64.
-            sequences: places in them, each sequence in the order of time.
-            states: banks the sequences continue with; empty ones by default.
-
-        Returns:
-            Fused tokens [m, n, d], and the bank after each sequence.
-        """
-        if states is None:
-            banks = [self.init_state(tokens.shape[1]) for _ in sequences]
-        else:
-            banks = list(states)
-        moment_times = times.tolist()
-        fused: list[Tensor] = []
-        fused_indices: list[Tensor] = []
-        for step in range(max(len(sequence) for sequence in sequences)):
-            running = [i for i, sequence in enumerate(sequences) if step < len(sequence)]
-            indices = torch.stack([sequences[i][step] for i in running]).to(tokens.device)
-            output = self.read([banks[i] for i in running], tokens[indices])
-            for row, i in enumerate(running):
-                index = int(sequences[i][step])
-                banks[i] = self.update(banks[i], tokens[index], output[row], moment_times[index])
-            fused.append(output)
-            fused_indices.append(indices)
-        order = torch.cat(fused_indices).argsort()
-        return torch.cat(fused)[order], banks
-
-
-def _merge(entries: Tensor, times: Tensor) -> BankState:
-    """Merge the two neighbours that are most alike into their mean, at the earlier's time."""
-    alike = functional.cosine_similarity(entries[:-1], entries[1:], dim=-1).mean(-1)
-    i = int((alike == alike.max()).nonzero()[0])
-    merged = (entries[i : i + 1] + entries[i + 1 : i + 2]) / 2
-    return BankState(
-        entries=torch.cat([entries[:i], merged, entries[i + 2 :]]),
-        times=torch.cat([times[: i + 1], times[i + 2 :]]),
-        merged=i,
-    )
-
-
-def _padded(x: Tensor, length: int) -> Tensor:
-    return functional.pad(x, (0, 0) * (x.ndim - 1) + (0, length - len(x)))
 
 
 @MEMORIES.register("bank")

@@ -120,11 +120,13 @@ class LearnedTopK(MemoryModule):
         weight = rows_at(soft, selected)
         weight = weight + (1 - weight).detach()
         best = best * weight[..., None].to(best.dtype)
-        # One token for all the others.
+        # One token for all the others: the means of their features and position features.
         others = soft * history.mask.scatter(1, selected, torch.zeros_like(mask))
         total = others.sum(1, keepdim=True)
         share = others / total.clamp(min=EPS)
-        remainder = self._remainder(history, share).to(best.dtype)
+        mean = (history.features.float() * share[..., None]).sum(1, keepdim=True)
+        embedded = self.encoder.embed_positions(history.positions) * share[..., None]
+        remainder = self.encoder.encode(mean, embedded.sum(1, keepdim=True)).to(best.dtype)
         ages = history.ages
         if ages is not None:
             mean_age = (ages * share.detach()).sum(1, keepdim=True)
@@ -169,11 +171,3 @@ class LearnedTopK(MemoryModule):
         border = (best[:, -2:].sum(1, keepdim=True) / 2).detach()
         soft = torch.sigmoid((scores - border) / self.temperature) * mask
         return order[:, :count].sort(1).values, soft
-
-    def _remainder(self, history: HistoryTokens, share: Tensor) -> Tensor:
-        """One token [b, 1, d] for what is not kept: the mean of its features and of its position
-        features, by share [b, n].
-        """
-        features = (history.features.float() * share[..., None]).sum(1, keepdim=True)
-        embedded = self.encoder.embed_positions(history.positions) * share[..., None]
-        return self.encoder.encode(features, embedded.sum(1, keepdim=True))

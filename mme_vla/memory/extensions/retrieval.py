@@ -70,17 +70,12 @@ class Retrieval(PerceptualMemory):
     ) -> np.ndarray:
         frames = self.storage.stored_frames(step + 1)
         if len(frames) > self.frames:
-            features = self.frame_features(history, frames)
+            # A frame's feature is the mean of its tokens as they are stored, of length 1.
+            tokens = history.stored(all_patches(frames, self.storage.grid)).float()
+            means = tokens.unflatten(0, (len(frames), -1)).mean(1)
+            features = torch.nn.functional.normalize(means, dim=-1)
             frames = frames[self.alike(features, frames >= history.exec_start)]
         return all_patches(frames, self.storage.grid)
-
-    def frame_features(self, history: History, frames: np.ndarray) -> Tensor:
-        """The mean of the tokens of stored frames [n] as they are stored: [n, d_vision], of length
-        1.
-        """
-        tokens = history.stored(all_patches(frames, self.storage.grid)).float()
-        means = tokens.unflatten(0, (len(frames), -1)).mean(1)
-        return torch.nn.functional.normalize(means, dim=-1)
 
     def alike(self, features: Tensor, execution: np.ndarray) -> np.ndarray:
         """Which frames are remembered.

@@ -10,7 +10,7 @@ always gives the same files.
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -76,10 +76,11 @@ def open_input(entry: str | Path, tasks: Path | None = None) -> list[Demonstrati
     root = SAMPLE if str(entry) == "sample" else Path(entry)
     if (root / "meta" / "info.json").is_file():
         return _from_lerobot(EpisodeSource(root), tasks)
-    refs = list_episodes(find_files([root]))
-    sums = {file: file_sum(file) for file in dict.fromkeys(ref.file for ref in refs)}
+    sums: dict[Path, str] = {}
     demonstrations = []
-    for ref in refs:
+    for ref in list_episodes(find_files([root])):
+        if ref.file not in sums:
+            sums[ref.file] = file_sum(ref.file)
         origin = f"{ref.file.name}:{sums[ref.file]}"
         labels = partial(_h5_labels, ref)
         read_images = partial(_h5_images, ref)
@@ -134,8 +135,7 @@ def _build(
     if not all(path.is_file() for path in rows_files.values()):
         missing = []
         for episode in episodes:
-            parts = [_part(output, name, episode) for name in sets]
-            if not all(part.is_file() for part in parts):
+            if not all(_part(output, name, episode).is_file() for name in sets):
                 missing.append(episode)
         n_built = len(episodes) - len(missing)
         with progress("subgoal data", len(episodes), n_built, "episodes") as advance:
@@ -143,16 +143,18 @@ def _build(
                 _build_episode(episode, output, sets, options)
                 advance(1)
         for name, path in rows_files.items():
-            parts = [_part(output, name, episode) for episode in episodes]
-            with write_atomically(path) as draft:
-                draft.write_text("".join(part.read_text() for part in parts))
+            with write_atomically(path) as draft, draft.open("w") as file:
+                for episode in episodes:
+                    file.write(_part(output, name, episode).read_text())
     shutil.rmtree(output / PARTS, ignore_errors=True)
 
     # The checksums are written last: a file that they do not list is not compared.
     if not (output / SUMS).is_file():
-        kinds = {".jsonl", ".png", ".mp4"}
-        files = [path for path in sorted(output.rglob("*.*")) if path.suffix in kinds]
-        write_sums(output, [str(path.relative_to(output)) for path in files])
+        files = []
+        for path in output.rglob("*.*"):
+            if path.suffix in (".jsonl", ".png", ".mp4"):
+                files.append(str(path.relative_to(output)))
+        write_sums(output, files)
     return {name: path.read_text().count("\n") for name, path in rows_files.items()}
 
 
@@ -195,14 +197,14 @@ def _part(output: Path, name: str, episode: Demonstration) -> Path:
 def _h5_labels(ref: EpisodeRef) -> Labels:
     with open_episode(ref) as episode:
         joints, targets = episode.joints()
-        simple, grounded = _two_kinds(list(episode.subgoals()))
+        texts = list(episode.subgoals())
         return Labels(
             task=ref.task,
             number=ref.index,
             goal=episode.goals[0],
             exec_start=episode.exec_start,
-            simple=simple,
-            grounded=grounded,
+            simple=[text["simple_subgoal"] for text in texts],
+            grounded=[text["grounded_subgoal"] for text in texts],
             joints=joints,
             targets=targets,
         )
@@ -258,14 +260,13 @@ def _read_tasks(path: Path) -> dict[str, str]:
 
 def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:
     texts = [source.subgoals(episode, t) for t in range(int(source.lengths[episode]))]
-    simple, grounded = _two_kinds(texts)
     return Labels(
         task=task,
         number=number,
         goal=source.goal(episode),
         exec_start=int(source.exec_starts[episode]),
-        simple=simple,
-        grounded=grounded,
+        simple=[text["simple_subgoal"] for text in texts],
+        grounded=[text["grounded_subgoal"] for text in texts],
         joints=source.states(episode)[:, :ARM_JOINTS],
         targets=source.actions(episode)[:, :ARM_JOINTS],
     )
@@ -276,7 +277,3 @@ def _lerobot_images(
 ) -> Iterator[np.ndarray]:
     for start in range(0, len(steps), 64):  # few frames are in memory at once
         yield from source.frames(episode, list(steps[start : start + 64]))
-
-
-def _two_kinds(texts: Sequence[Mapping[str, str]]) -> tuple[list[str], list[str]]:
-    return [text["simple_subgoal"] for text in texts], [text["grounded_subgoal"] for text in texts]

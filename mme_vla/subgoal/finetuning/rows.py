@@ -177,13 +177,18 @@ def _check_row(row: Row) -> Row:
         UserError: a part is missing or of another type.
     """
     messages = row.get("messages")
-    if not isinstance(messages, list) or not all(isinstance(message, dict) for message in messages):
+    if not isinstance(messages, list):
         raise _row_error("it has no messages")
-    if [message.get("role") for message in messages] != ["system", "user", "assistant"]:
+    roles = []
+    n_marks = 0
+    for message in messages:
+        if not isinstance(message, dict) or not is_text(message.get("content")):
+            raise _row_error("the content of a message is no text")
+        roles.append(message.get("role"))
+        if roles[-1] != "system":
+            n_marks += message["content"].count(BBOX)
+    if roles != ["system", "user", "assistant"]:
         raise _row_error("expected one message each of system, user and assistant")
-    texts = [message.get("content") for message in messages]
-    if not all(isinstance(text, str) and is_text(text) for text in texts):
-        raise _row_error("the content of a message is no text")
     for key in ("images", "videos"):
         names = row.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -194,7 +199,6 @@ def _check_row(row: Row) -> Row:
         raise _row_error(
             f"objects is {brief(objects)}, where bbox should be a list of [row, column]"
         )
-    n_marks = texts[1].count(BBOX) + texts[2].count(BBOX)
     if n_marks != len(points):
         raise _row_error(f"it has {n_marks} marks {BBOX} for {len(points)} points")
     return row

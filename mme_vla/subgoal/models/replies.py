@@ -4,14 +4,16 @@ import json
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
+from mme_vla.config.sections import Range, read_section
 from mme_vla.errors import UserError
 from mme_vla.utils import read_json, verified, with_checksum, write_atomically
 
 log = logging.getLogger(__name__)
 MOST_TOKENS = 2**40
 """Of one reply. A larger number is no count of tokens."""
+Tokens = Annotated[int, Range(0, MOST_TOKENS - 1)]
 
 
 @dataclass(frozen=True)
@@ -19,8 +21,8 @@ class Reply:
     """A usable reply and the tokens it took; thoughts count as output."""
 
     text: str
-    input_tokens: int
-    output_tokens: int
+    input_tokens: Tokens
+    output_tokens: Tokens
 
 
 class ReplyCache:
@@ -39,7 +41,7 @@ class ReplyCache:
             return None
         try:
             stored = verified(read_json(path, "a stored reply"), str(path))
-            return _checked(stored, path)
+            return read_section(Reply, stored, str(path))
         except UserError as error:
             log.warning("%s The question is asked again.", error)
             return None
@@ -51,12 +53,3 @@ class ReplyCache:
                 draft.write_text(json.dumps(with_checksum(asdict(reply))))
         except OSError as error:  # such as a full disk: the reply is used all the same
             log.warning("%s cannot be written: %s", path, error.strerror)
-
-
-def _checked(stored: dict[str, Any], path: Path) -> Reply:
-    text = stored.get("text")
-    counts = [stored.get("input_tokens"), stored.get("output_tokens")]
-    numbers = [n for n in counts if type(n) is int and 0 <= n < MOST_TOKENS]
-    if not isinstance(text, str) or len(numbers) != len(counts):
-        raise UserError(f"{path} lacks a text and two numbers of tokens.")
-    return Reply(text, *numbers)

@@ -109,14 +109,14 @@ def tiny_config(processor: Any) -> Any:
     )
 
 
-def make_tiny(seed: int = 0) -> tuple[Any, Any]:
+def make_tiny() -> tuple[Any, Any]:
     """Make the model and its processor."""
     import torch
     from transformers import Qwen3VLForConditionalGeneration
 
     processor = tiny_processor()
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(0)
         model = Qwen3VLForConditionalGeneration(tiny_config(processor))
     model.generation_config.eos_token_id = processor.tokenizer.eos_token_id
     model.generation_config.pad_token_id = processor.tokenizer.pad_token_id

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.extras.methods.memoryvla.bank import BankState
 from mme_vla.extras.methods.memoryvla.model import BankStates, MemoryVlaCore
-from mme_vla.memory.extensions.bank import BankState
-from mme_vla.policy.capabilities import MemoryEntries
+from mme_vla.extras.methods.writable_memory import MemoryEntries
 from mme_vla.policy.episode import Episode, Host
 from mme_vla.types import FrameBatch
 
@@ -90,7 +90,7 @@ class MemoryVlaEpisode(Episode):
         super()._take(frames, demo, executed, states)
         self._moments = [*self._moments, *moments]  # a twin of this episode has its own list
 
-    # Writable memory (`policy/capabilities.py`)
+    # Writable memory (`methods/writable_memory.py`)
 
     memory_clock = "moments"
 

@@ -9,10 +9,11 @@ from torch import Tensor, nn
 from mme_vla.backbone.layers import additive_mask
 from mme_vla.errors import check_sizes, require
 from mme_vla.extras.methods.memoryvla.action_head import Dit, DitConfig, Schedule
+from mme_vla.extras.methods.memoryvla.bank import BankState, EpisodeBank, MemoryRetrieval
 from mme_vla.extras.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig
 from mme_vla.extras.methods.prismatic import Prismatic
 from mme_vla.integration.base import required
-from mme_vla.memory.extensions.bank import BankState, MemoryBank, Retrieval
+from mme_vla.memory.extensions.bank import Retrieval
 from mme_vla.types import MemoryTokens
 
 
@@ -71,7 +72,7 @@ class Compression(nn.Module):
 
 @dataclass(frozen=True)
 class BankConfig:
-    """Both banks' options; see `MemoryBank`. A memory in their place is read by as many layers and
+    """Both banks' options; see `EpisodeBank`. A memory in their place is read by as many layers and
     the same fusion.
     """
 
@@ -200,14 +201,14 @@ class RecallingCore(Core):
     Its tokens are as wide as perceptual ones; nothing is written.
     """
 
-    cognition_retrieval: Retrieval
-    perceptual_retrieval: Retrieval
+    cognition_retrieval: MemoryRetrieval
+    perceptual_retrieval: MemoryRetrieval
 
     def __init__(self, config: MemoryVlaConfig) -> None:
         widths, of_bank = (config.vlm.width, config.perceptual_width), config.bank
         # Without a time code: tokens of a memory carry their own time and place.
         cognition, perceptual = (
-            Retrieval(
+            MemoryRetrieval(
                 width, of_bank.retrieval_layers, False, of_bank.fusion, config.perceptual_width
             )
             for width in widths
@@ -231,11 +232,11 @@ class RecallingCore(Core):
 class MemoryVlaCore(Core):
     """The original: two banks of its own, that are read and written moment by moment."""
 
-    cognition_bank: MemoryBank
-    perceptual_bank: MemoryBank
+    cognition_bank: EpisodeBank
+    perceptual_bank: EpisodeBank
 
     def __init__(
-        self, config: MemoryVlaConfig, cognition_bank: MemoryBank, perceptual_bank: MemoryBank
+        self, config: MemoryVlaConfig, cognition_bank: EpisodeBank, perceptual_bank: EpisodeBank
     ) -> None:
         super().__init__(config, cognition_bank=cognition_bank, perceptual_bank=perceptual_bank)
 
@@ -289,7 +290,7 @@ def build_core(config: MemoryVlaConfig, recalls: bool) -> Core:
     if recalls:
         return RecallingCore(config)
     widths = (config.vlm.width, config.perceptual_width)
-    return MemoryVlaCore(config, *(MemoryBank(width, **vars(config.bank)) for width in widths))
+    return MemoryVlaCore(config, *(EpisodeBank(width, **vars(config.bank)) for width in widths))
 
 
 def cognition_token(hidden: Tensor, patches: int, words: Tensor) -> Tensor:

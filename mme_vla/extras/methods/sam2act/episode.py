@@ -25,7 +25,7 @@ from mme_vla.extras.methods.sam2act.processor import (
     zoomed_images,
 )
 from mme_vla.extras.methods.sam2act.sam2 import BankState
-from mme_vla.policy.capabilities import MemoryEntries
+from mme_vla.extras.methods.writable_memory import MemoryEntries
 from mme_vla.policy.episode import Episode, Host
 
 
@@ -202,7 +202,7 @@ class KeyframeEpisode(Episode):
         """What `decided` noted last, until the next frames are observed."""
         return self._after
 
-    # Writable memory (`policy/capabilities.py`)
+    # Writable memory (`methods/writable_memory.py`)
 
     memory_clock = None
 

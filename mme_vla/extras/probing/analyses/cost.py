@@ -94,5 +94,6 @@ def _streamed(policy: Policy, batch: Any) -> int | None:
 def _frames(policy: Policy) -> int:
     if policy.memory is None or not isinstance(policy, NetworkPolicy):
         return 0
-    n_encoded = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
+    stored = policy.memory.storage.stored_frames(2 * REPLAN)
+    n_encoded = int((stored >= REPLAN).sum())
     return n_encoded * flops(policy.warm_up_vision)

@@ -6,10 +6,11 @@ from torch import Tensor
 
 from mme_vla import UserError
 from mme_vla.extras.methods.memoryvla.action_head import Dit, DitConfig, Schedule
+from mme_vla.extras.methods.memoryvla.bank import BankState, EpisodeBank
 from mme_vla.extras.methods.memoryvla.model import MemoryVlaConfig, MemoryVlaCore
 from mme_vla.extras.methods.memoryvla.weights import memoryvla_table
 from mme_vla.extras.methods.prismatic import Prismatic
-from mme_vla.memory.extensions.bank import BankState, MemoryBank
+from mme_vla.memory.extensions.bank import CONSOLIDATIONS
 
 
 def moments(count: int, tokens: int = 3, width: int = 8, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -17,7 +18,7 @@ def moments(count: int, tokens: int = 3, width: int = 8, seed: int = 0) -> tuple
     return torch.randn(count, tokens, width, generator=generator), torch.arange(count) * 3
 
 
-def one_by_one(bank: MemoryBank, tokens: Tensor, times: Tensor) -> tuple[Tensor, BankState]:
+def one_by_one(bank: EpisodeBank, tokens: Tensor, times: Tensor) -> tuple[Tensor, BankState]:
     state, fused = bank.init_state(tokens.shape[1]), []
     for moment, time in zip(tokens, times.tolist(), strict=False):
         output = bank.read([state], moment[None])[0]
@@ -28,7 +29,7 @@ def one_by_one(bank: MemoryBank, tokens: Tensor, times: Tensor) -> tuple[Tensor,
 
 @torch.no_grad()
 def test_of_equal_moments_the_first_two_become_one_and_of_none_the_earlier_time_stays() -> None:
-    bank = MemoryBank(8, length=4)
+    bank = EpisodeBank(8, length=4)
     tokens = moments(1)[0].repeat(5, 1, 1)
     _, state = one_by_one(bank, tokens, torch.tensor([2, 4, 6, 8, 10]))
     assert state.merged == 0 and state.times.tolist() == [2, 6, 8, 10]
@@ -36,7 +37,7 @@ def test_of_equal_moments_the_first_two_become_one_and_of_none_the_earlier_time_
 
 
 def test_what_is_stored_carries_no_gradient_and_what_is_read_does() -> None:
-    bank = MemoryBank(8, length=4)
+    bank = EpisodeBank(8, length=4)
     tokens, times = moments(2)
     tokens.requires_grad_()
     fused, (state,) = bank.run(tokens, times, [torch.arange(2)])
@@ -45,13 +46,36 @@ def test_what_is_stored_carries_no_gradient_and_what_is_read_does() -> None:
     assert gradient[0].abs().sum() == 0 and gradient[1].abs().sum() > 0
 
 
+@pytest.mark.parametrize("consolidation", CONSOLIDATIONS)
+def test_entries_stored_at_once_equal_those_stored_one_by_one(consolidation: str) -> None:
+    torch.manual_seed(0)
+    bank = EpisodeBank(8, length=4, consolidation=consolidation)
+    moments, times, counts = torch.randn(3, 9, 2, 8), torch.arange(9).repeat(3, 1) * 3, [9, 6, 2]
+    moments[0, 5] = moments[0, 4]  # alike, so that they are merged
+    valid = torch.arange(9) >= 9 - torch.tensor(counts)[:, None]
+    entries, at, there = bank.replay(moments, times, valid)
+    for row, count in enumerate(counts):
+        state = bank.init_state(2)
+        for i in range(9 - count, 9):
+            state = bank.update(state, moments[row, i], moments[row, i], int(times[row, i]))
+        torch.testing.assert_close(entries[row, there[row]], state.entries)
+        assert torch.equal(at[row, there[row]], state.times) and int(there[row].sum()) == min(
+            count, 4
+        )
+        query = torch.randn(1, 2, 8)
+        together = bank.retrieve_from(
+            query, entries[row : row + 1], at[row : row + 1], there[row : row + 1]
+        )
+        torch.testing.assert_close(together, bank.retrieve([state], query))
+
+
 @pytest.mark.parametrize(
     "options",
     [{"fusion": "gat"}, {"consolidation": "lifo"}, {"length": 0}, {"retrieval_layers": 0}],
 )
 def test_a_bank_that_cannot_be_is_refused(options: dict[str, object]) -> None:
     with pytest.raises(UserError, match=f"bank.{next(iter(options))}"):
-        MemoryBank(8, **options)  # type: ignore[arg-type]
+        EpisodeBank(8, **options)  # type: ignore[arg-type]
 
 
 def test_a_number_of_ddim_steps_that_no_stride_gives_is_refused() -> None:
@@ -81,7 +105,7 @@ def test_full_size_parameters_are_the_originals_to_the_number() -> None:
     with torch.device("meta"):
         vlm = Prismatic(config.vision, config.vlm, config.vocab_size)
         width = config.vlm.width
-        core = MemoryVlaCore(config, MemoryBank(width), MemoryBank(config.perceptual_width))
+        core = MemoryVlaCore(config, EpisodeBank(width), EpisodeBank(config.perceptual_width))
     parts = {
         "vision": (vlm.vision, 730_911_680),
         "projector": (vlm.projector, 71_385_600),

@@ -14,8 +14,8 @@ from torch import Tensor
 from helpers.baselines import arrays, baselines_folder, relative_error
 from helpers.memoryvla_golden import bank, core, golden_name
 from mme_vla.extras.methods.memoryvla.action_head import Schedule
+from mme_vla.extras.methods.memoryvla.bank import BankState, EpisodeBank
 from mme_vla.extras.methods.memoryvla.model import MemoryVlaCore, cognition_token
-from mme_vla.memory.extensions.bank import BankState, MemoryBank
 
 TOLERANCE, LONG = (
     1e-4,
@@ -68,7 +68,7 @@ def test_memoryvla_modules(folder: Path, network: MemoryVlaCore) -> None:
 
 
 def stepwise(
-    one: MemoryBank, tokens: Tensor, times: Tensor, ids: Tensor
+    one: EpisodeBank, tokens: Tensor, times: Tensor, ids: Tensor
 ) -> list[tuple[Tensor, Tensor, BankState]]:
     """Each moment's retrieved and fused tokens and the bank of its episode after it."""
     states: dict[int, BankState] = {}

@@ -1,4 +1,4 @@
-"""A capability that the episodes of some policies have beside `Episode`: check for it with
+"""A capability that the episodes of some policies have beside `Episode`: probes check for it with
 `isinstance`.
 """
 
