@@ -206,11 +206,13 @@ def distinct_parts(runs: Sequence[str]) -> list[str]:
     the model.
     """
     names = [run.split(", ") for run in runs]
+    shared = set(names[0][1:])
     if len(names) > 1:
-        shared = set.intersection(*(set(parts) for parts in names))
-    else:
-        shared = set(names[0][1:])
-    return [", ".join(part for part in parts if part not in shared) for parts in names]
+        shared = set(names[0]).intersection(*names[1:])
+    labels = []
+    for parts in names:
+        labels.append(", ".join(part for part in parts if part not in shared))
+    return labels
 
 
 CAPTION = (
@@ -232,8 +234,12 @@ def process_tables(results: Results) -> list[Table]:
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:
-    scores = [score for score in map(process_of, records) if score is not None]
-    progress = 100 * np.mean([score.done / max(score.of, 1) for score in scores])
-    ends = Counter(score.operation or score.broke or "success" for score in scores)
+    progress: list[float] = []
+    ends: Counter[str] = Counter()
+    for record in records:
+        score = process_of(record)
+        if score is not None:
+            progress.append(score.done / max(score.of, 1))
+            ends[score.operation or score.broke or "success"] += 1
     counts = [str(ends[kind] or "–") for kind in ("success", *OPERATIONS, MOTION, "stuck")]
-    return [name, str(len(scores)), f"{progress:.1f}", *counts]
+    return [name, str(len(progress)), f"{100 * np.mean(progress):.1f}", *counts]

@@ -125,16 +125,13 @@ class ModelCost:
 @cache
 def counted() -> dict[str, ModelCost]:
     """The shipped counts of every model at full size, made by `python -m mme_vla.analyse cost`."""
+    costs = {}
     with _COUNTED.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    numbers = [
-        {key: int(text) if text else None for key, text in row.items() if key != "model"}
-        for row in rows
-    ]
-    return {
-        row["model"]: ModelCost(row["model"], **of)  # type: ignore[arg-type]
-        for row, of in zip(rows, numbers, strict=True)
-    }
+        for row in csv.DictReader(file):
+            model = row.pop("model")
+            numbers = {key: int(text) if text else None for key, text in row.items()}
+            costs[model] = ModelCost(model, **numbers)  # type: ignore[arg-type]
+    return costs
 
 
 def chunk_flops() -> dict[str, float]:
