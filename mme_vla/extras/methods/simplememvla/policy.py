@@ -29,9 +29,9 @@ from mme_vla.extras.methods.simplememvla.model import (
     words_loss,
 )
 from mme_vla.extras.methods.simplememvla.processor import (
-    PromptSettings,
     SimpleMemVlaProcessor,
     VideoBatch,
+    processor_settings,
 )
 from mme_vla.extras.methods.simplememvla.prompt import (
     IMAGE,
@@ -491,8 +491,8 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         """A batch of one without content: a full video, or a full memory, and a response of a usual
         length.
         """
-        sizes, robot, section = self.sizes, self.embodiment, dict(self.config["processor"])
-        settings = PromptSettings(**{key: value for key, value in section.items() if key != "name"})
+        sizes, robot = self.sizes, self.embodiment
+        settings = processor_settings(self.config)
         window = Window(settings.seconds, settings.fps, settings.native_fps)
         patches = window.length // TEMPORAL if self.memory is None and settings.video else 1
         side = settings.side or sizes.image_size
