@@ -13,26 +13,13 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from mme_vla.config.devices import find_device
-from mme_vla.config.sections import read_section
+from mme_vla.config.sections import PathText, read_section
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.run_folders import locate_checkpoint
+from mme_vla.policy.sections import SECTIONS, PolicySections
 from mme_vla.processing.normalise import NormStats
-
-# What a checkpoint brings along, so that it cannot be set beside one.
-_MODEL_KEYS = (
-    "name",
-    "model",
-    "embodiment",
-    "backbone",
-    "memory",
-    "integration",
-    "policy",
-    "processor",
-    "subgoal_text",
-    "token_budget",
-)
 
 
 @dataclass(frozen=True)
@@ -42,8 +29,8 @@ class PolicyChoice:
     config: all of the command's configuration, plain. Without a checkpoint its model is built.
     """
 
-    name: str
-    checkpoint: str | None
+    name: PathText
+    checkpoint: PathText | None
     revision: str | None
     device: str
     dtype: str
@@ -53,16 +40,7 @@ class PolicyChoice:
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read a composed configuration, plain and resolved."""
-        checkpoint = config["checkpoint"]
-        choice = read_section(
-            cls,
-            config,
-            others=True,
-            name=str(config["name"]),
-            checkpoint=None if checkpoint is None else str(checkpoint),
-            config={},
-        )
-        return replace(choice, config=config)
+        return replace(read_section(cls, config, others=True, config={}), config=config)
 
 
 class LoadedPolicy(NamedTuple):
@@ -90,7 +68,8 @@ def load_policy(
         device: instead of the configured one.
     """
     device = find_device(choice.device) if device is None else device
-    named = words_of(*_MODEL_KEYS)
+    # What a checkpoint brings along, so that it cannot be set beside one.
+    named = words_of("model", *set(SECTIONS) - {"plugins"})
     if choice.checkpoint is not None:
         if named:
             raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
@@ -102,7 +81,7 @@ def load_policy(
             revision=choice.revision,
             trust_plugins=choice.trust_plugins,
         )
-        name = str(policy.config.get("name", "policy"))
+        name = str(PolicySections.of(policy.config).name or "policy")
         logger.info("%s from %s, on %s", name, where, device)
         return LoadedPolicy(policy, name, where)
     require(

@@ -64,17 +64,8 @@ def join_memories(cfg: DictConfig) -> DictConfig:
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
-POLICY, DEFAULT_POLICY = "policy.name", "mme"
-
-Sections = dict[str, Any]  # Flat dotted keys
-
-
-def of_policy(section: Mapping[str, Any]) -> Sections:
-    """The kind of policy, where it is not the usual one, which configurations did not
-    use to name.
-    """
-    name = section.get("name", DEFAULT_POLICY)
-    return {} if name == DEFAULT_POLICY else {POLICY: name}
+DEFAULT_POLICY = "mme"
+"""The policy of configurations that name none: backbone × memory × integration."""
 
 
 def digest(values: Mapping[str, Any], letters: int) -> str:
@@ -83,13 +74,12 @@ def digest(values: Mapping[str, Any], letters: int) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:letters]
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> Sections:
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested sections as one, under dotted keys."""
-    result: Sections = {}
+    result: dict[str, Any] = {}
     for key, value in values.items():
-        result |= (
-            flat(value, f"{prefix}{key}.")
-            if isinstance(value, Mapping)
-            else {f"{prefix}{key}": value}
-        )
+        if isinstance(value, Mapping):
+            result |= flat(value, f"{prefix}{key}.")
+        else:
+            result[f"{prefix}{key}"] = value
     return result

@@ -16,6 +16,7 @@ from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.saving import load_policy, push_to_hub, save_policy
+from mme_vla.policy.sections import PolicySections
 from mme_vla.types import Noise, stack_noise
 
 if TYPE_CHECKING:
@@ -214,7 +215,7 @@ class Policy(nn.Module):
             n_past = self.require_processor().samples.window - 1
             return np.zeros((0, self.horizon - n_past, self.embodiment.action.width), np.float32)
         if not self.info.supports_rtc and any(e.action_prefix is not None for e in episodes):
-            name = self.config.get("name", type(self).__name__)
+            name = PolicySections.of(self.config).name or type(self).__name__
             raise UserError(
                 f"{name} does not support real-time chunking, which needs a flow policy such as"
                 " π0.5. Leave out set_action_prefix()."

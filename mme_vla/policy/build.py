@@ -18,7 +18,8 @@ from mme_vla.errors import UserError, require
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import Memory, MemoryModule
 from mme_vla.policy.base import Policy
-from mme_vla.policy.saving import SECTIONS, policy_class
+from mme_vla.policy.saving import policy_class
+from mme_vla.policy.sections import SECTIONS, PolicySections
 from mme_vla.processing.base import DEFAULT as DEFAULT_PROCESSOR
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.prompt import PROMPTS
@@ -63,8 +64,9 @@ def check_integrated(
             )
         return
     if takes_tokens and memory.budget == 0:
+        name = PolicySections.of(config).memory.get("name")
         raise UserError(
-            f"The memory {config['memory']['name']!r} produces no tokens with these settings."
+            f"The memory {name!r} produces no tokens with these settings."
             " Set integration=none or memory.states=true."
         )
     if not takes_tokens and memory.budget > 0:
@@ -78,10 +80,11 @@ def check_integrated(
 
 def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) -> None:
     """Make sure that the backbone reads past views if the memory gives them."""
+    sections = PolicySections.of(config)
     if memory.past_view_spec is not None and "past" not in supports:
         raise UserError(
-            f"The memory {config['memory']['name']!r} gives the vision tower past views along with"
-            f" the current ones, and the tower of the backbone {config['backbone']['name']!r} sees"
+            f"The memory {sections.memory['name']!r} gives the vision tower past views along with"
+            f" the current ones, and the tower of the backbone {sections.backbone['name']!r} sees"
             " one image at a time. Take another memory, a backbone that hosts `past` (pi05), or"
             " past states alone (memory.views=false)."
         )
@@ -95,15 +98,16 @@ def check_positions(
     """
     if integration.memory_position != "time":
         return
+    sections = PolicySections.of(config)
     if not memory.timed:
         raise UserError(
             "integration.memory_position=time: the tokens of the memory"
-            f" {config['memory']['name']!r} have no time each. Take memory_position=slot, or a"
+            f" {sections.memory['name']!r} have no time each. Take memory_position=slot, or a"
             " memory that is `timed`."
         )
     if "blocks" in extension_points(type(integration)) and "positions" not in supports:
         raise UserError(
-            f"integration.memory_position=time: the backbone {config['backbone']['name']!r} has no"
+            f"integration.memory_position=time: the backbone {sections.backbone['name']!r} has no"
             " place for blocks at positions of their own. Take memory_position=slot, or"
             " integration=modulator where it hosts that."
         )
@@ -166,13 +170,11 @@ def build_from_config(
         fresh_backbone: False if a checkpoint is loaded next: the backbone's weights are not
             initialised.
     """
-    import_plugins(plugins_of(config, "the configuration"))
-    container = OmegaConf.to_container(with_embodiment(config), resolve=True)
-    assert isinstance(container, dict)
-    sections = {key: container[key] for key in SECTIONS if key in container}
-    check_token_budget(sections)
+    values = policy_config(config)
+    sections = {key: values[key] for key in SECTIONS if key in values}
+    check_token_budget(PolicySections.of(sections))
     if seed is None:
-        seed = container.get("seed", 42)
+        seed = values.get("seed", 42)
     is_on_meta = torch.device(device).type == "meta"
     # On meta the tokenizer is not needed.
     processor = None if is_on_meta else build_processor(sections)
@@ -212,14 +214,15 @@ def with_embodiment(config: DictConfig) -> DictConfig:
     return config
 
 
-def check_token_budget(sections: Mapping[str, Any]) -> None:
+def check_token_budget(sections: PolicySections) -> None:
     """Make sure that memory and subgoal together stay within `token_budget`, where there is one."""
-    budget = sections.get("token_budget")
+    budget = sections.token_budget
     if budget is None:
         return
-    memory = (sections.get("memory") or {}).get("budget", 0)
-    reads = PROMPTS[sections["processor"].get("prompt", "plain")].reads_subgoal
-    subgoal = sections["processor"].get("subgoal_length") if reads else 0
+    memory = sections.memory.get("budget", 0)
+    subgoal = sections.processor.get("subgoal_length")
+    if not PROMPTS[sections.processor.get("prompt", "plain")].reads_subgoal:
+        subgoal = 0
     if subgoal is None:
         raise UserError(
             f"token_budget={budget} needs a limit of the subgoal too: set processor.subgoal_length."
@@ -231,12 +234,18 @@ def check_token_budget(sections: Mapping[str, Any]) -> None:
     )
 
 
-def build_processor(sections: Mapping[str, Any]) -> PolicyProcessor:
-    if not sections.get("processor"):
+def build_processor(config: Mapping[str, Any]) -> PolicyProcessor:
+    """The processor of a policy's configuration.
+
+    Raises:
+        UserError: it has none.
+    """
+    sections = PolicySections.of(config)
+    if not sections.processor:
         raise UserError(
-            f"No processor goes with the backbone {sections['backbone'].get('name')!r}: under"
+            f"No processor goes with the backbone {sections.backbone.get('name')!r}: under"
             " `defaults` of its file write `/processor@_global_.processor: tiny`, or the name of a"
             " configs/processor file of your own."
         )
-    kind: type[PolicyProcessor] = PROCESSORS[sections["processor"].get("name", DEFAULT_PROCESSOR)]
-    return kind.from_sections(sections)
+    kind: type[PolicyProcessor] = PROCESSORS[sections.processor.get("name", DEFAULT_PROCESSOR)]
+    return kind.from_sections(config)

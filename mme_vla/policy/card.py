@@ -9,6 +9,7 @@ from torch import nn
 
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import brief, require
+from mme_vla.policy.sections import PolicySections
 
 CARD_FILE = "README.md"
 
@@ -23,8 +24,9 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
     Raises:
         UserError: `recipe` or `results` is no mapping.
     """
-    name = str(config.get("name", "policy"))
-    known = config.get("card") or {}
+    sections = PolicySections.of(config)
+    name = str(sections.name or "policy")
+    known = sections.card
     for key in ("recipe", "results"):
         value = known.get(key) or {}
         require(
@@ -32,23 +34,23 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
             f"card[{key!r}]={brief(value)} must map names to values, such as {{'success (%)':"
             " 54.0}.",
         )
-    backbone = config.get("backbone") or {}
+    backbone = sections.backbone
     network = backbone.get("name", "pi05")
     if "depth" in backbone:
         network += f", {backbone['depth']} layers"
     rows = {
-        "memory": _part(config.get("memory")),
-        "integration": _part(config.get("integration")),
+        "memory": _part(sections.memory),
+        "integration": _part(sections.integration),
         "backbone": network,
-        "robot": str((config.get("embodiment") or {}).get("name", "robomme_joint")),
+        "robot": embodiment_of(config).name,
         "action chunk": (
             f"{backbone.get('horizon', '?')} steps of {backbone.get('action_dim', '?')} numbers"
         ),
         "parameters": f"{sum(p.numel() for p in policy.parameters()) / 1e6:.1f} M",
     }
-    if config.get("adapters"):
-        rows["adapters"] = f"LoRA, rank {config['adapters'].get('rank')}, not merged"
-    memory = "with a memory of the episode" if config.get("memory") else "without memory"
+    if sections.adapters:
+        rows["adapters"] = f"LoRA, rank {sections.adapters.get('rank')}, not merged"
+    memory = "with a memory of the episode" if sections.memory else "without memory"
     return f"""---
 {front_matter(name, known)}
 ---
@@ -142,14 +144,11 @@ def front_matter(name: str, known: Mapping[str, Any]) -> str:
 
 
 def _part(section: Mapping[str, Any] | None) -> str:
-    if not section or section.get("name") in (None, "none"):
-        return "none"
-    options = ", ".join(
-        f"{key} {value}" for key, value in section.items() if key != "name" and value is not None
-    )
+    options = {key: value for key, value in (section or {}).items() if value is not None}
+    name = str(options.pop("name", "none"))
     if not options:
-        return str(section["name"])
-    return f"{section['name']} ({options})"
+        return name
+    return f"{name} ({', '.join(f'{key} {value}' for key, value in options.items())})"
 
 
 def _table(rows: Mapping[str, Any] | None) -> str:

@@ -31,6 +31,7 @@ from mme_vla.policy.build import build_memory, check_integrated
 from mme_vla.policy.episode import Episode, prefix_overlap
 from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
+from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes
@@ -153,23 +154,23 @@ class MMEPolicy(NetworkPolicy):
         Raises:
             UserError: an unknown name or option, or sizes that do not fit together.
         """
-        backbone_cls, sizes = read_backbone(config["backbone"])
+        sections = PolicySections.of(config)
+        backbone_cls, sizes = read_backbone(sections.backbone)
         embodiment_of(config)  # raises an error before anything is built
 
         # The integration, which decides on the backbone's extra experts.
-        section = config.get("integration")
         integration = Integration(sizes)
-        if section:
-            required = extension_points(INTEGRATIONS[section.get("name")])
-            unsupported = required - backbone_cls.supports
+        if sections.integration:
+            name: Any = sections.integration.get("name")
+            unsupported = extension_points(INTEGRATIONS[name]) - backbone_cls.supports
             if unsupported:
                 raise UserError(
-                    f"The backbone {config['backbone']['name']!r} has no place for"
-                    f" {listed(sorted(unsupported))} of the integration {section['name']!r}; it"
-                    f" hosts {listed(sorted(backbone_cls.supports))}. Choose another integration or"
+                    f"The backbone {sections.backbone['name']!r} has no place for"
+                    f" {listed(sorted(unsupported))} of the integration {name!r}; it hosts"
+                    f" {listed(sorted(backbone_cls.supports))}. Choose another integration or"
                     " backbone."
                 )
-            integration = INTEGRATIONS.build(section, sizes)
+            integration = INTEGRATIONS.build(sections.integration, sizes)
         experts = integration.extra_experts()
 
         # The backbone, whose weights are not initialised if a checkpoint is loaded next.
@@ -181,9 +182,9 @@ class MMEPolicy(NetworkPolicy):
                 backbone.init_experts(list(experts))
 
         memory: MemoryModule | None = None
-        if config.get("memory"):
+        if sections.memory:
             memory = build_memory(
-                config["memory"], backbone.vision_width, backbone.grid, integration.memory_width
+                sections.memory, backbone.vision_width, backbone.grid, integration.memory_width
             )
         cls._check_parts(config, integration, memory, backbone_cls.supports)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
@@ -442,7 +443,7 @@ class MMEPolicy(NetworkPolicy):
         return batch
 
     def _prompt_length(self) -> int:
-        words = int(self.config["processor"]["prompt_length"])
+        words = int(PolicySections.of(self.config).processor["prompt_length"])
         return words + self.embodiment.action.options_length
 
     def warm_up_vision(self) -> None:
@@ -471,6 +472,6 @@ def mme_of(policy: Policy, what: str) -> MMEPolicy:
     if not isinstance(policy, MMEPolicy):
         raise UserError(
             f"{what} requires a policy of backbone, memory and integration; "
-            f"{policy.config.get('name', 'this')} is a {type(policy).__name__}."
+            f"{PolicySections.of(policy.config).name or 'this'} is a {type(policy).__name__}."
         )
     return policy

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.building import shapes_only
-from mme_vla.config.naming import DECISIVE, digest, flat, of_policy
+from mme_vla.config.naming import DECISIVE, DEFAULT_POLICY, digest, flat
 from mme_vla.config.plugins import import_trusted
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import embodiment_of
@@ -21,6 +21,7 @@ from mme_vla.errors import UserError, brief, check_known, did_you_mean, require
 from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
 from mme_vla.policy.run_folders import newest_checkpoint
+from mme_vla.policy.sections import KNOWN_SECTIONS, PolicySections
 from mme_vla.policy.tensor_files import (
     assign_tensors,
     dtype_of,
@@ -48,7 +49,9 @@ def composition_digest(config: Mapping[str, Any]) -> str:
             where it is not RoboMME's Panda in joint space.
     """
     settings = flat({key: config.get(key) for key in (*DECISIVE, "backbone")})
-    settings |= of_policy(config.get("policy") or {})
+    name = policy_name(config)
+    if name != DEFAULT_POLICY:  # which configurations did not use to name
+        settings["policy.name"] = name
     settings.pop("processor.tokenizer", None)
     settings = {key: value for key, value in settings.items() if value is not None}
     robot = embodiment_of(config)
@@ -58,15 +61,11 @@ def composition_digest(config: Mapping[str, Any]) -> str:
     return digest(settings, 12)
 
 
-DEFAULT = "mme"
-"""The policy of configurations that name none: backbone × memory × integration."""
-
-
 def policy_name(config: Mapping[str, Any]) -> str:
     """What the section `policy` of a configuration calls its class."""
-    section = config.get("policy") or {}
+    section = PolicySections.of(config).policy
     require(isinstance(section, Mapping), f"policy={brief(section)} must be a section.")
-    return section.get("name", DEFAULT)  # the registry refuses what is no name
+    return section.get("name", DEFAULT_POLICY)  # the registry refuses what is no name
 
 
 def policy_class(config: Mapping[str, Any]) -> type[Any]:
@@ -93,7 +92,8 @@ def policy_options(cls: type, config: Mapping[str, Any]) -> dict[str, Any]:
 
     Where a constructor takes `**options`, those of its parent class count too.
     """
-    options = {key: value for key, value in config.get("policy", {}).items() if key != "name"}
+    options = dict(PolicySections.of(config).policy)
+    options.pop("name", None)
     known = _keyword_options(cls)
     for key in options:
         if key not in known:
@@ -205,25 +205,6 @@ def push_folder(
 CONFIG = "config.json"
 
 
-SECTIONS = (
-    "name",
-    "plugins",
-    "embodiment",
-    "backbone",
-    "memory",
-    "integration",
-    "policy",
-    "processor",
-    "subgoal_text",
-    "token_budget",
-)
-"""Parts of a configuration that build a policy."""
-KNOWN_SECTIONS = (*SECTIONS, "adapters", TRAINING, "card")
-"""What `config.json` may hold: also adapters, the training that the policy came from, and texts for
-its card.
-"""
-
-
 def read_config(folder: Path) -> dict[str, Any]:
     """Read `config.json` of a checkpoint, as plain values: nothing in it is resolved
     or imported.
@@ -249,7 +230,7 @@ def save_policy(
     """
     kind = dtype_of(dtype)
     if card is not None:
-        policy.config["card"] = {**policy.config.get("card", {}), **card}
+        policy.config["card"] = {**PolicySections.of(policy.config).card, **card}
     save_tensors(policy.state_dict(), folder, dtype=kind)
     settings = save_settings(policy, folder, facts)
     # without the card, which people edit
@@ -355,18 +336,21 @@ def build_saved[P: "Policy"](
         config: plain sections. source: where they are from, for messages. options: overrides of the
             section `policy`.
     """
-    section = config.get("policy", {})
-    require(isinstance(section, dict), f"{source}: policy={brief(section)} must be a section.")
-    config = {**config, "policy": {**section, **(options or {})}}
+    sections = PolicySections.of(config)
+    require(
+        isinstance(sections.policy, dict),
+        f"{source}: policy={brief(sections.policy)} must be a section.",
+    )
+    config = {**config, "policy": {**sections.policy, **(options or {})}}
     try:
         with shapes_only():
             built = kind.from_config(config)
-            if config.get("adapters"):
-                add_adapters(built, **config["adapters"])
+            if sections.adapters:
+                add_adapters(built, **sections.adapters)
     except UserError as error:
         raise UserError(f"{source}: {error}") from error
     except Exception as error:
-        if config.get("plugins"):
+        if sections.plugins:
             raise  # it may be in the user's own code
         reason = brief(f"{type(error).__name__}: {error}", 300, quote=False)
         raise UserError(
@@ -406,7 +390,8 @@ def check_processor(policy: "Policy", source: str) -> None:
     """Make sure that a policy and its processor have the same robot and sizes."""
     processor = policy.require_processor()
     robot = embodiment_of(policy.config)
-    if policy.config.get("embodiment") is not None and robot != processor.embodiment:
+    is_named = PolicySections.of(policy.config).embodiment is not None
+    if is_named and robot != processor.embodiment:
         raise UserError(
             f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the"
             f" configuration of {brief(robot.name)}, or they describe it differently. The files are"

@@ -9,34 +9,41 @@ from typing import Annotated, Any
 
 from mme_vla.config.naming import digest, flat
 from mme_vla.config.sections import Range, read_section
+from mme_vla.policy.run_folders import newest_checkpoint
 from mme_vla.utils import Sums
 
 KEY = "training"
 """The section of a checkpoint's configuration that holds the identity of its training."""
 NONE = "none"
 """What `init_from` says for random weights."""
-_RECIPE = ("train", "finetune", "learning", "init_from")
-_POLICY = ("augment", "compute_dtype", "stage", "subtask_weight")
-_DATA = (
-    "action_offset",
-    "mask_padding",
-    "jitter",
-    "history_transforms",
-    "weights",
-    "narrow_ranges",
+# A dot ends each name: `train.keep.` means this key, or the section with all that is in it.
+_RECIPE = (
+    "train.",
+    "finetune.",
+    "learning.",
+    "policy.augment.",
+    "policy.compute_dtype.",
+    "policy.stage.",
+    "policy.subtask_weight.",
+    "data.action_offset.",
+    "data.mask_padding.",
+    "data.jitter.",
+    "data.history_transforms.",
+    "data.weights.",
+    "data.narrow_ranges.",
 )
 _NO_EFFECT = (
-    "train.log_every",
-    "train.val_every",
-    "train.val_samples",
-    "train.save_every",
-    "train.keep",
-    "train.parallel",
-    "train.prefetch_gb",
-    "train.workers",
-    "train.open_loop_chunks",
-    "train.device",
-    "train.seed",
+    "train.log_every.",
+    "train.val_every.",
+    "train.val_samples.",
+    "train.save_every.",
+    "train.keep.",
+    "train.parallel.",
+    "train.prefetch_gb.",
+    "train.workers.",
+    "train.open_loop_chunks.",
+    "train.device.",
+    "train.seed.",
 )
 
 
@@ -62,26 +69,24 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
     Args:
         config: the plain configuration of a training. content: fingerprints of its datasets.
     """
-    policy = config.get("policy") or {}
-    data = config.get("data") or {}
-    settings = {key: config.get(key) for key in _RECIPE}
-    settings["policy"] = {key: policy.get(key) for key in _POLICY}
-    settings["data"] = {key: data.get(key) for key in _DATA}
-    if settings["init_from"] == NONE:
-        settings["init_from"] = None
-    if settings["init_from"] is not None:
-        settings["init_from"] = _start(str(settings["init_from"]))
-    no_effect = tuple(f"{key}." for key in _NO_EFFECT)
+    values = flat(config)
     recipe = {}
-    for key, value in flat(settings).items():
-        if value not in (None, [], {}) and not f"{key}.".startswith(no_effect):
+    for key, value in values.items():
+        changes_updates = f"{key}.".startswith(_RECIPE) and not f"{key}.".startswith(_NO_EFFECT)
+        if changes_updates and value not in (None, [], {}):
             recipe[key] = value
+    source = values.get("init_from")
+    if source not in (None, NONE):
+        # The weights to start from: their digest, or the end of their path or hub name.
+        folder = newest_checkpoint(Path(source).expanduser())
+        recipe["init_from"] = weights_digest(folder) or Path(source).name
     split = {
         "content": list(content),
-        "val_fraction": data.get("val_fraction"),
-        "val_episodes": data.get("val_episodes"),
+        "val_fraction": values.get("data.val_fraction"),
+        "val_episodes": values.get("data.val_episodes"),
     }
-    identity = TrainingIdentity(int(config["seed"]), digest(recipe, 12), digest(split, 12))
+    seed = int(values["seed"])
+    identity = TrainingIdentity(seed, digest(recipe, 12), digest(split, 12))
     return {key: value for key, value in asdict(identity).items() if value is not None}
 
 
@@ -106,12 +111,3 @@ def weights_digest(folder: Path) -> str | None:
     if not sums:
         return None
     return digest({"weights": sums}, 12)
-
-
-def _start(source: str) -> str:
-    """What weights to start from are called in a recipe: their digest, or the end of their path or
-    hub name.
-    """
-    from mme_vla.policy.run_folders import newest_checkpoint
-
-    return weights_digest(newest_checkpoint(Path(source).expanduser())) or Path(source).name
