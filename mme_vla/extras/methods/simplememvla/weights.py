@@ -24,6 +24,7 @@ from mme_vla.extras.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.extras.methods.simplememvla.processor import TOKENIZER_FILE, processor_settings
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import WEIGHTS, cast
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import checked_file, read_json
@@ -204,8 +205,9 @@ def simplememvla_of(policy: Policy) -> SimpleMemVlaPolicy:
     """The policy, where it is SimpleMemVLA."""
     if not isinstance(policy, SimpleMemVlaPolicy):
         raise UserError(
-            f"This format holds SimpleMemVLA; {policy.config.get('name', 'this')} is a"
-            f" {type(policy).__name__}. Set model=simplememvla."
+            "This format holds SimpleMemVLA;"
+            f" {PolicySections.of(policy.config).name or 'this'} is a {type(policy).__name__}. Set"
+            " model=simplememvla."
         )
     return policy
 
