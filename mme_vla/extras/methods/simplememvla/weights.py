@@ -149,7 +149,7 @@ class PublishedConfig:
             variable_history=settings.variable,
             image_keys=tuple(_IMAGE_KEY + name for name in robot.camera_names),
             history_image_keys=(_IMAGE_KEY + robot.memory_camera,),
-            model_type=NAME,
+            model_type="simplememvla",
         )
 
     def configure(self, config: DictConfig) -> None:
