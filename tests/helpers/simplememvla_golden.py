@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from omegaconf import OmegaConf
 from torch import Tensor
 
 from helpers import baselines
 from mme_vla.extras.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.extras.methods.simplememvla.processor import SimpleMemVlaProcessor
 from mme_vla.extras.methods.simplememvla.video import Window
-from mme_vla.extras.methods.simplememvla.weights import backbone_section, processor_section
+from mme_vla.extras.methods.simplememvla.weights import PublishedConfig
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.weights.load import load_weights
 
@@ -60,10 +61,13 @@ def sections(**processor: Any) -> dict[str, Any]:
     meta = read("meta")
     config, pixels = meta["config"], meta["processor"]
     bounds = [pixels["min_pixels"], pixels["max_pixels"]]
-    backbone = backbone_section(config)
+    composed = OmegaConf.create({"backbone": {}, "processor": {}})
+    PublishedConfig.read(config).configure(composed)
+    read_sections: Any = OmegaConf.to_container(composed)
+    backbone = read_sections["backbone"]
     settings = {
         "name": "simplememvla",
-        **processor_section(config),
+        **read_sections["processor"],
         "tokenizer": str(folder() / "tokenizer.json"),
     }
     return {

@@ -328,9 +328,10 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
         """Vision tokens [b, …, d] as they are read with a prompt.
 
         With `goal=text` their last numbers are the features of the classes that each query of
-        `GoalReader` selects. `goal=swap` is of policies of earlier versions: the class of cubes
-        that the prompt names first and the first class are exchanged, so that one index holds the
-        requested one; `ConvTower.words`, part of the tower's weights, says which word names which.
+        `GoalReader` selects. `goal=swap` is of the shipped policy `checkpoint=nano`: the class of
+        cubes that the prompt names first and the first class are exchanged, so that one index holds
+        the requested one. `ConvTower.words`, part of the tower's weights, says which word names
+        which.
         """
         if self.goal_reader is not None:
             selected = self.goal_reader(prompt, prompt_mask).to(tokens.dtype)

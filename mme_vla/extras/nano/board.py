@@ -65,16 +65,14 @@ class Row:
         """A `policy` with memory, a `floor` or a `ceiling`, as one is that reads the simulator's
         subgoals.
         """
-        if self.method.subgoal == "oracle":
+        subgoal = self.method.subgoal
+        if subgoal == "oracle":
             return "ceiling"
-        lacks_memory = (
-            self.facts.trained and self.facts.budget is None and self.method.subgoal is None
-        )
-        return (
-            "floor"
-            if lacks_memory or self.name.partition(" ")[0].partition("@")[0] == MATCHED
-            else self.facts.kind
-        )
+        if self.facts.trained and self.facts.budget is None and subgoal is None:
+            return "floor"  # it has no memory
+        if self.name.partition(" ")[0].partition("@")[0] == MATCHED:
+            return "floor"
+        return self.facts.kind
 
     @property
     def average(self) -> Figure:
@@ -88,19 +86,19 @@ class Row:
     @property
     def paper(self) -> PaperMethod | None:
         """The published method that the row is, at its default budget."""
-        known = None if self.budget else paper.paper_method(self.name, self.method.subgoal)
-        return (
-            known
-            if known and known.name in {line["method"] for line in paper.paper_table("suites")}
-            else None
-        )
+        if self.budget:
+            return None
+        known = paper.paper_method(self.name, self.method.subgoal)
+        reported = [line["method"] for line in paper.paper_table("suites")]
+        return known if known and known.name in reported else None
 
     def outcomes(self, task: str) -> np.ndarray:
         """Success of a task [scenes, trainings], averaged over the noise seeds of a training."""
-        trainings = [
-            [run.successes(task) for run in training] for training in self.method.trainings
-        ]
-        return np.stack([np.mean(np.array(runs, np.float64), 0) for runs in trainings], 1)
+        trainings = []
+        for training in self.method.trainings:
+            runs = np.array([run.successes(task) for run in training], np.float64)
+            trainings.append(runs.mean(0))
+        return np.stack(trainings, 1)
 
     def mean(self, tasks: Sequence[str]) -> np.ndarray:
         """Success over tasks in percent, of each training."""
@@ -165,22 +163,19 @@ class Board:
     def __init__(self, rows: Mapping[str, Sequence[Training]], samples: int = SAMPLES) -> None:
         """Make the figures. rows: as `read_rows` gives them."""
         require(rows, "There are no rows: train one with model=…, or name folders with rows=….")
-        scenes = next(iter(rows.values()))[0].scenes
-        names = dict.fromkeys(key.task for key in scenes)
-        tasks = [
-            *(task for task in PAPER_ORDER if task in names),
-            *(task for task in names if task not in PAPER_ORDER),
-        ]
-        counts = {sum(key.task == task for key in scenes) for task in tasks}
+        first = next(iter(rows.values()))[0]  # the scenes of all rows are the same
+        counts = Counter(key.task for key in first.scenes)
+        # In the paper's order; other tasks behind, in that of the records
+        tasks = [task for task in PAPER_ORDER if task in counts]
+        tasks += [task for task in counts if task not in PAPER_ORDER]
+        amounts = set(counts.values())
         require(
-            len(counts) == 1,
-            f"Tasks have {sorted(counts)} scenes: a board has as many of each task.",
+            len(amounts) == 1,
+            f"Tasks have {sorted(amounts)} scenes: a board has as many of each task.",
         )
-        self.protocol = Protocol(tuple(tasks), counts.pop(), samples=samples)
-        self.split, self.action_space = (
-            next(iter(scenes.values()))[0],
-            next(iter(rows.values()))[0].action_space,
-        )
+        self.protocol = Protocol(tuple(tasks), amounts.pop(), samples=samples)
+        self.split = first.records[0].split
+        self.action_space = first.action_space
         # where intervals are of `draws`, and no others are read
         self._once = replace(self.protocol, samples=1)
         made = [_row(name, trainings, self._once) for name, trainings in rows.items()]
@@ -214,14 +209,12 @@ class Board:
         rows, or the row's own where that is larger, without the variance of single episodes, which
         the sampled scenes have already.
         """
-        values = {
-            task: [row.outcomes(task).mean(1, keepdims=True) for row in rows] for task in tasks
-        }
+        values: dict[str, list[np.ndarray]] = {}
+        for task in tasks:
+            values[task] = [row.outcomes(task).mean(1, keepdims=True) for row in rows]
         means = 100 * resampled_means(values, self.protocol.samples, self.protocol.seed)
-        rng, shared = (
-            np.random.default_rng([self.protocol.seed, 2]),
-            self._training_deviation(self.rows, tasks),
-        )
+        rng = np.random.default_rng([self.protocol.seed, 2])
+        shared = self._training_deviation(self.rows, tasks)
         for row, sampled in zip(rows, means, strict=True):
             if row.facts.trained:
                 deviation = max(shared, self._training_deviation([row], tasks))
@@ -236,26 +229,20 @@ class Board:
         if not repeated:
             return 0.0
         noise = pooled([row.mean(tasks) for row in repeated]) or 0.0
-        variances = [
-            sum(row.outcomes(task).var(1, ddof=1).sum() for task in tasks) for row in repeated
-        ]
+        # The variance of single episodes, in points of the mean over tasks and episodes
+        variances: list[float] = []
+        for row in repeated:
+            variances.append(sum(row.outcomes(task).var(1, ddof=1).sum() for task in tasks))
         degrees = [len(row.method.trainings) - 1 for row in repeated]
-        of_episodes = (
-            np.average(variances, weights=degrees)
-            * (100 / len(tasks) / self.protocol.episodes) ** 2
-        )
+        points = 100 / len(tasks) / self.protocol.episodes
+        of_episodes = np.average(variances, weights=degrees) * points**2
         return float(max(0.0, noise**2 - of_episodes) ** 0.5)
 
     @cached_property
     def sampled(self) -> dict[str, np.ndarray]:
         """`draws` over all tasks by row."""
-        return dict(
-            zip(
-                [row.name for row in self.rows],
-                self.draws(self.rows, self.protocol.tasks),
-                strict=True,
-            )
-        )
+        names = [row.name for row in self.rows]
+        return dict(zip(names, self.draws(self.rows, self.protocol.tasks), strict=True))
 
     def interval(self, row: Row) -> Interval:
         """Of a row's success over all tasks, in percent; Wilson's where no draw differs."""
@@ -263,7 +250,8 @@ class Board:
         if interval.low < interval.high:
             return interval
         scenes = len(self.protocol.tasks) * self.protocol.episodes
-        return Interval(*(100 * end for end in wilson(self.success(row) / 100, scenes)))
+        low, high = wilson(self.success(row) / 100, scenes)
+        return Interval(100 * low, 100 * high)
 
     @cached_property
     def places(self) -> dict[str, tuple[int, Interval]]:
@@ -272,10 +260,11 @@ class Board:
         """
         means = np.array([self.success(row) for row in self.ranked])
         draws = np.array([self.sampled[row.name] for row in self.ranked])
-        return {
-            row.name: (1 + int((means > mean).sum()), percentiles(1 + (draws > sampled).sum(0)))
-            for row, mean, sampled in zip(self.ranked, means, draws, strict=True)
-        }
+        places = {}
+        for row, mean, sampled in zip(self.ranked, means, draws, strict=True):
+            place = 1 + int((means > mean).sum())
+            places[row.name] = (place, percentiles(1 + (draws > sampled).sum(0)))
+        return places
 
     def neighbours(self) -> list[Comparison]:
         """Each row and the next; of a user's rows, with those beside them, the best and the trained
@@ -285,13 +274,13 @@ class Board:
         """
         ranked = self.ranked
         pairs = list(pairwise(ranked))
-        if local := [row for row in ranked if row.is_local]:
+        local = [row for row in ranked if row.is_local]
+        if local:
             pairs = [pair for pair in pairs if pair[0].is_local or pair[1].is_local]
             floors = [row for row in ranked if row.kind == "floor" and row.facts.trained]
-            pairs += [
-                (other, row) for row in local for other in (ranked[0], *floors) if other is not row
-            ]
-        unique = {frozenset(row.name for row in pair): pair for pair in pairs}
+            for row in local:
+                pairs += [(other, row) for other in (ranked[0], *floors) if other is not row]
+        unique = {frozenset((first.name, second.name)): (first, second) for first, second in pairs}
         return self._compared(list(unique.values()))
 
     def variants(self, part: Literal["memory", "integration"]) -> list[Comparison]:
@@ -313,13 +302,12 @@ class Board:
         return self._compared(pairs)
 
     def _compared(self, pairs: Sequence[tuple[Row, Row]]) -> list[Comparison]:
-        made = compare_all(
-            [(first.method, second.method) for first, second in pairs], self._once, _compare
-        )
-        return [
-            replace(c, interval=percentiles(self.sampled[c.first] - self.sampled[c.second]))
-            for c in made
-        ]
+        methods = [(first.method, second.method) for first, second in pairs]
+        comparisons = []
+        for comparison in compare_all(methods, self._once, _compare):
+            difference = self.sampled[comparison.first] - self.sampled[comparison.second]
+            comparisons.append(replace(comparison, interval=percentiles(difference)))
+        return comparisons
 
     @cached_property
     def apart(self) -> list[Row]:
@@ -332,47 +320,43 @@ class Board:
     @cached_property
     def separations(self) -> list[Separation]:
         """Of each budget that several memories have, and each task."""
-        made = []
-        for budget in sorted(
-            {row.budget for row in self.rows}, key=lambda budget: (len(budget), budget)
-        ):
-            # Outcomes change places within a scene, so all must be of the same one.
-            rows = [
-                row
-                for row in self.of_kind("policy")
-                if row.budget == budget and row not in self.apart
-            ]
-            if len(rows) > 1:
-                tasks = [self._separation(budget, task, rows) for task in self.protocol.tasks]
-                over_policies = holm([separation.p for separation in tasks])
-                repeated = [
-                    separation.p_repeated
-                    for separation in tasks
-                    if separation.p_repeated is not None
-                ]
-                over_trainings = holm(repeated) if repeated else [None] * len(tasks)
-                corrected = zip(tasks, over_policies, over_trainings, strict=True)
-                made += [
-                    replace(separation, p=p, p_repeated=nested)
-                    for separation, p, nested in corrected
-                ]
-        return made
+        separations: list[Separation] = []
+        # Outcomes change places within a scene, so all must be of the same one.
+        policies = [row for row in self.of_kind("policy") if row not in self.apart]
+        budgets = {row.budget for row in self.rows}
+        for budget in sorted(budgets, key=lambda budget: (len(budget), budget)):
+            rows = [row for row in policies if row.budget == budget]
+            if len(rows) < 2:
+                continue
+            tasks = [self._separation(budget, task, rows) for task in self.protocol.tasks]
+            over_policies = holm([separation.p for separation in tasks])
+            # Whether trainings are enough for a test is the same for all tasks.
+            nested = [s.p_repeated for s in tasks if s.p_repeated is not None]
+            over_trainings: Sequence[float | None] = [None] * len(tasks)
+            if nested:
+                over_trainings = holm(nested)
+            corrected = zip(tasks, over_policies, over_trainings, strict=True)
+            for separation, p, p_repeated in corrected:
+                separations.append(replace(separation, p=p, p_repeated=p_repeated))
+        return separations
+
+    def _best(self, kind: str, task: str) -> float | None:
+        """Success of the best row of a kind on a task, in percent; None where there is none."""
+        return max((self.success(row, [task]) for row in self.of_kind(kind)), default=None)
 
     def _separation(self, budget: str, task: str, rows: Sequence[Row]) -> Separation:
         trainings = [row.mean([task]) for row in rows]
-        means, noise = np.array([of_row.mean() for of_row in trainings]), pooled(trainings)
-        variance = means.var(ddof=1) - (noise or 0) ** 2 * np.mean(
-            [1 / len(of_row) for of_row in trainings]
-        )
-        floor, ceiling = (
-            max((self.success(row, [task]) for row in self.of_kind(kind)), default=None)
-            for kind in ("floor", "ceiling")
-        )
+        means = np.array([of_row.mean() for of_row in trainings])
+        # Of the variance between memories, trainings add 1/n of that between trainings.
+        noise = pooled(trainings)
+        shares = [1 / len(of_row) for of_row in trainings]
+        variance = means.var(ddof=1) - (noise or 0) ** 2 * np.mean(shares)
         outcomes = [row.outcomes(task) for row in rows]
         repeated = [of_row for of_row in outcomes if of_row.shape[1] > 1]
-        testable = (
-            smallest_p([of_row.shape[1] for of_row in repeated]) * len(self.protocol.tasks) < 0.05
-        )
+        smallest = smallest_p([of_row.shape[1] for of_row in repeated])
+        p_repeated = None
+        if smallest * len(self.protocol.tasks) < 0.05:
+            p_repeated = homogeneity(repeated, over_trainings=True)
         return Separation(
             budget,
             task,
@@ -382,11 +366,11 @@ class Board:
             float(means.max()),
             float(max(0, variance)) ** 0.5,
             noise,
-            floor,
-            ceiling,
+            self._best("floor", task),
+            self._best("ceiling", task),
             homogeneity(outcomes),
             len(repeated),
-            homogeneity(repeated, over_trainings=True) if testable else None,
+            p_repeated,
         )
 
     @property
@@ -405,13 +389,11 @@ class Board:
         `draws`. Published figures are fixed.
         """
         memories = [(row, method) for row, method in self.published if row.kind == "policy"]
-        named = [
-            (s.kind, s.name, s.tasks)
-            for s in scopes(self.protocol)
-            if s.kind in ("average", "suite", "task")
-        ]
-        named.sort(key=lambda scope: ("average", "suite", "task").index(scope[0]))
-        compared = [(name, tasks, self.published) for _, name, tasks in named]
+        compared = []
+        for kind in ("average", "suite", "task"):
+            for scope in scopes(self.protocol):
+                if scope.kind == kind:
+                    compared.append((scope.name, scope.tasks, self.published))
         compared.insert(1, ("average, memories alone", self.protocol.tasks, memories))
         made = []
         for name, tasks, pairs in compared:
@@ -438,56 +420,56 @@ class Board:
         """
         if self.action_space != CHOICES:
             return []
-        names = (
-            "best memory solves at least 60 % of all episodes",
-            f"{MATCHED} solves at most half of that",
-        )
-        best, matched = (
-            next(iter(self.of_kind("policy")), None),
-            [row for row in self.rows if row.name == MATCHED],
-        )
-        if best is None:
-            return [Target(name) for name in names]
-        success, (low, high) = self.success(best), self.interval(best)
-        first = Target(
-            names[0],
-            f"{success:.1f} % ({best.name})",
-            f"[{low:.1f}, {high:.1f}]",
+        first = Target("best memory solves at least 60 % of all episodes")
+        second = Target(f"{MATCHED} solves at most half of that")
+        policies = self.of_kind("policy")
+        if not policies:
+            return [first, second]
+
+        best = policies[0]
+        success = self.success(best)
+        low, high = self.interval(best)
+        first = replace(
+            first,
+            measured=f"{success:.1f} % ({best.name})",
+            interval=f"[{low:.1f}, {high:.1f}]",
             reached=success >= 60,
         )
-        if not matched or not success:
-            return [first, Target(names[1])]
-        ratios = self.sampled[MATCHED] / self.sampled[best.name]
-        share, (low, high) = self.success(matched[0]) / success, percentiles(ratios)
-        second = Target(
-            names[1],
-            f"{100 * share:.0f} % of it",
-            f"[{100 * low:.0f}, {100 * high:.0f}]",
+        matched = next((row for row in self.rows if row.name == MATCHED), None)
+        if matched is None or not success:
+            return [first, second]
+
+        share = self.success(matched) / success
+        low, high = percentiles(self.sampled[MATCHED] / self.sampled[best.name])
+        second = replace(
+            second,
+            measured=f"{100 * share:.0f} % of it",
+            interval=f"[{100 * low:.0f}, {100 * high:.0f}]",
             reached=share <= 0.5,
         )
-        suites = [
-            (suite, tuple(self.protocol.choose("suite", suite))) for suite in self.protocol.suites
-        ]
-        compared = [
-            _compare(best.method, matched[0].method, replace(self._once, tasks=tasks))
-            for _, tasks in suites
-        ]
-        intervals = [
-            percentiles(np.subtract(*self.draws([best, matched[0]], tasks))) for _, tasks in suites
-        ]
-        advantages = [
-            Target(
+
+        # The advantage in each suite, corrected for their number
+        comparisons: list[Comparison] = []
+        intervals: list[Interval] = []
+        for suite in self.protocol.suites:
+            tasks = tuple(self.protocol.choose("suite", suite))
+            protocol = replace(self._once, tasks=tasks)
+            comparisons.append(_compare(best.method, matched.method, protocol))
+            of_best, of_matched = self.draws([best, matched], tasks)
+            intervals.append(percentiles(of_best - of_matched))
+        corrected = holm([comparison.p for comparison in comparisons])
+        targets = [first, second]
+        rows = zip(self.protocol.suites, comparisons, intervals, corrected, strict=True)
+        for suite, comparison, (low, high), p in rows:
+            advantage = Target(
                 f"significant advantage in {suite}",
-                f"{c.difference:+.1f} points",
+                f"{comparison.difference:+.1f} points",
                 f"[{low:+.1f}, {high:+.1f}]",
-                f"{c.better_worse}, p = {p:.4f}",
+                f"{comparison.better_worse}, p = {p:.4f}",
                 reached=p < 0.05 and low > 0,
             )
-            for (suite, _), c, (low, high), p in zip(
-                suites, compared, intervals, holm([c.p for c in compared]), strict=True
-            )
-        ]
-        return [first, second, *advantages]
+            targets.append(advantage)
+        return targets
 
 
 def _row(name: str, trainings: Sequence[Training], protocol: Protocol) -> Row:
@@ -575,10 +557,10 @@ def spearman(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """
     from scipy.stats import rankdata
 
-    first, second = (
-        ranks - ranks.mean(-1, keepdims=True)
-        for ranks in (rankdata(values, axis=-1), rankdata(reference))
-    )
+    first = rankdata(values, axis=-1)
+    first -= first.mean(-1, keepdims=True)
+    second = rankdata(reference)
+    second -= second.mean()
     return _ratio((first * second).sum(-1), (first**2).sum(-1) * (second**2).sum())
 
 
@@ -586,7 +568,8 @@ def kendall(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Kendall's tau-b of each row of values [..., n] with reference [n]; NaN where all
     are equal.
     """
-    first, second = (np.sign(x[..., :, None] - x[..., None, :]) for x in (values, reference))
+    first = np.sign(values[..., :, None] - values[..., None, :])
+    second = np.sign(reference[:, None] - reference[None, :])
     return _ratio((first * second).sum((-1, -2)), (first**2).sum((-1, -2)) * (second**2).sum())
 
 

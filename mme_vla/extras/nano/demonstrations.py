@@ -39,8 +39,8 @@ class Demonstration:
     length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its
     decisions. subgoals: `simple` and `grounded` → what the simulator says at each decision, as it
     says it at test time. images: camera → frame → [256, 256, 3] uint8. boundaries: frames at which
-    a sub-task begins, of the video too; None in files of earlier versions. carried_out: whether its
-    motions were carried out one by one, see `record`.
+    a sub-task begins, of the video too. carried_out: whether its motions were carried out one by
+    one, see `record`.
     """
 
     task: str
@@ -53,7 +53,7 @@ class Demonstration:
     motions: Motions
     images: dict[str, dict[int, np.ndarray]]
     subgoals: dict[str, list[str]] = field(default_factory=dict)
-    boundaries: np.ndarray | None = None
+    boundaries: np.ndarray = field(default_factory=lambda: np.zeros(1, np.int64))
     carried_out: bool = False
 
     def save(self, path: Path) -> None:
@@ -73,9 +73,8 @@ class Demonstration:
             "states": self.states,
             "decisions": self.motions.decisions,
             "targets": self.motions.targets,
+            "boundaries": self.boundaries,
         }
-        if self.boundaries is not None:
-            arrays["boundaries"] = self.boundaries
         for camera, taken in self.images.items():
             arrays[f"{camera}_frames"] = np.array(list(taken), np.int64)
             arrays[f"{camera}_pictures"] = np.stack(list(taken.values()))
@@ -86,22 +85,18 @@ class Demonstration:
     def load(cls, path: Path, images: bool = True) -> "Demonstration":
         """Read what `save` wrote, or what of it is no image."""
         with np.load(path) as file:
-            loaded_images = {
-                camera: dict(
-                    zip(file[f"{camera}_frames"].tolist(), file[f"{camera}_pictures"], strict=True)
-                )
-                for camera in CAMERAS
-                if images and f"{camera}_frames" in file
-            }
-            motions = Motions(file["decisions"], file["targets"])
-            about = parse_json(str(file["about"]), str(path))
-            boundaries = file.get("boundaries")
+            loaded_images: dict[str, dict[int, np.ndarray]] = {}
+            for camera in CAMERAS:
+                if images and f"{camera}_frames" in file:
+                    frames = file[f"{camera}_frames"].tolist()
+                    pictures = file[f"{camera}_pictures"]
+                    loaded_images[camera] = dict(zip(frames, pictures, strict=True))
             return cls(
-                **about,
+                **parse_json(str(file["about"]), str(path)),
                 states=file["states"],
-                motions=motions,
+                motions=Motions(file["decisions"], file["targets"]),
                 images=loaded_images,
-                boundaries=boundaries,
+                boundaries=file["boundaries"],
             )
 
 
@@ -151,7 +146,7 @@ class Scene:
     def _complete(self) -> bool:
         with np.load(self.path) as file:
             about = parse_json(str(file["about"]), str(self.path))
-            carried_out = about.get("carried_out", False)
+            carried_out = about["carried_out"]
             width = file["targets"].shape[1]
             required = width if self.acts is None else self.acts.width
             require(
@@ -309,11 +304,15 @@ class _Taken:
         from sapien.render import RenderBodyComponent
 
         scene = self.env.scene
-        self._entities = [
-            actor._objs[0] for actor in scene.actors.values() if actor.px_body_type != "static"
-        ]
-        bodies = [entity.find_component_by_type(RenderBodyComponent) for entity in self._entities]
-        self._bodies = [body for body in bodies if body is not None]
+        self._entities = []
+        self._bodies = []
+        for actor in scene.actors.values():
+            if actor.px_body_type != "static":
+                entity = actor._objs[0]
+                self._entities.append(entity)
+                body = entity.find_component_by_type(RenderBodyComponent)
+                if body is not None:
+                    self._bodies.append(body)
         self._articulations = [each._objs[0] for each in scene.articulations.values()]
 
     def put_back(self, frame: int) -> None:

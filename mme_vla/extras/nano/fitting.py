@@ -30,6 +30,7 @@ from mme_vla.memory.perturbation import build_transforms
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning, copy_tower
 from mme_vla.policy.mme import MMEPolicy, mme_of
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.training_identity import KEY as TRAINING
 from mme_vla.policy.training_identity import identify, identity_of
 from mme_vla.training.checkpoint import checkpoints_in, read_state, tidy
@@ -104,16 +105,25 @@ class Training:
     tower_seed: int = 0
 
     @property
+    def seed(self) -> int:
+        """The training's own."""
+        return int(self.config["seed"])
+
+    @property
+    def content(self) -> list[str]:
+        """Digests of the demonstrations."""
+        acts = Embodiment.from_dict(self.config["embodiment"]).action
+        return list(content_of(tuple(self.files), tuple(acts.choice)))
+
+    @property
     def full_config(self) -> dict[str, Any]:
         """All that the trained policy follows from, with digests of the demonstrations as
         `data.content`.
         """
-        acts = Embodiment.from_dict(self.config["embodiment"]).action
-        content = list(content_of(tuple(self.files), tuple(acts.choice)))
         sections = {
             "train": dict(self.settings),
             "learning": dict(self.learning),
-            "data": {"content": content},
+            "data": {"content": self.content},
         }
         return {**self.config, **sections}
 
@@ -131,7 +141,7 @@ class Training:
         if then["train"]["steps"] != now["train"]["steps"]:
             changed["train.steps"] = (then["train"]["steps"], now["train"]["steps"])
         about = read_json(self.folder / TRAINED, "a training's end")
-        data = identify(now, now["data"]["content"])["data"]
+        data = identify(now, self.content)["data"]
         if about["data"] != data:
             changed["the demonstrations' digest"] = (about["data"], data)
         require(
@@ -180,7 +190,8 @@ def train(job: Training) -> Path:
     started_cpu = time.process_time()
     folder = job.folder
     full_config = job.full_config
-    train_settings = TrainSettings.from_dict(job.settings, int(job.config["seed"]))
+    content = job.content
+    train_settings = TrainSettings.from_dict(job.settings, job.seed)
     resume = str(folder) if checkpoints_in(folder / CHECKPOINTS) else None
     if resume is None:
         with FolderLock(folder, "training run"):  # it may have ended before its first checkpoint
@@ -189,9 +200,9 @@ def train(job: Training) -> Path:
     with ExitStack() as resources:
         resources.push(lock)  # it is held already
         if run.checkpoint is not None:
-            check_content(run.checkpoint, full_config["data"]["content"])
+            check_content(run.checkpoint, content)
         policy = build(job.config)
-        if job.tower_seed != int(job.config["seed"]):
+        if job.tower_seed != job.seed:
             copy_tower(build({**job.config, "seed": job.tower_seed}), policy)
         samples, val_set = prepared(policy, job)
         card = {"data": f"{len(job.files)} demonstrations", "recipe": dict(job.settings)}
@@ -213,7 +224,7 @@ def train(job: Training) -> Path:
             full_config,
             Accelerator(cpu=True),
             facts={
-                TRAINING: identify(full_config, full_config["data"]["content"]),
+                TRAINING: identify(full_config, content),
                 "card": card,
             },
         )
@@ -253,11 +264,12 @@ def summary(job: Training, policy: MMEPolicy, decisions: int) -> dict[str, Any]:
     """What was trained on what, as `trained.json` says it."""
     identity = identity_of(policy.config)
     assert identity is not None  # `train` has written it
+    sections = PolicySections.of(policy.config)
     return {
         "row": job.row,
         "kind": "policy",
         "trained": True,
-        "seed": int(job.config["seed"]),
+        "seed": job.seed,
         "steps": job.settings["steps"],
         "updates": job.settings["steps"],
         "batch_size": job.settings["batch_size"],
@@ -267,14 +279,10 @@ def summary(job: Training, policy: MMEPolicy, decisions: int) -> dict[str, Any]:
         "recipe": identity.recipe,
         "weights": identity.weights,
         "tower": job.store.tower,
-        "memory": _name_of(policy.config.get("memory")),
-        "integration": _name_of(policy.config.get("integration")),
+        "memory": sections.memory.get("name"),
+        "integration": sections.integration.get("name"),
         "budget": None if policy.memory is None else policy.memory.budget,
     }
-
-
-def _name_of(section: Mapping[str, Any] | None) -> str | None:
-    return None if section is None else section["name"]
 
 
 def measured_cost(policy: MMEPolicy, samples: Decisions, batch_size: int) -> dict[str, Any]:
@@ -349,7 +357,7 @@ def prepared(policy: MMEPolicy, job: Training) -> tuple[Decisions, Decisions]:
         read(learnt),
         learning.elsewhere,
         build_transforms(learning.history_transforms),
-        int(job.config["seed"]),
+        job.seed,
         learning.reflect,
         learning.sides,
         oversample=learning.often,

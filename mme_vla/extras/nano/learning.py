@@ -2,7 +2,6 @@
 beforehand.
 """
 
-import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,20 +27,15 @@ from mme_vla.memory.history import CachedHistory, History
 from mme_vla.memory.perturbation import Perturbation
 from mme_vla.memory.transforms import TransformedHistory, map_frames
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import motion_rows
-from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats
+from mme_vla.processing.normalise import NormStats, RunningStats
 from mme_vla.processing.prompt import perturb_point, subgoal_kind
 from mme_vla.training.order import generator_for, seed_of
-from mme_vla.types import Batch, HistoryTokens, Labels, labels_read, stack_noise
-
-logger = logging.getLogger(__name__)
+from mme_vla.types import Batch, HistoryTokens, labels_read, stack_noise
 
 # of an action's number, in metres or radians: less than that is jitter, and is not blown up
 NARROWEST = 0.1
-OLD_FILES = (
-    "Demonstrations of an earlier version name no sub-tasks: the memory learns without its loss on"
-    " them. Remove their files, and record them again, for that loss."
-)
 FrameLabels = Mapping[str, Callable[[np.ndarray], np.ndarray]]
 """Name of a label → its values [n] at frames [n]."""
 JOINT_NOISE = 0.05
@@ -203,8 +197,10 @@ class Decisions(Dataset[int]):
         self.reflection = reflection
         self.replay = replay
         repeats = torch.where(distant, oversample, 1)
-        if balanced:
-            repeats = repeats * _to_balance(tasks)
+        if balanced:  # all tasks have about as many as the largest
+            counts = Counter(tasks)
+            largest = max(counts.values())
+            repeats = repeats * torch.tensor([round(largest / counts[task]) for task in tasks])
         self._rows = torch.arange(len(batch.prompt)).repeat_interleave(repeats)
 
     @classmethod
@@ -245,15 +241,12 @@ class Decisions(Dataset[int]):
             if history is not None and transforms:
                 labels = _labels(policy.require_memory(), demonstration)
                 rows += [(history, frame, labels) for frame in _decisions(policy, demonstration)]
-            is_distant = _distant(demonstration.motions.targets, min_distance)
+            # Motions that end far above the table from the one before; the first does.
+            ends = demonstration.motions.targets[:, :2]
+            steps = np.linalg.norm(np.diff(ends, axis=0), axis=1)
+            is_distant = np.concatenate([[True], steps > min_distance])
             distant.append(is_distant[:: policy.embodiment.action.execute])
         require(items, "The demonstrations hold no decision to learn from.")
-        if labels_read(policy.memory) and not all(item["history"].labels for item in items):
-            logger.warning(OLD_FILES)
-            items = [
-                item | {"history": replace(item["history"], labels=Labels())} for item in items
-            ]
-            rows = [(history, frame, {}) for history, frame, _ in rows]
         replay = Replay(policy.require_memory(), rows, transforms, seed) if rows else None
         reflection = Reflection.of(policy, reflect_p, goals, sides)
         stacked = torch.from_numpy(np.concatenate(distant))
@@ -307,28 +300,11 @@ class Decisions(Dataset[int]):
         """The standard deviation of each number of a token, of the present images and of those
         remembered.
         """
-        features = {"views": self.batch.view_tokens, "past": None}
+        assert self.batch.view_tokens is not None
+        features = {"views": self.batch.view_tokens}
         if self.batch.history is not None:
             features["past"] = self.batch.history.features[self.batch.history.mask]
-        return {
-            name: t.float().flatten(0, -2).std(0) for name, t in features.items() if t is not None
-        }
-
-
-def _to_balance(tasks: Sequence[str]) -> Tensor:
-    """How many times each decision must occur for all tasks to have about as many as the largest.
-    [n].
-    """
-    counts = Counter(tasks)
-    return torch.tensor([round(max(counts.values()) / counts[task]) for task in tasks])
-
-
-def _distant(targets: np.ndarray, min_distance: float) -> np.ndarray:
-    """Which of an episode's motions [m, 7] end that far above the table from the one before; the
-    first does. [m].
-    """
-    steps = np.linalg.norm(np.diff(targets[:, :2], axis=0), axis=1)
-    return np.concatenate([[True], steps > min_distance])
+        return {name: tokens.float().flatten(0, -2).std(0) for name, tokens in features.items()}
 
 
 @torch.no_grad()
@@ -338,18 +314,18 @@ def _predicted(
     """The first action of each chunk, as it is predicted and as it should be: [n, w] each,
     absolute.
     """
-    generator, processor = torch.Generator().manual_seed(seed), policy.require_processor()
-    pairs = []
+    generator = torch.Generator().manual_seed(seed)
+    processor = policy.require_processor()
+    predicted: list[Tensor] = []
+    recorded: list[Tensor] = []
     for start in range(0, len(rows), 64):
         batch = val_set.collate(rows[start : start + 64])
         assert batch.actions is not None and batch.state is not None
         noise = stack_noise([policy.sampling_noise(generator) for _ in range(len(batch.prompt))])
         chunk = policy.sample_actions(batch, noise).float()
-        pairs.append(
-            [processor.absolute_actions(x, batch.state)[:, 0] for x in (chunk, batch.actions)]
-        )
-    predicted, recorded = (torch.cat(side) for side in zip(*pairs, strict=True))
-    return predicted, recorded
+        predicted.append(processor.absolute_actions(chunk, batch.state)[:, 0])
+        recorded.append(processor.absolute_actions(batch.actions, batch.state)[:, 0])
+    return torch.cat(predicted), torch.cat(recorded)
 
 
 def position_error(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> Tensor:
@@ -405,12 +381,11 @@ def statistics(demonstrations: Iterable[Demonstration], policy: MMEPolicy) -> No
         states.update(state.numpy())
         targets = torch.from_numpy(demonstration.motions.targets)[:, None]
         actions.update(space.to_relative(targets, state).numpy())
-    return NormStats(state=states.result(), actions=_widened(actions.result()))
-
-
-def _widened(stats: QuantileStats) -> QuantileStats:
-    middle, half = (stats.q01 + stats.q99) / 2, np.maximum((stats.q99 - stats.q01) / 2, NARROWEST)
-    return replace(stats, q01=middle - half, q99=middle + half)
+    of_actions = actions.result()
+    middle = (of_actions.q01 + of_actions.q99) / 2
+    half = np.maximum((of_actions.q99 - of_actions.q01) / 2, NARROWEST)
+    widened = replace(of_actions, q01=middle - half, q99=middle + half)
+    return NormStats(state=states.result(), actions=widened)
 
 
 def _items(
@@ -454,10 +429,8 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
     read = policy.frames_read(np.array(_decisions(policy, demonstration)), demonstration.exec_start)
     frames = np.intersect1d(read, made.frames[camera])
     tokens = pool_grid(made.at(camera, frames).float(), memory.storage.grid, memory.storage.pooling)
-    stored, scores = (
-        tokens.to(policy.info.history_dtype).float().numpy(),
-        made.scores.get(memory.storage.scorer),
-    )
+    stored = tokens.to(policy.info.history_dtype).float().numpy()
+    scores = made.scores.get(memory.storage.scorer)
     history = CachedHistory(
         memory.storage, stored, frames, demonstration.length, scores, demonstration.exec_start
     )
@@ -472,12 +445,8 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
 
 
 def _labels(memory: Memory, demonstration: Demonstration) -> FrameLabels:
-    """The labels of sub-tasks that a memory reads; none where the demonstration names
-    no sub-tasks.
-    """
+    """The labels of sub-tasks that a memory reads."""
     begins = demonstration.boundaries
-    if begins is None:
-        return {}
     known: FrameLabels = {
         SUBTASK: lambda frames: np.searchsorted(begins, frames, side="right").astype(np.float32),
         BOUNDARY: lambda frames: np.isin(frames, begins).astype(np.float32),
@@ -492,14 +461,10 @@ def _subgoals(policy: MMEPolicy, demonstration: Demonstration) -> Sequence[str |
     kind = subgoal_kind(policy)
     if kind is None:
         return [None] * len(demonstration.motions.decisions)
-    noise, rng = (
-        int(policy.config["subgoal_text"]["point_noise"]),
-        np.random.default_rng(demonstration.seed),
-    )
-    return [
-        perturb_point(text, noise, rng)
-        for text in demonstration.subgoals[kind.removesuffix("_subgoal")]
-    ]
+    noise = int(PolicySections.of(policy.config).subgoal_text["point_noise"])
+    rng = np.random.default_rng(demonstration.seed)
+    texts = demonstration.subgoals[kind.removesuffix("_subgoal")]
+    return [perturb_point(text, noise, rng) for text in texts]
 
 
 def _stack(items: Sequence[dict[str, Any]]) -> Batch:
@@ -508,14 +473,15 @@ def _stack(items: Sequence[dict[str, Any]]) -> Batch:
 
     view_tokens = stack("view_tokens")
     rows, views = view_tokens.shape[:2]
+    history = None
+    if "history" in items[0]:
+        history = stack_history([item["history"] for item in items])
     batch = Batch(
         images=torch.zeros(rows, views, 3, 0, 0, dtype=torch.uint8),
         image_mask=torch.ones(rows, views, dtype=torch.bool),
         prompt=stack("prompt"),
         prompt_mask=stack("prompt_mask"),
-        history=stack_history([item["history"] for item in items])
-        if "history" in items[0]
-        else None,
+        history=history,
         actions=stack("actions"),
         action_mask=stack("action_mask"),
         state=stack("state"),

@@ -25,6 +25,7 @@ from mme_vla.evaluation.results.tables import comparison_table, to_markdown
 from mme_vla.extras.nano.evaluating import PLANNER
 from mme_vla.extras.nano.fitting import learning_curve
 from mme_vla.extras.nano.rows import TRAINED
+from mme_vla.extras.nano.settings import NanoRun
 from mme_vla.utils import read_json, write_atomically
 from mme_vla.utils.pages import render
 
@@ -33,7 +34,7 @@ PAGE, CURVES = "page.md", "learning.png"
 
 def write_page(
     folder: Path,
-    config: Mapping[str, Any],
+    nano: NanoRun,
     records: Mapping[str, Sequence[EpisodeRecord]],
     without: str | None,
     minutes: Mapping[str, float],
@@ -48,7 +49,7 @@ def write_page(
     videos: one of a success, one of a failure, as far as there are such. runs: of each model, the
     folders of its trainings. demonstrations: how many they learned from.
     """
-    results, comparisons = compared(records, config["task"], config["split"], without)
+    results, comparisons = compared(records, nano.task, nano.split, without)
     ends: dict[str, list[Any]] = {}
     curves: dict[str, list[dict[str, float]]] = {}
     for model, folders in runs.items():
@@ -59,9 +60,9 @@ def write_page(
     plot_curves(curves, folder / CURVES)
     text = render(
         "nano.md",
-        config=config,
+        config=nano.config,
         demonstrations=demonstrations,
-        seeds=str(config["policy_seed"]),
+        seeds=str(nano.policy_seed),
         planner=PLANNER,
         without=without,
         success=success_table(records, ends, results),
@@ -92,11 +93,10 @@ def compared(
     renumbered = [replace(record, episode=numbers[record.episode]) for record in pooled]
     results = aggregate(renumbered, protocol, split)
 
-    methods = {
-        model: _method(results, model_records[0])
-        for model, model_records in records.items()
-        if model != PLANNER
-    }
+    methods = {}
+    for model, model_records in records.items():
+        if model != PLANNER:
+            methods[model] = _method(results, model_records[0])
     baseline = methods.pop(next(iter(methods)) if without is None else without)
     pairs = []
     for method in methods.values():

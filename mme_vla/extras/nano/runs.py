@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain, count, islice, zip_longest
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -81,15 +81,18 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
         records = evaluate_all(nano, results, jobs, files, rows.robot)
     if nano.shard is not None or len(choose_tasks(nano.task)) > 1:
         for row, of_row in records.items():
-            logger.info(
-                "%s: %d of %d episodes", row, sum(record.success for record in of_row), len(of_row)
-            )
+            won = sum(record.success for record in of_row)
+            logger.info("%s: %d of %d episodes", row, won, len(of_row))
         return results
+    videos: list[Path] = []
     with minutes.of("videos"):
-        videos = videos_of(nano, jobs, records, folder / "videos")
+        if nano.videos:  # of the first row's first training
+            row, (first, *others) = next(iter(jobs.items()))
+            of_first = records[row][: len(records[row]) // (1 + len(others))]
+            videos = record_videos(first.checkpoint, folder / "videos", of_first, rules_of(nano))
     page = write_page(
         folder,
-        nano.config,
+        nano,
         records,
         rows.blind,
         minutes.spent,
@@ -135,11 +138,15 @@ def compose_rows(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Rows:
     require(models, "No row is to be trained: name one, such as model=framesamp_modul.")
     composed: dict[str, dict[str, Any]] = {}
     for model in models:
-        # The floor that reads the current frame alone has the tokens of that frame, at any budget.
-        for budget in (None,) if model == MATCHED else nano.budgets:
+        budgets = nano.budgets
+        if model == MATCHED:  # it has the tokens of the current frame, at any budget
+            budgets = (None,)
+        for budget in budgets:
             each = compose_model(model, budget=budget)
-            has_budget = budget is not None and each["memory"] is not None
-            composed[f"{model}@{budget}" if has_budget else model] = each
+            row = model
+            if budget is not None and each["memory"] is not None:
+                row = f"{model}@{budget}"
+            composed[row] = each
     others = [compose_model(model) for model in nano.rendered_for if model not in models]
     robot = Embodiment.from_dict(next(iter(composed.values()))["embodiment"])
     for each in composed.values():
@@ -148,10 +155,11 @@ def compose_rows(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Rows:
         check_reflection(nano.learning["reflect"], robot.action, layout)
     memories = [each["memory"] for each in (*composed.values(), *others) if each["memory"]]
     choices = [FrameChoice(DECISIONS, memory, robot.action.execute) for memory in [None, *memories]]
-    blind = [
-        row for row, each in composed.items() if each["memory"] is None and not each["subgoal_text"]
-    ]
-    return Rows(composed, choices, robot, next(iter(blind), None))
+    blind = None
+    for row, each in composed.items():
+        if blind is None and each["memory"] is None and not each["subgoal_text"]:
+            blind = row
+    return Rows(composed, choices, robot, blind)
 
 
 def trainings_of(
@@ -204,7 +212,7 @@ def evaluate_all(
         for name in [row] if oracle is None else [row, oracle]:
             records[name] = []
             for job in of_row:
-                place = folder / name / str(job.config["seed"])
+                place = folder / name / str(job.seed)
                 ceiling = None if name == row else oracle
                 records[name] += evaluate_row(
                     job.folder, job.checkpoint, place, selected, rules, ceiling
@@ -245,20 +253,6 @@ def episodes_of(nano: NanoRun, folder: Path, episodes: Any) -> list[EpisodeSpec]
     return specs
 
 
-def videos_of(
-    nano: NanoRun,
-    jobs: Mapping[str, Sequence[Training]],
-    records: Mapping[str, Sequence[Any]],
-    folder: Path,
-) -> list[Path]:
-    """Videos of a success and a failure of the first row's first training."""
-    if not nano.videos:
-        return []
-    row, of_row = next(iter(jobs.items()))
-    first = records[row][: len(records[row]) // len(of_row)]
-    return record_videos(of_row[0].checkpoint, folder, first, rules_of(nano))
-
-
 # Demonstrations -----------------------------------------------------------------------------------
 
 
@@ -283,7 +277,8 @@ def counts_of(
             f"demonstrations={brief(amounts)}: write how many of each difficulty"
             f" ({', '.join(DIFFICULTIES)}), such as {{easy: 100}}.",
         )
-        counts |= {(name, level): n for level, n in amounts.items()}
+        for level, amount in amounts.items():
+            counts[name, level] = amount
     require(
         sum(counts.values()) >= 2,
         f"demonstrations={brief(demonstrations)}: it takes two, to learn from and to measure by.",
@@ -314,31 +309,30 @@ def record_all(
             nano.carried_out,
             robot.action,
         )
-        groups.append(Group(map(partial(_with_seed, scene), count(first)), required))
+        groups.append(Group(scene, required))
     return demonstrate(groups, nano.workers)
-
-
-def _with_seed(scene: Scene, seed: int) -> "Scene":
-    return replace(scene, seed=seed)
 
 
 @dataclass
 class Group:
-    """Scenes of one task and difficulty, of which so many are to be demonstrated. files: those that
-    are.
+    """Scenes of one task and difficulty, of which so many are to be demonstrated.
+
+    scene: the next one to try; seeds follow each other. files: of those that are demonstrated.
+    failed: scenes in a row that no demonstration succeeded in.
     """
 
-    scenes: Iterator[Scene]
+    scene: Scene
     required: int
     files: list[Path] = field(default_factory=list)
     failed: int = 0
-    """Scenes in a row that no demonstration succeeded in."""
 
     def next(self) -> list[Scene]:
         """The scenes to try now."""
-        return list(
-            islice(self.scenes, min(RETRIES - self.failed, self.required - len(self.files)))
-        )
+        scenes = []
+        for _ in range(min(RETRIES - self.failed, self.required - len(self.files))):
+            scenes.append(self.scene)
+            self.scene = replace(self.scene, seed=self.scene.seed + 1)
+        return scenes
 
     def take(self, tried: Sequence[Scene]) -> None:
         """Note what came of them."""
@@ -360,15 +354,12 @@ def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
     """The files of the first demonstrations of each group that succeed; existing ones are not made
     again.
     """
-    with progress(
-        "record", sum(group.required for group in groups), unit="demonstrations"
-    ) as advance:
+    total = sum(group.required for group in groups)
+    with progress("record", total, unit="demonstrations") as advance:
         while lacking := [group for group in groups if len(group.files) < group.required]:
             tried = [group.next() for group in lacking]
             # In turn, so that an interrupted run has some of every group.
-            alternating = [
-                scene for scenes in zip_longest(*tried) for scene in scenes if scene is not None
-            ]
+            alternating = [scene for scene in chain(*zip_longest(*tried)) if scene is not None]
             missing = [scene for scene in alternating if not scene.tried]
             advance(sum(scene.made for scene in alternating if scene.tried))
             for made in carry_out(missing, demonstrated, workers):

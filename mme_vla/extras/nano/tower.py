@@ -78,8 +78,8 @@ class TowerConfig:
     128-pixel image.
 
     `blocks_…` are residual blocks. `pretrained` takes the weights that ship with the library.
-    `layout` is that of the tokens: `places` (`PlaceTower`), or `segments` (`nano_vision.ConvTower`)
-    of checkpoints from before it.
+    `layout` is that of the tokens: `places` (`PlaceTower`), or `segments` (`vision.ConvTower`) of
+    the shipped policy `checkpoint=nano`.
     """
 
     image_size: int = 128

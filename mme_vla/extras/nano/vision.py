@@ -1,5 +1,5 @@
-"""The vision tower of nano checkpoints from before `tower.PlaceTower`: which of twelve classes each
-place shows.
+"""The vision tower of the shipped policy `checkpoint=nano`: which of twelve classes each place
+shows. New policies have `tower.PlaceTower`.
 """
 
 import math

@@ -21,9 +21,7 @@ def test_a_demonstration_for_a_robot_that_chooses_is_its_choices_and_says_the_op
     across = made.motions.targets[1:5, 9]
     # right of the robot is left in the image
     assert across[0] == across[2] < across[1] == across[3]
-    assert made.boundaries is not None and len(made.boundaries) == len(letters) + 1, (
-        "after the last one it is over"
-    )
+    assert len(made.boundaries) == len(letters) + 1, "after the last one it is over"
     assert set(made.motions.decisions.tolist()) == set(made.images["front"])
 
 

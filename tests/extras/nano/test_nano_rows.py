@@ -23,6 +23,7 @@ from mme_vla.extras.nano.learning import Decisions, position_error, statistics
 from mme_vla.extras.nano.page import write_page
 from mme_vla.extras.nano.rows import TRAINED
 from mme_vla.extras.nano.runs import Group, demonstrate
+from mme_vla.extras.nano.settings import NanoRun
 from mme_vla.extras.nano.tokens import TokenStore
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.utils import write_json
@@ -161,10 +162,8 @@ def test_tokens_are_made_once_for_a_tower_and_again_for_other_frames_or_scores(
     ]
 
 
-def scenes(folder: Path, count: int, *choices: FrameChoice) -> list[Scene]:
-    return [
-        Scene("VideoUnmask", seed, "easy", folder, ("front",), choices) for seed in range(count)
-    ]
+def first_scene(folder: Path, *choices: FrameChoice) -> Scene:
+    return Scene("VideoUnmask", 0, "easy", folder, ("front",), choices)
 
 
 def test_scenes_are_demonstrated_until_there_are_enough_and_once(
@@ -179,7 +178,7 @@ def test_scenes_are_demonstrated_until_there_are_enough_and_once(
     monkeypatch.setattr(demonstrations, "record", record)
 
     def demonstrated(count: int, *choices: FrameChoice) -> list[Path]:
-        return demonstrate([Group(iter(scenes(tmp_path, 9, *choices)), count)])
+        return demonstrate([Group(first_scene(tmp_path, *choices), count)])
 
     results = demonstrated(3)
     assert [path.stem for path in results] == ["easy-0", "easy-2", "easy-3"] and tried == [
@@ -210,7 +209,7 @@ def test_scenes_are_demonstrated_until_there_are_enough_and_once(
 def test_demonstrations_of_other_actions_are_not_taken_for_what_is_recorded(
     how: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
-    (scene,) = scenes(tmp_path, 1)
+    scene = first_scene(tmp_path)
     demonstration().save(scene.path)
     assert scene.tried
     with pytest.raises(UserError, match=message):
@@ -218,7 +217,7 @@ def test_demonstrations_of_other_actions_are_not_taken_for_what_is_recorded(
 
 
 def test_a_demonstration_without_a_cameras_images_is_made_again(tmp_path: Path) -> None:
-    (scene,) = scenes(tmp_path, 1, FrameChoice(DECISIONS))
+    scene = first_scene(tmp_path, FrameChoice(DECISIONS))
     made = demonstration()
     made.save(scene.path)
     assert scene.tried
@@ -230,7 +229,7 @@ def test_scene_after_scene_without_a_demonstration_is_reported(
 ) -> None:
     monkeypatch.setattr(demonstrations, "record", lambda *_: None)
     with pytest.raises(UserError, match="20 easy scenes in a row, to seed 19"):
-        demonstrate([Group(iter(scenes(tmp_path, 40)), 3)])
+        demonstrate([Group(first_scene(tmp_path), 3)])
 
 
 def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Path) -> None:
@@ -256,13 +255,8 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
         (tmp_path / model).mkdir()
         write_json(tmp_path / model / TRAINED, {"off_by_m": [0.01, 0.02, 0.05]})
         (tmp_path / model / "metrics.jsonl").write_text('{"step": 10, "val/loss": 0.5}\n')
-    config = {
-        "task": "VideoUnmask",
-        "split": "further",
-        "demonstrations": {"easy": 4},
-        "train": {"steps": 20},
-        "policy_seed": 7,
-    }
+    words = ["task=VideoUnmask", "split=further", "demonstrations={easy: 4}", "policy_seed=7"]
+    config = NanoRun.from_config(resolved(compose("nano", words)))
     video = tmp_path / "videos" / "a.mp4"
     runs = {
         "framesamp_modul": records("framesamp_modul", 60, 100, 4), "pi05": records("pi05", 5, 100),

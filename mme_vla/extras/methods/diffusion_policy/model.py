@@ -25,14 +25,6 @@ Schedule = Any
 """A `diffusers.DDPMParallelScheduler`, imported only where it is used."""
 
 
-def require_diffusers() -> None:
-    """Make sure that the package is there, before anything is built."""
-    try:
-        import diffusers  # noqa: F401
-    except ImportError:
-        raise missing_extra("Diffusion Policy", "baselines") from None
-
-
 def noise_schedule(steps: int) -> Schedule:
     """A squared-cosine schedule of so many steps that predicts noise and clips its guesses of the
     chunk to ±1.

@@ -4,6 +4,7 @@ with a memory.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.extras.methods.diffusion_policy import model
 from mme_vla.extras.methods.diffusion_policy.config import DiffusionSizes
 from mme_vla.extras.methods.diffusion_policy.model import DiffusionNetwork
@@ -24,6 +25,7 @@ from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
 from mme_vla.policy.saving import policy_options
+from mme_vla.policy.sections import PolicySections
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed import Recompute
 from mme_vla.speed.sharding import ShardGroup
@@ -94,15 +96,19 @@ class DiffusionPolicy(NetworkPolicy):
         *,
         fresh_backbone: bool = True,
     ) -> Self:
-        model.require_diffusers()
-        sizes, robot = DiffusionSizes.from_dict(config["backbone"]), embodiment_of(config)
-        integration = _pooled(config.get("integration"), sizes)
-        if (integration is None) != (not config.get("memory")):
-            mismatch = (
-                "a memory without an integration"
-                if integration is None
-                else "an integration without a memory"
-            )
+        if not find_spec("diffusers"):  # which is used much later
+            raise missing_extra("Diffusion Policy", "baselines")
+        sections = PolicySections.of(config)
+        sizes, robot = DiffusionSizes.from_dict(sections.backbone), embodiment_of(config)
+        integration = None
+        if sections.integration:
+            integration = _pooled(sections.integration, sizes)
+        mismatch = ""
+        if sections.memory and integration is None:
+            mismatch = "a memory without an integration"
+        elif integration is not None and not sections.memory:
+            mismatch = "an integration without a memory"
+        if mismatch:
             raise UserError(f"This configuration names {mismatch}; name both, or neither.")
         require(
             robot.action.width == sizes.action_dim,
@@ -117,7 +123,7 @@ class DiffusionPolicy(NetworkPolicy):
         if integration is not None:
             grid = sizes.memory_tower.image_size // sizes.memory_tower.patch_size
             memory = build_memory(
-                config["memory"], sizes.memory_width, grid, integration.memory_width
+                sections.memory, sizes.memory_width, grid, integration.memory_width
             )
             check_past(config, memory, frozenset())
         processor = processor_for(DiffusionProcessor, processor, "dp, or dp_tiny to try things out")
@@ -162,11 +168,11 @@ class DiffusionPolicy(NetworkPolicy):
             predicted = self.backbone.unet(noisy, sampled["step"], condition)
         losses = (predicted.float() - sampled["noise"]).square().mean(-1)  # b h
         loss = masked_mean(losses, batch.action_mask)
-        reported = {} if memory is None else memory.metrics
-        return loss, {
-            "loss": loss.detach(),
-            **{f"memory/{name}": value for name, value in reported.items()},
-        }
+        metrics = {"loss": loss.detach()}
+        if memory is not None:
+            for name, value in memory.metrics.items():
+                metrics[f"memory/{name}"] = value
+        return loss, metrics
 
     def condition(
         self,
@@ -197,14 +203,15 @@ class DiffusionPolicy(NetworkPolicy):
 
     def _cropped_images(self, images: Tensor, corner: tuple[int, int] | None) -> Tensor:
         """Images [..., H, W] uint8, all cropped at one place, in [−1, 1]."""
-        margins = [
-            side - size for side, size in zip(images.shape[-2:], self.sizes.cropped, strict=True)
-        ]
-        if corner is None and self.training and self.augment:
-            top, left = (int(torch.randint(most + 1, ())) for most in margins)
-        else:
-            top, left = (round(most / 2) for most in margins) if corner is None else corner
         height, width = self.sizes.cropped
+        lowest, rightmost = images.shape[-2] - height, images.shape[-1] - width
+        if corner is not None:
+            top, left = corner
+        elif self.training and self.augment:
+            top = int(torch.randint(lowest + 1, ()))
+            left = int(torch.randint(rightmost + 1, ()))
+        else:
+            top, left = round(lowest / 2), round(rightmost / 2)
         cropped = images[..., top : top + height, left : left + width]
         return (cropped.float() / 255 - 0.5) / 0.5
 
@@ -277,11 +284,9 @@ class DiffusionPolicy(NetworkPolicy):
         processor = self.require_processor()
         if processor.samples.window > 1 and processor.samples.consecutive:
             return None
-        return (
-            np.zeros(0, np.int64)
-            if self.memory is None
-            else self.memory.frames_read(steps, exec_start)
-        )
+        if self.memory is None:
+            return np.zeros(0, np.int64)
+        return self.memory.frames_read(steps, exec_start)
 
     def require_processor(self) -> DiffusionProcessor:
         processor = super().require_processor()
@@ -301,14 +306,15 @@ class DiffusionPolicy(NetworkPolicy):
         """A batch of one without content, with a memory that is full."""
         sizes, robot = self.sizes, self.embodiment
         shape = (1, sizes.window, len(robot.cameras), 3, *sizes.picture)
+        history = None
+        if self.memory is not None:
+            history = full_history(self.memory, sizes.memory_width, device)
         return DiffusionBatch(
             images=torch.zeros(shape, dtype=torch.uint8, device=device),
             state=torch.zeros(1, sizes.window, robot.state.width, device=device),
             text=torch.zeros(1, sizes.text_dim, device=device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            history=None
-            if self.memory is None
-            else full_history(self.memory, sizes.memory_width, device),
+            history=history,
         )
 
     def warm_up_vision(self) -> None:
@@ -316,10 +322,8 @@ class DiffusionPolicy(NetworkPolicy):
         self.backbone.vision(torch.zeros(1, 3, side, side, device=self.device))
 
 
-def _pooled(section: Mapping[str, Any] | None, sizes: DiffusionSizes) -> PooledIntegration | None:
+def _pooled(section: Mapping[str, Any], sizes: DiffusionSizes) -> PooledIntegration:
     """The integration of a configuration, which must hand memory over as one vector."""
-    if not section:
-        return None
     kind = INTEGRATIONS[section.get("name", "")]
     if not (isinstance(kind, type) and issubclass(kind, PooledIntegration)):
         raise UserError(

@@ -34,6 +34,7 @@ from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
 from mme_vla.policy.saving import policy_options
+from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
@@ -113,23 +114,22 @@ class MemoryVlaPolicy(NetworkPolicy):
         *,
         fresh_backbone: bool = True,
     ) -> Self:
-        section = {key: value for key, value in config["backbone"].items() if key != "name"}
+        sections = PolicySections.of(config)
+        section = {key: value for key, value in sections.backbone.items() if key != "name"}
         sizes = read_section(MemoryVlaConfig, section, "backbone")
         embodiment_of(config).check_network(sizes.action_dim, sizes.horizon)
-        if config.get("integration"):
+        if sections.integration:
+            name = sections.integration.get("name")
             raise UserError(
-                f"MemoryVLA has no place for the integration {config['integration'].get('name')!r}:"
-                " its own retrieval reads a memory, in place of its banks. Set integration=none."
+                f"MemoryVLA has no place for the integration {name!r}: its own retrieval reads a"
+                " memory, in place of its banks. Set integration=none."
             )
         processor = processor_for(
             MemoryVlaProcessor, processor, "memoryvla, or memoryvla_tiny to try it"
         )
+        is_alone = processor is not None and processor.samples.group_size == 1
         require(
-            not (
-                processor is not None
-                and processor.samples.group_size == 1
-                and not config.get("memory")
-            ),
+            sections.memory or not is_alone,
             "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other;"
             " give groups of 2 or more, or a memory in place of the banks (memory=framesamp).",
         )
@@ -138,11 +138,11 @@ class MemoryVlaPolicy(NetworkPolicy):
         if not fresh_backbone:
             vlm.to_empty(device=torch.get_default_device())
         # Drawn in any case: OpenVLA, to start from, has none.
-        core = build_core(sizes, recalls=bool(config.get("memory")))
+        core = build_core(sizes, recalls=bool(sections.memory))
         memory: Memory | None = None
-        if config.get("memory"):
+        if sections.memory:
             memory = build_memory(
-                config["memory"], sizes.vision.width, sizes.vision.grid, sizes.perceptual_width
+                sections.memory, sizes.vision.width, sizes.vision.grid, sizes.perceptual_width
             )
             check_past(config, memory, frozenset())
         return cls(vlm, core, memory, processor, config, **policy_options(cls, config))
@@ -179,11 +179,9 @@ class MemoryVlaPolicy(NetworkPolicy):
     @property
     def group_size(self) -> int:
         """Moments of a training sample: its processor's, else its configuration's."""
-        return (
-            self.config["processor"]["group_size"]
-            if self.processor is None
-            else self.processor.samples.group_size
-        )
+        if self.processor is not None:
+            return self.processor.samples.group_size
+        return int(PolicySections.of(self.config).processor["group_size"])
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """Of `count` groups: `noise` [n, r, m, h, a], `steps` and `drop` [n, r, m], for r copies of
@@ -223,6 +221,8 @@ class MemoryVlaPolicy(NetworkPolicy):
         if "changes" not in values:
             values |= self.augmentation_params(len(batch.images), torch.default_generator)
         changes = values.pop("changes", None)
+        if changes is not None:
+            changes = changes.to(self.device)
         copies = batch.valid.shape[1]
 
         def repeat_batch(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
@@ -230,9 +230,7 @@ class MemoryVlaPolicy(NetworkPolicy):
 
         sampled = map_noise(values, lambda value: repeat_batch(value.to(self.device)))
         memory = self.encode_memory(batch.histories())
-        cognition, features, groups = self._of_batch(
-            batch, None if changes is None else changes.to(self.device)
-        )
+        cognition, features, groups = self._of_batch(batch, changes)
         with self.autocast():
             read, perceptual = self.core.through(
                 cognition, features, batch.times[batch.valid], groups, memory
@@ -244,11 +242,11 @@ class MemoryVlaPolicy(NetworkPolicy):
             of_moments = batch.action_mask[batch.valid]
             counted = of_moments.repeat(len(losses) // len(of_moments), 1)
         loss = masked_mean(losses, counted)
-        reported = {} if memory is None else memory.metrics
-        return loss, {
-            "loss": loss.detach(),
-            **{f"memory/{name}": value for name, value in reported.items()},
-        }
+        metrics = {"loss": loss.detach()}
+        if memory is not None:
+            for name, value in memory.metrics.items():
+                metrics[f"memory/{name}"] = value
+        return loss, metrics
 
     def recompute(self, mode: Recompute) -> None:
         self.vlm.recompute(mode)
@@ -313,11 +311,9 @@ class MemoryVlaPolicy(NetworkPolicy):
 
     def start_episode(self, goal: str, seed: int = 0) -> Episode:
         """Begin an episode with empty banks, or an empty memory."""
-        return (
-            MemoryVlaEpisode(self, goal, seed)
-            if self.memory is None
-            else super().start_episode(goal, seed)
-        )
+        if self.memory is not None:
+            return super().start_episode(goal, seed)
+        return MemoryVlaEpisode(self, goal, seed)
 
     def observation(self, episodes: Sequence[Episode]) -> GroupBatch:
         """The current moments of running episodes, each a group of one; only banks know what number
@@ -327,12 +323,9 @@ class MemoryVlaPolicy(NetworkPolicy):
             torch.stack([episode.images for episode in episodes])
         )
         ids, masks = words([episode.prompt for episode in episodes])
-        times = torch.tensor(
-            [
-                0 if self.memory is not None else _memoryvla_episode(episode).banks.count
-                for episode in episodes
-            ]
-        )
+        times = torch.zeros(len(episodes), dtype=torch.int64)
+        if self.memory is None:
+            times = torch.tensor([_memoryvla_episode(e).banks.count for e in episodes])
         valid = torch.ones(len(episodes), 1, dtype=torch.bool)
         return GroupBatch(images[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(
             self.device
@@ -407,9 +400,13 @@ class MemoryVlaPolicy(NetworkPolicy):
 
         Where the moment is, is known on meta too.
         """
-        size, length = self.sizes.vision.image_size, int(self.config["processor"]["prompt_length"])
+        size = self.sizes.vision.image_size
+        length = int(PolicySections.of(self.config).processor["prompt_length"])
         length += self.embodiment.action.options_length
         known = "cpu" if torch.device(device).type == "meta" else device
+        history = None
+        if self.memory is not None:
+            history = full_history(self.memory, self.sizes.vision.width, device)
         return GroupBatch(
             images=torch.zeros(1, 1, 3, size, size, dtype=torch.uint8, device=device),
             prompt=torch.full((1, 1, length), 5, device=device),
@@ -417,9 +414,7 @@ class MemoryVlaPolicy(NetworkPolicy):
             times=torch.zeros(1, 1, dtype=torch.int64, device=known),
             valid=torch.ones(1, 1, dtype=torch.bool, device=known),
             actions=torch.zeros(1, 1, self.horizon, self.action_dim, device=device),
-            history=None
-            if self.memory is None
-            else full_history(self.memory, self.sizes.vision.width, device),
+            history=history,
         )
 
     def warm_up_vision(self) -> None:

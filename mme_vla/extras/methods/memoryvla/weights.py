@@ -10,6 +10,7 @@ from torch import Tensor
 from mme_vla.errors import UserError
 from mme_vla.extras.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.policy.base import Policy
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import cast
 from mme_vla.processing.normalise import NormStats
 from mme_vla.weights.tables import Adapter, NameTable, Piece
@@ -113,7 +114,7 @@ def memoryvla_adapter(policy: Policy) -> Adapter:
     """The authors' names of this policy's tensors; what they start from lacks banks and head."""
     if not isinstance(policy, MemoryVlaPolicy):
         raise UserError(
-            f"This format holds MemoryVLA; {policy.config.get('name', 'this')} is a"
+            f"This format holds MemoryVLA; {PolicySections.of(policy.config).name or 'this'} is a"
             f" {type(policy).__name__}. Set model=memoryvla."
         )
     names = policy.state_dict()

@@ -15,6 +15,7 @@ from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.extras.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.extras.methods.openvla_oft.policy import OpenVlaPolicy
 from mme_vla.policy.base import Policy
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import WEIGHTS, cast, read_files
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import check_sums, checked_file, inside, read_json
@@ -161,9 +162,9 @@ def openvla_adapter(policy: Policy) -> Adapter:
     """
     if not isinstance(policy, OpenVlaPolicy | MemoryVlaPolicy):
         raise UserError(
-            f"This format holds OpenVLA and OpenVLA-OFT; {policy.config.get('name', 'this')} is a "
-            f"{type(policy).__name__}. Set model=openvla_oft, or "
-            "start model=memoryvla from it (init_from=…)."
+            "This format holds OpenVLA and OpenVLA-OFT;"
+            f" {PolicySections.of(policy.config).name or 'this'} is a {type(policy).__name__}. Set"
+            " model=openvla_oft, or start model=memoryvla from it (init_from=…)."
         )
     names = [
         name for name in policy.state_dict() if ".lora_" not in name and ".base_layer." not in name

@@ -86,11 +86,10 @@ def shift_and_rotate(points: Tensor, centre: Tensor, shift: Tensor, angle: Tenso
 
 VIEWS = 3
 """top · front · right, everywhere in this order."""
-_ABOVE, _AHEAD, _BESIDE = (
-    1.0,
-    1.0,
-    0.5,
-)  # where the eyes stand; the third one stands closer, as released
+# Where the eyes stand; the third one stands closer, as released.
+_ABOVE = 1.0
+_AHEAD = 1.0
+_BESIDE = 0.5
 
 
 def project(points: Tensor, side: int) -> Tensor:
@@ -118,8 +117,9 @@ def constant_channels(side: int, device: torch.device | None = None) -> Tensor:
     """
     line = torch.linspace(-1, 1, side, device=device)
     number = torch.linspace(-1, 1, VIEWS, device=device)[:, None, None].expand(VIEWS, side, side)
-    rows, columns = line[:, None].expand(side, side), line[None].expand(side, side)
-    return torch.stack([number, *(x.expand(VIEWS, side, side) for x in (rows, columns))], 1)
+    rows = line[:, None].expand(VIEWS, side, side)
+    columns = line[None].expand(VIEWS, side, side)
+    return torch.stack([number, rows, columns], 1)
 
 
 _LOCK = 1.0
@@ -148,15 +148,6 @@ def angles_of(quaternions: Tensor) -> Tensor:
     )
 
 
-def quaternions_of(angles: Tensor) -> Tensor:
-    """Quaternions [..., 4] (x, y, z, w) of extrinsic x-y-z angles [..., 3] in degrees."""
-    halves = torch.deg2rad(angles.double()) / 2
-    (sa, sb, sc), (ca, cb, cc) = halves.sin().unbind(-1), halves.cos().unbind(-1)
-    x, y = sa * cb * cc - ca * sb * sc, ca * sb * cc + sa * cb * sc
-    z, w = ca * cb * sc - sa * sb * cc, ca * cb * cc + sa * sb * sc
-    return torch.stack([x, y, z, w], -1)
-
-
 def to_bins(quaternions: Tensor, count: int) -> Tensor:
     """The bins [..., 3] int64 of quaternions [..., 4] (x, y, z, w), where a turn has `count` of
     them.
@@ -176,9 +167,8 @@ def _wrap_angle(degrees: Tensor) -> Tensor:
 
 SIGMA = 1.5
 """Width of a target's peak in pixels, as released."""
-_CUT = (
-    4.5  # a target is zero where its Gaussian's exponent is below −4.5, three widths from the peak
-)
+_CUT = 4.5
+"""A target is zero where its Gaussian's exponent is below −4.5, three widths from the peak."""
 
 
 def targets(pixels: Tensor, side: int, sigma: float = SIGMA) -> Tensor:

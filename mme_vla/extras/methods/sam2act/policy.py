@@ -34,6 +34,7 @@ from mme_vla.extras.methods.sam2act.sam2 import BankState
 from mme_vla.policy.base import PolicyInfo
 from mme_vla.policy.network import NetworkPolicy, processor_for
 from mme_vla.policy.saving import policy_options
+from mme_vla.policy.sections import PolicySections
 from mme_vla.registry import POLICIES
 from mme_vla.speed import Recompute
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
@@ -210,7 +211,8 @@ class SAM2ActPolicy(NetworkPolicy):
         *,
         fresh_backbone: bool = True,
     ) -> Self:
-        sizes, robot = SAM2ActSizes.from_dict(config["backbone"]), embodiment_of(config)
+        sections = PolicySections.of(config)
+        sizes, robot = SAM2ActSizes.from_dict(sections.backbone), embodiment_of(config)
         require(
             robot.action.width == WIDTH
             and robot.action.frames is None
@@ -220,7 +222,7 @@ class SAM2ActPolicy(NetworkPolicy):
             " embodiment=robomme_keyframes.",
         )
         require(
-            not config.get("memory") and not config.get("integration"),
+            not sections.memory and not sections.integration,
             "SAM2Act+ has a memory of its own: set memory=none integration=none.",
         )
         processor = processor_for(SAM2ActProcessor, processor, "sam2act_plus")
@@ -245,11 +247,9 @@ class SAM2ActPolicy(NetworkPolicy):
     @property
     def cube(self) -> Cube:
         """The workspace of the processor, else of the configuration."""
-        return (
-            Cube.of(self.config["processor"]["bounds"])
-            if self.processor is None
-            else self.processor.cube
-        )
+        if self.processor is not None:
+            return self.processor.cube
+        return Cube.of(PolicySections.of(self.config).processor["bounds"])
 
     # Training
 
@@ -261,12 +261,9 @@ class SAM2ActPolicy(NetworkPolicy):
         self, batch: KeyframeBatch, noise: Mapping[str, Tensor] | None = None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The stage's loss, and its parts to log (detached)."""
-        values = (
-            self.training_noise(len(batch.points), torch.default_generator)
-            if noise is None
-            else noise
-        )
-        sampled = map_noise(values, lambda value: value.to(self.device))
+        if noise is None:
+            noise = self.training_noise(len(batch.points), torch.default_generator)
+        sampled = map_noise(noise, lambda value: value.to(self.device))
         cube, sizes = self.cube, self.backbone.sizes
         augmentation = sampled if self.training and self.augment else None
         scenes = augmented(batch, batch.language, augmentation, cube, sizes.rotation_bins)

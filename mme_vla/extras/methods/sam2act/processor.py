@@ -7,6 +7,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from mme_vla.embodiment import Embodiment
@@ -24,7 +25,6 @@ from mme_vla.extras.methods.sam2act.geometry import (
     VIEWS,
     Cube,
     constant_channels,
-    quaternions_of,
     unproject,
     virtual_images,
 )
@@ -377,14 +377,14 @@ class SAM2ActProcessor(GoalProcessor):
         states = []
         for is_open, place in zip(sample.open, sample.places, strict=True):
             states.append(self.commanded_state(bool(is_open), int(place)))
-        rotation = quaternions_of(torch.rad2deg(torch.from_numpy(targets[:, 3:6]).double()))
+        rotation = Rotation.from_euler("xyz", targets[:, 3:6]).as_quat().astype(np.float32)
         return {
             "points": torch.from_numpy(np.stack([points for points, _ in clouds])),
             "colours": torch.from_numpy(np.stack([colours for _, colours in clouds])),
             "state": torch.stack(states),
             "language": self.prompt(sample.goal),
             "target": torch.from_numpy(targets[:, :3]),
-            "rotation": rotation.float(),
+            "rotation": torch.from_numpy(rotation),
             "gripper": torch.from_numpy((targets[:, 6] > 0).astype(np.int64)),
             # The recorder's plans ignore collisions.
             "collision": torch.ones(len(targets), dtype=torch.int64),

@@ -12,6 +12,7 @@ from mme_vla.errors import UserError, require
 from mme_vla.extras.methods.sam2act.model import code_rates
 from mme_vla.extras.methods.sam2act.policy import SAM2ActPolicy
 from mme_vla.policy.base import Policy
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import cast
 from mme_vla.processing.normalise import NormStats
 from mme_vla.weights.tables import Adapter, Derived, NameTable, Piece, Unread, prefixed
@@ -222,7 +223,7 @@ def sam2act_adapter(policy: Policy) -> Adapter:
     """The authors' names of this policy's tensors."""
     if not isinstance(policy, SAM2ActPolicy):
         raise UserError(
-            f"This format holds SAM2Act+; {policy.config.get('name', 'this')} is a"
+            f"This format holds SAM2Act+; {PolicySections.of(policy.config).name or 'this'} is a"
             f" {type(policy).__name__}. Set model=sam2act_plus."
         )
     sizes = policy.backbone.sizes

@@ -62,13 +62,6 @@ class VideoMemory:
     patches: dict[Pair, Tensor] = field(default_factory=dict)
     ahead: Ahead | None = None
 
-    def forget(self, before: int) -> None:
-        """Drop what lies before a frame."""
-        for frame in [frame for frame in self.frames if frame < before]:
-            del self.frames[frame]
-        for pair in [pair for pair in self.patches if pair[0] < before]:
-            del self.patches[pair]
-
 
 class VideoEpisode(Episode):
     """Recent frames of the memory camera beside the current view."""
@@ -88,13 +81,19 @@ class VideoEpisode(Episode):
         executed: np.ndarray,
         states: np.ndarray | None = None,
     ) -> None:
-        start, processor = self.n_observed_frames, self._policy.require_processor()
-        oldest = start + len(demo) - 1 - (processor.window.span if processor.shows_video else 0)
+        start = self.n_observed_frames
+        processor = self._policy.require_processor()
+        oldest = start + len(demo) - 1
+        if processor.shows_video:
+            oldest -= processor.window.span
         for i in range(max(oldest - start, 0), len(demo)):
             if (image := frames.image(i)) is not None:
                 self.video.frames[start + i] = torch.from_numpy(np.moveaxis(image, -1, 0).copy())
         super()._take(frames, demo, executed, states)
-        self.video.forget(oldest)
+        # What lies before the window is dropped.
+        video = self.video
+        video.frames = {k: image for k, image in video.frames.items() if k >= oldest}
+        video.patches = {pair: t for pair, t in video.patches.items() if pair[0] >= oldest}
 
     @property
     def step(self) -> int:
@@ -144,7 +143,8 @@ class VideoEpisode(Episode):
         """Read some more temporal patches of the planned prompt; return whether more remain."""
         ahead = self.video.ahead
         assert ahead is not None
-        count, tokens = len(ahead.pairs) - 1, ahead.tokens
+        count = len(ahead.pairs) - 1
+        tokens = ahead.tokens
         if ahead.patches == count:
             return False
         last = min(ahead.patches + PIECE, count)

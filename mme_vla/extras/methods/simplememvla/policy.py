@@ -29,9 +29,9 @@ from mme_vla.extras.methods.simplememvla.model import (
     words_loss,
 )
 from mme_vla.extras.methods.simplememvla.processor import (
-    PromptSettings,
     SimpleMemVlaProcessor,
     VideoBatch,
+    processor_settings,
 )
 from mme_vla.extras.methods.simplememvla.prompt import (
     IMAGE,
@@ -46,8 +46,9 @@ from mme_vla.extras.methods.simplememvla.video import TEMPORAL, Window, augment,
 from mme_vla.memory.base import MemoryModule, full_history
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.network import MemoryTower, NetworkPolicy
+from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
 from mme_vla.policy.saving import policy_options
+from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.registry import POLICIES
 from mme_vla.speed import Recompute
@@ -114,10 +115,13 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         if not fresh_backbone:
             self.backbone.to_empty(device=torch.get_default_device())
             self.backbone.reset_buffers()
-        head = (sizes.width, sizes.action_dim, sizes.horizon, sizes.state_dim)
-        self.action_head = ActionHead(sizes.head, *head)
+        self.action_head = ActionHead(
+            sizes.head, sizes.width, sizes.action_dim, sizes.horizon, sizes.state_dim
+        )
         self.memory, self.sizes = memory, sizes
-        self.memory_proj = None if memory is None else nn.Linear(sizes.memory_width, sizes.width)
+        self.memory_proj = None
+        if memory is not None:
+            self.memory_proj = nn.Linear(sizes.memory_width, sizes.width)
         self.horizon, self.action_dim = sizes.horizon, sizes.action_dim
         self.info = replace(
             self.info,
@@ -138,32 +142,32 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         *,
         fresh_backbone: bool = True,
     ) -> Self:
-        sizes, robot = SimpleMemVlaSizes.from_dict(config["backbone"]), embodiment_of(config)
+        sections = PolicySections.of(config)
+        sizes = SimpleMemVlaSizes.from_dict(sections.backbone)
+        robot = embodiment_of(config)
         robot.check_network(sizes.action_dim, sizes.horizon)
         if sizes.state_dim not in (0, robot.state.width):
             raise UserError(
                 f"backbone.state_dim={sizes.state_dim} must be {robot.state.width}, or 0 for no"
                 " state."
             )
-        if config.get("integration"):
+        if sections.integration:
             raise UserError(
                 "SimpleMemVLA has no place for the integration"
-                f" {config['integration'].get('name')!r}: a memory's tokens stand in the prompt, in"
+                f" {sections.integration.get('name')!r}: a memory's tokens stand in the prompt, in"
                 " place of the video. Set integration=none."
             )
-        if processor is not None and not isinstance(processor, SimpleMemVlaProcessor):
-            raise UserError(
-                "SimpleMemVLA needs its own processor: set processor=simplememvla, or"
-                " simplememvla_tiny."
-            )
+        processor = processor_for(
+            SimpleMemVlaProcessor, processor, "simplememvla, or simplememvla_tiny to try it"
+        )
         memory: MemoryModule | None = None
-        if config.get("memory"):
+        if sections.memory:
             grid = sizes.image_size // sizes.factor
-            memory = build_memory(config["memory"], sizes.width, grid, sizes.memory_width)
+            memory = build_memory(sections.memory, sizes.width, grid, sizes.memory_width)
             check_past(config, memory, frozenset())
             if not memory.budget:
                 raise UserError(
-                    f"The memory {config['memory']['name']!r} has no tokens with these settings."
+                    f"The memory {sections.memory['name']!r} has no tokens with these settings."
                 )
         options = policy_options(cls, config)
         return cls(sizes, memory, processor, config, fresh_backbone=fresh_backbone, **options)
@@ -181,30 +185,22 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         video, images = batch.video, batch.images
         if changes is not None:
             video, images = _augmented(video, images, batch.patches, changes)
+        replaced: list[tuple[Tensor, Tensor]] = []
         pairs = images.flatten(0, 1)[:, None].expand(-1, TEMPORAL, -1, -1, -1)
-        replaced = (
-            [(batch.kinds == IMAGE, self.backbone.encode_patches(pairs).flatten(0, 1))]
-            if len(pairs)
-            else []
-        )
+        if len(pairs):
+            tokens = self.backbone.encode_patches(pairs)
+            replaced.append((batch.kinds == IMAGE, tokens.flatten(0, 1)))
         features = batch.features
         if features is None and video is not None and len(video):
             features = self.backbone.encode_patches(video)
         if features is not None:
             replaced.append((batch.kinds == VIDEO, features.flatten(0, 1)))
         if memory is not None:
-            replaced.append((batch.kinds == MEMORY, self._projected(memory).flatten(0, 1)))
+            assert self.memory_proj is not None
+            # Empty tokens are zero before the projection.
+            filled = torch.where(memory.mask[..., None], memory.tokens.float(), 0.0)
+            replaced.append((batch.kinds == MEMORY, self.memory_proj(filled).flatten(0, 1)))
         return self.backbone.embed(batch.ids, *replaced)
-
-    def _projected(self, memory: MemoryTokens) -> Tensor:
-        """Memory tokens [b, n, D] for the language model; empty ones are zero before the
-        projection.
-        """
-        assert self.memory_proj is not None
-        tokens: Tensor = self.memory_proj(
-            torch.where(memory.mask[..., None], memory.tokens.float(), 0.0)
-        )
-        return tokens
 
     # Training
 
@@ -218,11 +214,9 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         """While training with augmentation `changes` [n, 7]: uniform numbers for the images of
         `count` samples.
         """
-        return (
-            {"changes": torch.rand(count, 7, generator=generator)}
-            if self.training and self.augment
-            else {}
-        )
+        if not (self.training and self.augment):
+            return {}
+        return {"changes": torch.rand(count, 7, generator=generator)}
 
     def forward(
         self, batch: VideoBatch, noise: Mapping[str, Tensor] | None = None
@@ -258,18 +252,16 @@ class SimpleMemVlaPolicy(NetworkPolicy):
                 batch.action_mask,
             )
         loss = self.sizes.action_weight * action + self.sizes.words_weight * words
-        reported = (
-            {}
-            if memory is None
-            else {f"memory/{name}": value for name, value in memory.metrics.items()}
-        )
         metrics = {
             "loss": loss.detach(),
             "action": action.detach(),
             "words": words.detach(),
             "words_right": right,
         }
-        return loss, metrics | reported
+        if memory is not None:
+            for name, value in memory.metrics.items():
+                metrics[f"memory/{name}"] = value
+        return loss, metrics
 
     def _state(self, batch: VideoBatch) -> Tensor | None:
         return batch.state if self.sizes.state_dim else None
@@ -340,7 +332,10 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         """
         with self.autocast():
             embedded = self.embed(batch, memory)
-            longest, start = max(batch.prompts), 0 if prefill is None else prefill.length
+            longest = max(batch.prompts)
+            start = 0
+            if prefill is not None:
+                start = prefill.length
             rows = [
                 functional.pad(e[:n], (0, 0, longest - n, 0))
                 for e, n in zip(embedded, batch.prompts, strict=True)
@@ -353,23 +348,20 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             if min(batch.prompts) < longest:
                 lengths = torch.tensor(batch.prompts, device=embedded.device)
                 mask = torch.arange(longest, device=embedded.device) >= (longest - lengths)[:, None]
-            ids, limit = self._word_settings(batch)
+            if batch.words is None:
+                processor = self.require_processor()
+                ends, limit = processor.word_ids, processor.settings.max_words
+            else:  # of words that are known any number is read, and none ends them
+                ends, limit = WordIds(0, 0), max(map(len, batch.words))
             return self.backbone.generate(
                 torch.stack(rows)[:, start:],
                 torch.stack(places)[..., start:],
-                ids,
+                ends,
                 limit,
                 mask,
                 prefill,
                 batch.words,
             )
-
-    def _word_settings(self, batch: VideoBatch) -> tuple[WordIds, int]:
-        """Ids that end a response, and its most words; of words that are known, any."""
-        if batch.words is not None:
-            return WordIds(0, 0), max(map(len, batch.words))
-        processor = self.require_processor()
-        return processor.word_ids, processor.settings.max_words
 
     # Episodes
 
@@ -491,28 +483,26 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         """A batch of one without content: a full video, or a full memory, and a response of a usual
         length.
         """
-        sizes, robot, section = self.sizes, self.embodiment, dict(self.config["processor"])
-        settings = PromptSettings(**{key: value for key, value in section.items() if key != "name"})
+        sizes, robot = self.sizes, self.embodiment
+        settings = processor_settings(self.config)
         window = Window(settings.seconds, settings.fps, settings.native_fps)
-        patches = window.length // TEMPORAL if self.memory is None and settings.video else 1
+        patches, n_memory, history = 1, 0, None
+        if self.memory is not None:
+            n_memory = self.memory.budget
+            history = full_history(self.memory, sizes.width, device)
+        elif settings.video:
+            patches = window.length // TEMPORAL
         side = settings.side or sizes.image_size
         grid = (side // sizes.factor, side // sizes.factor)
-        stamped = [*[TEXT] * _STAMP_TOKENS, *[VIDEO] * (grid[0] * grid[1])]
-        image = [TEXT, *[IMAGE] * (grid[0] * grid[1])] * (len(robot.cameras) - 1)
-        memory = [MEMORY] * (0 if self.memory is None else self.memory.budget)
-        kinds = np.array(
-            [
-                TEXT,
-                *memory,
-                *stamped * patches,
-                *image,
-                *[TEXT] * (_REQUEST_TOKENS + _RESPONSE_TOKENS),
-            ]
-        )
-        cameras = [
-            CameraTokens("front", grid, [0.0] * patches),
-            *[CameraTokens("wrist", grid)] * (len(robot.cameras) - 1),
-        ]
+        n_images, n_tokens = len(robot.cameras) - 1, grid[0] * grid[1]
+        # The prompt: memory and video, current images, request and response
+        kinds_of_tokens = [TEXT] + [MEMORY] * n_memory
+        kinds_of_tokens += ([TEXT] * _STAMP_TOKENS + [VIDEO] * n_tokens) * patches
+        kinds_of_tokens += ([TEXT] + [IMAGE] * n_tokens) * n_images
+        kinds_of_tokens += [TEXT] * (_REQUEST_TOKENS + _RESPONSE_TOKENS)
+        kinds = np.array(kinds_of_tokens)
+        cameras = [CameraTokens("front", grid, [0.0] * patches)]
+        cameras += [CameraTokens("wrist", grid)] * n_images
         length = len(kinds)
         return VideoBatch(
             ids=torch.zeros(1, length, dtype=torch.int64, device=device),
@@ -522,12 +512,10 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             lengths=(length,),
             patches=(patches,),
             state=torch.zeros(1, robot.state.width, device=device),
-            images=torch.zeros(
-                1, len(robot.cameras) - 1, 3, side, side, dtype=torch.uint8, device=device
-            ),
+            images=torch.zeros(1, n_images, 3, side, side, dtype=torch.uint8, device=device),
             video=torch.zeros(patches, TEMPORAL, 3, side, side, dtype=torch.uint8, device=device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            history=None if self.memory is None else full_history(self.memory, sizes.width, device),
+            history=history,
             words=((1,) * (_RESPONSE_TOKENS - 2),),
         )
 
@@ -542,12 +530,13 @@ def _augmented(
 ) -> tuple[Tensor | None, Tensor]:
     """The video [K, 2, 3, H, W] and the images [b, c, 3, H, W] of each row, all changed alike."""
     draws = [augmentation_draw(row) for row in changes.tolist()]
+    changed = [augment(row, draw) for row, draw in zip(images, draws, strict=True)]
     if video is not None:
-        parts = zip(video.split(list(patches)), draws, strict=True)
-        video = torch.cat(
-            [augment(part.flatten(0, 1), draw).unflatten(0, (-1, TEMPORAL)) for part, draw in parts]
-        )
-    return video, torch.stack([augment(row, draw) for row, draw in zip(images, draws, strict=True)])
+        parts = []
+        for part, draw in zip(video.split(list(patches)), draws, strict=True):
+            parts.append(augment(part.flatten(0, 1), draw).unflatten(0, (-1, TEMPORAL)))
+        video = torch.cat(parts)
+    return video, torch.stack(changed)
 
 
 def _video_episode(episode: Episode) -> VideoEpisode:

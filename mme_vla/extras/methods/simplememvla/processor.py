@@ -83,6 +83,12 @@ class PromptSettings:
     goal_case: str | None = None
 
 
+def processor_settings(config: Mapping[str, Any]) -> PromptSettings:
+    """The section `processor` of a policy's configuration."""
+    values = {key: value for key, value in config["processor"].items() if key != "name"}
+    return read_section(PromptSettings, values, "processor")
+
+
 @dataclass
 class VideoBatch(TensorStruct):
     """Prompts with the images that are in them.
@@ -193,8 +199,7 @@ class SimpleMemVlaProcessor(PolicyProcessor):
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
         sizes = SimpleMemVlaSizes.from_dict(sections["backbone"])
-        values = {key: value for key, value in sections["processor"].items() if key != "name"}
-        settings = read_section(PromptSettings, values, "processor")
+        settings = processor_settings(sections)
         robot = embodiment_of(sections)
         settings = replace(settings, goal_case=settings.goal_case or goal_case(robot))
         memory = (sections.get("memory") or {}).get("budget", 0)

@@ -65,7 +65,8 @@ class WordTokenizer:
             raise UserError(
                 f"processor.tokenizer={brief(spec, 300)} is no tokenizer.json: {reason}"
             ) from None
-        self.content, self.spec = content, spec
+        self.content = content
+        self.spec = spec
         self.fingerprint = hashlib.sha256(content.encode()).hexdigest()[:16]
         if lacking := [token for token in SPECIAL if self._tokenizer.token_to_id(token) is None]:
             raise UserError(
@@ -86,7 +87,8 @@ class WordTokenizer:
         if spec in (BYTES, WORDS):
             return cls(_small_tokenizer(spec), spec)
         path = _download(spec) if spec.startswith(HUB) else Path(spec).expanduser()
-        path = path / "tokenizer.json" if path.is_dir() else path
+        if path.is_dir():
+            path = path / "tokenizer.json"
         if not path.is_file():
             raise UserError(
                 f"No tokenizer at {brief(spec, 300)}. Set processor.tokenizer to the path of"
@@ -132,33 +134,25 @@ def _small_tokenizer(spec: str) -> str:
         from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers, trainers
     except ImportError:
         raise missing_extra("SimpleMemVLA", "vlm") from None
+    alphabet = pre_tokenizers.ByteLevel.alphabet()
+    tokenizer: Any
     if spec == WORDS:
-        learned: Any = Tokenizer(models.BPE())
-        learned.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-        learned.decoder = decoders.ByteLevel()
-        alphabet = pre_tokenizers.ByteLevel.alphabet()
-        corpus = (
-            files("mme_vla")
-            .joinpath("assets/tokenizer_corpus.txt")
-            .read_text(encoding="utf-8")
-            .splitlines()
-        )
+        tokenizer = Tokenizer(models.BPE())
+        tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+        corpus = files("mme_vla").joinpath("assets/tokenizer_corpus.txt").read_text("utf-8")
         request = instruction("", Robot("Panda single-arm robot", 20, 30), 1, 1)
-        stamps = [timestamp(place / 4) for place in range(400)]
+        texts = [*corpus.splitlines(), *[request] * 200]
+        texts += [timestamp(place / 4) for place in range(400)]
+        texts += ["Front camera:\n\n"] * 200
         trainer = trainers.BpeTrainer(
             vocab_size=_WORDS_SIZE, initial_alphabet=alphabet, show_progress=False
         )
-        learned.train_from_iterator(
-            [*corpus, *[request] * 200, *stamps, *["Front camera:\n\n"] * 200], trainer
-        )
-        learned.add_special_tokens([AddedToken(token, normalized=False) for token in SPECIAL])
-        trained: str = learned.to_str()
-        return trained
-    letters = sorted(pre_tokenizers.ByteLevel.alphabet())
-    newline = "\u010a"  # how byte-level tokenizers spell a line break
-    vocabulary = {letter: i for i, letter in enumerate([*letters, newline * 2])}
-    tokenizer: Any = Tokenizer(models.BPE(vocab=vocabulary, merges=[(newline, newline)]))
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)
+        tokenizer.train_from_iterator(texts, trainer)
+    else:
+        newline = "\u010a"  # how byte-level tokenizers spell a line break
+        vocabulary = {letter: i for i, letter in enumerate([*sorted(alphabet), newline * 2])}
+        tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=[(newline, newline)]))
+        tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)
     tokenizer.decoder = decoders.ByteLevel()
     tokenizer.add_special_tokens([AddedToken(token, normalized=False) for token in SPECIAL])
     content: str = tokenizer.to_str()
@@ -222,30 +216,24 @@ class CameraTokens:
 
 def instruction(goal: str, robot: Robot, videos: int, images: int) -> str:
     """The request of a prompt, for a task in words, and so many cameras with and without a past."""
-    stamped = "(each frame is tagged with its timestamp in seconds)"
     if videos == 1 and not images:
         history = "the recent history video (frames tagged with timestamps)"
     else:
+        sources = "one camera" if videos == 1 else f"{videos} cameras"
         history = (
-            f"the recent history video from {'one camera' if videos == 1 else f'{videos} cameras'}"
-            f" {stamped}"
+            f"the recent history video from {sources} (each frame is tagged with its timestamp in"
+            " seconds)"
         )
-    current = "" if not images else f", plus the current image from {_more(images)}"
+    current = ""
+    if images:
+        others = "one more camera" if images == 1 else f"{images} more cameras"
+        current = f", plus the current image from {others}"
+    task = goal.strip().replace("_", " ").rstrip(". ")
     return (
         f"The robot is a {robot.words}. The control frequency is {robot.hz:g} Hz. The next"
         f" {robot.horizon} control actions are predicted from the current sub-task. You are given"
-        f" {history}{current}. The overall task is: {clean_goal(goal)}. Identify the current"
-        " sub-task."
+        f" {history}{current}. The overall task is: {task}. Identify the current sub-task."
     )
-
-
-def _more(images: int) -> str:
-    return "one more camera" if images == 1 else f"{images} more cameras"
-
-
-def clean_goal(goal: str) -> str:
-    """A goal as prompts contain it: no underscores, no full stop at its end."""
-    return goal.strip().replace("_", " ").rstrip(". ")
 
 
 def clean_response(subtask: str) -> str:
@@ -301,12 +289,11 @@ def encode(
         if camera.times is not None:
             kinds[video[used : used + camera.memory]] = MEMORY
             used += camera.memory + len(camera.times) * camera.grid[0] * camera.grid[1]
-    prefix, first = 0, cameras[0]
+    prefix = 0
+    first = cameras[0]
     if first.times is not None and len(first.times) > 1:
-        prefix = (
-            int(video[first.memory + (len(first.times) - 1) * first.grid[0] * first.grid[1] - 1])
-            + 1
-        )
+        n_before_last = (len(first.times) - 1) * first.grid[0] * first.grid[1]
+        prefix = int(video[first.memory + n_before_last - 1]) + 1
     return Tokens(ids, kinds, rope_positions(kinds, cameras), len(prompt), prefix)
 
 

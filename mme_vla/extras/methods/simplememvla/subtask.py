@@ -17,11 +17,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.backbone.base import FineTuneSpec
+from mme_vla.backbone.building import read_backbone
 from mme_vla.errors import UserError
 from mme_vla.extras.methods.simplememvla.prompt import clean_response
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import Sample
 from mme_vla.processing.processor import Processor
 from mme_vla.registry import POLICIES, PROCESSORS
@@ -163,16 +165,16 @@ class SubtaskPolicy(MMEPolicy):
             subtask_weight: of the cross entropy of its words.
         """
         super().__init__(*parts, **options)
-        section, width = self.config["backbone"], self.integration.memory_width
-        sizes = (
-            section["vlm"]["width"],
-            width,
-            section["vocab_size"],
+        _, network = read_backbone(PolicySections.of(self.config).backbone)
+        self.subtask_weight = subtask_weight
+        self.subtask = SubtaskDecoder(
+            network.vlm.width,
+            self.integration.memory_width,
+            network.vocab_size,
             subtask_depth,
             subtask_heads,
             subtask_words,
         )
-        self.subtask, self.subtask_weight = SubtaskDecoder(*sizes), subtask_weight
 
     @staticmethod
     def _check_parts(

@@ -57,18 +57,14 @@ class Window:
         """Camera frames before the current one that a full window reaches back."""
         return (self.length - 1) * self.stride
 
-    def frame_count(self, available: int) -> int:
-        """Frames that a window shows when `available` of them exist, the current one among them."""
-        if not self.variable:
-            return self.length
-        available = min(available, self.length)
-        return max(TEMPORAL, available + available % 2)
-
     def frames(self, step: int) -> np.ndarray:
         """The frames shown at a step, counted from the episode's first one, video included: int64
         [n], ascending.
         """
-        count = self.frame_count(step // self.stride + 1)
+        count = self.length
+        if self.variable:  # those that exist, an even number
+            available = min(step // self.stride + 1, self.length)
+            count = max(TEMPORAL, available + available % 2)
         return np.maximum(step - self.stride * np.arange(count - 1, -1, -1), 0)
 
     def times(self, count: int) -> list[float]:
@@ -94,17 +90,21 @@ def fitting_size(
     if max(height, width) > 200 * min(height, width):
         raise UserError(f"Images of {height}×{width} pixels are too narrow for the vision tower.")
     low, high = bounds
-    sides = [max(factor, round(side / factor) * factor) for side in (height, width)]
-    padded = frames + frames % TEMPORAL if frames > 1 else 1
-    if padded * math.prod(sides) > high:
+    padded = frames
+    if frames > 1:
+        padded += frames % TEMPORAL
+    rows = max(1, round(height / factor))
+    columns = max(1, round(width / factor))
+    pixels = padded * rows * columns * factor**2
+    if pixels > high:
         scale = math.sqrt(frames * height * width / high)
-        sides = [
-            max(factor, math.floor(side / scale / factor) * factor) for side in (height, width)
-        ]
-    elif padded * math.prod(sides) < low:
+        rows = max(1, math.floor(height / scale / factor))
+        columns = max(1, math.floor(width / scale / factor))
+    elif pixels < low:
         scale = math.sqrt(low / (frames * height * width))
-        sides = [math.ceil(side * scale / factor) * factor for side in (height, width)]
-    return sides[0], sides[1]
+        rows = math.ceil(height * scale / factor)
+        columns = math.ceil(width * scale / factor)
+    return rows * factor, columns * factor
 
 
 def resized(frames: Tensor, size: tuple[int, int]) -> Tensor:

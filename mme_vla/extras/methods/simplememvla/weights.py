@@ -8,20 +8,23 @@ library already.
 import json
 import shutil
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 from torch import Tensor
 
+from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, brief, listed
 from mme_vla.extras.methods.simplememvla.config import NAME
 from mme_vla.extras.methods.simplememvla.policy import SimpleMemVlaPolicy
-from mme_vla.extras.methods.simplememvla.processor import TOKENIZER_FILE
+from mme_vla.extras.methods.simplememvla.processor import TOKENIZER_FILE, processor_settings
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import WEIGHTS, cast
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import checked_file, read_json
@@ -34,32 +37,130 @@ _LM_HEAD, _EMBEDDING = (
     "backbone.model.language_model.embed_tokens.weight",
 )
 _IMAGE_KEY = "observation.images."
+_STATISTICS = ("mean", "std", "q01", "q99", "min", "max")
 _ONE_PERCENT = 2.326
 """Deviations from the mean to a normal distribution's 1 % quantile."""
 
-HEAD_KEYS = {
-    "dit_hidden_size": "width",
-    "dit_depth": "depth",
-    "dit_num_heads": "heads",
-    "dit_mlp_ratio": "mlp_ratio",
-    "dit_dropout": "dropout",
-    "dit_rope_theta": "rope_theta",
-    "dit_mrope_section": "rope_section",
-    "dit_partial_rotary_factor": "rope_factor",
-    "state_dropout_prob": "state_dropout",
-    "timestep_beta_alpha": "time_alpha",
+KEYS = {
+    "action_dim": "backbone.action_dim",
+    "action_horizon": "backbone.horizon",
+    "action_loss_weight": "backbone.action_weight",
+    "vl_loss_weight": "backbone.words_weight",
+    "dit_hidden_size": "backbone.head.width",
+    "dit_depth": "backbone.head.depth",
+    "dit_num_heads": "backbone.head.heads",
+    "dit_mlp_ratio": "backbone.head.mlp_ratio",
+    "dit_dropout": "backbone.head.dropout",
+    "dit_rope_theta": "backbone.head.rope_theta",
+    "dit_mrope_section": "backbone.head.rope_section",
+    "dit_partial_rotary_factor": "backbone.head.rope_factor",
+    "state_dropout_prob": "backbone.head.state_dropout",
+    "timestep_beta_alpha": "backbone.head.time_alpha",
+    "robot_tag": "processor.robot",
+    "control_frequency_hz": "processor.control_hz",
+    "history_video_sec": "processor.seconds",
+    "history_video_fps": "processor.fps",
+    "native_video_fps": "processor.native_fps",
+    "variable_history": "processor.variable",
 }
-BACKBONE_KEYS = {
-    "action_dim": "action_dim", "action_horizon": "horizon", "action_loss_weight": "action_weight",
-    "vl_loss_weight": "words_weight",
-}  # fmt: skip
-PROCESSOR_KEYS = {
-    "robot_tag": "robot", "control_frequency_hz": "control_hz", "history_video_sec": "seconds",
-    "history_video_fps": "fps", "native_video_fps": "native_fps", "variable_history": "variable",
-}  # fmt: skip
-"""Keys of a published config.json → keys of our sections `backbone.head`, `backbone` and
-`processor`.
-"""
+"""Keys of a published config.json → keys of a configuration here."""
+
+
+Number = int | float
+"""Whole numbers stay whole: compositions of policies are compared by their text."""
+
+
+@dataclass(frozen=True)
+class PublishedConfig:
+    """What a published config.json says, in its own keys.
+
+    backbone_config: Qwen3.5's own configuration. state_dim: of the robot, also where `use_proprio`
+    leaves the state out. image_keys: cameras in the order in which they are shown.
+    history_image_keys: those with a video.
+    """
+
+    backbone_config: Mapping[str, Any]
+    action_dim: int
+    action_horizon: int
+    action_loss_weight: Number
+    vl_loss_weight: Number
+    use_proprio: bool
+    state_dim: int
+    dit_hidden_size: int
+    dit_depth: int
+    dit_num_heads: int
+    dit_mlp_ratio: Number
+    dit_dropout: Number
+    dit_rope_theta: Number
+    dit_mrope_section: tuple[int, int, int]
+    dit_partial_rotary_factor: Number
+    state_dropout_prob: Number
+    timestep_beta_alpha: Number
+    robot_tag: str
+    control_frequency_hz: Number
+    history_video_sec: Number
+    history_video_fps: Number
+    native_video_fps: Number
+    variable_history: bool
+    image_keys: tuple[str, ...]
+    history_image_keys: tuple[str, ...] = ()
+    timestep_beta_beta: float = 1.0
+    model_type: Literal["simplememvla"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.timestep_beta_beta != 1.0:
+            raise UserError(
+                f"config.json: timestep_beta_beta={self.timestep_beta_beta:g}; only 1 is supported."
+            )
+
+    @classmethod
+    def read(cls, config: Mapping[str, Any]) -> Self:
+        """Read a config.json; keys that say nothing of the network are left out."""
+        return read_section(cls, config, "config.json", others=True)
+
+    @classmethod
+    def of(cls, policy: SimpleMemVlaPolicy) -> Self:
+        """What the config.json of a policy says."""
+        sizes, robot = policy.sizes, policy.embodiment
+        settings = processor_settings(policy.config)
+        return cls(
+            backbone_config=sizes.qwen.to_dict(),
+            action_dim=sizes.action_dim,
+            action_horizon=sizes.horizon,
+            action_loss_weight=sizes.action_weight,
+            vl_loss_weight=sizes.words_weight,
+            use_proprio=sizes.state_dim > 0,
+            state_dim=sizes.state_dim or robot.state.width,
+            dit_hidden_size=sizes.head.width,
+            dit_depth=sizes.head.depth,
+            dit_num_heads=sizes.head.heads,
+            dit_mlp_ratio=sizes.head.mlp_ratio,
+            dit_dropout=sizes.head.dropout,
+            dit_rope_theta=sizes.head.rope_theta,
+            dit_mrope_section=sizes.head.rope_section,
+            dit_partial_rotary_factor=sizes.head.rope_factor,
+            state_dropout_prob=sizes.head.state_dropout,
+            timestep_beta_alpha=sizes.head.time_alpha,
+            robot_tag=settings.robot,
+            control_frequency_hz=_whole(settings.control_hz),
+            history_video_sec=_whole(settings.seconds),
+            history_video_fps=_whole(settings.fps),
+            native_video_fps=_whole(settings.native_fps),
+            variable_history=settings.variable,
+            image_keys=tuple(_IMAGE_KEY + name for name in robot.camera_names),
+            history_image_keys=(_IMAGE_KEY + robot.memory_camera,),
+            model_type="simplememvla",
+        )
+
+    def configure(self, config: DictConfig) -> None:
+        """Set the keys of a configuration that it names."""
+        with open_dict(config):
+            for name, key in KEYS.items():
+                value = getattr(self, name)
+                OmegaConf.update(config, key, list(value) if isinstance(value, tuple) else value)
+            config.backbone.name = NAME
+            config.backbone.vlm = dict(self.backbone_config)
+            config.backbone.state_dim = self.state_dim if self.use_proprio else 0
 
 
 def is_simplememvla(names: Iterable[str]) -> bool:
@@ -104,59 +205,18 @@ def simplememvla_of(policy: Policy) -> SimpleMemVlaPolicy:
     """The policy, where it is SimpleMemVLA."""
     if not isinstance(policy, SimpleMemVlaPolicy):
         raise UserError(
-            f"This format holds SimpleMemVLA; {policy.config.get('name', 'this')} is a"
-            f" {type(policy).__name__}. Set model=simplememvla."
+            "This format holds SimpleMemVLA;"
+            f" {PolicySections.of(policy.config).name or 'this'} is a {type(policy).__name__}. Set"
+            " model=simplememvla."
         )
     return policy
 
 
+def _whole(number: float) -> Number:
+    return int(number) if number.is_integer() else number
+
+
 # config.json
-
-
-def backbone_section(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Our section `backbone` of a published config.json, without sizes that only costs
-    depend on.
-    """
-    _check_config(config)
-    return {
-        "name": NAME,
-        "vlm": dict(config["backbone_config"]),
-        "head": {target_key: config[source_key] for source_key, target_key in HEAD_KEYS.items()},
-        **{target_key: config[source_key] for source_key, target_key in BACKBONE_KEYS.items()},
-        "state_dim": config["state_dim"] if config["use_proprio"] else 0,
-    }
-
-
-def processor_section(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What a published config.json says of our section `processor`."""
-    _check_config(config)
-    return {target_key: config[source_key] for source_key, target_key in PROCESSOR_KEYS.items()}
-
-
-def _check_config(config: Mapping[str, Any]) -> None:
-    if config.get("model_type") not in (NAME, None):
-        raise UserError(
-            f"config.json: model_type={brief(config['model_type'])}, where SimpleMemVLA's is"
-            f" {NAME!r}."
-        )
-    needed = (
-        "backbone_config",
-        *HEAD_KEYS,
-        *BACKBONE_KEYS,
-        *PROCESSOR_KEYS,
-        "use_proprio",
-        "state_dim",
-        "image_keys",
-    )
-    if lacking := [key for key in needed if key not in config]:
-        raise UserError(f"config.json is no SimpleMemVLA's: it lacks {listed(lacking)}.")
-    if config.get("timestep_beta_beta", 1.0) != 1.0:
-        raise UserError(
-            f"config.json: timestep_beta_beta={brief(config['timestep_beta_beta'])}; only 1 is"
-            " supported."
-        )
-    if not isinstance(config["backbone_config"], Mapping):
-        raise UserError("config.json: backbone_config must be a Qwen3.5's configuration.")
 
 
 def configured(cfg: DictConfig, config: Mapping[str, Any], folder: Path) -> DictConfig:
@@ -165,14 +225,11 @@ def configured(cfg: DictConfig, config: Mapping[str, Any], folder: Path) -> Dict
     """
     if (folder / TOKENIZER_FILE).is_file():
         cfg.processor.tokenizer = str(checked_file(folder, TOKENIZER_FILE, "tokenizer"))
-    if not config or "backbone_config" not in config:
-        return cfg
-    with open_dict(cfg):
-        cfg.backbone = OmegaConf.merge(cfg.backbone, backbone_section(config) | {"vlm": None})
-        cfg.backbone.vlm = dict(config["backbone_config"])
-        cfg.processor = OmegaConf.merge(cfg.processor, processor_section(config))
-        cfg.embodiment.action.horizon = config["action_horizon"]
-        cfg.embodiment.fps = config["native_video_fps"]
+    if "backbone_config" in config:
+        published = PublishedConfig.read(config)
+        published.configure(cfg)
+        cfg.embodiment.action.horizon = published.action_horizon
+        cfg.embodiment.fps = published.native_video_fps
     return cfg
 
 
@@ -180,7 +237,7 @@ def check_config(policy: Policy, config: Mapping[str, Any], source: str) -> None
     """Refuse a published checkpoint that was trained with another video, robot or head than the
     policy's.
     """
-    if not config or "action_dim" not in config:  # of Qwen3.5, or none
+    if "action_dim" not in config:  # of Qwen3.5, or none
         return
     target = simplememvla_of(policy)
     if target.memory is not None:
@@ -189,68 +246,31 @@ def check_config(policy: Policy, config: Mapping[str, Any], source: str) -> None
             " stay unset. To begin training from it use start_from() (on the command line:"
             " init_from=…)."
         )
-    sections = {"backbone": backbone_section(config), "processor": processor_section(config)}
-    for section, expected in sections.items():
-        current = dict(target.config[section])
-        for key, value in expected.items():
-            if key == "vlm":
-                continue
-            # (dotted name, the source's value, the policy's)
-            triples = [(f"{section}.{key}", value, current.get(key))]
-            if isinstance(value, dict):
-                triples = [
-                    (f"{section}.{key}.{name}", member, current[key].get(name))
-                    for name, member in value.items()
-                ]
-            for name, source_value, has in triples:
-                if isinstance(has, tuple):
-                    has = list(has)
-                if has != source_value:
-                    raise UserError(
-                        f"{source} was trained with {name}={brief(source_value)}; this policy has"
-                        f" {brief(has)}. Set {name}={brief(source_value)}."
-                    )
-    robot = target.embodiment
-    if [*config["image_keys"]] != [_IMAGE_KEY + name for name in robot.camera_names]:
-        cameras = listed(robot.camera_names)
+    published, expected = PublishedConfig.read(config), PublishedConfig.of(target)
+    for name, key in KEYS.items():
+        value, has = getattr(published, name), getattr(expected, name)
+        if value != has:
+            raise UserError(
+                f"{source} was trained with {key}={brief(value)}; this policy has {brief(has)}. Set"
+                f" {key}={brief(value)}."
+            )
+    state_dim = published.state_dim if published.use_proprio else 0
+    if state_dim != target.sizes.state_dim:
         raise UserError(
-            f"{source} sees {listed(config['image_keys'])}; the robot {robot.name!r} has {cameras}."
+            f"{source} was trained with backbone.state_dim={state_dim}; this policy has"
+            f" {target.sizes.state_dim}. Set backbone.state_dim={state_dim}."
         )
-    if list(config.get("history_image_keys", [])) not in ([], [_IMAGE_KEY + robot.memory_camera]):
+    robot = target.embodiment
+    if published.image_keys != expected.image_keys:
         raise UserError(
-            f"{source} shows a video of {listed(config['history_image_keys'])}; here it is the"
+            f"{source} sees {listed(published.image_keys)}; the robot {robot.name!r} has"
+            f" {listed(robot.camera_names)}."
+        )
+    if published.history_image_keys not in ((), expected.history_image_keys):
+        raise UserError(
+            f"{source} shows a video of {listed(published.history_image_keys)}; here it is the"
             f" memory camera's, {robot.memory_camera!r} (embodiment.memory_camera)."
         )
-
-
-def published_config(policy: SimpleMemVlaPolicy) -> dict[str, Any]:
-    """The config.json of a policy, as its authors' code reads it."""
-    sizes, robot, processor = policy.sizes, policy.embodiment, policy.config["processor"]
-    head = {
-        source_key: getattr(sizes.head, target_key) for source_key, target_key in HEAD_KEYS.items()
-    }
-    return {
-        "model_type": NAME,
-        "backbone_model_name_or_path": BASE,
-        "backbone_config": sizes.qwen.to_dict(),
-        "hidden_size": sizes.width,
-        **{
-            source_key: getattr(sizes, target_key)
-            for source_key, target_key in BACKBONE_KEYS.items()
-        },
-        "use_proprio": bool(sizes.state_dim),
-        "state_dim": sizes.state_dim or robot.state.width,
-        **{
-            name: list(value) if isinstance(value, tuple) else value for name, value in head.items()
-        },
-        "timestep_beta_beta": 1.0,
-        "freeze_backbone": False,
-        **{source_key: processor[target_key] for source_key, target_key in PROCESSOR_KEYS.items()},
-        "image_keys": [_IMAGE_KEY + name for name in robot.camera_names],
-        "history_image_keys": [_IMAGE_KEY + robot.memory_camera],
-        "subtask_key": "subtask",
-        "subtask_index_key": "subtask_online_index",
-    }
 
 
 # stats.json
@@ -264,31 +284,22 @@ def read_published_stats(folder: Path) -> NormStats | None:
     """
     if not (folder / STATS).is_file():
         return None
-    data = read_json(
+    features = read_json(
         checked_file(folder, STATS, "statistics"), "normalisation statistics", limit=2**24
     )
-    features = {"state": data.get("observation.state"), "actions": data.get("action")}
-    if not all(isinstance(feature, dict) for feature in features.values()):
-        return None
-    return NormStats(
-        **{
-            name: _stats(f"{folder / STATS}: {name}", feature or {})
-            for name, feature in features.items()
-        }
-    )
-
-
-def _stats(name: str, feature: Mapping[str, Any]) -> QuantileStats:
-    values = {
-        key: feature[key] for key in ("mean", "std", "q01", "q99", "min", "max") if key in feature
-    }
-    if {"mean", "std"} <= set(values) and not {"q01", "q99"} <= set(values):
-        mean, std = (np.asarray(values[key], np.float64) for key in ("mean", "std"))
-        values |= {
-            "q01": (mean - _ONE_PERCENT * std).tolist(),
-            "q99": (mean + _ONE_PERCENT * std).tolist(),
-        }
-    return QuantileStats.from_dict(values, name)
+    stats = {}
+    for name, key in {"state": "observation.state", "actions": "action"}.items():
+        feature = features.get(key)
+        if not isinstance(feature, dict):
+            return None
+        values = {key: feature[key] for key in _STATISTICS if key in feature}
+        if {"mean", "std"} <= set(values) and not {"q01", "q99"} <= set(values):
+            mean = np.asarray(values["mean"], np.float64)
+            std = np.asarray(values["std"], np.float64)
+            values["q01"] = (mean - _ONE_PERCENT * std).tolist()
+            values["q99"] = (mean + _ONE_PERCENT * std).tolist()
+        stats[name] = QuantileStats.from_dict(values, f"{folder / STATS}: {name}")
+    return NormStats(**stats)
 
 
 def write_simplememvla(
@@ -306,13 +317,23 @@ def write_simplememvla(
     }
     tensors[_LM_HEAD] = tensors[_LM_HEAD].clone()  # tied, and published under both names
     save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
-    (folder / CONFIG).write_text(json.dumps(published_config(target), indent=2) + "\n")
+    # Beside what is read here, keys that the authors' code expects
+    config = asdict(PublishedConfig.of(target)) | {
+        "backbone_model_name_or_path": BASE,
+        "hidden_size": target.sizes.width,
+        "freeze_backbone": False,
+        "subtask_key": "subtask",
+        "subtask_index_key": "subtask_online_index",
+    }
+    (folder / CONFIG).write_text(json.dumps(config, indent=2) + "\n")
     if target.processor is not None:
         (folder / TOKENIZER_FILE).write_text(
             target.require_processor().tokenizer.content, encoding="utf-8"
         )
-    elif (tokenizer := Path(str(target.config["processor"].get("tokenizer", "")))).is_file():
-        shutil.copyfile(tokenizer, folder / TOKENIZER_FILE)
+    else:  # on meta: the file that the configuration names, if it is one
+        tokenizer = Path(processor_settings(target.config).tokenizer)
+        if tokenizer.is_file():
+            shutil.copyfile(tokenizer, folder / TOKENIZER_FILE)
     if stats is not None:
         features = {"observation.state": stats.state.to_dict(), "action": stats.actions.to_dict()}
         (folder / STATS).write_text(json.dumps(features, indent=2) + "\n")
