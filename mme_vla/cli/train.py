@@ -302,13 +302,12 @@ def config_of(run: TrainRun, place: Run) -> dict[str, Any]:
 
     A resumed command may leave out what the run began with: later checkpoints keep it.
     """
-    config = dict(run.config)
-    if place.checkpoint is not None:
-        began_with: dict[str, Any] = read_state(place.checkpoint)["config"]
-        data = began_with["data"]
-        config["init_from"] = began_with.get("init_from")
-        config["data"] = {**config["data"], "narrow_ranges": data.get("narrow_ranges")}
-    return config
+    if place.checkpoint is None:
+        return dict(run.config)
+    began_with: dict[str, Any] = read_state(place.checkpoint)["config"]
+    ranges = {"narrow_ranges": began_with["data"].get("narrow_ranges")}
+    kept = {"init_from": began_with.get("init_from"), "data": {**run.config["data"], **ranges}}
+    return {**run.config, **kept}
 
 
 def recipe(config: dict[str, Any]) -> dict[str, Any]:

@@ -271,12 +271,13 @@ class ActionSpace:
         }
         # Keys that a robot does not need are absent.
         if self.choice:
-            section["choice"] = list(self.choice)
-            section["point"] = list(self.point)
-            section["options_length"] = self.options_length
+            section |= {
+                "choice": list(self.choice),
+                "point": list(self.point),
+                "options_length": self.options_length,
+            }
         if self.of_pose:
-            section["of_pose"] = list(self.of_pose)
-            section["pose_key"] = list(self.pose_key)
+            section |= {"of_pose": list(self.of_pose), "pose_key": list(self.pose_key)}
         return section
 
     def with_names(self, names: Sequence[str]) -> Self:

@@ -280,7 +280,7 @@ class SubgoalText:
     @classmethod
     def from_config(cls, config: Mapping[str, Any] | None) -> Self | None:
         """Build from the section `subgoal_text`, or return None where there is none."""
-        if config is None:
+        if not config:
             return None
         return read_section(cls, config, "subgoal_text")
 

@@ -19,6 +19,7 @@ from mme_vla.data.statistics import check_ranges, compute_norm_stats
 from mme_vla.errors import UserError, require
 from mme_vla.memory.perturbation import build_transforms
 from mme_vla.policy.base import Policy
+from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import SubgoalText
@@ -226,7 +227,7 @@ def _samples(
         action_offset=data.action_offset,
         mask_padding=data.mask_padding,
         jitter=data.jitter and not held_out,
-        subgoal=SubgoalText.from_config(policy.config.get("subgoal_text")),
+        subgoal=SubgoalText.from_config(PolicySections.of(policy.config).subgoal_text),
         labels=labels_read(*(part for part in policy.modules() if part not in memory_parts)),
         weights=data.weights,
         seed=seed,

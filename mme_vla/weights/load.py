@@ -13,6 +13,7 @@ from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
 from mme_vla.policy.saving import recompute_buffers
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import (
     assign_tensors,
     check_fit,
@@ -98,7 +99,7 @@ def load_weights(
 def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
     """Read a checkpoint in the names of a policy of its own variant."""
     if source.format == "ours":
-        return merge_state(source.tensors(), source.config.get("adapters"))
+        return merge_state(source.tensors(), PolicySections.of(source.config).adapters)
     if source.format == "lerobot":
         check_window(policy, source.config, str(source.folder))
     if (of := method_formats().get(source.format)) is not None and of.check is not None:
@@ -166,7 +167,7 @@ def _match_ours(
     """The tensors of a checkpoint of ours that a policy has too, and the names of a memory's that
     it has not.
     """
-    tensors = merge_state(checkpoint.tensors(), checkpoint.config.get("adapters"))
+    tensors = merge_state(checkpoint.tensors(), PolicySections.of(checkpoint.config).adapters)
     _check_tokenizer(policy, checkpoint.folder)
     state = policy.state_dict()
     left = []

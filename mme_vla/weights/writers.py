@@ -12,6 +12,7 @@ from torch import Tensor
 from mme_vla.errors import UserError, brief
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy, mme_of
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
 from mme_vla.processing.base import DEFAULT
 from mme_vla.processing.normalise import NormStats
@@ -43,7 +44,7 @@ def write_pipelines(
     """
     if stats is None:
         return "there are no normalisation statistics"
-    words = policy.config.get("processor") or {}
+    words = PolicySections.of(policy.config).processor
     processor = PROCESSORS[words.get("name", DEFAULT)]
     prompt = PROMPTS[words.get("prompt", "plain")]
     if processor is not Processor or prompt is not GoalPrompt:
@@ -201,7 +202,7 @@ def write_released(
 ) -> None:
     """A run with one step, 0, as the released JAX code lays it out."""
     policy = mme_of(policy, "The released layout")
-    name = str(policy.config.get("name"))
+    name = str(PolicySections.of(policy.config).name)
     for variant, target in VARIANTS.items():
         if target == name and name != "pi05":  # the memoryless baseline has no such file
             (folder / VARIANT_FILE).write_text(f"{variant}.yaml\n")

@@ -34,6 +34,7 @@ from mme_vla.evaluation.store import (
 )
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import composition_digest
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.training_identity import identity_of
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
@@ -321,9 +322,8 @@ def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
     if subgoals is None:
         return
     if not policy.require_processor().prompt_spec.reads_subgoal:
-        raise UserError(
-            f"{policy.config.get('name', 'The policy')} reads no subgoal: leave out subgoal=…."
-        )
+        name = PolicySections.of(policy.config).name or "The policy"
+        raise UserError(f"{name} reads no subgoal: leave out subgoal=….")
     kind = subgoal_kind(policy)
     if kind is not None and kind != f"{subgoals.kind}_subgoal":
         expected = kind.removesuffix("_subgoal")
@@ -371,7 +371,7 @@ def facts_of(
     predictor.
     """
     return RunFacts(
-        name or str(policy.config.get("name", "policy")),
+        name or str(PolicySections.of(policy.config).name or "policy"),
         checkpoint_label(source),
         settings.seed,
         settings.split,

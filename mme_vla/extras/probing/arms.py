@@ -21,6 +21,7 @@ from mme_vla.memory.perturbation import (
     split_word,
 )
 from mme_vla.policy.base import Policy
+from mme_vla.policy.sections import PolicySections
 
 DEFAULT_ARMS = (
     "drop:all",
@@ -183,10 +184,8 @@ def choose_arms(
         elif specs is None:
             left_out.append(f"{arm.name} was left out: it needs {why}.")
         else:
-            raise UserError(
-                f"with={arm.name} needs {why}; {policy.config.get('name', 'this policy')} has none"
-                " here."
-            )
+            name = PolicySections.of(policy.config).name or "this policy"
+            raise UserError(f"with={arm.name} needs {why}; {name} has none here.")
     return arms, left_out
 
 

@@ -24,6 +24,7 @@ from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.network import NetworkPolicy
+from mme_vla.policy.sections import PolicySections
 
 
 def count_model(model: str, budget: int | None = None, backbone: str | None = None) -> ModelCost:
@@ -37,7 +38,7 @@ def count_model(model: str, budget: int | None = None, backbone: str | None = No
     batch, memory = policy.full_batch("meta"), policy.memory
     return ModelCost(
         model=model,
-        prompt=policy.config["processor"].get("prompt_length", 0),
+        prompt=PolicySections.of(policy.config).processor.get("prompt_length", 0),
         parameters=sum(p.numel() for p in policy.parameters()),
         forward=flops(lambda: policy(batch)),
         chunk=flops(lambda: policy.sample_actions(batch)),

@@ -20,6 +20,7 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.prompt import SubgoalText
 
 STRIDE = 16  # Steps between two chunks, as an evaluation executes them
@@ -48,7 +49,7 @@ def replay(
     check_episode(source, episode)
     give_statistics(policy, source)
     recording, n_observed = Recording(source, episode), 0
-    text = SubgoalText.from_config(policy.config.get("subgoal_text"))
+    text = SubgoalText.from_config(PolicySections.of(policy.config).subgoal_text)
     running = policy.start_episode(recording.goal)
     for step in recording.decisions(stride, most):
         recording.show(running, n_observed, step + 1)

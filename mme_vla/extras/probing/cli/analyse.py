@@ -25,6 +25,7 @@ from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
 from mme_vla.errors import UserError, check_choice, require
+from mme_vla.policy.sections import PolicySections
 from mme_vla.utils import require_replaceable, safe_name
 
 if TYPE_CHECKING:
@@ -298,7 +299,9 @@ def writing(args: argparse.Namespace) -> None:
         policy = MMEPolicy.from_pretrained(
             resolve_checkpoint(args.checkpoint), trust_plugins=args.trust_plugins
         )
-        selectors[str(policy.config.get("name") or args.checkpoint.name)] = policy.require_memory()
+        selectors[str(PolicySections.of(policy.config).name or args.checkpoint.name)] = (
+            policy.require_memory()
+        )
     required = [
         required_frames(memory) for memory in selectors.values() if not isinstance(memory, str)
     ]
@@ -358,7 +361,7 @@ def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]"
             resolve_checkpoint(args.checkpoint), device=device, trust_plugins=args.trust_plugins
         )
         name = safe_name(
-            str(policy.config.get("name") or args.checkpoint.name), "the policy's name"
+            str(PolicySections.of(policy.config).name or args.checkpoint.name), "the policy's name"
         )
         return policy, EpisodeSource(args.dataset, robot=policy.embodiment), name
     print(
