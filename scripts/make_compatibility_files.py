@@ -4,7 +4,7 @@ version has them.
     python scripts/make_compatibility_files.py tests/data/compatibility
 
 Run it at the version whose files later versions have to read, from the root of a clone with the
-extras `dev`, `sim`, `vlm`, `baselines` and `orbax`, on a CPU.
+group `dev`, on a CPU.
 `tests/end_to_end/test_compatibility.py` opens the files and compares what it gets with
 `expected.json`. Floating-point figures agree to 1e-5 between CPUs, not bitwise. Never regenerate
 the folder to make that test pass: a failure means that files of users can no longer be read.
