@@ -1,15 +1,20 @@
-"""Write the table, the figure and the evidence page of nanoMME from the rows in benchmarks/nano16.
+"""Write the table, the figure and the evidence page of nanoMME from the published rows.
 
-python scripts/nano_board.py                                # pages, from the rows that are
-committed python scripts/nano_board.py --add outputs/nano16/reserved  # copy the rows of a run
-first, records compressed
+    python scripts/nano_board.py                                # pages, from the committed rows
+    python scripts/nano_board.py --add outputs/nano16/reserved  # add the rows of a run first
+
+The rows are archives in mme_vla/assets/board, see scripts/published.py.
 """
 
 import argparse
 import lzma
 import re
 import shutil
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import published
 
 from mme_vla.evaluation.receipts import read_receipt
 from mme_vla.evaluation.results.paper import paper_methods
@@ -21,7 +26,7 @@ from mme_vla.extras.nano.rows import CHOICES, FILES, SCENES, read_rows, read_tra
 from mme_vla.utils import read_json, with_checksum, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
-ROWS = ROOT / "benchmarks" / "nano16"
+_UNPACKED = TemporaryDirectory(prefix="mme-vla-board-")
 PAGE, EVIDENCE, FIGURE = (
     ROOT / "docs" / name
     for name in ("train/nano.md", "evidence/nano-board.md", "images/nano16.svg")
@@ -35,13 +40,24 @@ EXPECTED = ["demonstrator", "oracle_frames", *VARIANTS, "pi05", MATCHED, "freque
 """The rows of the benchmark: ceilings, the paper's variants, floors."""
 
 
+@cache
+def rows_folder() -> Path:
+    """The rows, unpacked, a folder for each table."""
+    for name in published.BOARD_TABLES:
+        published.unpack(name, Path(_UNPACKED.name))
+    return Path(_UNPACKED.name) / "nano16"
+
+
 def add(folder: Path) -> None:
     """Copy the rows of a run's split into the folder of their table, checked, with compressed
     records.
     """
     for place in sorted(path.parent for path in folder.rglob("trained.json")):
         training = read_training(place)
-        table = ROWS / training.table
+        archive = f"nano16/{training.table}"
+        if archive not in published.BOARD_TABLES:
+            raise SystemExit(f"Name the archive of {archive} in scripts/published.py first.")
+        table = rows_folder() / training.table
         target = table / training.facts.row / str(training.facts.seed)
         target.mkdir(parents=True, exist_ok=True)
         for name in FILES:
@@ -56,7 +72,8 @@ def add(folder: Path) -> None:
             copy_receipt(receipt, target / receipt.name)
         if (scenes := place.parents[1] / SCENES).is_file():
             add_scenes(scenes, table / SCENES)
-        print(f"added {target.relative_to(ROOT)}")
+        published.replace(archive, table)
+        print(f"added {target.relative_to(rows_folder())}")
 
 
 def add_scenes(file: Path, target: Path) -> None:
@@ -85,7 +102,7 @@ def boards() -> list[Board]:
     """A board for each split and action space that has rows: those of choices first, then those
     with most rows.
     """
-    tables = sorted({path.parents[2] for path in ROWS.rglob("trained.json")})
+    tables = sorted({path.parents[2] for path in rows_folder().rglob("trained.json")})
     made = [Board(read_rows([table])) for table in tables]
     return sorted(made, key=lambda board: (board.action_space != CHOICES, -len(board.rows)))
 
@@ -109,7 +126,7 @@ def evidence(made: list[Board]) -> str:
     """The page with every table."""
     head = (
         "# nanoMME-16: the board\n\nEvery table of the [board](../train/nano.md), "
-        "from the rows in `benchmarks/nano16`, written by `python scripts/nano_board.py`.\n"
+        "from the rows in `mme_vla/assets/board`, written by `python scripts/nano_board.py`.\n"
     )
     parts = [head] + ([] if made else ["Not run yet.\n"])
     for board in made:

@@ -6,9 +6,9 @@ needs an extra names it, and the words that install it.
 """
 
 import os
-import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.metadata import packages_distributions, requires
@@ -187,13 +187,21 @@ def run(case: Case, folder: Path) -> tuple[int, str]:
 
 @cache
 def needs() -> dict[str, set[str]]:
-    """The packages that each extra names; those of the library itself under an empty name."""
-    packages: dict[str, set[str]] = {}
-    for requirement in map(Requirement, requires("mme-vla") or []):
-        extra = re.search(r"extra == ['\"](\w+)['\"]", str(requirement.marker))
-        packages.setdefault(extra[1] if extra else "", set()).add(
-            canonicalize_name(requirement.name)
-        )
+    """The packages that each extra names; those of the library itself under an empty name, the
+    tools under `dev`.
+    """
+    pyproject = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    project = pyproject["project"]
+    lines = {
+        "": project["dependencies"],
+        **project["optional-dependencies"],
+        "dev": pyproject["dependency-groups"]["dev"],
+    }
+    packages = {
+        extra: {canonicalize_name(Requirement(line).name) for line in required}
+        for extra, required in lines.items()
+    }
+    packages["dev"].remove("mme-vla")  # with all extras
     return packages
 
 

@@ -4,9 +4,11 @@ import lzma
 from pathlib import Path
 
 import nano_board
+import published
 import pytest
 
 from helpers.nano_rows import TASKS, write_training
+from helpers.published import published_folder
 from mme_vla.evaluation.receipts import read_receipt, verify
 from mme_vla.utils import with_checksum, write_json
 
@@ -21,7 +23,7 @@ def test_the_pages_are_those_of_the_committed_rows() -> None:
 
 
 def test_committed_rows_are_compressed_and_small() -> None:
-    files = [path for path in nano_board.ROWS.rglob("*") if path.is_file()]
+    files = [path for path in nano_board.rows_folder().rglob("*") if path.is_file()]
     assert not any(path.suffix == ".jsonl" for path in files)
     assert sum(path.stat().st_size for path in files) <= 5e6
 
@@ -29,8 +31,8 @@ def test_committed_rows_are_compressed_and_small() -> None:
 @pytest.mark.slow
 def test_receipts_of_committed_rows_fit_their_records() -> None:
     paths = [
-        *nano_board.ROWS.rglob("receipt.json"),
-        *nano_board.ROWS.parent.glob("reserved/*/receipt.json"),
+        *nano_board.rows_folder().rglob("receipt.json"),
+        *published_folder("reserved").rglob("receipt.json"),
     ]
     assert paths
     for path in paths:
@@ -49,8 +51,9 @@ def test_rows_of_a_run_are_added_and_reach_the_page(
         "Not run yet: `demonstrator`, "
     ) and "|" not in nano_board.block(None)
     assert len(nano_board.VARIANTS) == 14
-    monkeypatch.setattr(nano_board, "ROOT", tmp_path)
-    monkeypatch.setattr(nano_board, "ROWS", tmp_path / "rows")
+    monkeypatch.setattr(nano_board, "rows_folder", lambda: tmp_path / "rows")
+    packed_tables: list[str] = []
+    monkeypatch.setattr(published, "replace", lambda name, folder: packed_tables.append(name))
     for seed, won in enumerate((3, 2)):
         write_training(tmp_path / "run", "framesamp_modul", seed, won)
     write_training(tmp_path / "run", "pi05", 0, {TASKS[0]: 1})
@@ -89,6 +92,7 @@ def test_rows_of_a_run_are_added_and_reach_the_page(
     assert (
         tmp_path / "rows" / "further-waypoint" / "framesamp_modul" / "0" / "trained.json"
     ).is_file()
+    assert set(packed_tables) == {"nano16/further", "nano16/further-waypoint"}
     both = nano_board.boards()
     assert [made.action_space for made in both] == ["multi_choice", "waypoint"]
     page = nano_board.evidence(both)

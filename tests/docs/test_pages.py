@@ -80,7 +80,7 @@ def test_the_documentation_workflow_builds_the_site() -> None:
 def test_the_test_workflow_runs_the_commands_of_the_readme() -> None:
     readme = (REPOSITORY / "README.md").read_text()
     commands = re.findall(
-        r"^((?:pip install uv && .*|)uv run (?:--extra dev|python).*)$", readme, re.MULTILINE
+        r"^((?:pip install uv && .*|)uv run (?:--group dev|python).*)$", readme, re.MULTILINE
     )
     assert len(commands) == 3
     assert set(commands) <= set(steps("tests.yml"))

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from helpers import REPOSITORY, commands
+from helpers.published import published_folder
 from mme_vla import build_policy
 from mme_vla.testing.small import unit_stats
 
@@ -147,7 +148,7 @@ PREPARE: dict[str, Callable[[dict[str, Any]], None]] = {
     "docs/evaluate/evaluation.md": evaluation,
     "docs/evaluate/play.md": simulated,
     "docs/evaluate/results.md": lambda space: space.update(
-        folder=REPOSITORY / "benchmarks/nano/VideoUnmask/rmt_modul"
+        folder=published_folder("nano") / "VideoUnmask/rmt_modul"
     ),
     "docs/probe/analyses.md": analyses,
     "docs/benchmark/benchmark.md": simulated,

@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from shutil import copytree
 
+import published
 import pytest
 from hydra._internal.utils import get_args_parser
 
@@ -57,7 +58,9 @@ NOT_RUN = {
         "needs a policy that was trained before"
     ),
     r"--checkpoint outputs/": "needs a policy that was trained before",
-    r"mme_vla\.results outputs/|mme-vla results verify": "needs the records of an evaluation",
+    r"mme_vla\.results outputs/(?!published)|mme-vla results verify": (
+        "needs the records of an evaluation"
+    ),
     r"mme-vla probe card": "needs recorded episodes",
     r"analyse writing --memories anchors": (
         "demonstrates 48 episodes; tests/extras/probing/test_writing.py runs it on one"
@@ -124,8 +127,11 @@ def folder_of(page: str, root: Path) -> Path:
     if page in EXAMPLES:
         return copytree(REPOSITORY / "examples" / EXAMPLES[page], folder)
     folder.mkdir()
-    for name in ("benchmarks", "examples"):
+    for name in ("benchmarks", "examples", "scripts"):
         (folder / name).symlink_to(REPOSITORY / name)
+    (folder / "outputs").mkdir()
+    for name in published.ARCHIVES:
+        published.unpack(name, folder / published.TARGET)
     return folder
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -44,9 +45,11 @@ def run_lerobot(folder: Path, commands: Sequence[Sequence[str]], plugin: str) ->
     """The output of commands in fresh processes, offline, with a package of plugins/ as if
     installed.
     """
-    metadata = folder / "site" / f"{plugin}-0.1.0.dist-info"  # LeRobot finds plugins by it
+    project = tomllib.loads((PLUGINS / plugin / "pyproject.toml").read_text())["project"]
+    name = project["name"]  # LeRobot finds plugins by it
+    metadata = folder / "site" / f"{name.replace('-', '_')}-0.1.0.dist-info"
     metadata.mkdir(parents=True)
-    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {plugin}\nVersion: 0.1.0\n")
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1.0\n")
     paths = [REPOSITORY, REPOSITORY / "tests", PLUGINS / plugin / "src", metadata.parent]
     variables = {
         "PYTHONPATH": os.pathsep.join(map(str, paths)),

@@ -6,7 +6,9 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import constraints
 import pytest
+import yaml
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -15,19 +17,49 @@ def pyproject() -> dict:
     return tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
 
 
-def test_pins_for_pip_and_for_uv_are_the_same() -> None:
-    lines = (REPOSITORY / "constraints.txt").read_text().splitlines()
-    for_pip = {line.split("#")[0].strip() for line in lines} - {""}
-    for_uv = pyproject()["tool"]["uv"]["constraint-dependencies"]
-    assert for_pip == set(for_uv)
-    assert len(for_uv) == len(for_pip), "a pin stands twice"
-    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", pin) for pin in for_pip), (
+def test_pins_for_pip_are_written_from_those_for_uv() -> None:
+    text = (REPOSITORY / "pyproject.toml").read_text()
+    assert constraints.constraints(text) == (REPOSITORY / "constraints.txt").read_text()
+    pins = pyproject()["tool"]["uv"]["constraint-dependencies"]
+    assert len({pin.partition("==")[0] for pin in pins}) == len(pins), "a pin stands twice"
+    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", pin) for pin in pins), (
         "only name==version: no addresses, no ranges"
     )
 
 
+def test_the_tools_come_with_every_extra() -> None:
+    extras = pyproject()["project"]["optional-dependencies"]
+    groups = pyproject()["dependency-groups"]
+    own = next(line for line in groups["dev"] if line.startswith("mme-vla["))
+    assert set(re.findall(r"[\w-]+", own.partition("[")[2])) == set(extras)
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    version = pyproject()["project"]["version"]
+    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
+    assert str(citation["version"]) == version
+    changes = (REPOSITORY / "CHANGELOG.md").read_text()
+    newest = re.search(r"^## (\d[\w.]*)", changes, re.MULTILINE)
+    assert newest is not None and newest[1] == version
+    for plugin in ("lerobot_policy_mme_vla", "robomme"):
+        file = REPOSITORY / "plugins" / plugin / "pyproject.toml"
+        assert tomllib.loads(file.read_text())["project"]["version"] == version
+
+
+def test_the_address_of_the_project_stands_in_one_place() -> None:
+    address = pyproject()["tool"]["hatch"]["metadata"]["hooks"]["custom"]["repository"]
+    owner = address.removeprefix("https://github.com/").partition("/")[0]
+    hits = []
+    for file in project_files():
+        try:
+            hits += [file.name] * file.read_text().count(f"github.com/{owner}/")
+        except UnicodeDecodeError:
+            continue
+    assert hits == ["pyproject.toml"]
+
+
 def test_ci_runs_the_commands_of_the_readme() -> None:
-    pattern = r"^((?:pip install uv && .*|)uv run (?:--extra dev|python).*)$"
+    pattern = r"^((?:pip install uv && .*|)uv run (?:--group dev|python).*)$"
     documented = re.findall(pattern, (REPOSITORY / "README.md").read_text(), re.MULTILINE)
     run_by_ci = re.findall(r"^run '(.*)'$", (REPOSITORY / ".ci" / "run").read_text(), re.MULTILINE)
     assert documented == run_by_ci

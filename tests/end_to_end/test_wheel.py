@@ -39,7 +39,7 @@ print("lerobot.datasets" in sys.modules)
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip(
-        "hatchling", reason="building the wheel needs hatchling (the dev extra has it)"
+        "hatchling", reason="building the wheel needs hatchling (the group dev has it)"
     )
     folder = tmp_path_factory.mktemp("wheel")
     run(
@@ -101,7 +101,7 @@ def test_the_wheel_holds_every_file_of_the_package_and_the_configs(wheel: Path) 
 
 @pytest.mark.slow
 def test_the_source_archive_holds_what_the_wheel_is_made_of(tmp_path: Path) -> None:
-    pytest.importorskip("hatchling", reason="building needs hatchling (the dev extra has it)")
+    pytest.importorskip("hatchling", reason="building needs hatchling (the group dev has it)")
     run(
         [sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(tmp_path)],
         cwd=REPOSITORY,

@@ -25,6 +25,17 @@ def wrapper() -> Iterator[ModuleType]:
         yield importlib.import_module("robomme.env_record_wrapper")
 
 
+def test_it_refuses_to_stand_beside_the_official_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    official = tmp_path / "robomme-0.1.0.dist-info"
+    official.mkdir()
+    (official / "METADATA").write_text("Metadata-Version: 2.1\nName: robomme\nVersion: 0.1.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ImportError, match="are both installed"), plugin("robomme", "robomme"):
+        pass
+
+
 def test_the_builder_knows_the_benchmarks_episodes(wrapper: ModuleType) -> None:
     builder = wrapper.BenchmarkEnvBuilder(
         "VideoUnmask", dataset="test", action_space="ee_pose", max_steps=7

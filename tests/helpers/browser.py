@@ -45,7 +45,7 @@ class Browser:
         if program is None:
             pytest.skip("no Chromium here: apt-get install chromium")
         sync = pytest.importorskip(
-            "websockets.sync.client", reason="pip install websockets (the dev extra has it)"
+            "websockets.sync.client", reason="pip install websockets (the group dev has it)"
         )
         window = "--window-size={},{}".format(*size)
         command = [program, *FLAGS, window, f"--user-data-dir={profile}", "about:blank"]

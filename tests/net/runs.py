@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mme_vla.extras.nano.cli.board import published_rows
 from net.archives import EndedError, command, run
 from net.models import PI05, sizes_of, words
 
@@ -109,9 +110,10 @@ def train() -> None:
 
 def make_board() -> None:
     """Rows that the repository ships, as rows of one's own."""
+    rows = published_rows("further")
     for row in BOARD:
-        shutil.copytree(REPOSITORY / "benchmarks" / "nano16" / "further" / row, Path("board", row))
-    shutil.copy(REPOSITORY / "benchmarks" / "nano16" / "further" / "scenes.json", "board")
+        shutil.copytree(rows / row, Path("board", row))
+    shutil.copy(rows / "scenes.json", "board")
 
 
 def losses(folder: Path, after: int = 0) -> dict[str, list[float]]:

@@ -665,3 +665,10 @@ def test_a_row_whose_trainings_differ_more_than_others_has_a_wider_interval(tmp_
     board = Board(read_rows([tmp_path]))
     widths = {row.name: np.subtract(*board.interval(row)[::-1]) for row in board.rows}
     assert widths["restless"] > 2 * widths["steady"]
+
+
+def test_the_package_brings_the_published_rows() -> None:
+    folder = board_command.published_rows("further")
+    assert len(list(folder.rglob("trained.json"))) > 50
+    assert board_command.published_rows("further") == folder  # unpacked once
+    assert not board_command.published_rows("of_no_split").is_dir()

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers import REPOSITORY
 from helpers.probe_fakes import SIDE, MadeUpSource
+from helpers.published import published_folder
 from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, records, roll, use_inline_envs
 from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs.vector.pool import Job
@@ -44,7 +44,7 @@ from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.utils import to_json
 
-CARDS = REPOSITORY / "benchmarks" / "clock" / "nano16" / "cards"
+CARDS = published_folder("clock") / "nano16" / "cards"
 JOBS = [Job("VideoUnmask", "test", episode) for episode in range(8)]
 VIDEO = (5, 21)  # frames of the video of a scene, by its right choice
 

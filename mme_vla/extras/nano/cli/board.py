@@ -7,9 +7,11 @@ it.
 
 import argparse
 import sys
+import tarfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
@@ -18,13 +20,13 @@ from mme_vla.errors import printable, require
 from mme_vla.extras.nano.settings import NanoRun
 from mme_vla.utils import require_replaceable
 
-SHIPPED = Path(__file__).resolve().parents[4] / "benchmarks" / "nano16"
-"""The rows of the repository, a folder for each split."""
+SHIPPED = Path(__file__).resolve().parents[3] / "assets" / "board"
+"""The published rows: an archive, or a folder, for each table."""
 NO_PUBLISHED_ROWS = (
-    "The published rows are not here: an installed package has none, and a clone has those of"
-    " benchmarks/nano16 for their splits. Rows of your own are ranked alone, and are not compared"
-    " with the published settings."
+    "There are no published rows of this split and these actions. Rows of your own are ranked"
+    " alone, and are not compared with the published settings."
 )
+_UNPACKED: dict[Path, TemporaryDirectory] = {}
 EXAMPLES = (
     "", "rows=outputs/nano16/further --html board.html",
     "--config-dir configs model=mine_modul '+memories.mine={budget: 32, grid: 1}'",
@@ -86,7 +88,7 @@ def row_folders(nano: NanoRun, trees: Sequence[Path]) -> list[Path]:
     rows = compose_rows(nano, trees)
     rules = rules_of(nano)
     actions = rows.robot.action.answers or rows.robot.name
-    shipped = SHIPPED / table_of(nano.split, actions)
+    shipped = published_rows(table_of(nano.split, actions))
     if not shipped.is_dir():
         print(NO_PUBLISHED_ROWS)
     trainings = sorted(file.parent for file in shipped.rglob(TRAINED))
@@ -106,10 +108,24 @@ def row_folders(nano: NanoRun, trees: Sequence[Path]) -> list[Path]:
         for name, value in values.items():
             require(
                 value == expected[name],
-                f"A row with {name} {value} does not fit those of {shipped}: they have"
-                f" {expected[name]}.",
+                f"A row with {name} {value} does not fit the published rows of {shipped.name}: they"
+                f" have {expected[name]}.",
             )
     return [Path(nano.output) / nano.split / row for row in rows.composed]
+
+
+def published_rows(table: str) -> Path:
+    """The folder of a table's published rows, which exists where there are any. An archive is
+    unpacked until the process ends.
+    """
+    archive = SHIPPED / f"{table}.tar.xz"
+    if not archive.is_file():
+        return SHIPPED / table
+    if archive not in _UNPACKED:
+        _UNPACKED[archive] = TemporaryDirectory(prefix="mme-vla-board-")
+        with tarfile.open(archive) as file:
+            file.extractall(_UNPACKED[archive].name, filter="data")
+    return Path(_UNPACKED[archive].name) / table
 
 
 def alone(words: Sequence[str]) -> list[str]:
@@ -132,7 +148,7 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
 
     folders = [Path(word.removeprefix("rows=")) for word in args.words if word.startswith("rows=")]
     local = read_rows([], local=[*folders, *trained])
-    shipped = SHIPPED / next((row[0].table for row in local.values()), split)
+    shipped = published_rows(next((row[0].table for row in local.values()), split))
     if shipped.is_dir():
         rows = read_rows([shipped], local=[*folders, *trained])
     else:
