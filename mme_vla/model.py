@@ -15,7 +15,9 @@ packages.
     integration/ base.py (interface) · context.py (context, expert) · modulator.py
 
 A memory works in two steps. `MemoryModule.gather_selection` chooses stored tokens, in a dataset or
-in an episode, and makes `Batch.history`. `MemoryModule.forward`, called here, encodes them.
+in an episode, and makes `Batch.history`. `MemoryModule.forward`, called here, encodes them. The
+stored tokens come from the vision tower and `pool_grid` (`policy/network.py`, `encode_frames`), in
+training from the vision cache.
 
 Shapes: b batch · n tokens · d width · v views · h action horizon · a action width (types.py).
 """

@@ -1,5 +1,5 @@
 """Files and lines that a reader needs for seven questions about the library
-(docs/extend/architecture.md).
+(docs/extend/layout.md).
 
 (a) and (e) follow imports from a starting point; the others list the files on the way. Every file
 is checked to exist, and every call of (d), (f) and (g) to be defined where it is listed.
@@ -56,7 +56,7 @@ EVALUATION = [
 """
 ALONE = "README.md"
 QUESTIONS = (
-    "How does FrameSamp + Modulator work, image to loss?",
+    "How does FrameSamp + Modulator work, from images and stored tokens to the loss?",
     "Change the selection rule of TokenDrop",
     "Another flow head (noise schedule, time distribution, sampler)",
     "Where is an action chunk sampled?",

@@ -27,26 +27,6 @@ EPISODES = (
 OPTIONS = ConvertOptions(pix_fmt="yuv420p", gop=32)
 LIMIT = 6_000_000
 
-README = """# The embedded sample
-
-Four RoboMME demonstrations (LeRobot v3.0, 916 frames at the simulator's 20 Hz, videos), written by the official
-recorder with a software rasteriser and converted by `mme-vla sample`.
-
-| episode | task | difficulty | seed | frames | of them video | front image | wrist image |
-| --- | --- | --- | --- | --- | --- | --- | --- |
-| 0 | VideoUnmask 6 | medium | 6600 | 173 | 66 | every step | every 6th step |
-| 1 | PatternLock 8 | easy | 15800 | 148 | 74 | every 4th step | every 4th step |
-| 2 | PickXtimes 8 | easy | 1800 | 332 | 0 | every 30th step | every 30th step |
-| 3 | VideoUnmask 4 | easy | 6400 | 263 | 66 | every 8th step | every 8th step |
-
-**Stale images.** To keep the sample small, images are stored only at every n-th step (n in the table), at sub-task
-boundaries, at the first and last frame, and where the conditioning video ends. Every other step repeats the last stored
-image, which is up to n - 1 steps old. States, actions, subgoals and flags are those of every step. So only episode 0
-shows motion as it was; use it where motion matters. Results on this sample say nothing about the benchmark.
-
-`configs/data/sample.yaml` holds out episode 3 for validation: another scene of the task of episode 0.
-"""  # noqa: E501
-
 
 def make_sample(full: Path, thinned: Path, output: Path = SAMPLE) -> int:
     """Write the sample and return its size in bytes."""
@@ -59,8 +39,9 @@ def make_sample(full: Path, thinned: Path, output: Path = SAMPLE) -> int:
         require(
             ref.file.is_file(), f"{ref.file} does not exist; the sample needs {ref.group} of it."
         )
+    readme = (SAMPLE / "README.md").read_text()  # of the shipped sample, which this replaces
     convert(refs, output, OPTIONS)
-    (output / "README.md").write_text(README)
+    (output / "README.md").write_text(readme)
     size = sum(file.stat().st_size for file in output.rglob("*") if file.is_file())
     if size > LIMIT:
         shutil.rmtree(output)

@@ -17,7 +17,7 @@ THRESHOLD = 1e-4  # patches that changed less are never candidates
 @dataclass
 class ChangeScorer(FrameScorer):
     """Mean |ΔRGB| per patch, in units of [−1, 1], between every `stride`-th frame and the one
-    scored before it.
+    scored before it. The memory `events` reads the same scores.
 
     Frames stride−1, 2·stride−1, … are scored; the first of them against frame 0, as released.
     """
@@ -52,6 +52,7 @@ class ChangeScorer(FrameScorer):
         return cells.mean(axis=(1, 3, 4), dtype=np.float32).reshape(-1)
 
 
+# Caches of this scorer had a written key before keys followed from code: they are found by it.
 FORMER_KEYS["c7f24220"] = "change{grid}x{grid}-every{stride}"
 
 

@@ -96,7 +96,10 @@ class NetworkPolicy(Policy, Recomputes):
         raise NotImplementedError
 
     def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
-        """Encode selections into memory tokens; None without memory or selections."""
+        """Encode selections into memory tokens; None without memory or selections.
+
+        For the losses of prior methods. A policy with an `MMEModel` leaves this to the model.
+        """
         if self.memory is None or history is None:
             return None
         with self.autocast():

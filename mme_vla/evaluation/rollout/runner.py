@@ -343,7 +343,11 @@ class Rollout:
     def _finish(
         self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True
     ) -> None:
-        """End an episode and let its worker begin another."""
+        """End an episode and let its worker begin another.
+
+        An episode that is tried again leaves a record with the outcome `error`, which the record of
+        the repetition supersedes (`records.merge`).
+        """
         outcome = status
         if status not in ("success", "fail", "timeout"):
             outcome = "error"
