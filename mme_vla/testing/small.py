@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import compose
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.memory.base import padded_length
 from mme_vla.memory.history import CachedHistory, FrameScores
@@ -100,6 +99,8 @@ def _composed(*words: str) -> DictConfig:
     """Composing takes several times as long as building a tiny policy, and tests build the same
     ones over and over.
     """
+    from mme_vla.config.composition import compose  # Hydra; batches and checks do without
+
     return compose("policy", words)
 
 

@@ -5,28 +5,23 @@ Which packages those are follows from pyproject.toml and from what is installed.
 needs an extra names it, and the words that install it.
 """
 
-import os
+import json
 import subprocess
 import sys
-import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
-from importlib.metadata import packages_distributions, requires
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
 
+from helpers import command_series
 from helpers.h5_files import write_file
+from helpers.installed import is_installed, modules_beyond, needs, without_modules
 from mme_vla.cli import commands
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import find_records, read_folders
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-FOLDER = REPOSITORY / "tests" / "data" / "hidden_modules"
-LEROBOT_EXTRAS = ("dataset",)  # of which the library itself depends
 NEW = "uv sync --inexact --extra {}"
 
 
@@ -47,11 +42,12 @@ TRAIN = (
 )
 PLAY = "mme_vla.play task=StopCube episodes=1 max_choices=1 output=played"
 STEP = "run/checkpoints/step_000001"
-NANO = (
-    "task=VideoUnmask model=framesamp_modul demonstrations.easy=2 demonstrations.medium=0"
-    " demonstrations.hard=0 train.steps=20 train.batch_size=4 train.val_every=10 episodes=2"
-    " max_steps=20 beside=[] also=[] rendered_for=[] output=nano"
+NANO_WORDS = (
+    "mme_vla.nano task=VideoUnmask model=framesamp_modul demonstrations.easy=2"
+    " demonstrations.medium=0 demonstrations.hard=0 train.steps=20 train.batch_size=4"
+    " train.val_every=10 episodes=2 max_steps=20 beside=[] also=[] rendered_for=[] output=nano"
 )
+NANO = Case(("sim",), NANO_WORDS, "page", draws=True)
 """The whole way of nanoMME, small: two demonstrations, twenty updates, two episodes."""
 
 # In this order: some read what an earlier one wrote.
@@ -107,7 +103,7 @@ SUFFICE = [
         "workers=1 render=false output=evaluated execute=1 flow_steps=1",
         "timeout",
     ),
-    Case(("sim",), f"mme_vla.nano {NANO}", "page", draws=True),
+    NANO,
     Case(
         ("sim",),
         "mme_vla vision-pretrain tasks=StopCube scenes=2 held_out=1 arrangements=1 steps=1 "
@@ -162,89 +158,68 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(case: Case, folder: Path) -> tuple[int, str]:
-    """Exit code and output of a command, run where only its own extras are installed."""
-    if not all(is_installed(extra) for extra in case.extras):
-        pytest.skip(f"not installed: {NEW.format(' --extra '.join(case.extras))}")
-    if case.draws and not can_draw():
-        pytest.skip("no Vulkan driver: scripts/install_vulkan.sh installs one")
-    path = os.pathsep.join([str(FOLDER), str(REPOSITORY)])
-    variables = {**os.environ, "PYTHONPATH": path, "HIDDEN_MODULES": " ".join(hidden(case.extras)),
-                 "HF_HUB_OFFLINE": "1", "GEMINI_API_KEY": "none",
-                 "OPENAI_API_KEY": "none"}  # fmt: skip
+@pytest.fixture(scope="module")
+def outcomes(folder: Path) -> Callable[[Case], tuple[int, str]]:
+    """Exit code and output of a case.
+
+    One process runs all commands of a set of extras in their order. Those without an extra come
+    first, since others read what they wrote.
+    """
+    finished: dict[Case, tuple[int, str]] = {}
+
+    def outcome(case: Case) -> tuple[int, str]:
+        if not all(is_installed(extra) for extra in case.extras):
+            pytest.skip(f"not installed: {NEW.format(' --extra '.join(case.extras))}")
+        if case.draws and not can_draw():
+            pytest.skip("no Vulkan driver: scripts/install_vulkan.sh installs one")
+        for extras in ((), case.extras):
+            series = [other for other in SUFFICE + NEED if other.extras == extras]
+            if series[0] in finished:
+                continue
+            for waiting in [other for other in series if other.wait]:
+                finished[waiting] = run_until(waiting, folder)
+            rest = [o for o in series if not o.wait and (can_draw() or not o.draws)]
+            finished.update(zip(rest, run_series(rest, folder), strict=True))
+        return finished[case]
+
+    return outcome
+
+
+def environment(extras: Sequence[str]) -> dict[str, str]:
+    """The variables of a process that finds the packages of these extras alone."""
+    present = set().union(*(needs()[extra] for extra in ("", *extras)))
+    offline = {"HF_HUB_OFFLINE": "1", "GEMINI_API_KEY": "none", "OPENAI_API_KEY": "none"}
+    return {**without_modules(modules_beyond(present)), **offline}
+
+
+def run_series(cases: Sequence[Case], folder: Path) -> list[tuple[int, str]]:
+    """Run cases of one set of extras in one process."""
+    if not cases:
+        return []
+    results = folder / "results.json"
+    results.unlink(missing_ok=True)
+    process = subprocess.run(
+        [sys.executable, "-W", "ignore", command_series.__file__, str(results)],
+        input=json.dumps([case.words for case in cases]), env=environment(cases[0].extras),
+        cwd=folder, capture_output=True, text=True,
+    )  # fmt: skip
+    assert results.is_file(), process.stderr[-3000:]
+    return [(code, printed) for code, printed in json.loads(results.read_text())]
+
+
+def run_until(case: Case, folder: Path) -> tuple[int, str]:
+    """Run a case in a process of its own, and stop it once it has printed what it waits for."""
     process = subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-m", *case.words.split()], env=variables, cwd=folder,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        [sys.executable, "-W", "ignore", "-m", *case.words.split()], env=environment(case.extras),
+        cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
     with process:
         printed = ""
         for line in process.stdout:
             printed += line
-            if case.wait and case.wait in line:
+            if case.wait in line:
                 process.terminate()
     return process.returncode, printed
-
-
-@cache
-def needs() -> dict[str, set[str]]:
-    """The packages that each extra names; those of the library itself under an empty name, the
-    tools under `dev`.
-    """
-    pyproject = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
-    project = pyproject["project"]
-    lines = {
-        "": project["dependencies"],
-        **project["optional-dependencies"],
-        "dev": pyproject["dependency-groups"]["dev"],
-    }
-    packages = {
-        extra: {canonicalize_name(Requirement(line).name) for line in required}
-        for extra, required in lines.items()
-    }
-    packages["dev"].remove("mme-vla")  # with all extras
-    return packages
-
-
-@cache
-def modules() -> dict[str, set[str]]:
-    """The modules of each installed package; a namespace that several share belongs to none."""
-    owned: dict[str, set[str]] = {}
-    for module, owners in packages_distributions().items():
-        if len(set(owners)) == 1:
-            owned.setdefault(canonicalize_name(owners[0]), set()).add(module)
-    return owned
-
-
-def is_installed(extra: str) -> bool:
-    return all(package in modules() for package in needs()[extra])
-
-
-def with_dependencies(packages: Iterable[str]) -> set[str]:
-    """Installed packages, and all that these require."""
-    required: set[str] = set()
-    left = list(packages)
-    while left:
-        package = left.pop()
-        if package in required or package not in modules():
-            continue
-        required.add(package)
-        for requirement in map(Requirement, requires(package) or []):
-            extras = ("", *LEROBOT_EXTRAS) if package == "lerobot" else ("",)
-            if requirement.marker is None or any(
-                requirement.marker.evaluate({"extra": extra}) for extra in extras
-            ):
-                left.append(canonicalize_name(requirement.name))
-    return required
-
-
-def hidden(extras: Sequence[str]) -> set[str]:
-    """Modules of the packages that only other extras name, and that no present package requires."""
-    present = with_dependencies(set().union(*(needs()[extra] for extra in ("", *extras))))
-    return {
-        module
-        for package in set().union(*needs().values()) - present
-        for module in modules().get(package, ())
-    }
 
 
 @cache
@@ -265,32 +240,41 @@ def name_of(case: Case) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", SUFFICE, ids=name_of)
-def test_the_command_runs_with_this_extra_alone(folder: Path, case: Case) -> None:
-    code, output = run(case, folder)
+def test_the_command_runs_with_this_extra_alone(
+    outcomes: Callable[[Case], tuple[int, str]], case: Case
+) -> None:
+    code, output = outcomes(case)
     assert code == case.code and case.says in output, output[-3000:]
-    if case.words.endswith(NANO):  # run again, it computes nothing twice
-        nano = folder / "nano"
-        records = read_folders(find_records([nano / "further" / "framesamp_modul"]))
-        assert sorted(record.episode for record in records) == [0, 1]
-        assert {record.action_space for record in records} == {"waypoint"}
-        page = (nano / "page.md").read_text()
-        assert (
-            "| framesamp_modul" in page
-            and "| planner" in page
-            and (nano / "learning.png").is_file()
-        )
-        videos = list(nano.glob("videos/failure/**/*.mp4"))
-        assert len(videos) == 1 and videos[0].name in page
-        saved = {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")}
-        assert run(case, folder)[0] == 0
-        assert {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")} == saved
-        assert len(read_folders(find_records([nano / "further" / "framesamp_modul"]))) == 2
+
+
+@pytest.mark.slow
+def test_nano_run_again_computes_nothing_twice(
+    outcomes: Callable[[Case], tuple[int, str]], folder: Path
+) -> None:
+    outcomes(NANO)
+    nano = folder / "nano"
+    records = read_folders(find_records([nano / "further" / "framesamp_modul"]))
+    assert sorted(record.episode for record in records) == [0, 1]
+    assert {record.action_space for record in records} == {"waypoint"}
+    page = (nano / "page.md").read_text()
+    assert "| framesamp_modul" in page and "| planner" in page
+    assert (nano / "learning.png").is_file()
+    videos = list(nano.glob("videos/failure/**/*.mp4"))
+    assert len(videos) == 1 and videos[0].name in page
+
+    saved = {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")}
+    ((code, _),) = run_series([NANO], folder)
+    assert code == 0
+    assert {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")} == saved
+    assert len(read_folders(find_records([nano / "further" / "framesamp_modul"]))) == 2
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", NEED, ids=name_of)
-def test_a_command_names_the_extra_that_it_needs(folder: Path, case: Case) -> None:
-    code, output = run(case, folder)
+def test_a_command_names_the_extra_that_it_needs(
+    outcomes: Callable[[Case], tuple[int, str]], case: Case
+) -> None:
+    code, output = outcomes(case)
     assert code == case.code and "Traceback" not in output, output[-3000:]
     assert f"extra `{case.says}`" in output and NEW.format(case.says) in output
 
