@@ -97,6 +97,7 @@ def test_the_last_layer_reads_a_subset_of_the_queries(backend: str) -> None:
     assert torch.equal(selected, torch.cat([full[:, :, at] for at in rows], 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["pi05", "tokendrop_expert", "framesamp_modul"])
 @pytest.mark.parametrize("backend", OTHERS)
 def test_a_policy_gives_the_same_loss_and_the_same_chunk(model: str, backend: str) -> None:

@@ -33,6 +33,7 @@ def full_size(variant: str) -> Policy:
     return build_policy(variant, backbone="pi05", device="meta")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_names_and_shapes_equal_the_released_tree(variant: str, shared):
     tree = json.loads((shared / "spec" / f"param_tree_{VARIANTS[variant]}.json").read_text())

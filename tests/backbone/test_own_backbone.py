@@ -107,6 +107,7 @@ def trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     return weights.parent
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_it_works_in_every_command(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -16,7 +16,7 @@ TINY = (
 )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("launcher", "package", "words"),
     [

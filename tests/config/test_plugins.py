@@ -176,6 +176,7 @@ def test_plugins_are_names_of_modules(names: str) -> None:
         plugins_of(OmegaConf.create(f"plugins: {names}"), "the configuration")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     find_spec("mani_skill") is None, reason="the simulator (extra `sim`) is not installed"
 )

@@ -42,6 +42,7 @@ def ensure(source: EpisodeSource, memory: LastFrames, root: Path, **options) -> 
     return ensure_cache(source, memory, encode, options.pop("encoder", "abc"), root=root, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("keep_every", "scored", "dtype"),
     [(1, False, "float32"), (1, True, "float32"), (4, False, "bfloat16"), (4, True, "bfloat16")],

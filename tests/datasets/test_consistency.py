@@ -604,6 +604,7 @@ def test_replaced_tables_are_read_though_time_and_size_are_kept(
     assert opened(root).states(0)[0, 0] == 2
 
 
+@pytest.mark.slow
 def test_a_change_in_the_middle_of_a_large_table_is_read(tmp_path: Path) -> None:
     """The fingerprint reads three places of a file; the numbers are never taken on its word."""
     total = 40_000
@@ -638,6 +639,7 @@ def test_inspecting_names_the_contradiction(tmp_path: Path, monkeypatch, capsys)
     assert "has frame_index 7" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_datasets_that_lerobot_edited_are_in_order(tmp_path: Path, caplog) -> None:
     from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

@@ -65,6 +65,7 @@ def caches(data, tmp_path_factory) -> list[VisionCache]:
     ]
 
 
+@pytest.mark.slow
 def test_golden_samples_are_reproduced(parity: Path, tmp_path: Path) -> None:
     golden = json.loads((parity / "pipeline_datasets.json").read_text())["policy_dataset"]
     with zipfile.ZipFile(parity / "pipeline_h5.zip") as archive:

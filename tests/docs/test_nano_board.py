@@ -13,6 +13,7 @@ from mme_vla.evaluation.receipts import read_receipt, verify
 from mme_vla.utils import with_checksum, write_json
 
 
+@pytest.mark.nightly
 def test_the_pages_are_those_of_the_committed_rows() -> None:
     made = nano_board.boards()
     for path, text in nano_board.pages(made).items():
@@ -28,7 +29,7 @@ def test_committed_rows_are_compressed_and_small() -> None:
     assert sum(path.stat().st_size for path in files) <= 5e6
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_receipts_of_committed_rows_fit_their_records() -> None:
     paths = [
         *nano_board.rows_folder().rglob("receipt.json"),

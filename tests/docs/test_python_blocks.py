@@ -17,7 +17,7 @@ from helpers.published import published_folder
 from mme_vla import build_policy
 from mme_vla.testing.small import unit_stats
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 TESTED_BY = {
     "README.md": "tests/integration/test_model_alone.py",

@@ -119,6 +119,7 @@ def test_the_page_shows_the_file_that_is_tested() -> None:
     assert blocks("yaml") == [(EXAMPLE / "configs" / "embodiment" / "two_arms.yaml").read_text()]
 
 
+@pytest.mark.slow
 def test_the_page_from_the_dataset_to_a_served_policy(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,8 +14,16 @@ from mme_vla.testing.small import ALL_MODELS, BEYOND, NEURAL, RECURRENT
 from mme_vla.training.logging import read_metrics
 from mme_vla.training.settings import TrainRun
 
-pytestmark = pytest.mark.slow
-
+EACH_PART_ONCE = {
+    "pi05",
+    "framesamp_modul",
+    "tokendrop_context",
+    "ttt_expert",
+    "rmt_modul",
+    "hybrid",
+    *BEYOND,
+}
+"""Each memory and each integration. The other compositions of the paper train nightly."""
 STEPS, WINDOW = 30, 6
 SMALL = [
     "backbone.depth=1",
@@ -68,7 +76,12 @@ def run(model: str, folder: Path, caches: Path, *overrides: str) -> None:
     train(TrainRun.from_config(config), folder, begun=time.perf_counter())
 
 
-@pytest.mark.parametrize("model", [*ALL_MODELS, *BEYOND])
+def marked(model: str) -> Any:
+    mark = pytest.mark.slow if model in EACH_PART_ONCE else pytest.mark.nightly
+    return pytest.param(model, marks=mark)
+
+
+@pytest.mark.parametrize("model", [marked(model) for model in [*ALL_MODELS, *BEYOND]])
 def test_every_model_trains_on_the_sample(model: str, tmp_path: Path, caches: Path) -> None:
     run(model, tmp_path, caches, f"train.steps={STEPS}")
     lines = read_metrics(tmp_path)

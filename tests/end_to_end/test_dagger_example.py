@@ -29,7 +29,7 @@ def run(folder: Path, module: str, *words: str) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("renderer")
 def test_dagger_learns_from_the_oracle_and_its_policy_works_in_every_command(
     tmp_path: Path,

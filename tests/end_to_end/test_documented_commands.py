@@ -27,8 +27,6 @@ from mme_vla.config.composition import compose
 from mme_vla.config.plugins import trust_as_override
 from mme_vla.extras.nano.cli.nano import with_settings
 
-pytestmark = pytest.mark.slow
-
 EXAMPLES = {
     "add-a-memory.md": "last_frames",
     "add-a-backbone.md": "regression",
@@ -140,6 +138,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("pages")
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("page", "command"), RUN[::-1])
 def test_a_documented_command_runs_as_printed(
     page: str, command: str, root: Path, monkeypatch: pytest.MonkeyPatch
@@ -169,6 +168,7 @@ def test_a_documented_command_runs_as_printed(
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "command"), OTHERS)
 def test_the_words_of_other_documented_commands_are_valid(page: str, command: str) -> None:
     # what means several words, and may be none

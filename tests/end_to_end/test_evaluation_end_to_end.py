@@ -26,7 +26,7 @@ def call(module: str, *words: str) -> str:
     return done.stdout + done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("renderer")
 def test_a_policy_is_evaluated_in_two_parts_with_the_same_results(tmp_path: Path) -> None:
     saved = tmp_path / "policy"

@@ -112,7 +112,7 @@ def test_the_page_of_an_example_shows_its_files_and_its_code_runs(
         exec(compile(block, f"docs/extend/{row.page}.md", "exec"), {})
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @PARAMETERS
 def test_an_example_works_in_its_commands(row: Row, tmp_path: Path) -> None:
     configs = str(EXAMPLES / row.name / "configs")

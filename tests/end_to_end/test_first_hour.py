@@ -66,7 +66,7 @@ def shell(command: str) -> None:
     assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", SETTINGS)
 def test_the_cells_of_a_notebook_run(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, request: pytest.FixtureRequest
@@ -105,7 +105,7 @@ def shortest_path() -> list[str]:
     return re.findall(r"```bash\n(.*?)```", section, re.DOTALL)[1].strip().splitlines()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("renderer")
 def test_the_shortest_path_leads_to_a_memory_in_closed_loop(tmp_path: Path) -> None:
     unneeded = ignore_patterns(".*", "__pycache__", "outputs", "tests", "docs", "*.egg-info")

@@ -57,6 +57,7 @@ def quoted() -> list[str]:
     return [row.split("`")[1] for row in rows]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("message", quoted())
 def test_a_message_of_the_troubleshooting_page_is_one_of_the_library(message: str) -> None:
     fragments = [part.strip() for part in message.split("…") if part.strip()]
@@ -94,7 +95,7 @@ def test_published_numbers_of_the_comparison_are_the_papers() -> None:
         assert row.split("|")[-2].strip() == published
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_figures_come_from_the_sample(tmp_path: Path) -> None:
     command = [
         sys.executable,

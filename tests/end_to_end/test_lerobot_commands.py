@@ -22,7 +22,7 @@ pytest.importorskip(
     "mani_skill", reason="lerobot-eval runs the simulator: uv sync --inexact --extra sim"
 )
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 TRAIN, EVAL, VIZ = (f"lerobot.scripts.lerobot_{name}" for name in ("train", "eval", "dataset_viz"))
 SMALL_ACT = (

@@ -14,7 +14,7 @@ pytest.importorskip("lerobot", reason="LeRobot is not installed")
 pytest.importorskip("gymnasium", reason="LeRobot's environments: uv sync --inexact --extra sim")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_first_process_builds_the_cache_and_the_others_open_it(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -134,7 +134,7 @@ def test_a_policy_of_an_environment_of_ones_own_is_served(
     assert chunk.shape == (4, 1) and np.isfinite(chunk).all()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("renderer")
 def test_maniskills_pick_cube_is_recorded_trained_and_evaluated(tmp_path: Path) -> None:
     words = ("env=pick_cube", "plugins=[pick_cube]")

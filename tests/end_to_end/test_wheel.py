@@ -118,7 +118,7 @@ def test_the_source_archive_holds_what_the_wheel_is_made_of(tmp_path: Path) -> N
     } <= packed
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_policy_builds_and_trains_from_the_wheel_alone(installed: Path, tmp_path: Path) -> None:
     (tmp_path / "use.py").write_text(USE)
     module, kind, *_, imported = run([str(installed), "use.py", *TRAIN], cwd=tmp_path).splitlines()

@@ -268,6 +268,7 @@ def test_a_peg_is_inserted_from_the_side_that_was_requested(
     assert np.linalg.norm(free.position - box.position) < 0.05
 
 
+@pytest.mark.slow
 def test_out_of_reach_is_reported_before_anything_moves() -> None:
     _, log, demonstrator = scene(lambda _: None)
     with pytest.raises(PlanningError, match=r"No way to \[0\.9"):

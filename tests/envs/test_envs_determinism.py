@@ -36,6 +36,7 @@ def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:
     return np.stack(observed), texts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_the_same_seed_gives_bit_equal_states_twice(task: str) -> None:
     (first, words), (second, same_words) = states(task, "hard"), states(task, "hard")

@@ -117,6 +117,7 @@ def test_on_the_way_back_from_the_video_the_pegs_are_where_they_were(env):
         np.testing.assert_allclose(peg.pose.p, peg.initial_pose.p, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [710002, 9000063, 9000014], ids=["beside the box", "flung off", "out of reach"]
 )

@@ -35,6 +35,7 @@ def recorded(renderer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pat
     yield folder
 
 
+@pytest.mark.slow
 def test_a_recorded_episode_reads_as_an_official_one(recorded: Path) -> None:
     about = json.loads((recorded / f"{SHORT.name}.json").read_text())
     (ref,) = list_episodes([recorded / f"{SHORT.name}.h5"])
@@ -49,6 +50,7 @@ def test_a_recorded_episode_reads_as_an_official_one(recorded: Path) -> None:
     assert {path.suffix for path in (recorded / "previews").iterdir()} == {".png", ".mp4"}
 
 
+@pytest.mark.slow
 def test_the_command_saves_both_layouts_and_only_what_is_missing(
     recorded: Path,
     tmp_path: Path,

@@ -152,6 +152,7 @@ def sensor_images(scene: Scene) -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.slow
 def test_images_depth_and_segmentation_are_those_of_the_stock_shaders(
     software: dict[str, object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -265,6 +266,7 @@ def test_a_mesh_file_is_read_as_saved(tmp_path: Path) -> None:
         read_stl(path)
 
 
+@pytest.mark.slow
 def test_the_cameras_body_keeps_its_size_and_a_twentieth_of_its_triangles() -> None:
     stock = read_stl(
         Path(robots.PandaWristCam.urdf_path).parent

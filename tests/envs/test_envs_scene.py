@@ -135,6 +135,7 @@ def test_the_official_layout_comes_out_of_the_seed(pick, h5_folder):
     assert project(pick.target.position).round().tolist() == [93, 109]
 
 
+@pytest.mark.slow
 def test_recorded_actions_have_the_recorded_effect(pick, h5_folder):
     pick.reset()
     error = replay(pick, h5_folder, PICK[1])

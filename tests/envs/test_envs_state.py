@@ -65,6 +65,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "split", "space", "before", "after"), CASES)
 def test_a_restored_episode_goes_on_to_the_last_bit(
     task: str, split: str, space: str, before: list[Any], after: list[Any]

@@ -38,6 +38,7 @@ def tallied(env: Any) -> list[np.ndarray]:
     return [place for _, radius, place in lying(env) if radius == TALLY_RADIUS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_in_a_twin_the_fact_is_in_view_and_nothing_else_is_changed(task: str) -> None:
     original, twin = built(task), built(task, in_view=True)

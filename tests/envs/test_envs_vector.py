@@ -54,6 +54,7 @@ def only(replies: list[Reply]) -> Reply:
     return reply
 
 
+@pytest.mark.slow
 def test_every_episode_is_run_once_by_whoever_is_free(envs: VecEnv) -> None:
     envs.jobs.extend(Job("StopCube", "test", episode) for episode in range(5))
     begun, finished = [envs.start_next(0), envs.start_next(1)], []
@@ -169,6 +170,7 @@ def test_misuse_is_refused(envs: VecEnv) -> None:
         envs.send(0, "go")
 
 
+@pytest.mark.slow
 def test_closing_ends_all_processes_even_busy_ones() -> None:
     before = {child.pid for child in multiprocessing.active_children()}
     envs = VecEnv(

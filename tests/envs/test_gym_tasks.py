@@ -21,6 +21,7 @@ from mme_vla.envs import rendering
 from mme_vla.errors import UserError
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["StopCube", "PatternLock"])
 def test_tasks_of_gripper_and_stick_pass_gymnasiums_check(task: str) -> None:
     env = gymnasium.make(f"mme_vla/{task}-v0", images=False, max_steps=50)
@@ -45,6 +46,7 @@ def test_a_seed_fixes_the_episodes_and_an_option_names_one() -> None:
         env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("renderer")
 def test_images_and_the_conditioning_video_are_numpy_arrays() -> None:
     env = gymnasium.make("mme_vla/PatternLock-v0", episode=0)
@@ -106,7 +108,7 @@ def test_a_fresh_process_makes_a_task(beginning: str) -> None:
     assert run_fresh(code).split() == ["ongoing"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("renderer")
 @pytest.mark.parametrize("made", VECTORS.values(), ids=VECTORS)
 def test_vector_environments_step_in_a_fresh_process(made: str) -> None:
@@ -168,7 +170,7 @@ def test_vector_environments_hand_on_videos_of_different_lengths(
         envs.close()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("renderer")
 def test_episodes_with_videos_begin_in_a_vector_environment_in_a_fresh_process() -> None:
     code = f"""{FRESH["an import"]}
@@ -234,7 +236,7 @@ def test_an_episode_is_truncated_at_its_limit(max_steps: int) -> None:
         env.close()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ppo_runs_on_a_task() -> None:
     sb3 = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
     env = gymnasium.make("mme_vla/StopCube-v0", images=False, max_steps=40, reward="subtask")

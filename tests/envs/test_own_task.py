@@ -63,6 +63,7 @@ def test_a_policy_is_evaluated_on_it_in_a_worker_process(tmp_path: Path) -> None
     assert [(r.task, r.episode, r.success) for r in run.records] == [("TwoButtons", 0, False)]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("renderer")
 def test_its_demonstrations_are_recorded(tmp_path: Path) -> None:
     selection = "frames=[0]"  # an image takes its time

@@ -144,6 +144,7 @@ def test_what_is_rendered_is_what_a_full_recording_shows(recorded: EpisodeRef) -
                 assert np.array_equal(getattr(frame, camera), full.obs[f"{camera}_rgb"])
 
 
+@pytest.mark.slow
 def test_a_dataset_of_it_is_read_where_it_was_rendered_and_nowhere_else(
     recorded: EpisodeRef, tmp_path: Path
 ) -> None:

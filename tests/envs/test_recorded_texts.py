@@ -47,6 +47,7 @@ def recorded_video(task: str, episode: int) -> tuple[list[str], str]:
     return video, after
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "episode"), VIDEOS)
 def test_a_video_has_the_texts_of_its_recording(task: str, episode: int) -> None:
     video, after = recorded_video(task, episode)

@@ -73,6 +73,7 @@ def row_of(task: str, split: str = "ood", episode: int = 0) -> Row:
     return copy.deepcopy(dict(row))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_a_scene_built_from_its_values_is_the_same(task: str) -> None:
     for episode in (0, 2, 3):

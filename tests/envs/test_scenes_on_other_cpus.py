@@ -47,7 +47,7 @@ def test_scenes_here_have_the_recorded_bits() -> None:
     assert scene_digest(every=10) == EVERY_TENTH
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "setting", SETTINGS, ids=lambda setting: "-".join(*setting.items()).split()[0]
 )

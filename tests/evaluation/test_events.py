@@ -432,6 +432,7 @@ def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

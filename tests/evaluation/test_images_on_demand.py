@@ -29,6 +29,7 @@ MEMORIES: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MEMORIES)
 def test_rendering_what_is_needed_changes_no_action(name: str) -> None:
     policy = quick_policy(name, patch_size=8 if name != "pi05" else 16, **MEMORIES[name])

@@ -78,6 +78,7 @@ def run(
     return folder / "receipt.json"
 
 
+@pytest.mark.slow
 def test_a_receipt_agrees_with_its_run(
     checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -252,6 +253,7 @@ ABSENCES: dict[str, tuple[Callable[[dict[str, Any]], object], set[str]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change, expected", ABSENCES.values(), ids=ABSENCES)
 def test_what_a_receipt_lacks_is_not_compared(
     change: Callable[[dict[str, Any]], object],

@@ -178,6 +178,7 @@ def test_intervals_of_a_difference_never_contradict_the_sign_test() -> None:
                 assert (low <= 0 <= high) == (sign_test(won, lost) >= 0.05), (won, lost, n)
 
 
+@pytest.mark.slow
 def test_an_interval_of_a_paired_difference_covers_the_truth_at_any_number_of_episodes() -> None:
     rng = np.random.default_rng(2)
     for n in (3, 20, 200):
@@ -327,6 +328,7 @@ def test_six_episodes_are_enough_for_one_comparison_and_not_for_two() -> None:
     assert not any(comparison.testable for comparison in both)
 
 
+@pytest.mark.slow
 def test_several_comparisons_are_corrected(demo: Results) -> None:
     pair = (demo.methods[0], demo.methods[1])
     (alone,), (first, _) = (
@@ -427,6 +429,7 @@ def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
     assert unknown.count("state it manually") == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [([], "Name files or folders"), (["nowhere"], "does not exist"),

@@ -192,6 +192,7 @@ def test_a_list_of_memories_is_understood_everywhere(tmp_path: Path) -> None:
     assert [member.budget for member in policy.memory.memories] == [128, 256]
 
 
+@pytest.mark.slow
 def test_inspect_draws_what_all_members_store(tmp_path: Path) -> None:
     inspect.main(
         compose(

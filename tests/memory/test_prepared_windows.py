@@ -123,6 +123,7 @@ FULL = {
 """Windows that six chunks fill, where there is one."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", FULL)
 def test_preparing_changes_no_action(model):
     policy = quick_policy(model, 8, memory=FULL[model])

@@ -60,6 +60,7 @@ def as_lerobots(only: str, folder: Path, **settings: Any) -> Path:
 # LeRobot
 
 
+@pytest.mark.slow
 @torch.no_grad()
 @pytest.mark.parametrize("only", ONLY)
 def test_a_checkpoint_of_lerobots_loads_completely_and_acts_as_it_does_there(

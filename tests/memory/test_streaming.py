@@ -60,6 +60,7 @@ def feed(policy, frames, goal="pick up the cube", seed=0, chunk=16, demo=30, upt
     return episode
 
 
+@pytest.mark.slow
 def test_streaming_and_offline_give_the_same_actions(policy, frames):
     episode = feed(policy, frames)
     streamed = policy.act([episode])
@@ -81,6 +82,7 @@ def test_streaming_and_offline_give_the_same_actions(policy, frames):
     assert np.abs(streamed - offline).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_batch_of_episodes_acts_as_each_alone(policy, frames):
     def episodes():
         return [

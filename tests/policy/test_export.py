@@ -11,7 +11,7 @@ from helpers import REPOSITORY
 from mme_vla.testing.small import random_batch
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(900)
 def test_an_exported_chunk_is_the_policys_at_other_inputs() -> None:
     page = (REPOSITORY / "docs" / "extend" / "export.md").read_text()

@@ -302,6 +302,7 @@ def test_a_masked_loss_does_not_depend_on_what_is_computed_together():
     assert torch.isfinite(unchanged)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("memory", "options", "message"),
     [

@@ -163,6 +163,7 @@ def test_hybrid_reads_subgoal_and_memory_and_both_change_its_actions(source):
     )
 
 
+@pytest.mark.slow
 def test_hybrid_keeps_memory_and_subgoal_within_one_budget():
     policy = build_policy("hybrid")
     most = policy.processor.subgoal_length

@@ -72,6 +72,7 @@ def in_process(policy: MMEPolicy) -> np.ndarray:
     return np.stack(taken)
 
 
+@pytest.mark.slow
 def test_its_benchmark_runs_on_our_environments_and_takes_the_policys_actions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

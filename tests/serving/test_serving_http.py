@@ -176,6 +176,7 @@ def test_a_body_has_a_time_limit_as_a_whole(policy):
         assert output.startswith(b"HTTP/1.1 408")
 
 
+@pytest.mark.slow
 def test_silent_sessions_are_freed(policy):
     with Served(policy, limits=Limits(idle_s=4)) as served:
         by_http(served, course()[:1])

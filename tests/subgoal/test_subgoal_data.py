@@ -77,6 +77,7 @@ def made_up(task="BinFill", length=64, changes=(0, 20, 40), exec_start=0, number
     return Labels(task, number, "a goal", exec_start, list(names), points, joints, joints + 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_sets_equal_the_released_ones_row_by_row(built, golden, name):
     assert rows_of(built, name) == golden["vlm_datasets"][SETS[name]]
@@ -129,6 +130,7 @@ def test_every_image_and_video_a_row_names_is_there(built, labelled):
     )
 
 
+@pytest.mark.slow
 def test_a_lerobot_dataset_gives_the_same_rows(h5, golden, tmp_path):
     refs = [
         ref
@@ -146,6 +148,7 @@ def test_a_lerobot_dataset_gives_the_same_rows(h5, golden, tmp_path):
         assert rows_of(tmp_path / "data", name) == expected
 
 
+@pytest.mark.slow
 def test_an_interrupted_build_continues_and_ends_the_same(h5, built, tmp_path, monkeypatch):
     episodes, output = open_input(h5), tmp_path / "data"
     names, original = [], module._build_episode
@@ -288,6 +291,7 @@ def test_the_argument_file_of_ms_swift_is_the_papers_recipe(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_settings_that_cannot_work_are_named(tmp_path):
     from mme_vla.config.composition import compose
 

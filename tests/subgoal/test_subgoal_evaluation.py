@@ -285,7 +285,7 @@ TINY_VLM = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("words", [["subgoal=oracle"], TINY_VLM], ids=["oracle", "qwenvl"])
 def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(
     words: list[str], tmp_path: Path

@@ -145,6 +145,7 @@ def test_damaged_rows_and_missing_images_are_named(tmp_path, data):
         question_of(read_rows(data / "simple.jsonl")[0], tmp_path)
 
 
+@pytest.mark.slow
 def test_the_full_path_learns_resumes_and_predicts(data, tmp_path):
     straight = fine_tune(settings(data, tmp_path / "straight"))
     values = losses(tmp_path / "straight")

@@ -137,6 +137,7 @@ def test_a_backbone_has_the_labels_of_the_current_frame(tmp_path: Path) -> None:
     assert batch.labels["frame_index"].tolist() == [item["place"][2] for item in items]
 
 
+@pytest.mark.slow
 def test_labels_lie_at_the_frames_of_the_tokens(policy: MMEPolicy, tmp_path: Path) -> None:
     dataset = prepared(policy, tmp_path, weights="frame_index")
     item = dataset[150]

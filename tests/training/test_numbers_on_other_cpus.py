@@ -45,7 +45,7 @@ def test_noise_of_a_seed_has_the_recorded_bits() -> None:
     assert number_digests.noise() == RECORDED["noise"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "setting", SETTINGS, ids=lambda setting: "-".join(*setting.items()).split()[0]
 )

@@ -35,6 +35,7 @@ SMALL = [
 ]
 
 
+@pytest.mark.slow
 def test_several_trainings_resume_and_share_a_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -52,6 +52,7 @@ def losses(folder: Path) -> list[float]:
     return [line["train/loss"] for line in read_metrics(folder) if "train/loss" in line]
 
 
+@pytest.mark.slow
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     straight = train(tmp_path / "whole")
     train(tmp_path / "parts", steps=3)

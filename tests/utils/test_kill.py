@@ -10,7 +10,7 @@ import pytest
 from helpers import commands
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_killed_conversion_ends_as_an_undisturbed_one(tmp_path: Path) -> None:
     report = tmp_path / "killed.json"
     words = ["benchmarks/kill.py", "convert", "--every=60", "--times=1", f"--json={report}"]

@@ -90,6 +90,7 @@ def test_another_variants_memory_is_left_behind_and_reported(tmp_path: Path) -> 
         )
 
 
+@pytest.mark.slow
 def test_the_same_variant_starts_completely(tmp_path: Path) -> None:
     small_policy("framesamp_modul", seed=5).save_pretrained(tmp_path / "ours")
     convert(tmp_path / "ours", tmp_path / "released", to="released")
@@ -126,6 +127,7 @@ def test_another_tokenizer_is_not_a_start(bases: dict[str, Path], tmp_path: Path
         start_from(build_policy("framesamp_modul"), tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["pi05", "simplesg", "groundsg", *PERCEPTUAL])
 def test_conversion_there_and_back_keeps_every_bit(variant: str, tmp_path: Path) -> None:
     policy = small_policy(variant)

@@ -9,8 +9,6 @@ import pytest
 from helpers import REPOSITORY
 from mme_vla.testing.small import BEYOND
 
-pytestmark = pytest.mark.slow
-
 GUESSING = 0.75
 # no square in the first frame and the last
 LEARNING = [model for model in BEYOND if not model.startswith("anchors")]
@@ -33,6 +31,7 @@ def test_a_memory_learns_what_only_the_video_showed(learn):
     assert learn("framesamp_expert")["error"] < 0.5 * GUESSING
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("model", [*LEARNING, "actions_context", "spacetime_modul"])
 def test_so_does_each_memory_beyond_the_paper(learn, model):
     assert learn(model)["error"] < 0.5 * GUESSING

@@ -256,7 +256,7 @@ def test_floors_and_ceilings_are_played_and_resumed(tmp_path: Path) -> None:
     assert (about["kind"], about["trained"], about.get("parameters")) == ("floor", False, None)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_command_learns_two_tasks_and_continues_in_a_fresh_process(
     tmp_path: Path, renderer: str
 ) -> None:

@@ -43,7 +43,7 @@ def test_models_and_budgets_are_lists_of_one_run() -> None:
     assert "--multirun" in with_settings(["--multirun", "model=a,b", "seed=0,1"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -161,7 +161,7 @@ def test_memories_that_read_tokens_are_scored_by_their_policy(name: str) -> None
     "task",
     [
         "VideoUnmask",
-        *(pytest.param(t, marks=pytest.mark.slow) for t in TASK_NAMES if t != "VideoUnmask"),
+        *(pytest.param(t, marks=pytest.mark.nightly) for t in TASK_NAMES if t != "VideoUnmask"),
     ],
 )
 def test_the_score_separates_evidence_from_chance_on_every_task(task: str) -> None:
@@ -178,7 +178,7 @@ def test_the_score_separates_evidence_from_chance_on_every_task(task: str) -> No
     assert oracle >= 0.95 and chance < oracle - 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_command_writes_scores_and_tables(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -185,7 +185,7 @@ def test_a_reward_of_your_own_is_registered_by_name() -> None:
     assert REWARDS["half"] is half and {"none", "sparse", "subtask"} <= set(REWARDS)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("example", ["grpo", "reward_weighted"])
 def test_an_example_learns_the_right_choices(example: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)

@@ -1,0 +1,52 @@
+"""Run the tests of scenes, numbers and replays as libraries compute on other CPUs.
+
+`uv run --extra dev --extra sim python scripts/test_on_other_cpus.py [PYTEST ARGUMENTS]`
+
+Each setting makes a library choose the kernels of another CPU, or PyTorch another number of threads.
+Libraries read the variables when they are loaded, so every setting is one process of pytest. The
+command ends with the settings that failed.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+TESTS = (
+    "tests/envs/test_scenes_on_other_cpus.py",
+    "tests/envs/test_scene_values.py",
+    "tests/envs/test_scene_parity.py",
+    "tests/envs/test_recorded_texts.py",
+    "tests/training/test_numbers_on_other_cpus.py",
+    "tests/training/test_resume_exactly.py",
+    "tests/memory/test_streaming.py",
+)
+AVX512 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
+SETTINGS = (
+    {"ATEN_CPU_CAPABILITY": "default"},
+    {"NPY_DISABLE_CPU_FEATURES": AVX512},
+    {"OPENBLAS_CORETYPE": "Prescott"},
+    {"MKL_CBWR": "COMPATIBLE"},
+    {"MKL_CBWR": "AVX2"},
+    {"OMP_NUM_THREADS": "1"},
+    {"OMP_NUM_THREADS": "2"},
+)
+
+
+def main() -> int:
+    """Run all settings, and return how many failed."""
+    failed = []
+    for setting in SETTINGS:
+        name = " ".join(f"{variable}={value.split()[0]}" for variable, value in setting.items())
+        print(f"+ {name}", flush=True)
+        command = [sys.executable, "-m", "pytest", "-q", *TESTS, *sys.argv[1:]]
+        variables = {"OMP_NUM_THREADS": "1", **os.environ, **setting}
+        if subprocess.run(command, cwd=REPOSITORY, env=variables, check=False).returncode:
+            failed.append(name)
+    print("failed: " + ", ".join(failed) if failed else f"all {len(SETTINGS)} settings pass")
+    return len(failed)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
