@@ -69,7 +69,10 @@ function find(words) {
       missing ||= !points;
       total += points;
     });
-    if (!missing) found.push({ section, score: total * (section.doc.boost ?? 1) * (section.parent ? 1 : 1.3) });
+    if (missing) continue;
+    const phrase = words.join(" ");
+    if (words.length > 1 && `${section.lowerTitle} ${section.lowerText}`.includes(phrase)) total *= 4;
+    found.push({ section, score: total * (section.doc.boost ?? 1) * (section.parent ? 1 : 1.3) });
   }
   return found;
 }

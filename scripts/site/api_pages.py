@@ -84,11 +84,12 @@ def pages(nav: list[Any]) -> dict[str, str]:
 
 def page(name: str) -> str:
     """The page of one name."""
-    options = "    options:\n      heading_level: 1\n      show_root_heading: true\n"
-    return (
-        f"---\ntitle: {name}\n---\n\n::: {target_of(name)}\n{options}\n"
-        f"```python\nfrom mme_vla import {name}\n```\n"
-    )
+    target = target_of(name)
+    options = f"    options:\n      heading_level: 1\n      heading: {name}\n"
+    text = f"---\ntitle: {name}\n---\n\n::: {target}\n{options}\n"
+    if name in FORMER_NAMES:
+        text += f"`{name}` is another name of `{target}`.\n\n"
+    return f"{text}```python\nfrom mme_vla import {name}  # {target}\n```\n"
 
 
 def module_page(module: str) -> str:
@@ -110,8 +111,8 @@ def registries_page() -> str:
         rows.append(f"| `{name}` | `{mme_vla._HOME[name]}` |")
     table = "\n".join(["| name | module |", "|---|---|", *rows])
     return (
-        "# Registries\n\nA registry maps names of configurations to classes. [`register`](register.md)"
-        f" adds to it.\n\n{table}\n\n::: mme_vla.registry.Registry\n"
+        "# Registries\n\nA registry maps names of configurations to classes."
+        f" [`register`](register.md) adds to it.\n\n{table}\n\n::: mme_vla.registry.Registry\n"
         "    options:\n      heading_level: 2\n      show_root_heading: true\n"
     )
 

@@ -39,13 +39,14 @@ HOME = "index.md"
 HEADLINE = "<!-- headline -->"
 """Where the landing page shows the first table of the README."""
 BOOST = {
+    "concepts/memory.md": 6.0,
     "concepts": 3.0,
     "reference/api": 2.0,
     "reference/commands": 1.2,
     "reference": 0.6,
     "evidence": 0.5,
 }
-"""Folder → weight of its pages in the search, 1 for the others."""
+"""Folder or page → weight in the search, 1 for the others."""
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)(#[^)\s]*)?\)")
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", ".toml": "toml"}
 
@@ -121,14 +122,16 @@ def on_page_context(context: dict[str, Any], page: "Page", **_: object) -> dict[
 
 
 def boost_of(path: str) -> float:
-    """The weight of a page in the search: that of the longest folder which is named."""
-    folders = [folder for folder in BOOST if path.startswith(f"{folder}/")]
+    """The weight of a page in the search: its own, or that of the longest folder which is named."""
+    folders = [name for name in BOOST if f"{path}/".startswith(f"{name}/")]
     return BOOST[max(folders, key=len)] if folders else 1.0
 
 
 def headline() -> str:
     """The first table of the README, with links as from `docs/`."""
-    rows = re.search(r"(?:^\|.*\n)+", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    rows = re.search(
+        r"(?:^\|.*\n)+", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
     if rows is None:
         raise PluginError("README.md has no table for the landing page.")
     return rows[0].replace("](docs/", "](")
