@@ -8,6 +8,7 @@ let sections = [];
 
 const plain = (html) =>
   html
+    .replace(/<\/?(a|code|em|span|strong)\b[^>]*>/g, "")
     .replace(/<[^>]*>/g, " ")
     .replace(/&lt;/g, "<")
     .replace(/&gt;/g, ">")

@@ -16,5 +16,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = commands.run("mme_vla", "docs", "--build", "--output", str(folder))
     assert done.returncode == 0, done.stderr
     assert "WARNING" not in done.stderr
+    assert done.stdout.startswith("Building the site")
     assert str(folder / "index.html") in done.stdout
     return folder

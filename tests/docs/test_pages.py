@@ -66,6 +66,25 @@ def test_the_navigation_has_the_tasks_of_a_user() -> None:
     ]
 
 
+def test_no_page_hangs_between_groups_of_the_navigation() -> None:
+    """A page without a group stands before the groups of its tab, or it seems to belong to one."""
+    for tab in hooks.navigation():
+        for title, entries in tab.items():
+            is_group = [
+                isinstance(entry, dict) and isinstance(next(iter(entry.values())), list)
+                for entry in entries
+            ]
+            assert is_group == sorted(is_group), title
+
+
+def test_no_page_has_text_art() -> None:
+    for page in pages():
+        for block in re.findall(
+            r"^```(?:text)?\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE
+        ):
+            assert not re.search(r"[►◄▼▲]", block), page
+
+
 def test_every_page_is_in_the_navigation_once() -> None:
     listed = list(leaves(hooks.navigation()))
     stored = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}

@@ -2,6 +2,7 @@
 
 import html
 import re
+import sys
 import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,6 +14,8 @@ import pytest
 from helpers import REPOSITORY
 from mme_vla import cli
 from mme_vla.cli import docs
+from mme_vla.cli import help as cli_help
+from mme_vla.config.trees import library_files
 from mme_vla.errors import UserError
 
 pytestmark = pytest.mark.slow
@@ -104,8 +107,15 @@ def test_an_installed_package_without_pages_is_an_error(
 
 def test_words_of_comments_and_outputs_of_notebooks_are_shown(site: Path) -> None:
     """Braces, links to pages, computed values, HTML of a notebook."""
-    train = text_of(site / "reference/configuration/train.html")
-    assert "such as {vlm: 0.1}" in train
+    shown = 0
+    for group in config_pages.groups():
+        page = text_of(site / "reference" / "configuration" / f"{group}.html")
+        for file in library_files(group).values():
+            for key in cli_help.keys(file):
+                for braces in re.findall(r"\{[^{}]*\}", key.comment.replace("`", "")):
+                    assert braces in page, f"{file.name}: {key.name}"
+                    shown += 1
+    assert shown > 3
     command = (site / "reference/commands/train.html").read_text()
     assert "docs/train/weights.md" not in command and "train/weights.html" in command
     assert "outputs/&lt;name&gt;/&lt;now&gt;" in command
@@ -127,6 +137,15 @@ def test_the_theme_has_the_projects_name_version_and_mark(site: Path) -> None:
     assert f"MME-VLA {version}" in page and "images/mark.svg" in page
     assert "Made with" not in page
     assert page.count("VideoUnmask") == 1, "the first table of the README"
+
+
+def test_help_begins_with_a_capital_letter(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["mme-vla docs", "--help"])
+    with pytest.raises(SystemExit):
+        docs.main()
+    assert "\nBuild the documentation site" in capsys.readouterr().out
 
 
 def text_of(file: Path) -> str:
