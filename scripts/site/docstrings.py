@@ -6,10 +6,13 @@ of code, and names in backticks become links.
 """
 
 import re
+from pathlib import Path
 from typing import Any
 
 import griffe
 
+REPOSITORY = Path(__file__).resolve().parents[2]
+PAGE = re.compile(r"docs/([\w/-]+)\.md")
 SECTIONS = ("Args:", "Attributes:")
 OTHER_SECTIONS = ("Returns:", "Raises:", "Yields:", "Examples:", "Example:")
 ENTRY = re.compile(r"(\w+(?:, \w+)*): (?=\S)")
@@ -153,7 +156,16 @@ def linked(text: str, item: griffe.Object, targets: dict[str, str]) -> str:
         return f'<autoref optional identifier="{identifier}"><code>{match[1]}</code></autoref>'
 
     parts = re.split(r"(^```.*?^```)", text, flags=re.DOTALL | re.MULTILINE)
-    return "".join(
-        part if part.startswith("```") else re.sub(r"`([A-Za-z_][\w.]*)`", link, part)
-        for part in parts
-    )
+    for i, part in enumerate(parts):
+        if not part.startswith("```"):
+            parts[i] = PAGE.sub(page_link, re.sub(r"`([A-Za-z_][\w.]*)`", link, part))
+    return "".join(parts)
+
+
+def page_link(match: re.Match[str]) -> str:
+    """A link to a page of the documentation from a page of the API; the path where it is none."""
+    file = REPOSITORY / "docs" / f"{match[1]}.md"
+    if not file.is_file():
+        return match[0]
+    title = file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ").replace("`", "")
+    return f'<a href="../../{match[1]}.html">{title}</a>'

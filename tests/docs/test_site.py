@@ -116,6 +116,9 @@ def test_words_of_comments_and_outputs_of_notebooks_are_shown(site: Path) -> Non
                     assert braces in page, f"{file.name}: {key.name}"
                     shown += 1
     assert shown > 3
+    for folder in ("api", "commands", "configuration"):
+        for file in (site / "reference" / folder).glob("*.html"):
+            assert re.findall(r"\bdocs/[\w/-]+\.md", text_of(file)) == [], file.name
     command = (site / "reference/commands/train.html").read_text()
     assert "docs/train/weights.md" not in command and "train/weights.html" in command
     assert "outputs/&lt;name&gt;/&lt;now&gt;" in command
