@@ -36,6 +36,7 @@ FROM_ROOT = {
 """Pages that are files of the repository's root."""
 HOME = "index.md"
 """The landing page. A link to the README leads to it."""
+GALLERY = "benchmark/gallery.md"
 HEADLINE = "<!-- headline -->"
 """Where the landing page shows the first table of the README."""
 BOOST = {
@@ -110,6 +111,8 @@ def on_page_markdown(markdown: str, page: "Page", **_: object) -> str:
     if path == HOME:
         page.meta |= {"template": "home.html", "hide": ["navigation", "toc", "footer"]}
         markdown = markdown.replace(HEADLINE, headline())
+    if path == GALLERY:
+        page.meta["hide"] = ["toc"]  # four clips beside each other
     return unbroken(relink(path, markdown))
 
 
