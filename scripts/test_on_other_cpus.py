@@ -1,10 +1,10 @@
 """Run the tests of scenes, numbers and replays as libraries compute on other CPUs.
 
-`uv run --extra dev --extra sim python scripts/test_on_other_cpus.py [PYTEST ARGUMENTS]`
+`uv run --group dev python scripts/test_on_other_cpus.py [PYTEST ARGUMENTS]`
 
-Each setting makes a library choose the kernels of another CPU, or PyTorch another number of threads.
-Libraries read the variables when they are loaded, so every setting is one process of pytest. The
-command ends with the settings that failed.
+Each setting makes a library choose the kernels of another CPU, or PyTorch another number of
+threads. Libraries read the variables when they are loaded, so every setting is one process of
+pytest. The command ends with the settings that failed.
 """
 
 import os

@@ -13,7 +13,8 @@ if (location.protocol === "file:") {
         this.inner.importScripts = async (...addresses) => {
           for (const address of addresses) await this.load(new URL(address, base).href);
         };
-        this.inner.postMessage = (data) => this.dispatchEvent(new MessageEvent("message", { data }));
+        // Not at once: a worker's messages arrive one after the other.
+        this.inner.postMessage = (data) => setTimeout(() => this.dispatchEvent(new MessageEvent("message", { data })));
         await this.load(base);
         this.pending.forEach((data) => this.deliver(data));
         this.pending = null;

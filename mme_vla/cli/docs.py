@@ -6,6 +6,7 @@ import argparse
 import logging
 import shutil
 import tempfile
+import time
 import webbrowser
 from pathlib import Path
 
@@ -113,8 +114,9 @@ def _replace(draft: Path, target: Path) -> None:
 
 def main() -> None:
     """Run `mme-vla docs`."""
+    purpose = str(__doc__).partition(": ")[2]
     parser = argparse.ArgumentParser(
-        prog="mme-vla docs", description=str(__doc__).partition(": ")[2]
+        prog="mme-vla docs", description=purpose[0].upper() + purpose[1:]
     )
     parser.add_argument(
         "--output",
@@ -126,7 +128,10 @@ def main() -> None:
     arguments = parser.parse_args()
     # its warnings, which are errors here
     logging.getLogger("mkdocs").addHandler(logging.StreamHandler())
+    check_site(arguments.output.resolve())
+    print("Building the site: some 400 pages, about half a minute …", flush=True)
+    start = time.monotonic()
     page = build_site(arguments.output).resolve()
-    print(f"The site is in {page}")
+    print(f"The site is in {page} ({time.monotonic() - start:.0f} s).")
     if not arguments.build and not webbrowser.open(page.as_uri()):
         print("No browser was found: open this file in one.")

@@ -84,17 +84,22 @@ def page(command: str) -> str:
     """The page of one command."""
     purpose = commands()[command].text
     guide = f"The [guide](../../{GUIDES[command]}) shows it at work."
-    parts = [f"# `mme-vla {command}`", f"{purpose[0].upper()}{purpose[1:]}. {guide}"]
+    parts = [f"# `mme-vla {command}`"]
     stem = config_of(command)
     if stem is None:
         parts += [
+            f"{purpose[0].upper()}{purpose[1:]}. {guide}",
             f"```bash\n{EXAMPLES[command]}\n```",
             f"## Options\n\n```text\n{help_text(command)}\n```",
         ]
         return "\n\n".join(parts) + "\n"
     file = library_files("")[stem]
+    # The file's comment says what the command does; the table of commands where it has none.
+    if not cli_help.heading(file)[1]:
+        parts.append(f"{purpose[0].upper()}{purpose[1:]}.")
     parts += [
         config_pages.introduction(file),
+        guide,
         f"## Keys of [{file.name}]({config_pages.source_link(file)})",
     ]
     parts.append(config_pages.key_table(file))

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from os.path import relpath
 from pathlib import Path
 
 from mme_vla.cli.help import heading
@@ -59,40 +60,65 @@ def keys(file: Path) -> list[Key]:
     return result
 
 
-def prose(text: str) -> str:
-    """Text of a comment as Markdown: what is in angle brackets is no tag, a bar is no column."""
+MARKUP = {"<": "&lt;", ">": "&gt;", "*": r"\*", "{": "&#123;", "}": "&#125;"}
+"""Characters of a comment that mean something in Markdown or its extension for attributes."""
+PAGE = re.compile(r"docs/([\w/-]+\.md)(#[\w-]+)?")
+
+
+def prose(text: str, folder: str = "reference/commands") -> str:
+    """Text of a comment as Markdown: what is in angle brackets is no tag, a bar is no column, a
+    page of the documentation is a link.
+
+    Args:
+        text: the comment. folder: of the page that shows it, under `docs/`.
+    """
     pieces = text.split("`")  # every second one is in backticks, where only a bar means anything
     for i, piece in enumerate(pieces):
-        bare = (
-            piece if i % 2 else piece.replace("<", "&lt;").replace(">", "&gt;").replace("*", r"\*")
-        )
-        pieces[i] = bare.replace("|", r"\|")
+        if i % 2 == 0:
+            for character, entity in MARKUP.items():
+                piece = piece.replace(character, entity)
+            piece = PAGE.sub(lambda match: page_link(match[1], match[2] or "", folder), piece)
+        pieces[i] = piece.replace("|", r"\|")
     return "`".join(pieces)
 
 
+def page_link(page: str, anchor: str, folder: str) -> str:
+    """A link with the page's title; the path as it is where there is no such page."""
+    file = REPOSITORY / "docs" / page
+    if not file.is_file():
+        return f"docs/{page}{anchor}"
+    title = file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ").replace("`", "")
+    return f"[{title}]({relpath(page, folder)}{anchor})"
+
+
 def code(text: str) -> str:
-    """Text in backticks within a table, where a bar would end the cell."""
+    """Text in backticks within a table, where a bar would end the cell. A value that is computed
+    is named: `outputs/<name>/<now>`.
+    """
+    text = re.sub(r"\$\{(\w+)(?::[^}]*)?\}", r"<\1>", text)
     return f"`{text.replace('|', chr(92) + '|')}`" if text else ""
 
 
-def introduction(file: Path) -> str:
+def introduction(file: Path, folder: str = "reference/commands") -> str:
     """The comment that a file begins with: text and example commands."""
     examples, text = heading(file)
     blocks = ["\n".join(["```bash", *examples, "```"])] if examples else []
-    return "\n\n".join([*([prose(text)] if text else []), *blocks])
+    return "\n\n".join([*([prose(text, folder)] if text else []), *blocks])
 
 
-def key_table(file: Path) -> str:
+def key_table(file: Path, folder: str = "reference/commands") -> str:
     """A file's keys with their defaults and comments; empty where it has none."""
     rows = [
-        f"| {code(key.name)} | {code(key.default)} | {prose(key.comment)} |" for key in keys(file)
+        f"| {code(key.name)} | {code(key.default)} | {prose(key.comment, folder)} |"
+        for key in keys(file)
     ]
     return "\n".join(["| key | default | |", "|---|---|---|", *rows]) if rows else ""
 
 
-def section(file: Path, title: str) -> str:
+def section(file: Path, title: str, folder: str) -> str:
     """One file as a heading, its introduction and its keys."""
-    return "\n\n".join(part for part in (title, introduction(file), key_table(file)) if part)
+    parts = (title, introduction(file, folder), key_table(file, folder))
+    return "\n\n".join(part for part in parts if part)
 
 
 def groups() -> list[str]:
@@ -111,7 +137,7 @@ def overview() -> str:
     """Introduction, and a table of the groups with their files."""
     files = {group: " · ".join(f"`{name}`" for name in library_files(group)) for group in groups()}
     rows = [f"| [`{name}`](configuration/{name}.md) | {stems} |" for name, stems in files.items()]
-    policy = section(library_files("")["policy"], "## `build_policy`")
+    policy = section(library_files("")["policy"], "## `build_policy`", "reference")
     return "\n\n".join(
         [
             INTRODUCTION.strip(),
@@ -130,7 +156,7 @@ def group_page(group: str) -> str:
     ]
     for file in library_files(group).values():
         title = f"## [`{group}={file.stem}`]({source_link(file)})"
-        parts.append(section(file, title))
+        parts.append(section(file, title, "reference/configuration"))
     return "\n\n".join(parts) + "\n"
 
 

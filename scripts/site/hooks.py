@@ -7,16 +7,18 @@ offline.
 """
 
 import re
+import tomllib
 from collections.abc import Callable
 from os.path import normpath, relpath
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 import api_pages
 import command_pages
 import config_pages
 import notebook_pages
+import yaml
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
@@ -28,15 +30,47 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parents[2]
 FROM_ROOT = {
-    "index.md": "README.md",
     "reference/changes.md": "CHANGELOG.md",
     "extend/contributing.md": "CONTRIBUTING.md",
 }
 """Pages that are files of the repository's root."""
-BOOST = {"concepts": 2.0, "reference": 0.5, "evidence": 0.5}
-"""Folder → weight of its pages in the search, 1 for the others."""
+HOME = "index.md"
+"""The landing page. A link to the README leads to it."""
+GALLERY = "benchmark/gallery.md"
+HEADLINE = "<!-- headline -->"
+"""Where the landing page shows the first table of the README."""
+BOOST = {
+    "concepts/memory.md": 6.0,
+    "concepts": 3.0,
+    "reference/api": 2.0,
+    "reference/commands": 1.2,
+    "reference": 0.6,
+    "evidence": 0.5,
+}
+"""Folder or page → weight in the search, 1 for the others."""
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)(#[^)\s]*)?\)")
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", ".toml": "toml"}
+
+
+def on_config(config: "MkDocsConfig") -> "MkDocsConfig":
+    """Take version and address of the project from `pyproject.toml`."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    config.extra["version_label"] = project["version"]
+    config.copyright = f"{config.site_name} {project['version']} · {config.copyright}"
+    config.repo_url = config.repo_url or project.get("urls", {}).get("Repository")
+    return config
+
+
+def navigation() -> list[Any]:
+    """The navigation of `mkdocs.yml`."""
+    return yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), _Settings)["nav"]
+
+
+class _Settings(yaml.SafeLoader):
+    """Reads `mkdocs.yml`, which names a Python function."""
+
+
+_Settings.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: suffix)
 
 
 def generated() -> dict[str, str]:
@@ -44,7 +78,7 @@ def generated() -> dict[str, str]:
     copies = {page: (ROOT / file).read_text(encoding="utf-8") for page, file in FROM_ROOT.items()}
     return {
         **copies,
-        "reference/api.md": api_pages.page(),
+        **api_pages.pages(navigation()),
         **config_pages.pages(),
         **command_pages.pages(),
     }
@@ -72,10 +106,49 @@ def on_page_markdown(markdown: str, page: "Page", **_: object) -> str:
     """Point links to files of the repository at their pages in the site, and rank the page in the
     search.
     """
-    folder = page.file.src_uri.partition("/")[0]
-    if folder in BOOST:
-        page.meta["search"] = {"boost": BOOST[folder]}
-    return relink(page.file.src_uri, markdown)
+    path = page.file.src_uri
+    page.meta.setdefault("search", {})["boost"] = boost_of(path)
+    if path == HOME:
+        page.meta |= {"template": "home.html", "hide": ["navigation", "toc", "footer"]}
+        markdown = markdown.replace(HEADLINE, headline())
+    if path == GALLERY:
+        page.meta["hide"] = ["toc"]  # four clips beside each other
+    return unbroken(relink(path, markdown))
+
+
+def on_page_context(context: dict[str, Any], page: "Page", **_: object) -> dict[str, Any]:
+    """Give a page without sections the width of the column that would list them."""
+    titles = list(page.toc)
+    if not titles or (len(titles) == 1 and not titles[0].children):
+        page.meta.setdefault("hide", []).append("toc")
+    return context
+
+
+def boost_of(path: str) -> float:
+    """The weight of a page in the search: its own, or that of the longest folder which is named."""
+    folders = [name for name in BOOST if f"{path}/".startswith(f"{name}/")]
+    return BOOST[max(folders, key=len)] if folders else 1.0
+
+
+def headline() -> str:
+    """The first table of the README, with links as from `docs/`."""
+    rows = re.search(
+        r"(?:^\|.*\n)+", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    if rows is None:
+        raise PluginError("README.md has no table for the landing page.")
+    return rows[0].replace("](docs/", "](")
+
+
+def unbroken(text: str) -> str:
+    """A page's text whose values stay on one line: `63 %`, `49.17 ± 0.48`, `16 × 16`."""
+    value = re.compile(r"(?<=\d) (?=[%±×])|(?<=[±×]) (?=\d)")
+
+    def change(part: str) -> str:
+        pieces = re.split(r"(`[^`\n]*`)", part)
+        return "".join(p if p.startswith("`") else value.sub("\u00a0", p) for p in pieces)
+
+    return outside_of_code(text, change)
 
 
 def origin(path: str) -> str:
@@ -94,7 +167,7 @@ def target_of(path: str, link: str) -> str | None:
 
 def shown_as(target: str) -> str:
     """The path in the site of a file of the repository."""
-    copies = {file: page for page, file in FROM_ROOT.items()}
+    copies = {"README.md": HOME} | {file: page for page, file in FROM_ROOT.items()}
     if target in copies:
         return copies[target]
     return target.removeprefix("docs/") if target.startswith("docs/") else f"source/{target}.md"

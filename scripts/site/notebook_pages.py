@@ -1,10 +1,12 @@
 """A notebook as a page: its text, its code, and the outputs that it keeps."""
 
+import base64
 import json
 import re
 from pathlib import Path
 from typing import Any
 
+IMAGE = '<img alt="output of the cell" src="data:image/{};base64,{}">'
 ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -27,11 +29,18 @@ def cell_parts(cell: dict[str, Any]) -> list[str]:
 
 
 def output_part(output: dict[str, Any]) -> str:
-    """An output as an image, if it has one, else as text."""
-    data = output.get("data", {})
-    for kind in ("image/png", "image/jpeg"):
-        if kind in data:
-            encoded = "".join(data[kind]).replace("\n", "")
-            return f'<img alt="output of the cell" src="data:{kind};base64,{encoded}">'
+    """An output in the richest form that it has: HTML, Markdown, an image, else text."""
+    data = {kind: "".join(value) for kind, value in output.get("data", {}).items()}
+    if "text/html" in data:
+        # Within a block of HTML an empty line would begin Markdown anew.
+        html = re.sub(r"\n\s*\n", "\n", data["text/html"].strip())
+        return f'<div class="output">{html}</div>'
+    if "text/markdown" in data:
+        return data["text/markdown"].strip()
+    if "image/svg+xml" in data:
+        return IMAGE.format("svg+xml", base64.b64encode(data["image/svg+xml"].encode()).decode())
+    for kind in ("png", "jpeg", "gif", "webp"):
+        if f"image/{kind}" in data:
+            return IMAGE.format(kind, data[f"image/{kind}"].replace("\n", ""))
     text = ANSI.sub("", "".join(output.get("text", data.get("text/plain", "")))).rstrip()
     return f"```text\n{text}\n```" if text else ""

@@ -52,7 +52,7 @@ def test_a_page_begins_with_one_title_and_its_purpose(page: Path) -> None:
 
 
 def test_the_navigation_has_the_tasks_of_a_user() -> None:
-    titles = [title for entry in navigation() for title in entry]
+    titles = [title for entry in hooks.navigation() for title in entry]
     assert titles == [
         "Start",
         "Train",
@@ -66,15 +66,34 @@ def test_the_navigation_has_the_tasks_of_a_user() -> None:
     ]
 
 
+def test_no_page_hangs_between_groups_of_the_navigation() -> None:
+    """A page without a group stands before the groups of its tab, or it seems to belong to one."""
+    for tab in hooks.navigation():
+        for title, entries in tab.items():
+            is_group = [
+                isinstance(entry, dict) and isinstance(next(iter(entry.values())), list)
+                for entry in entries
+            ]
+            assert is_group == sorted(is_group), title
+
+
+def test_no_page_has_text_art() -> None:
+    for page in pages():
+        for block in re.findall(
+            r"^```(?:text)?\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE
+        ):
+            assert not re.search(r"[►◄▼▲]", block), page
+
+
 def test_every_page_is_in_the_navigation_once() -> None:
-    listed = list(leaves(navigation()))
+    listed = list(leaves(hooks.navigation()))
     stored = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
     assert sorted(listed) == sorted(stored | set(hooks.generated()))
 
 
 def test_the_documentation_workflow_builds_the_site() -> None:
     runs = list(steps("docs.yml"))
-    assert any(run.endswith("mme-vla docs --build") for run in runs)
+    assert any(run.endswith("uv run --extra docs mme-vla docs --build") for run in runs)
 
 
 def test_the_test_workflow_runs_the_commands_of_the_readme() -> None:
@@ -99,17 +118,6 @@ def steps(workflow: str) -> list[str]:
             re.fullmatch(r"[\w/-]+@v\d+", step["uses"]) for step in job["steps"] if "uses" in step
         )
     return [step["run"] for job in jobs for step in job["steps"] if "run" in step]
-
-
-class Loader(yaml.SafeLoader):
-    """Reads MkDocs's settings, which name a Python function."""
-
-
-Loader.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: suffix)
-
-
-def navigation() -> list[dict]:
-    return yaml.load((REPOSITORY / "mkdocs.yml").read_text(), Loader)["nav"]
 
 
 def leaves(entries: list) -> list[str]:

@@ -1,5 +1,6 @@
 """The generated pages: API, configuration, commands, and files that pages link to."""
 
+import inspect
 import json
 import re
 import sys
@@ -12,45 +13,58 @@ import hooks
 import notebook_pages
 import pytest
 
+from helpers import REPOSITORY
 from mme_vla.cli import commands
 from mme_vla.cli import help as cli_help
 from mme_vla.config.trees import library_files
 from mme_vla.registry import Command
 
 
-def test_every_public_name_has_a_description() -> None:
-    pytest.importorskip(
-        "gymnasium", reason="the environments' signatures: uv sync --inexact --extra sim"
+def test_every_public_name_has_a_page_and_a_description() -> None:
+    nav = hooks.navigation()
+    pages = api_pages.pages(nav)
+    for name in api_pages.public_names():
+        assert f"::: {api_pages.target_of(name)}\n" in pages[f"reference/api/{name}.md"]
+        assert api_pages.first_sentence(name)
+    assert "| `MEMORIES` | `mme_vla.registry` |" in pages["reference/api/registries.md"]
+
+
+def test_a_public_name_without_a_page_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    nav = [{"API": ["reference/api.md", {"Mistakes": ["reference/api/UserError.md"]}]}]
+    with pytest.raises(ValueError, match="build_policy"):
+        api_pages.pages(nav)
+
+
+def test_the_page_of_a_module_leaves_out_the_public_names() -> None:
+    page = api_pages.module_page("mme_vla.types")
+    assert "- TensorStruct\n" in page and "- Batch\n" not in page
+
+
+def test_docstrings_become_sections_lists_and_links() -> None:
+    pytest.importorskip("griffe", reason="the extra `docs` is not installed")
+    import docstrings
+
+    names = {"tasks", "episodes", "width", "grid", "storage"}
+    text = """Run it.
+
+    Args:
+        tasks, episodes: as in the command. grid: side of a view's
+            token grid.
+
+    >>> run(1)  # doctest: +SKIP
+    """
+    assert docstrings.rewritten(inspect.cleandoc(text), names) == (
+        "Run it.\n\nArgs:\n    tasks: as in the command.\n    episodes: as in the command.\n"
+        "    grid: side of a view's token grid.\n\n```python\n>>> run(1)\n```"
     )
-    page = api_pages.page()
-    names = [name for names in api_pages.GROUPS.values() for name in names]
-    assert [name for name in names if f"### `{name}`" not in page] == []
-    import mme_vla
-
-    assert [name for name in names if not api_pages.text_of(getattr(mme_vla, name))] == []
-
-
-def test_a_public_name_without_a_group_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(api_pages, "GROUPS", {**api_pages.GROUPS, "Mistakes": []})
-    with pytest.raises(ValueError, match="UserError"):
-        api_pages.page()
-
-
-def test_a_long_signature_has_a_line_for_each_argument() -> None:
-    call = (
-        "evaluate(policy: Policy, tasks: tuple[str, ...] = (), *, seed: int = 42, output: Path |"
-        " None = None) -> Run"
+    fields = "A struct.\n\nwidth: of a token.\ngrid: its side.\n    In tokens."
+    assert docstrings.rewritten(fields, names) == (
+        "A struct.\n\nAttributes:\n    width: of a token.\n    grid: its side. In tokens."
     )
-    assert api_pages.wrapped(call).splitlines() == [
-        "evaluate(",
-        "    policy: Policy,",
-        "    tasks: tuple[str, ...] = (),",
-        "    *,",
-        "    seed: int = 42,",
-        "    output: Path | None = None",
-        ") -> Run",
-    ]
-    assert api_pages.wrapped("act(episode: Episode)") == "act(episode: Episode)"
+    members = "It sets:\n    storage: what is stored.\n    other: the rest."
+    assert docstrings.rewritten(members, names) == (
+        "It sets:\n\n- `storage`: what is stored.\n- `other`: the rest."
+    )
 
 
 def test_every_file_of_the_top_level_configures_a_command() -> None:
@@ -95,6 +109,24 @@ def test_comments_become_markdown() -> None:
         config_pages.prose("train | val, `a|b` in <folder>, 2*3")
         == r"train \| val, `a\|b` in &lt;folder&gt;, 2\*3"
     )
+    assert config_pages.prose("such as {vlm: 0.1}") == "such as &#123;vlm: 0.1&#125;"
+    linked = config_pages.prose("see docs/train/weights.md#formats.", "reference/configuration")
+    assert linked == "see [Weights](../../train/weights.md#formats)."
+    assert config_pages.prose("docs/no/page.md") == "docs/no/page.md"
+    assert config_pages.code("outputs/${name}/${now:%Y}") == "`outputs/<name>/<now>`"
+
+
+def test_values_of_pages_do_not_break() -> None:
+    text = "49.17 ± 0.48, 63 %, 16 × 16, `1 % 2`\n\n```text\n3 %\n```"
+    assert hooks.unbroken(text) == text.replace("49.17 ± 0.48", "49.17\u00a0±\u00a00.48").replace(
+        "63 %", "63\u00a0%"
+    ).replace("16 × 16", "16\u00a0×\u00a016")
+
+
+def test_the_landing_page_has_the_first_table_of_the_readme() -> None:
+    table = hooks.headline()
+    assert table.startswith("| task |") and "](docs/" not in table
+    assert hooks.HEADLINE in (REPOSITORY / "docs" / "index.md").read_text()
 
 
 def test_each_command_has_a_page_with_its_options() -> None:
@@ -145,6 +177,9 @@ def test_a_notebook_is_shown_with_its_outputs(tmp_path: Path) -> None:
             "outputs": [
                 {"text": ["\x1b[1m1\x1b[0m\n"]},
                 {"data": {"image/png": "QUJD\n", "text/plain": ["<Figure>"]}},
+                {"data": {"text/html": ["<video src='a'>\n\n</video>"], "text/plain": "<v>"}},
+                {"data": {"text/markdown": ["| a |"], "text/plain": "<table>"}},
+                {"data": {"image/svg+xml": ["<svg/>"], "text/plain": "<s>"}},
             ],
         },
     ]
@@ -153,3 +188,6 @@ def test_a_notebook_is_shown_with_its_outputs(tmp_path: Path) -> None:
     page = notebook_pages.page(file)
     assert "# Title\n\n```python\nprint(1)\n```\n\n```text\n1\n```" in page
     assert 'src="data:image/png;base64,QUJD"' in page and "Figure" not in page
+    assert "<div class=\"output\"><video src='a'>\n</video></div>" in page
+    assert "| a |" in page and "data:image/svg+xml;base64,PHN2Zy8+" in page
+    assert "<v>" not in page and "<table>" not in page
