@@ -96,13 +96,15 @@ def test_the_documentation_workflow_builds_the_site() -> None:
     assert any(run.endswith("uv run --extra docs mme-vla docs --build") for run in runs)
 
 
-def test_the_test_workflow_runs_the_commands_of_the_readme() -> None:
-    readme = (REPOSITORY / "README.md").read_text()
-    commands = re.findall(
-        r"^((?:pip install uv && .*|)uv run (?:--group dev|python).*)$", readme, re.MULTILINE
-    )
-    assert len(commands) == 3
-    assert set(commands) <= set(steps("tests.yml"))
+def test_the_test_workflow_trains_and_runs_both_tiers() -> None:
+    runs = list(steps("tests.yml"))
+    assert any(run.endswith("python -m mme_vla.train model=tokendrop_expert") for run in runs)
+    content = yaml.safe_load((WORKFLOWS / "tests.yml").read_text())
+    assert content["jobs"]["test"]["strategy"]["matrix"]["tier"] == [
+        "not slow and not nightly",
+        "slow",
+    ]
+    assert all("timeout-minutes" in job for job in content["jobs"].values())
 
 
 def steps(workflow: str) -> list[str]:
@@ -115,7 +117,9 @@ def steps(workflow: str) -> list[str]:
     for job in jobs:
         assert all(set(step) & {"run", "uses"} for step in job["steps"])
         assert all(
-            re.fullmatch(r"[\w/-]+@v\d+", step["uses"]) for step in job["steps"] if "uses" in step
+            re.fullmatch(r"[\w/-]+@v\d+(\.\d+)*", step["uses"])
+            for step in job["steps"]
+            if "uses" in step
         )
     return [step["run"] for job in jobs for step in job["steps"] if "run" in step]
 
