@@ -51,8 +51,8 @@ EVALUATION = [
     ("policy/scheduler.py", "next_steps"), ("evaluation/records.py", "to_json"),
 ]  # fmt: skip
 """From the command line to the line of an episode's record. Beside it: what a terminal shows
-(`rollout/progress.py`), the run's receipt (`receipts.py`), and, where they are asked for, subgoals
-(`rollout/subgoals.py`) and videos (`rollout/video.py`).
+(`rollout/progress.py`), the run's receipt (`receipts.py`), and, where they are asked for, events
+(`rollout/events.py`), subgoals (`rollout/subgoals.py`) and videos (`rollout/video.py`).
 """
 ALONE = "README.md"
 QUESTIONS = (

@@ -39,7 +39,8 @@ from mme_vla.evaluation.rollout.evaluation import (
     facts_of,
     kind_section,
 )
-from mme_vla.evaluation.rollout.settings import RolloutSettings, event_arms
+from mme_vla.evaluation.rollout.events import event_arms
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import total_score
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import policy_config

@@ -20,7 +20,8 @@ from mme_vla.evaluation.rollout.evaluation import (
     facts_of,
     predictor_of,
 )
-from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings, event_arms
+from mme_vla.evaluation.rollout.events import event_arms
+from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings
 from mme_vla.policy.base import Policy
 from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.subgoal import SubgoalPredictor

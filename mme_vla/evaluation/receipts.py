@@ -20,7 +20,7 @@ from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, brief
 from mme_vla.evaluation.records import EpisodeRecord, count_outcomes
-from mme_vla.evaluation.rollout.settings import read_events
+from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.store import RUN_FILE, read_records, read_run
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE

@@ -41,7 +41,8 @@ from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import Interval, wilson
 from mme_vla.evaluation.rollout.episode import EventCourse
 from mme_vla.evaluation.rollout.evaluation import RunOptions, evaluate_events
-from mme_vla.evaluation.rollout.settings import RolloutSettings, event_arms, read_events
+from mme_vla.evaluation.rollout.events import event_arms, read_events
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.processing.normalise import NormStats
 from mme_vla.registry import PERTURBATIONS

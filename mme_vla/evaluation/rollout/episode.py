@@ -13,7 +13,7 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds
 from mme_vla.evaluation.rollout.environment import Observation, Report
-from mme_vla.evaluation.rollout.settings import Event
+from mme_vla.evaluation.rollout.events import Event
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.memory.perturbation import Perturbation
 from mme_vla.policy.base import Policy

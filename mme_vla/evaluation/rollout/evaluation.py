@@ -19,9 +19,10 @@ from mme_vla.errors import UserError
 from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
+from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Waiting, Workload
-from mme_vla.evaluation.rollout.settings import RolloutSettings, read_events
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import (
     INDIFFERENT,

@@ -15,7 +15,8 @@ import numpy as np
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.episode import RunningEpisode
-from mme_vla.evaluation.rollout.settings import RolloutSettings, read_events
+from mme_vla.evaluation.rollout.events import read_events
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.memory.base import union_frames
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor

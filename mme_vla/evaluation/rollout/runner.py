@@ -22,9 +22,10 @@ from mme_vla.errors import SceneError, UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.environment import Command
 from mme_vla.evaluation.rollout.episode import RunningEpisode
+from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.render_plan import RenderPlan
-from mme_vla.evaluation.rollout.settings import RolloutSettings, read_events
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy

@@ -30,8 +30,9 @@ from mme_vla.evaluation.rollout.evaluation import (
     facts_of,
     predictor_of,
 )
+from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.runner import RunFacts
-from mme_vla.evaluation.rollout.settings import RolloutSettings, event_arms
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RUN_FILE, claim_run, find_records, fingerprint, read_folders
 from mme_vla.extras.probing import lines
 from mme_vla.extras.probing.arms import UNPROBED, Arm, choose_arms, options_of, slug
