@@ -7,7 +7,17 @@ from difflib import get_close_matches
 class UserError(ValueError):
     """Something the user gave cannot work: the message names the value, what was expected, and what
     to do.
+
+    Values come from files of strangers, too: the middle of a message that is longer than
+    `LONGEST` characters is left out.
     """
+
+    LONGEST = 2000
+
+    def __init__(self, message: str = "") -> None:
+        if len(message) > self.LONGEST:
+            message = f"{message[: self.LONGEST - 500]} … {message[-400:]}"
+        super().__init__(message)
 
 
 class SceneError(RuntimeError):

@@ -260,7 +260,8 @@ class Restart(Perturbation):
 
 # The grammar --------------------------------------------------------------------------------------
 
-_WORD = re.compile(r"([A-Za-z]\w*)(?::(-?[\d.]+|all))?(?:@(\w+):(-?\d+))?")
+_NUMBER = r"-?(?:\d{1,15}(?:\.\d{0,15})?|\.\d{1,15})"
+_WORD = re.compile(rf"([A-Za-z]\w*)(?::({_NUMBER}|all))?(?:@(\w+):(-?\d{{1,15}}))?", re.ASCII)
 
 
 class Word(NamedTuple):
@@ -283,8 +284,6 @@ def split_word(text: str) -> Word | None:
     name, digits, unit, place = match.groups()
     value: float | int | None = None
     if digits is not None and digits != "all":
-        if digits.count(".") > 1:
-            return None
         value = float(digits) if "." in digits else int(digits)
     number = None if place is None else int(place)
     return Word(name, digits is not None, value, unit, number)

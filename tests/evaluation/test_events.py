@@ -476,3 +476,20 @@ def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task(
     ((subtask, steps, motion),) = holds
     assert paused.outcome == "timeout" and paused.steps > 150
     assert (subtask, steps) == (1, 30) and motion < 0.05
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "pause:.",
+        "pause:1.2.3",
+        "pause:-",
+        "pause:" + "9" * 5000,
+        "restart@step:" + "9" * 5000,
+        "pause:٥",
+    ],
+    ids=["point", "points", "sign", "digits", "digits of a place", "digits of another script"],
+)
+def test_a_number_that_cannot_be_read_is_refused_as_another_form(text: str) -> None:
+    with pytest.raises(UserError, match="write pause:100"):
+        read_events(text)

@@ -47,7 +47,7 @@ def read_event(text: str) -> Event:
         UserError: another form, an unknown event, a number that it does not take, or an unknown
             place.
     """
-    key = f"event={text}"
+    key = f"event={brief(text, quote=False)}"
     word = split_word(text)
     if word is None:
         raise UserError(f"{key}: {FORM}.")
