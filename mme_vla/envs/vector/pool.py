@@ -57,7 +57,7 @@ class Reply:
     reward: Any
     terminated: bool
     truncated: bool
-    info: dict[str, Any] | Any
+    info: Any
     """What the environment says: a dictionary, or the `Report` of a rollout's environment."""
     error: Exception | None = None
     """Why there is no result of the policy: the environment raised it, or the worker died or hung
