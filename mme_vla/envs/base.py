@@ -19,7 +19,7 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
-from mme_vla.errors import UserError, check_known, require
+from mme_vla.errors import check_known, listed, require
 from mme_vla.registry import ENVS
 
 Actions = Sequence[Any]
@@ -361,13 +361,12 @@ class EpisodeEnv:
         if self._frames == 0:
             require("state" in frame, f"{self.spec.task}: observations have no 'state'.")
             self._names = set(frame)
-        for name in sorted(self._names ^ set(frame)):
-            what = "state" if name == "state" else f"camera {name!r}"
-            have, other = ("lacks", "has") if name in self._names else ("has", "lacks")
-            raise UserError(
-                f"{self.spec.task}: frame {self._frames} of the episode {have} the {what}, which"
-                f" frame 0 {other}. Give the same cameras and the state in every observation."
-            )
+        place = f"{self.spec.task}: frame {self._frames} of the episode"
+        remedy = "Give the same cameras and the state in every observation."
+        missing = sorted(self._names - set(frame))
+        require(not missing, f"{place} lacks {listed(missing)}, which frame 0 has. {remedy}")
+        added = sorted(set(frame) - self._names)
+        require(not added, f"{place} has {listed(added)}, which frame 0 lacks. {remedy}")
         self._frames += 1
 
     def _info(self, info: Mapping[str, Any], terminated: bool, truncated: bool) -> dict[str, Any]:

@@ -123,9 +123,9 @@ class Flickering(Line):
 @pytest.mark.parametrize(
     ("name", "lacking", "message"),
     [
-        ("wrist", {2.0}, "frame 2 of the episode lacks the camera 'wrist', which frame 0 has"),
-        ("state", {2.0}, "frame 2 of the episode lacks the state, which frame 0 has"),
-        ("front", {0.0}, "frame 1 of the episode has the camera 'front', which frame 0 lacks"),
+        ("wrist", {2.0}, "frame 2 of the episode lacks wrist, which frame 0 has"),
+        ("state", {2.0}, "frame 2 of the episode lacks state, which frame 0 has"),
+        ("front", {0.0}, "frame 1 of the episode has front, which frame 0 lacks"),
         ("state", {0.0}, "observations have no 'state'"),
     ],
 )
