@@ -161,19 +161,27 @@ def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
     """
     root, fps, lengths = dataset.root, dataset.fps, dataset.lengths
     total = int(lengths.sum())
-    index = rows.get("episode_index", np.zeros(0))
-    # The sizes first: a damaged length may be larger than memory.
-    is_complete = len(index) == total
-    if is_complete:
-        is_complete = np.array_equal(index, np.repeat(np.arange(len(lengths)), lengths))
     require(
-        is_complete,
-        f"{root}: the tables hold {len(index)} rows where meta/episodes describes {total} in"
-        f" {len(lengths)} episodes (episode_index); the dataset is incomplete or mixed up. Copy,"
-        " download or convert it again.",
+        "episode_index" in rows,
+        f"{root}: not every file in data/ has the column episode_index, which LeRobot writes in"
+        f" every dataset. {REMEDY}",
     )
+    index = rows["episode_index"]
+    # Before anything of that size: a damaged length may be larger than memory.
+    require(
+        len(index) == total,
+        f"{root}: the tables hold {len(index)} rows where meta/episodes describes {total} in"
+        f" {len(lengths)} episodes; the dataset is incomplete or mixed up. {REMEDY}",
+    )
+    episodes = np.repeat(np.arange(len(lengths)), lengths)
+    row = _first(index != episodes)
+    if row is not None:
+        raise UserError(
+            f"{root}: row {row} has episode_index {index[row]}; by meta/episodes it is of episode"
+            f" {episodes[row]}. The dataset is incomplete or mixed up. {REMEDY}"
+        )
     places = np.arange(total)
-    frames = places - np.repeat(dataset.starts, lengths)
+    frames = places - dataset.starts[episodes]
     if "frame_index" in rows:
         row = _first(rows["frame_index"] != frames)
         if row is not None:

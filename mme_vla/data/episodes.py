@@ -147,7 +147,7 @@ class EpisodeSource:
         image_columns = tuple(dict.fromkeys(images))
         flags = ["is_demo", "exec_start_idx"]
         flags += [f"{camera}{RENDERED_SUFFIX}" for camera in self.columns]
-        rows = read_index_columns(self.root, [name for name in flags if name in features])
+        rows = read_index_columns(self.root, features, flags)
         self._table = open_table(self.root, columns, features)
         self.tasks = check_consistency(
             Description(self.root, info, self._episodes, video_columns, image_columns),

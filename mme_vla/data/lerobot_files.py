@@ -346,16 +346,18 @@ def parquet_files(root: Path, folder: str) -> list[Path]:
     numbers.
     """
 
-    def numbers(path: Path) -> tuple[list[int], str]:
+    def in_order(path: Path) -> list[str | int]:
         # file-1000 comes after file-999, where texts would put it after file-100
-        name = f"{path.parent.name}/{path.name}"
-        return [int(number) for number in re.findall(r"\d+", name)], name
+        parts: list[str | int] = []
+        for part in re.split(r"(\d+)", f"{path.parent.name}/{path.name}"):
+            parts.append(int(part) if part.isdecimal() else part)
+        return parts
 
     files = []
     for path in (root / folder).glob("*/*.parquet"):
         if not path.name.startswith(_HIDDEN):
             files.append(require_file(path, "a parquet table"))
-    return sorted(files, key=numbers)
+    return sorted(files, key=in_order)
 
 
 @dataclass(frozen=True)
@@ -523,29 +525,66 @@ INDEX_COLUMNS = ("episode_index", "frame_index", "timestamp", "index", "task_ind
 """What LeRobot writes of every row beside the recorded values."""
 
 
-def read_index_columns(root: Path, extra: Sequence[str] = ()) -> dict[str, np.ndarray]:
+def read_index_columns(
+    root: Path, features: Mapping[str, Feature], flags: Sequence[str] = ()
+) -> dict[str, np.ndarray]:
     """The columns that say which row is which, each [rows]: int64, and `timestamp` float64; those
     that all files have.
 
     Args:
-        extra: further columns of one whole number a row.
+        features: what info.json declares. flags: further columns of one whole number a row, read
+            where they are declared.
+
+    Raises:
+        UserError: a file lacks a declared flag, or a column holds something else than one number a
+            row.
     """
     import pyarrow as pa
+    import pyarrow.compute as pc
     import pyarrow.parquet as pq
+
+    declared = [name for name in flags if name in features]
+    for name in ("episode_index", *declared):
+        if name in features:
+            kind = features[name].dtype
+            require(
+                kind.startswith(("int", "uint", "bool")),
+                f"{root}: {name} is {brief(kind)}; expected whole numbers. {REMEDY}",
+            )
 
     files = parquet_files(root, "data")
     with decoding(root / "data", "tables of frames", REMEDY):
         opened = [pq.ParquetFile(file) for file in files]
         there = set.intersection(*(set(file.schema_arrow.names) for file in opened))
-        names = [name for name in (*INDEX_COLUMNS, *extra) if name in there]
+        names = [name for name in (*INDEX_COLUMNS, *declared) if name in there]
         table = pa.concat_tables([file.read(names) for file in opened])
+    lost = [name for name in declared if name not in there]
+    require(
+        not lost,
+        f"{root}: meta/info.json declares {listed(lost)}, which not every file in data/ has."
+        f" {REMEDY}",
+    )
+
     columns = {}
     for name in names:
         values = table[name]
-        require(not values.null_count, f"{root}: {values.null_count} rows have no {name}. {REMEDY}")
         with decoding(root / "data", f"numbers ({name})", REMEDY):
-            kind = pa.float64() if name == "timestamp" else pa.int64()
-            columns[name] = flat(values).cast(kind).to_numpy(zero_copy_only=False)
+            # One number may stand in a list of its own.
+            if pa.types.is_nested(values.type):
+                sizes = pc.list_value_length(values).fill_null(1)
+                require(
+                    pc.all(pc.equal(sizes, 1)).as_py(),
+                    f"{root}: {name} holds lists; expected one number a row. {REMEDY}",
+                )
+            numbers = flat(values)
+            missing = max(values.null_count, numbers.null_count)
+            require(not missing, f"{root}: {missing} rows have no {name}. {REMEDY}")
+            require(
+                len(numbers) == table.num_rows,
+                f"{root}: {name} has {len(numbers)} numbers in {table.num_rows} rows. {REMEDY}",
+            )
+            target = pa.float64() if name == "timestamp" else pa.int64()
+            columns[name] = numbers.cast(target).to_numpy(zero_copy_only=False)
     return columns
 
 

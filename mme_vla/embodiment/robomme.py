@@ -76,7 +76,9 @@ def benchmark_action(
         letter = ascii_uppercase[int(np.argmax(action[list(space.choice)]))]
         point = [float(share) * SIDE for share in action[list(space.point)]]
         return {"choice": letter, "point": point}
-    return action[:-1] if stick else action
+    # A policy may return more numbers than the robot has.
+    width = space.width - 1 if stick else space.width
+    return action[:width]
 
 
 def choice_row(letter: str, point: Sequence[float]) -> np.ndarray:

@@ -19,7 +19,7 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
-from mme_vla.errors import check_known, require
+from mme_vla.errors import check_known, listed, require
 from mme_vla.registry import ENVS
 
 Actions = Sequence[Any]
@@ -255,6 +255,8 @@ class EpisodeEnv:
         self._steps = 0
         self._limit = max_steps
         self._choices: dict[str, Actions] = {}
+        self._frames = 0  # seen since the reset
+        self._names: set[str] = set()  # of what the first of them holds
         self.scene_digest = NOT_BUILT
 
     def reset(self) -> tuple[dict[str, list[Any]], dict[str, Any]]:
@@ -265,6 +267,7 @@ class EpisodeEnv:
             f"{self.spec.task}: reset() must return the goal in info['goal'].",
         )
         self.goal = info["goal"]
+        self._frames = 0
         self._steps = 0
         self._limit = self.max_steps
         values = self.environment.scene_values(self.env)
@@ -338,8 +341,12 @@ class EpisodeEnv:
                 return
 
     def _lists(self, frames: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+        """The values of frames by their names; every frame of an episode must have all of them, or
+        images would be of other frames than states.
+        """
         lists: dict[str, list[Any]] = {"state_list": []}
         for frame in frames:
+            self._check_frame(frame)
             for name, value in frame.items():
                 if name == "state":
                     lists["state_list"].append(np.asarray(value, np.float32))
@@ -349,6 +356,18 @@ class EpisodeEnv:
             first_camera = next(images for name, images in lists.items() if name != "state_list")
             lists.setdefault("front_rgb_list", first_camera)  # what `play` shows
         return lists
+
+    def _check_frame(self, frame: Mapping[str, Any]) -> None:
+        if self._frames == 0:
+            require("state" in frame, f"{self.spec.task}: observations have no 'state'.")
+            self._names = set(frame)
+        place = f"{self.spec.task}: frame {self._frames} of the episode"
+        remedy = "Give the same cameras and the state in every observation."
+        missing = sorted(self._names - set(frame))
+        require(not missing, f"{place} lacks {listed(missing)}, which frame 0 has. {remedy}")
+        added = sorted(set(frame) - self._names)
+        require(not added, f"{place} has {listed(added)}, which frame 0 lacks. {remedy}")
+        self._frames += 1
 
     def _info(self, info: Mapping[str, Any], terminated: bool, truncated: bool) -> dict[str, Any]:
         report: dict[str, Any] = {

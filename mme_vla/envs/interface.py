@@ -306,14 +306,13 @@ class RoboMMEEnv(gymnasium.Env):
         grounded = request is None or request.grounded
         hidden = RenderRequest({}, now=(), grounded=grounded)
         newest = RenderRequest({}, grounded=grounded)
-        # What is rendered of the reset and of each action: the newest frame is the last one's.
-        requests = [hidden] * len(state.actions) + [newest]
         self.on_frame = None
         try:
-            self.render_request = requests[0]
+            # The newest frame is the last action's, without one the reset's.
+            self.render_request = hidden if state.actions else newest
             observation, info = self.reset(options=state.options)
-            for action, rendered in zip(state.actions, requests[1:], strict=True):
-                self.render_request = rendered
+            for number, action in enumerate(state.actions, start=1):
+                self.render_request = hidden if number < len(state.actions) else newest
                 observation, _, _, _, info = self.step(action)
         finally:
             self.on_frame = hook

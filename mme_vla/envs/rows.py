@@ -75,9 +75,10 @@ def _ood() -> dict[str, list[Row]]:
 @cache
 def _read_file(path: str, modified: int, known: tuple[str, ...]) -> dict[str, list[Row]]:
     """Rows by task. modified: time of the last change, so that a changed file is read again."""
+    text = read_text(Path(path), "scenes").replace("\r\n", "\n").replace("\r", "\n")
     rows = []
     # Not splitlines(): the values may hold other separators of lines.
-    for number, line in enumerate(read_text(Path(path), "scenes").split("\n"), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if line.strip():
             where = f"{path}, line {number}"
             rows.append(check_row(parse_json(line, where, object), where, known))
@@ -135,13 +136,18 @@ def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
     return row | {"where": where}
 
 
-class TaskOptions(TypedDict, total=False):
-    """Keyword arguments of a task that make a scene (`envs/task.py`)."""
+class SceneOptions(TypedDict, total=False):
+    """Keyword arguments of `make_env` that choose a scene."""
 
     seed: int
     difficulty: str | None
     recovery: str | None
     row: Mapping[str, Any]
+
+
+class TaskOptions(SceneOptions, total=False):
+    """Keyword arguments of a task that make a scene (`envs/task.py`)."""
+
     in_view: bool
     stress: Mapping[str, int]
 

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple, NotRequired, TypedDict
 
 from pydantic import StrictInt
 
@@ -119,6 +119,7 @@ class _Receipt(TypedDict):
     settings: _Settings
     conditions: list[_Conditions]
     records: dict[str, str | None]
+    scenes: NotRequired[str]
     score: dict[str, Any]
 
 
@@ -204,7 +205,8 @@ def receipt(
 
     def write() -> None:
         done = read_records(records) if records.exists() else []
-        write_json(path, with_checksum(to_json(facts | _score(records, done))))
+        score = _score(records, done, run["settings"])
+        write_json(path, with_checksum(to_json(facts | score)))
 
     write()  # before as well: a process that is killed has named its conditions
     try:
@@ -258,8 +260,11 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
             result.differences.append(missing)
         for file in present[:1]:
             records = read_records(file)
-            for key, value in to_json(_score(file, records)).items():
-                result.compare(key, content.get(key, {}), value)
+            for key, value in to_json(_score(file, records, content["settings"])).items():
+                if key == "scenes" and key not in content:
+                    result.not_compared.append("scenes: the receipt does not name them.")
+                else:
+                    result.compare(key, content.get(key, {}), value)
             _compare_records(result, records, content)
             _compare_scenes(result, records, content, build)
 
@@ -271,21 +276,30 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
 # The records --------------------------------------------------------------------------------------
 
 
-def _score(path: Path, records: Sequence[EpisodeRecord]) -> dict[str, Any]:
-    """Outcomes of each task, the digest of the file of records, uncompressed, and the digests of
-    the scenes that were built.
+def _score(
+    path: Path, records: Sequence[EpisodeRecord], settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Outcomes of each task, and digests: of the file of records, uncompressed, of the choice of
+    scenes (a file of scenes counts with its content) and of every scene that was built.
     """
     digest_of_file = None
     if path.exists():
         digest_of_file = hashlib.sha256(read_unpacked(path, "episode records")).hexdigest()
+    split = str(settings.get("split"))
+    if Path(split).is_file():
+        split = file_sum(Path(split))
+    seeds: dict[str, list[Any]] = {}
     scenes: dict[str, str] = {}
     tasks: dict[str, list[EpisodeRecord]] = {}
     for record in records:
+        name = f"{record.task} {record.episode}"
+        seeds[name] = [record.seed, record.difficulty]
         tasks.setdefault(record.task, []).append(record)
         if record.scene:
-            scenes[f"{record.task} {record.episode}"] = record.scene
+            scenes[name] = record.scene
     return {
         "records": {"file": path.name.removesuffix(".xz"), "sha256": digest_of_file},
+        "scenes": digest({"split": split, "scenes": seeds}, 64),
         "scene_digests": scenes,
         "score": {task: count_outcomes(members) for task, members in tasks.items()},
     }

@@ -342,13 +342,16 @@ class Claims:
         """Write a claim; False where another process was first, whose claim is noted."""
         path = self.folder / CLAIMS / f"{quote(key.task, safe='')}-{key.episode}.{number}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            _write_new(path, json.dumps(asdict(claim)) + "\n")
-        except FileExistsError:
-            self._newest[key] = number, _read_claim(path)
-            return False
+        is_first = not path.exists()  # a look costs less than a draft that is not needed
+        if is_first:
+            try:
+                _write_new(path, json.dumps(asdict(claim)) + "\n")
+            except FileExistsError:
+                is_first = False
+        if not is_first:
+            claim = _read_claim(path)
         self._newest[key] = number, claim
-        return True
+        return is_first
 
 
 def _read_claim(path: Path) -> Claim:

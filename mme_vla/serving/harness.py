@@ -173,6 +173,11 @@ class MMEVLAModelServer(PredictModelServer):
     def _caught_up(self, obs: dict[str, Any], ctx: SessionContext) -> Episode:
         """A session's episode, after it has taken the frames since its last chunk."""
         running = self.sessions[ctx.session_id]
+        # Taken out first: frames that cannot be read must not come back with the next call.
+        frames = running.images
+        states = running.states
+        running.images = []
+        running.states = []
         episode = running.episode
         episode.goal = str(obs["task_description"])
         episode.subgoal = obs.get("subgoal") or None
@@ -180,11 +185,9 @@ class MMEVLAModelServer(PredictModelServer):
         if video is not None and len(video):
             episode.add_frames(np.stack(video), is_demo=True)
         views = {}
-        for name in running.images[0]:
-            views[name] = np.stack([images[name] for images in running.images])
-        episode.observe(views, np.stack(running.states))
-        running.images.clear()
-        running.states.clear()
+        for name in frames[0]:
+            views[name] = np.stack([images[name] for images in frames])
+        episode.observe(views, np.stack(states))
         return episode
 
 

@@ -87,6 +87,7 @@ class Window:
             average = total / self._counts[name]
             if isinstance(average, Tensor):
                 measured[f"train/{name}"] = average
+                values[f"train/{name}"] = math.nan  # its place in the order; the number is below
             else:
                 values[f"train/{name}"] = average
         # One transfer from the device for all of them.

@@ -58,5 +58,5 @@ def read_torch_file(path: Path, mapped: bool = False) -> dict[str, Tensor]:
         else:
             tensors[str(name)] = value
     if not tensors or not all(isinstance(value, Tensor) for value in tensors.values()):
-        raise UserError(f"{path} holds no table of tensors, but {listed(content)}.")
+        raise UserError(f"{path} holds no table of tensors, but {listed(tensors or content)}.")
     return tensors

@@ -32,7 +32,14 @@ from helpers.lerobot_tables import (
     write_video,
 )
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.lerobot_files import SAMPLE, EpisodeTable, Feature, Info, content_fingerprint
+from mme_vla.data.lerobot_files import (
+    SAMPLE,
+    EpisodeTable,
+    Feature,
+    Info,
+    content_fingerprint,
+    parquet_files,
+)
 from mme_vla.data.sources import open_sources
 from mme_vla.errors import UserError
 
@@ -569,6 +576,14 @@ def test_files_are_ordered_by_their_numbers(tmp_path: Path, folder: str) -> None
     assert frames_read(source, 1) == [5, 6, 7, 8]
 
 
+def test_words_in_the_names_of_files_come_before_their_numbers(tmp_path: Path) -> None:
+    names = ["a-9/file-000", "a-10/file-000", "b-1/file-2", "b-1/file-10", "c/file-000"]
+    for name in names:
+        table(tmp_path / "data" / f"{name}.parquet", {"index": [0]})
+    read = [path.relative_to(tmp_path / "data") for path in parquet_files(tmp_path, "data")]
+    assert [path.with_suffix("").as_posix() for path in read] == names
+
+
 def whole_state(root: Path, folder: str) -> list[float]:
     file = root / ("data/chunk-999/file-999.parquet" if folder == "data" else ROWS)
     return list(pq.ParquetFile(file).read()["observation.state"][0].as_py())
@@ -588,6 +603,65 @@ def test_a_missing_column_is_named_and_not_called_damage(tmp_path: Path) -> None
     with pytest.raises(UserError, match=r"lacks videos/observation.images.top/file_index") as error:
         opened(tmp_path)
     assert "damaged" not in str(error.value)
+
+
+def test_rows_without_the_number_of_their_episode_are_refused(tmp_path: Path) -> None:
+    change(write_dataset(tmp_path), ROWS, "episode_index", None)
+    with pytest.raises(UserError, match="has the column episode_index"):
+        opened(tmp_path)
+
+
+def test_rows_of_other_episodes_than_described_are_named(tmp_path: Path) -> None:
+    change(write_dataset(tmp_path), ROWS, "episode_index", [0, 0, 0, 0, 1, 1, 1, 1, 1])
+    with pytest.raises(UserError, match=r"row 4 has episode_index 1; by .* of episode 0"):
+        opened(tmp_path)
+
+
+def declare(root: Path, name: str, dtype: str = "bool") -> None:
+    feature = {"dtype": dtype, "shape": [1], "names": None}
+    change_info(root, lambda info: info["features"].update({name: feature}))
+
+
+@pytest.mark.parametrize("flag", ["is_demo", "exec_start_idx", "top_drawn"])
+def test_a_declared_flag_that_one_file_lacks_is_named(tmp_path: Path, flag: str) -> None:
+    change(write_dataset(tmp_path), ROWS, flag, [0] * 9)
+    declare(tmp_path, flag, "int64")
+    opened(tmp_path)
+    whole = pq.ParquetFile(tmp_path / ROWS).read()
+    pq.write_table(whole.slice(0, 5), tmp_path / ROWS)
+    other = tmp_path / ROWS.replace("file-000", "file-001")
+    pq.write_table(whole.slice(5).drop_columns([flag]), other)
+    with pytest.raises(UserError, match=f"declares {flag}, which not every file in data/ has"):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize("flag", ["is_demo", "exec_start_idx", "top_drawn"])
+@pytest.mark.parametrize(
+    ("cells", "message"),
+    [
+        ([[0, 0], [], *[[0]] * 7], "holds lists; expected one number a row"),
+        ([[0, 0]] * 9, "holds lists; expected one number a row"),
+        ([[None], *[[0]] * 8], "1 rows have no"),
+        (["yes"] * 9, "cannot be read as numbers"),
+        ([0.5] * 9, "cannot be read as numbers"),
+    ],
+)
+def test_a_flag_of_another_form_than_one_number_a_row_is_refused(
+    tmp_path: Path, flag: str, cells: list[Any], message: str
+) -> None:
+    change(write_dataset(tmp_path), ROWS, flag, cells)
+    declare(tmp_path, flag)
+    with pytest.raises(UserError, match=message):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["is_demo", "exec_start_idx", "top_drawn", "episode_index"])
+def test_a_flag_declared_as_another_type_than_whole_numbers_is_refused(
+    tmp_path: Path, name: str
+) -> None:
+    declare(write_dataset(tmp_path), name, "float32")
+    with pytest.raises(UserError, match=f"{name} is 'float32'; expected whole numbers"):
+        opened(tmp_path)
 
 
 @pytest.mark.parametrize("video", [False, True])

@@ -46,6 +46,13 @@ def test_a_choice_survives_the_way_through_the_robots_numbers() -> None:
         assert action == {"choice": letter.upper(), "point": pytest.approx(point or [128, 128])}
 
 
+@pytest.mark.parametrize(("stick", "width"), [(False, 8), (True, 7)])
+def test_numbers_beyond_the_robots_do_not_reach_the_environment(stick: bool, width: int) -> None:
+    joints = robomme_robot("robomme_joint").action
+    action = benchmark_action(joints, np.arange(32.0), stick)
+    assert isinstance(action, np.ndarray) and action.tolist() == [*range(width)]
+
+
 def test_the_best_of_the_offered_letters_is_taken_and_no_other() -> None:
     scores = torch.zeros(2, 10)
     scores[0, [1, 3, 6]] = torch.tensor([0.2, 0.4, 0.9])

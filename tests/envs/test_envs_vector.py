@@ -15,6 +15,8 @@ import pytest
 
 from helpers.env_fakes import FRAME, make_light_env
 from mme_vla.envs import VecEnv, make_vec_env
+from mme_vla.envs.base import Environment
+from mme_vla.envs.vector import pool
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.envs.vector.worker import _portable, begin, settings, simulating_processes
 from mme_vla.errors import SceneError, UserError
@@ -233,6 +235,28 @@ def test_unknown_names_are_refused_before_any_process_starts(
     monkeypatch.setattr("mme_vla.envs.make.require_simulator", lambda: None)
     with pytest.raises(UserError, match=words):
         make_vec_env(**arguments)
+
+
+def test_the_choice_of_a_scene_reaches_the_environments(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    monkeypatch.setattr("mme_vla.envs.make.require_simulator", lambda: None)
+    monkeypatch.setattr(pool, "VecEnv", lambda jobs, workers, make, timeout: made.append(make))
+    make_vec_env("StopCube", [0], seed=3, difficulty="easy", recovery="z")
+    row = {"task": "StopCube", "spec": {}}
+    make_vec_env("StopCube", [0], row=row)
+    assert {"seed": 3, "difficulty": "easy", "recovery": "z"}.items() <= made[0].keywords.items()
+    assert made[1].keywords["row"] is row
+    with pytest.raises(UserError, match="A difficulty needs a seed"):
+        make_vec_env("StopCube", [0], difficulty="easy")
+
+
+def test_an_environment_of_ones_own_has_no_options_of_robommes_scenes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pool, "environment", lambda name: Environment)
+    monkeypatch.setattr(Environment, "check_installed", lambda: None)
+    with pytest.raises(UserError, match=r"env=own takes no reward, .*recovery.*: they are for"):
+        make_vec_env("Own", [0], env="own", recovery="z")
 
 
 def test_real_environments_run_in_workers() -> None:

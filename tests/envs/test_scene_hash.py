@@ -105,6 +105,42 @@ def test_an_environment_with_values_is_named_by_those_of_its_reset() -> None:
     assert isinstance(env, EpisodeEnv)
 
 
+class Flickering(Line):
+    """Its frames lack a part at some places."""
+
+    def __init__(self, name: str, lacking: set[float]) -> None:
+        self.name = name
+        self.lacking = lacking
+
+    def _frame(self) -> dict[str, Any]:
+        image = np.zeros((2, 2, 3), np.uint8)
+        frame = super()._frame() | {"front": image, "wrist": image}
+        if self.place in self.lacking:
+            frame.pop(self.name)
+        return frame
+
+
+@pytest.mark.parametrize(
+    ("name", "lacking", "message"),
+    [
+        ("wrist", {2.0}, "frame 2 of the episode lacks wrist, which frame 0 has"),
+        ("state", {2.0}, "frame 2 of the episode lacks state, which frame 0 has"),
+        ("front", {0.0}, "frame 1 of the episode has front, which frame 0 lacks"),
+        ("state", {0.0}, "observations have no 'state'"),
+    ],
+)
+def test_frames_of_one_episode_have_the_same_cameras_and_the_state(
+    name: str, lacking: set[float], message: str
+) -> None:
+    env = EpisodeEnv(
+        Lines(), Flickering(name, lacking), EpisodeSpec("Line", "test", 0, 0, "easy"), 9
+    )
+    with pytest.raises(UserError, match=message):
+        env.reset()
+        env.step(None)
+        env.step(None)
+
+
 # The benchmark ------------------------------------------------------------------------------------
 
 

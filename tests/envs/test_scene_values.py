@@ -250,3 +250,11 @@ def test_a_bad_line_is_refused_when_the_file_is_read(
     path.write_text(line + "\n")
     with pytest.raises(UserError, match=message):
         metadata.episodes("PickXtimes", str(path))
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_lines_of_scenes_may_end_as_on_any_system(tmp_path: Path, end: str) -> None:
+    line = '{"task": "PickXtimes", "spec": {}, "tier": "a\u2028b"}'
+    path = tmp_path / "scenes.jsonl"
+    path.write_bytes(f"{line}{end}{line}{end}".encode())
+    assert len(metadata.episodes("PickXtimes", str(path))) == 2

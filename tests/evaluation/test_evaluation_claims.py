@@ -64,6 +64,16 @@ def test_each_episode_is_taken_once(tmp_path: Path) -> None:
         assert first.take(JOBS) is None and second.take(JOBS) is None
 
 
+def test_no_draft_is_written_where_another_claim_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = Claims(tmp_path, "episodes-0of2.jsonl"), Claims(tmp_path, "episodes-1of2.jsonl")
+    with RecordLog(tmp_path / "episodes-0of2.jsonl"):
+        assert taken(first.take(JOBS[:1])) == 0
+        monkeypatch.setattr(store, "_write_new", lambda path, text: pytest.fail("was written"))
+        assert second.take(JOBS[:1]) is None
+
+
 @pytest.mark.slow
 def test_unfinished_episodes_of_a_killed_process_are_taken_again(tmp_path: Path) -> None:
     process = subprocess.Popen(

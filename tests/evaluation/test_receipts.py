@@ -148,7 +148,9 @@ def test_changed_records_scenes_and_receipts_are_named(checkpoint: Path, tmp_pat
     records.write_text("\n".join([json.dumps(changed), *lines[1:]]) + "\n")
     differences, *_ = receipts.verify(path)
     starts = [line.split(":")[0] for line in differences]
-    assert {"records.sha256", "score.VideoUnmask.success", "scene VideoUnmask 0"} <= set(starts)
+    assert {"records.sha256", "score.VideoUnmask.success", "scenes", "scene VideoUnmask 0"} <= set(
+        starts
+    )
     other = tmp_path / "receipt-of-something-else.json"
     other.write_text(json.dumps({"settings": {}}))
     with pytest.raises(
@@ -208,8 +210,13 @@ def rewrite_records(path: Path, **fields: Any) -> None:
         for line in records.read_text().splitlines()
     ]
     records.write_text("".join(line.to_json() + "\n" for line in lines))
-    score = to_json(receipts._score(records, read_records(records)))
-    rewrite(path, lambda content: content.update(score))
+    done = read_records(records)
+    rewrite(
+        path,
+        lambda content: content.update(
+            to_json(receipts._score(records, done, content["settings"]))
+        ),
+    )
 
 
 def first(content: dict[str, Any]) -> dict[str, Any]:
@@ -249,6 +256,7 @@ ABSENCES: dict[str, tuple[Callable[[dict[str, Any]], object], set[str]]] = {
     "no PyTorch": (lambda c: first(c)["libraries"].pop("torch"), {"libraries.torch"}),
     "no renderer": (lambda c: first(c).pop("renderer"), {"renderer"}),
     "no hardware": (lambda c: first(c).update(hardware={}), {"hardware.cpu"}),
+    "no scenes": (lambda c: c.pop("scenes"), {"scenes"}),
     "no file of records": (lambda c: c.update(records={}), {"records"}),
 }
 
@@ -304,6 +312,23 @@ def test_tasks_that_are_not_here_are_not_compared(finished: Path) -> None:
 
 
 # Records that contradict their settings, and other scenes -----------------------------------------
+
+
+def test_a_changed_file_of_scenes_is_noticed_without_building_any(
+    finished: Path, tmp_path: Path
+) -> None:
+    scenes = tmp_path / "scenes.jsonl"
+    scenes.write_text("{}\n")
+    rewrite(finished, lambda content: content["settings"].update(split=str(scenes)))
+    rewrite_records(finished)
+    assert not differing(finished, "scenes")
+    scenes.write_text("{ }\n")
+    assert differing(finished, "scenes")
+
+
+def differing(path: Path, name: str) -> bool:
+    lines = receipts.verify(path, build=False).differences
+    return any(line.startswith(f"{name}:") for line in lines)
 
 
 def test_another_scene_of_the_same_seed_is_noticed(finished: Path) -> None:
@@ -424,6 +449,7 @@ def test_names_that_lead_outside_are_refused(
         lambda c: c["settings"].update(max_steps="1300"),
         lambda c: c["settings"].update(subgoal="oracle"),
         lambda c: c["records"].update(file=5),
+        lambda c: c.update(scenes=5),
         lambda c: first(c).update(hardware="x"),
         lambda c: first(c)["checkpoint"].update(folder=5),
         lambda c: first(c)["checkpoint"].update(files=["x"]),

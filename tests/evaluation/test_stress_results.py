@@ -27,6 +27,13 @@ def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
     assert mine[0].interval.low < 100 == mine[0].interval.high and len(stress_figures(curves)) == 1
 
 
+def test_runs_are_drawn_in_the_order_of_their_records() -> None:
+    made = [record for run in "zab" for record in records("stress:count=2", [1, 0], run)]
+    (figure,) = stress_figures(stress_curves(made)).values()
+    places = [figure.index(f">{run}") for run in "zab"]
+    assert places == sorted(places)
+
+
 def test_the_command_saves_the_curve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, made in (("a", records("test", [1, 0])), ("b", records("stress:count=3", [0, 0]))):
         save_records(tmp_path / name, made)

@@ -5,6 +5,7 @@ the policy's.
 import asyncio
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -168,6 +169,24 @@ def test_an_observation_without_images_ends_its_episode_alone(policy: MMEPolicy)
     failing = Scripted(1, fails_at=4)
     with pytest.raises(ModelActError, match="lacks agentview, wrist, states"):
         through_the_harness(policy, [failing])
+
+
+def test_frames_that_cannot_be_read_are_not_read_again(policy: MMEPolicy) -> None:
+    server = MMEVLAModelServer(policy)
+    running = harness.Running(policy.start_episode("", seed=42))
+    server.sessions["one"] = running
+    context: Any = SimpleNamespace(session_id="one")
+    words = {"task_description": "touch"}
+    for side in (256, 128):
+        image = np.zeros((side, side, 3), np.uint8)
+        running.images.append({"front": image, "wrist": image})
+        running.states.append(np.zeros(8, np.float32))
+    with pytest.raises(ValueError, match="same shape"):
+        server._caught_up(words, context)
+
+    running.images.append({"front": image, "wrist": image})
+    running.states.append(np.zeros(8, np.float32))
+    assert server._caught_up(words, context) is running.episode
 
 
 def test_no_page_of_a_browser_is_served_and_no_message_above_the_limit(

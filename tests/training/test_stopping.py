@@ -106,3 +106,10 @@ def test_a_number_is_averaged_over_the_updates_that_report_it() -> None:
     values = window.close(2, lambda x, reduction: x)
     assert values["train/loss"] == 2
     assert values["train/memory/rate"] == 0.5
+
+
+def test_numbers_keep_the_order_in_which_updates_report_them() -> None:
+    window = Window(batch_size=1)
+    window.add({"loss": torch.tensor(1.0), "lr": 0.5, "grad_norm": torch.tensor(2.0)})
+    values = window.close(1, lambda x, reduction: x)
+    assert [*values.items()][:3] == [("train/loss", 1), ("train/lr", 0.5), ("train/grad_norm", 2)]

@@ -45,6 +45,12 @@ def test_both_layouts_are_read(tmp_path: Path) -> None:
             assert set(tensors) == {"a.weight", "a.bias"} and tensors["a.weight"].sum() == 12
 
 
+def test_what_is_no_tensor_is_named_with_the_part_it_is_of(tmp_path: Path) -> None:
+    torch.save({"a": {"step": 3}, "b": {"rate": 0.5}}, tmp_path / "w.pth")
+    with pytest.raises(UserError, match=r"no table of tensors, but a\.step, b\.rate"):
+        read_torch_file(tmp_path / "w.pth")
+
+
 @pytest.mark.parametrize("read", [read_torch_file, open_source])
 @pytest.mark.parametrize(
     "damage",

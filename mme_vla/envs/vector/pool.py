@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import wait
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -28,9 +28,10 @@ from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.base import environment, open_episode
 from mme_vla.envs.make import ROBOMME, check_names, make_env
 from mme_vla.envs.observations import Include, RenderRequest
+from mme_vla.envs.rows import SceneOptions
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import require
+from mme_vla.errors import listed, require
 from mme_vla.utils.processes import signals_deferred
 
 
@@ -57,7 +58,7 @@ class Reply:
     terminated: bool
     truncated: bool
     info: Any
-    """What the environment says: a dictionary, or a report with a `status`."""
+    """What the environment says: a dictionary, or the `Report` of a rollout's environment."""
     error: Exception | None = None
     """Why there is no result of the policy: the environment raised it, or the worker died or hung
     and was replaced.
@@ -71,8 +72,11 @@ class Reply:
     @property
     def done(self) -> bool:
         """Whether the episode is over."""
-        status = self.info.get("status") if isinstance(self.info, dict) else self.info.status
-        return self.terminated or self.truncated or status == "error"
+        if self.terminated or self.truncated:
+            return True
+        if isinstance(self.info, dict):
+            return self.info.get("status") == "error"
+        return self.info.status == "error"
 
     @classmethod
     def of_outcome(cls, worker: int, job: Job, resetting: bool, outcome: tuple) -> "Reply":
@@ -350,6 +354,7 @@ def make_vec_env(
     include: Include | None = None,
     timeout: float = 600.0,
     env: str = ROBOMME,
+    **scene: Unpack[SceneOptions],
 ) -> VecEnv:
     """Environments for all given episodes of all given tasks.
 
@@ -362,6 +367,7 @@ def make_vec_env(
             RoboMME alone.
         timeout: seconds after which a command without result counts as hung.
         env: the environment whose tasks these are.
+        scene: `seed`, `difficulty`, `recovery` and `row` of `make_env`, for RoboMME alone.
     """
     names = [tasks] if isinstance(tasks, str) else list(tasks)
     require(names, "No task given; expected a task name or several.")
@@ -369,14 +375,15 @@ def make_vec_env(
     source.check_installed()
     # A process would end with a traceback.
     require(
-        env == ROBOMME or (reward == "none" and include is None),
-        f"env={env} takes no reward and no include: they are for env={ROBOMME}.",
+        env == ROBOMME or (reward == "none" and include is None and not scene),
+        f"env={env} takes no reward, include, {listed(SceneOptions.__annotations__)}: they are for"
+        f" env={ROBOMME}.",
     )
     chosen = None if episodes is None else list(episodes)
     jobs = []
     for name in names:
         if env == ROBOMME:
-            check_names(name, action_space, None, None)
+            check_names(name, action_space, scene.get("difficulty"), scene.get("seed"))
         numbers = chosen
         if numbers is None:
             numbers = list(range(len(source.episodes(name, split))))
@@ -393,5 +400,6 @@ def make_vec_env(
             render=render,
             reward=reward,
             include=include,
+            **scene,
         )
     return VecEnv(jobs, workers, make, timeout)

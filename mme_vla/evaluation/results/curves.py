@@ -154,9 +154,11 @@ def stress_table(curves: Curves, title: str = "Success over the dials") -> Table
 def stress_figures(curves: Curves, unit: str = "more than in the benchmark") -> dict[str, str]:
     """For each task and dial a curve of every run, as SVG."""
     groups: dict[tuple[str, str], dict[str, list[tuple[float, float, Interval]]]] = {}
-    for (run, task, dial), points in sorted(curves.items()):
-        runs = groups.setdefault((task, dial), {})
-        runs[run] = [(point.turned, point.rate, point.interval) for point in points]
+    for _, task, dial in sorted(curves):
+        groups[task, dial] = {}
+    # Runs keep the order of the records, and with it their colours.
+    for (run, task, dial), points in curves.items():
+        groups[task, dial][run] = [(point.turned, point.rate, point.interval) for point in points]
     figures = {}
     for (task, dial), runs in groups.items():
         figures[f"{task}, {dial}"] = curve_figure(runs, f"{dial}: {unit}")
