@@ -198,8 +198,8 @@ class Pi05Backbone(
         """Integrate the flow from noise to a chunk [b, h, a], in `steps` Euler steps (10 by
         default).
 
-        All that does not depend on the flow time is computed once: keys and values of the prefix and
-        of the modulator, and every layer's time modulation. A step runs the action block alone.
+        All that does not depend on the flow time is computed once: keys and values of the prefix
+        and of the modulator, and every layer's time modulation. A step runs the action block alone.
         Memory tokens are encoded before, by the model or the policy.
         """
         steps = self.head.steps if steps is None else steps
