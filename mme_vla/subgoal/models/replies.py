@@ -59,8 +59,11 @@ def _reply_of(stored: dict[str, Any], path: Path) -> Reply:
     A model's text may hold half characters, which no section of a configuration may.
     """
     text = stored.get("text")
-    counts = [stored.get("input_tokens"), stored.get("output_tokens")]
-    for count in counts:
-        if type(count) is not int or not 0 <= count < MOST_TOKENS or not isinstance(text, str):
-            raise UserError(f"{path} lacks a text and two numbers of tokens.")
+    counts: list[int] = []
+    for key in ("input_tokens", "output_tokens"):
+        count = stored.get(key)
+        if type(count) is int and 0 <= count < MOST_TOKENS:
+            counts.append(count)
+    if not isinstance(text, str) or len(counts) != 2:
+        raise UserError(f"{path} lacks a text and two numbers of tokens.")
     return Reply(text, *counts)
