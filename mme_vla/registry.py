@@ -217,7 +217,15 @@ class Registry[T]:
         Args:
             section: `name`, and the options. args, fixed: what the caller adds; no option may say
                 the same.
+
+        Raises:
+            UserError: the section is no mapping, its name is unknown, or the constructor does not
+                take its options.
         """
+        require(
+            isinstance(section, Mapping),
+            f"The section of the {self.kind} must be a section of keys, got {brief(section)}.",
+        )
         options = dict(section)
         name = options.pop("name", None)
         if not isinstance(name, str):

@@ -209,12 +209,13 @@ def report(done: Evaluation, output: Path) -> None:
     if is_scored:
         columns += ["right subgoals", "points off by"]
     table = Table(*columns)
-    rows: dict[str, list[EpisodeRecord]] = {}
+    by_task: dict[str, list[EpisodeRecord]] = {}
     for record in done.records:
-        rows.setdefault(record.task, []).append(record)
+        by_task.setdefault(record.task, []).append(record)
+    rows = list(by_task.items())
     if len(rows) > 1:
-        rows["all"] = list(done.records)
-    for task, records in rows.items():
+        rows.append(("all", list(done.records)))  # beside a task that may have this name
+    for task, records in rows:
         counts = count_outcomes(records)
         cells = [task, str(len(records))]
         for name in ("success", "fail", "timeout", "error"):

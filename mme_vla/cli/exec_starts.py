@@ -63,19 +63,14 @@ def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> 
     matches = []
     for episode in range(len(source)):
         goal, joints = source.goal(episode), source.states(episode)[:, :ARM_JOINTS]
-        nearest = np.inf
-        starts: list[int] = []  # of the nearest ones
+        distances: list[tuple[float, int]] = []  # with the start, of every one that may be it
         for one in annotated:
-            if len(one.joints) != len(joints) or goal not in one.goals:
-                continue
-            distance = float(np.abs(one.joints - joints).mean())
-            if distance < nearest - 1e-6:
-                starts = []
-            if distance <= nearest + 1e-6 and one.start not in starts:
-                starts.append(one.start)
-            nearest = min(nearest, distance)
+            if len(one.joints) == len(joints) and goal in one.goals:
+                distances.append((float(np.abs(one.joints - joints).mean()), one.start))
+        nearest = min((distance for distance, _ in distances), default=np.inf)
+        starts = sorted({start for distance, start in distances if distance <= nearest + 1e-6})
         near = "none has its goal and length"
-        if starts:
+        if distances:
             near = f"the nearest is {nearest:.2f} rad away"
         place = f"{source.root}, episode {episode}"
         require(
@@ -83,10 +78,7 @@ def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> 
             f"{place} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} episodes"
             f" given: {near}. Give the recordings that the dataset was made from, all of them.",
         )
-        require(
-            len(starts) <= 1,
-            f"{place}: recordings that fit alike begin at {listed(sorted(starts))}.",
-        )
+        require(len(starts) <= 1, f"{place}: recordings that fit alike begin at {listed(starts)}.")
         matches.append(starts[0])
     return matches
 

@@ -198,9 +198,9 @@ def unknown_option(option: str, words: Sequence[str], keys: Sequence[str]) -> Us
     word = name.replace("-", "_").rpartition(".")[2]
     near = _keys_with_word(word, keys)
     if not near:
-        last_parts = {key.rpartition(".")[2] for key in keys}
-        alike = get_close_matches(word, last_parts)
-        near = [key for key in keys if key.rpartition(".")[2] in alike]
+        last_parts = list(dict.fromkeys(key.rpartition(".")[2] for key in keys))
+        for part in get_close_matches(word, last_parts):  # the nearest first
+            near += [key for key in keys if key.rpartition(".")[2] == part]
     hint = "--help lists them."
     if near:
         hint = f"write {' or '.join(f'{key}={value or "…"}' for key in near[:3])}."

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self, TypedDict
 
 from mme_vla.config.sections import Range, read_section
 from mme_vla.envs.metadata import DEFAULT_STEPS
@@ -69,6 +69,13 @@ class Seconds:
     policy: Number = 0.0
     total: Number = 0.0
     render: Number = 0.0
+
+
+class EventEntry(TypedDict):
+    """An event of an episode, and the control step at which it acted; None where it did not."""
+
+    event: str
+    step: Integer | None
 
 
 @dataclass(frozen=True)
@@ -139,7 +146,7 @@ class EpisodeRecord:
     refused: str | None = None
     video: str | None = None
     process: Mapping[str, Any] | None = None
-    events: tuple[Mapping[str, Any], ...] = ()
+    events: tuple[EventEntry, ...] = ()
     subgoals: Mapping[str, Any] | None = None
     made_up: bool = False
 

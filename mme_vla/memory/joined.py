@@ -298,6 +298,10 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[Memb
             isinstance(name, str) and name != "joined",
             f"memory.members: {brief(member)} is no memory to join; give a name, or {{name: …}}.",
         )
+        require(
+            own_budget is None or type(own_budget) is int,
+            f"memory.members: {brief(member)}: budget={brief(own_budget)} must be a whole number.",
+        )
         read.append(Member(name, own_budget, options))
         if own_budget is None:
             n_open += 1

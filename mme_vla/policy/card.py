@@ -143,10 +143,11 @@ def front_matter(name: str, known: Mapping[str, Any]) -> str:
     return data.to_yaml().strip()
 
 
-def _part(section: Mapping[str, Any] | None) -> str:
-    options = {key: value for key, value in (section or {}).items() if value is not None}
+def _part(section: Mapping[str, Any]) -> str:
+    """A part's name with its options; a section without a name describes no part."""
+    options = {key: value for key, value in section.items() if value is not None}
     name = str(options.pop("name", "none"))
-    if not options:
+    if name == "none" or not options:
         return name
     return f"{name} ({', '.join(f'{key} {value}' for key, value in options.items())})"
 

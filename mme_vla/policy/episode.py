@@ -79,9 +79,10 @@ class Episode:
         memory = policy.memory
         if memory is not None:
             scorer = memory.make_scorer()
-            self.history = OnlineHistory(memory.storage, scorer)
             if memory.lazy:
                 self.history = LazyHistory(memory.storage, policy.encode_frames, scorer)
+            else:
+                self.history = OnlineHistory(memory.storage, scorer)
             self.stream = memory.start_stream()
             if memory.uses_proprio:
                 self.history.motion = lambda frames: torch.stack(

@@ -62,7 +62,6 @@ def composition_digest(config: Mapping[str, Any]) -> str:
 def policy_name(config: Mapping[str, Any]) -> str:
     """What the section `policy` of a configuration calls its class."""
     section = PolicySections.of(config).policy
-    require(isinstance(section, Mapping), f"policy={brief(section)} must be a section.")
     return section.get("name", DEFAULT_POLICY)  # the registry refuses what is no name
 
 
@@ -280,13 +279,14 @@ def load_policy[P: "Policy"](
     if isinstance(config.get(TRAINING), dict):
         config[TRAINING] = {**config[TRAINING], "weights": weights_digest(folder)}
     require(
-        "backbone" in config,
+        config.get("backbone") is not None,
         f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of"
         " other formats are read by mme_vla.weights.load_weights() and converted by mme-vla"
         " weights.",
     )
     for key in config:
         check_known(f"section in {folder / CONFIG}:", key, KNOWN_SECTIONS)
+    PolicySections.of(config, str(folder / CONFIG))  # refuses a section that is none
     import_trusted(config, str(source), trust_plugins)
     policy_type = policy_class_for(requested, config, str(source))
 
@@ -320,10 +320,11 @@ def build_saved[P: "Policy"](
         config: plain sections. source: where they are from, for messages. options: overrides of the
             section `policy`.
     """
-    sections = PolicySections.of(config)
+    sections = PolicySections.of(config, source)
+    section = config.get("policy")
     require(
-        isinstance(sections.policy, dict),
-        f"{source}: policy={brief(sections.policy)} must be a section.",
+        section is None or isinstance(section, Mapping),  # not even an empty list
+        f"{source}: policy={brief(section)} must be a section of keys.",
     )
     config = {**config, "policy": {**sections.policy, **(options or {})}}
     try:

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
+from mme_vla.errors import brief, require
+
 
 @dataclass(frozen=True)
 class PolicySections:
@@ -31,12 +33,33 @@ class PolicySections:
     card: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, config: Mapping[str, Any]) -> Self:
-        """Name the sections of a configuration; null means the same as a missing one."""
-        values = {name: config[name] for name in KNOWN_SECTIONS if config.get(name) is not None}
+    def of(cls, config: Mapping[str, Any], source: str = "") -> Self:
+        """Name the sections of a configuration; null, or an empty one, means the same as a
+        missing one.
+
+        Args:
+            source: where the configuration is from, for messages.
+
+        Raises:
+            UserError: a section is no mapping.
+        """
+        values: dict[str, Any] = {}
+        for name in KNOWN_SECTIONS:
+            value = config.get(name)
+            if name not in _VALUES:
+                value = value or None
+                where = f"{source}: " if source else ""
+                require(
+                    value is None or isinstance(value, Mapping),
+                    f"{where}{name}={brief(value)} must be a section of keys.",
+                )
+            if value is not None:
+                values[name] = value
         return cls(**values)
 
 
+_VALUES = ("name", "plugins", "token_budget")
+"""Fields that are no sections."""
 KNOWN_SECTIONS = tuple(spec.name for spec in fields(PolicySections))
 SECTIONS = KNOWN_SECTIONS[: KNOWN_SECTIONS.index("adapters")]
 """Sections that build a policy. The others describe its weights."""

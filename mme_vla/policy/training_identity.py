@@ -16,34 +16,28 @@ KEY = "training"
 """The section of a checkpoint's configuration that holds the identity of its training."""
 NONE = "none"
 """What `init_from` says for random weights."""
-# A dot ends each name: `train.keep.` means this key, or the section with all that is in it.
-_RECIPE = (
-    "train.",
-    "finetune.",
-    "learning.",
-    "policy.augment.",
-    "policy.compute_dtype.",
-    "policy.stage.",
-    "policy.subtask_weight.",
-    "data.action_offset.",
-    "data.mask_padding.",
-    "data.jitter.",
-    "data.history_transforms.",
-    "data.weights.",
-    "data.narrow_ranges.",
+# What changes an update, by the section that holds it.
+_POLICY = ("augment", "compute_dtype", "stage", "subtask_weight")
+_DATA = (
+    "action_offset",
+    "mask_padding",
+    "jitter",
+    "history_transforms",
+    "weights",
+    "narrow_ranges",
 )
-_NO_EFFECT = (
-    "train.log_every.",
-    "train.val_every.",
-    "train.val_samples.",
-    "train.save_every.",
-    "train.keep.",
-    "train.parallel.",
-    "train.prefetch_gb.",
-    "train.workers.",
-    "train.open_loop_chunks.",
-    "train.device.",
-    "train.seed.",
+_TRAIN_WITHOUT_EFFECT = (
+    "log_every",
+    "val_every",
+    "val_samples",
+    "save_every",
+    "keep",
+    "parallel",
+    "prefetch_gb",
+    "workers",
+    "open_loop_chunks",
+    "device",
+    "seed",
 )
 
 
@@ -69,23 +63,31 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
     Args:
         config: the plain configuration of a training. content: fingerprints of its datasets.
     """
-    values = flat(config)
-    recipe = {}
-    for key, value in values.items():
-        changes_updates = f"{key}.".startswith(_RECIPE) and not f"{key}.".startswith(_NO_EFFECT)
-        if changes_updates and value not in (None, [], {}):
+    train = config.get("train") or {}
+    policy = config.get("policy") or {}
+    data = config.get("data") or {}
+    settings = {
+        "train": {key: train[key] for key in train if key not in _TRAIN_WITHOUT_EFFECT},
+        "finetune": config.get("finetune"),
+        "learning": config.get("learning"),
+        "policy": {key: policy.get(key) for key in _POLICY},
+        "data": {key: data.get(key) for key in _DATA},
+    }
+    recipe: dict[str, Any] = {}
+    for key, value in flat(settings).items():
+        if value not in (None, [], {}):
             recipe[key] = value
-    source = values.get("init_from")
+    source = config.get("init_from")
     if source not in (None, NONE):
         # The weights to start from: their digest, or the end of their path or hub name.
         folder = newest_checkpoint(Path(source).expanduser())
         recipe["init_from"] = weights_digest(folder) or Path(source).name
     split = {
         "content": list(content),
-        "val_fraction": values.get("data.val_fraction"),
-        "val_episodes": values.get("data.val_episodes"),
+        "val_fraction": data.get("val_fraction"),
+        "val_episodes": data.get("val_episodes"),
     }
-    seed = int(values["seed"])
+    seed = int(config["seed"])
     identity = TrainingIdentity(seed, digest(recipe, 12), digest(split, 12))
     return {key: value for key, value in asdict(identity).items() if value is not None}
 

@@ -71,6 +71,7 @@ def test_help_needs_no_torch() -> None:
         ("train", ["--steps", "10"], "There is no option '--steps'.*write train.steps=10"),
         ("train", ["--learning-rate=1"], "There is no option '--learning-rate=1'"),
         ("evaluate", ["--max-steps=9", "tasks=all"], "write max_steps=9"),
+        ("train", ["model=framesamp_modul", "--buget=5"], r"write memory\.budget=5"),
     ],
 )
 def test_an_option_that_does_not_exist_is_answered_with_the_word_to_type(

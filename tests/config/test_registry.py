@@ -46,3 +46,10 @@ def test_an_option_that_is_passed_on_is_named_where_no_constructor_takes_it() ->
         parts.build({"name": "named", "gird": 4})
     with pytest.raises(TypeError, match="negative"):
         parts.build({"name": "named", "grid": -1})
+
+
+@pytest.mark.parametrize("section", [[["name", "dot"]], ["name"], "dot", 3, None])
+def test_a_section_that_is_no_mapping_is_refused(section: object) -> None:
+    shapes: Registry[object] = Registry("shape")
+    with pytest.raises(UserError, match="section of the shape must be a section of keys"):
+        shapes.build(section)  # type: ignore[arg-type]

@@ -4,6 +4,7 @@ how it is read.
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -150,6 +151,18 @@ def test_images_inside_the_tables_are_read_as_they_are(
     np.testing.assert_array_equal(
         source.frames(1, range(9), "wrist"), expected.frames(2, range(9), "wrist")
     )
+
+
+def test_only_the_nearest_recordings_must_agree_on_the_start(tables: Path, converted: Path) -> None:
+    others = annotated_episodes([converted])
+    (first,) = [one for one in others if one.start == 4]
+    others.remove(first)
+    variants = []
+    for start, apart in enumerate([2.4e-6, 1.6e-6, 0.8e-6]):
+        variants.append(replace(first, joints=first.joints.astype(np.float64) + apart, start=start))
+    assert first_frames(tables, [variants[0], variants[2], *others]) == [0, 2, 2]
+    with pytest.raises(UserError, match=r"recordings that fit alike begin at 1, 2\."):
+        first_frames(tables, [*variants, *others])
 
 
 def test_our_demonstrations_mark_videos_too_and_unauthenticated_clients_are_named(

@@ -31,6 +31,15 @@ def record(**changes: Any) -> EpisodeRecord:
     return EpisodeRecord(**{**values, **changes})
 
 
+@pytest.mark.parametrize("entry", [{"event": 5, "step": 1}, {"step": None}, {"event": "pause:3"}])
+def test_an_event_without_text_or_step_is_refused(entry: dict[str, Any], tmp_path: Path) -> None:
+    line = {**json.loads(record().to_json()), "events": [entry]}
+    line.pop("crc32", None)
+    (tmp_path / "episodes.jsonl").write_text(json.dumps(line) + "\n")
+    with pytest.raises(UserError, match="record.events"):
+        read_records(tmp_path / "episodes.jsonl")
+
+
 def test_a_record_survives_its_line() -> None:
     made = record(
         error="IK failed\nat step 3",

@@ -107,6 +107,8 @@ def test_members_that_store_nothing_ask_nothing_of_the_storage() -> None:
         ([{**FRAMES, "budget": 512}, "ttt"], "ttt an even share"),
         (["framesamp"], "at least two"),
         (["framesamp", 3], "no memory to join"),
+        ([{**FRAMES, "budget": []}, TTT], r"budget=\[\] must be a whole number"),
+        ([{**FRAMES, "budget": 7.5}, TTT], r"budget=7\.5 must be a whole number"),
         (
             [FRAMES, {**TTT, "pooling": "max"}],
             r"(?s)framesamp stores.*mean.*ttt.*max.*Set the same pooling",

@@ -19,6 +19,8 @@ Run it from the root of a clone with all extras, on a CPU with one thread. It wr
 - `runs.json.xz`: what the commands say of them, and the losses of the runs when they are continued.
 - `formats.tar.xz`: a policy in the formats of LeRobot, openpi and the released code, and a dataset
   with videos. `formats.json`: what `inspect` counts in it, and a hash of nano's vision tower.
+- `earlier.tar.xz`, which nothing writes again: a finished run in two shards with claims, and one
+  started from Python, as version 0.1.0 left them.
 - `times.json`: seconds and imported modules of `import mme_vla` and `mme-vla --help`. Only modules
   are compared.
 

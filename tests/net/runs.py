@@ -58,6 +58,30 @@ POLICY = "framesamp_modul"
 """The saved model that is probed, as the folder `policy`."""
 BOARD = ("pi05", "present_modul", "framesamp_modul")
 
+EARLIER = Path("tests", "data", "compatibility")
+"""Where `earlier.tar.xz` has the runs of version 0.1.0: a run keeps the end of its checkpoint's
+path.
+"""
+SHARDS = EARLIER / "evaluation" / "shared"
+SHARD = [
+    f"checkpoint={EARLIER}/pretrained/groundsg", "episodes=1", "tasks=[PickXtimes,VideoUnmask]",
+    *ROLLOUT, "seed=7", "subgoal=oracle", "shard=1/2", f"output={SHARDS}",
+]  # fmt: skip
+SHARD_RESULTS = ["--tasks", "PickXtimes", "VideoUnmask", "--episodes", "1"]
+SCRIPTED = EARLIER / "evaluation" / "scripted"
+
+
+def evaluate_scripted() -> Any:
+    """Go on with a finished run in the tests' own environment."""
+    import mme_vla
+    from helpers.scripted_env import make_moving_env
+
+    return mme_vla.evaluate(
+        EARLIER / "training" / "framesamp", ["PickXtimes", "VideoUnmask"], 2, seed=3,
+        output=SCRIPTED, base=make_moving_env,
+        show_progress=False, max_steps=24, flow_steps=2, workers=1, max_batch=1, video="all",
+    )  # fmt: skip
+
 
 def numbers(text: str) -> list[str]:
     """The numbers in what a command prints: its words may change."""

@@ -127,6 +127,18 @@ def test_run_resumes_with_the_same_losses(run: str, at_runs: Path) -> None:
     assert_close(runs.resume(run), RUNS["resumed"][run])
 
 
+def contents(folder: Path) -> dict[Path, bytes]:
+    """All files below a folder but locks."""
+    files = [file for file in folder.rglob("[!.]*") if file.is_file()]
+    return {file: file.read_bytes() for file in files}
+
+
+def test_resumed_training_keeps_the_vision_cache(at_runs: Path) -> None:
+    before = contents(Path("cache"))
+    runs.resume("plain")
+    assert contents(Path("cache")) == before
+
+
 @pytest.mark.parametrize("model", RUNS["first_loss"])
 def test_saved_policy_has_the_same_loss_on_the_dataset(
     model: str, at_runs: Path, checkpoints: Path
@@ -158,6 +170,37 @@ def test_receipt_is_verified(at_runs: Path) -> None:
 
 def test_probe_has_the_same_table(at_runs: Path) -> None:
     assert runs.probed() == RUNS["probe"]
+
+
+def test_finished_probe_is_not_measured_again(at_runs: Path) -> None:
+    lines = Path("probe", "offline", "offline.jsonl")
+    before = lines.read_bytes()
+    command("probe", *runs.PROBE)
+    assert lines.read_bytes() == before
+
+
+@pytest.fixture
+def at_earlier(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of version 0.1.0, as the current folder."""
+    monkeypatch.chdir(unpack(NET / "earlier.tar.xz", tmp_path))
+
+
+def test_shards_with_claims_are_recognised_and_joined(at_earlier: None) -> None:
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    before = contents(runs.SHARDS)
+    command("evaluate", *runs.SHARD)
+    after = contents(runs.SHARDS)
+    claims = runs.SHARDS / "claims.jsonl"  # the process joined the run
+    assert after.pop(claims, before[claims]).startswith(before.pop(claims))
+    assert after == before
+    found = command("results", runs.SHARDS, *runs.SHARD_RESULTS, "--csv", "figures.csv")
+    assert found and "average,0.0000,,0.0000,65.7620,1,1,2,2" in Path("figures.csv").read_text()
+
+
+def test_finished_run_is_recognised_from_python(at_earlier: None) -> None:
+    before = contents(runs.SCRIPTED)
+    assert runs.evaluate_scripted().success_rate == 1.0
+    assert contents(runs.SCRIPTED) == before
 
 
 def test_report_card_is_the_same(at_runs: Path) -> None:

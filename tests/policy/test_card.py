@@ -82,3 +82,18 @@ def test_the_example_of_a_shipped_card_runs_to_an_action(name: str) -> None:
 def test_a_table_of_a_card_that_is_a_text_is_refused(policy: MMEPolicy, key: str) -> None:
     with pytest.raises(UserError, match=rf"card\['{key}'\]='54 %' must map names to values"):
         model_card(policy, {**policy.config, "card": {key: "54 %"}})
+
+
+@pytest.mark.parametrize("card", [None, [], False, {}])
+def test_an_empty_card_is_saved_as_none(policy: MMEPolicy, card: object) -> None:
+    assert "Not recorded." in model_card(policy, {**policy.config, "card": card})
+
+
+def test_a_card_that_is_no_section_is_refused_by_name(policy: MMEPolicy) -> None:
+    with pytest.raises(UserError, match=r"card=\['words'\] must be a section of keys"):
+        model_card(policy, {**policy.config, "card": ["words"]})
+
+
+def test_a_part_without_a_name_is_none_in_the_card(policy: MMEPolicy) -> None:
+    memory = {"name": "none", "views": True}
+    assert "| memory | none |" in model_card(policy, {**policy.config, "memory": memory})

@@ -220,3 +220,19 @@ def test_an_unknown_section_of_a_configuration_is_refused_with_the_known_ones(
     (checkpoint / SUMS).unlink()
     message = refusal(MMEPolicy.from_pretrained, checkpoint)
     assert repr(key) in message and "integration" in message
+
+
+@pytest.mark.parametrize("section", [[["name", "framesamp"]], "framesamp", 3, True])
+def test_a_section_that_is_no_mapping_is_refused_by_name(section: Any, checkpoint: Path) -> None:
+    config = json.loads((checkpoint / "config.json").read_text())
+    (checkpoint / "config.json").write_text(json.dumps({**config, "memory": section}))
+    (checkpoint / SUMS).unlink()
+    assert "memory=" in refusal(MMEPolicy.from_pretrained, checkpoint)
+
+
+def test_a_backbone_of_null_is_a_missing_section(checkpoint: Path) -> None:
+    config = json.loads((checkpoint / "config.json").read_text())
+    (checkpoint / "config.json").write_text(json.dumps({**config, "backbone": None}))
+    (checkpoint / SUMS).unlink()
+    message = refusal(MMEPolicy.from_pretrained, checkpoint)
+    assert "lacks the section 'backbone'" in message

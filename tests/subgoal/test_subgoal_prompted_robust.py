@@ -1,5 +1,6 @@
 """Faults around the prompted model: settings, replies, cached files, interrupts."""
 
+import json
 import subprocess
 import sys
 
@@ -8,6 +9,7 @@ import pytest
 from helpers import REPOSITORY
 from helpers.subgoal_fakes import frames, kinds, play, predictor_of, says, started, turns
 from mme_vla.errors import UserError
+from mme_vla.subgoal.models.replies import Reply, ReplyCache
 from mme_vla.subgoal.threads import side_by_side
 
 
@@ -54,6 +56,18 @@ def test_a_damaged_reply_on_disk_is_requested_again(damage, tmp_path):
     assert again.predict([started(again)])[0].text == "press"
     assert len(client.requests) == 1 and again.usage.cached == 0 and cached.read_text() == content
     assert [path.suffix for path in tmp_path.rglob("*.*")] == [".json"]
+
+
+@pytest.mark.parametrize("text", ["press", "press \ud800"])
+def test_a_stored_reply_is_found_again_with_half_characters_and_further_keys(text, tmp_path):
+    replies, reply = ReplyCache(tmp_path), Reply(text, 3, 4)
+    replies.write("abc", reply)
+    assert replies.read("abc") == reply
+    path = replies.path("abc")
+    stored = json.loads(path.read_text())
+    del stored["crc32"]
+    path.write_text(json.dumps(stored | {"model": "another"}))
+    assert replies.read("abc") == reply
 
 
 def test_a_reply_that_cannot_be_stored_is_used_all_the_same(tmp_path, caplog):

@@ -2,14 +2,16 @@
 end.
 """
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from helpers.rollout_fakes import FACTS, JOBS, quick_policy
+from helpers.rollout_fakes import FACTS, JOBS, quick_policy, records
 from mme_vla import UserError
-from mme_vla.cli.evaluate import choose_subgoals, report_usage
+from mme_vla.cli.evaluate import choose_subgoals, report, report_usage
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import predictor_of, run_settings
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -127,3 +129,17 @@ def test_what_a_predictor_did_is_reported_in_one_line(caplog: pytest.LogCaptureF
     assert caplog.messages == [
         "subgoals: 1,200 calls, 2 answers from the cache, 34,567 tokens read, 3 malformed answers"
     ]
+
+
+def test_a_task_named_all_keeps_its_row_beside_that_of_all_episodes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    won, lost = records("test", [1, 0])
+    done = SimpleNamespace(
+        records=[replace(won, task="all"), replace(lost, task="other")],
+        matched=[],
+        workload=SimpleNamespace(batches=0),
+    )
+    report(done, tmp_path)  # type: ignore[arg-type]
+    lines = [line for line in capsys.readouterr().out.splitlines() if " all " in line]
+    assert ["100.0 %" in lines[0], "50.0 %" in lines[1], len(lines)] == [True, True, 2]

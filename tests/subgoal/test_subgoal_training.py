@@ -25,6 +25,7 @@ from mme_vla.subgoal.finetuning.rows import (
 )
 from mme_vla.subgoal.finetuning.training import accumulation, find_checkpoint, fine_tune
 from mme_vla.subgoal.models.qwen3vl import VLM
+from mme_vla.subgoal.text import BBOX
 
 pytest.importorskip("peft", reason="needs the extra vlm")
 SETS = ["simple", "grounded", "memer"]
@@ -143,6 +144,20 @@ def test_damaged_rows_and_missing_images_are_named(tmp_path, data):
         read_rows(tmp_path / "nothing.jsonl")
     with pytest.raises(UserError, match="is missing; expected an image"):
         question_of(read_rows(data / "simple.jsonl")[0], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        ([1, 2, 3], "it has no messages"),
+        ([{"role": "robot", "content": 3}], "a message has the role 'robot'"),
+        ([{"role": "user", "content": BBOX}], "one message each of system, user and assistant"),
+    ],
+)
+def test_messages_that_are_no_conversation_are_named(messages, words, tmp_path):
+    (tmp_path / "rows.jsonl").write_text(json.dumps({"messages": messages}) + "\n")
+    with pytest.raises(UserError, match=words):
+        read_rows(tmp_path / "rows.jsonl")
 
 
 @pytest.mark.slow

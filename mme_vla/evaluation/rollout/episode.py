@@ -11,7 +11,7 @@ from mme_vla.embodiment.action_space import read_options
 from mme_vla.envs.scene_hash import NOT_BUILT
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.records import Seconds
+from mme_vla.evaluation.records import EventEntry, Seconds
 from mme_vla.evaluation.rollout.environment import Observation, Report
 from mme_vla.evaluation.rollout.events import Event
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
@@ -39,7 +39,7 @@ class EventCourse:
 
     def __init__(self, events: Sequence[Event]) -> None:
         self._events = events
-        self.log: list[dict[str, Any]] = [{"event": event.text, "step": None} for event in events]
+        self.log = [EventEntry(event=event.text, step=None) for event in events]
         self.hold_steps = 0
         self.holding: Perturbation | None = None
 

@@ -262,7 +262,7 @@ class Rollout:
             status = "error"
             message = f"{reply.job}: {reply.error}"
         if isinstance(reply.error, UserError):
-            raise UserError(message)
+            raise UserError(str(message))
         # A scene in which an object finds no place finds none again, and says nothing of the
         # simulator.
         is_unbuildable = isinstance(reply.error, SceneError)

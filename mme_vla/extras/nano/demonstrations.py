@@ -83,8 +83,13 @@ class Demonstration:
 
     @classmethod
     def load(cls, path: Path, images: bool = True) -> "Demonstration":
-        """Read what `save` wrote, or what of it is no image."""
+        """Read what `save` wrote, or what of it is no image.
+
+        Raises:
+            UserError: an earlier version wrote it.
+        """
         with np.load(path) as file:
+            about = _about(path, file)
             loaded_images: dict[str, dict[int, np.ndarray]] = {}
             for camera in CAMERAS:
                 if images and f"{camera}_frames" in file:
@@ -92,12 +97,22 @@ class Demonstration:
                     pictures = file[f"{camera}_pictures"]
                     loaded_images[camera] = dict(zip(frames, pictures, strict=True))
             return cls(
-                **parse_json(str(file["about"]), str(path)),
+                **about,
                 states=file["states"],
                 motions=Motions(file["decisions"], file["targets"]),
                 images=loaded_images,
                 boundaries=file["boundaries"],
             )
+
+
+def _about(path: Path, file: Any) -> dict[str, Any]:
+    """What an open file of a demonstration says beside its arrays."""
+    about: dict[str, Any] = parse_json(str(file["about"]), str(path))
+    require(
+        "carried_out" in about and "boundaries" in file,
+        f"{path} is of an earlier version: remove it and record it again.",
+    )
+    return about
 
 
 @dataclass(frozen=True)
@@ -145,7 +160,7 @@ class Scene:
 
     def _complete(self) -> bool:
         with np.load(self.path) as file:
-            about = parse_json(str(file["about"]), str(self.path))
+            about = _about(self.path, file)
             carried_out = about["carried_out"]
             width = file["targets"].shape[1]
             required = width if self.acts is None else self.acts.width

@@ -32,6 +32,17 @@ from mme_vla.types import Batch, HistoryTokens, Labels, TensorStruct
 
 KEEP = ("observations", "rewards", "log_probs", "oracle")
 
+_NOT_OF_THE_ENVIRONMENT = {
+    "task": "the jobs",
+    "split": "the jobs",
+    "episode": "the jobs",
+    "max_steps": "rollouts(…, max_steps=…)",
+    "base": "rollouts(…, env=…)",
+    "robot": "the policy's embodiment",
+    "oracle": 'rollouts(…, keep=["oracle"]), or oracle_share=…',
+}
+"""Names that `env_options` may not have → what says them instead."""
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -107,8 +118,8 @@ def rollouts(
             `max_batch`.
 
     Raises:
-        UserError: an unknown name, or something to keep that this policy or environment does not
-            have.
+        UserError: an unknown name, something to keep that this policy or environment does not
+            have, or something in `env_options` that another argument says.
     """
     require(
         len(set(jobs)) == len(jobs), "jobs has an episode twice: run it again with another seed=…."
@@ -129,6 +140,12 @@ def rollouts(
     run_settings = read_section(
         RolloutSettings, settings if callable(env) else {**settings, "env": env}
     )
+    options = dict(env_options or {})
+    for name, place in _NOT_OF_THE_ENVIRONMENT.items():
+        require(
+            name not in options,
+            f"env_options[{name!r}] is no option of the environment: {place} says it.",
+        )
     oracle = "oracle" in keep or oracle_share > 0
     require(
         not oracle or policy.embodiment.action.choice,
@@ -141,7 +158,7 @@ def rollouts(
         base = base_env(env, policy.embodiment, run_settings.render, reward)
     make = partial(
         make_rollout_env,
-        base=partial(base, **(env_options or {})),
+        base=partial(base, **options),
         max_steps=run_settings.max_steps,
         robot=policy.embodiment,
         oracle=oracle,

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, brief, did_you_mean, require
+from mme_vla.errors import UserError, brief, did_you_mean, listed, require
 from mme_vla.subgoal.answers import SubgoalHistory
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip, read_image
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes, selected_steps, windows
@@ -153,6 +153,7 @@ def _perturb(point: Point, noise: tuple[int, int] | None, rng: np.random.Generat
 
 IGNORED = -100  # a label that does not count
 _MARKS = 32  # tokens of the conversation's own marks, at most
+_ROLES = ["system", "user", "assistant"]
 _LIMIT = 2**31  # bytes of a file of rows
 _TIME = 12  # tokens of a video frame's time stamp, at most
 
@@ -177,18 +178,18 @@ def _check_row(row: Row) -> Row:
         UserError: a part is missing or of another type.
     """
     messages = row.get("messages")
-    if not isinstance(messages, list):
+    if not isinstance(messages, list) or not all(isinstance(one, dict) for one in messages):
         raise _row_error("it has no messages")
-    roles = []
-    n_marks = 0
-    for message in messages:
-        if not isinstance(message, dict) or not is_text(message.get("content")):
-            raise _row_error("the content of a message is no text")
-        roles.append(message.get("role"))
-        if roles[-1] != "system":
-            n_marks += message["content"].count(BBOX)
-    if roles != ["system", "user", "assistant"]:
+    roles = [message.get("role") for message in messages]
+    for role in roles:
+        if role not in _ROLES:
+            raise _row_error(f"a message has the role {brief(role)}, not one of {listed(_ROLES)}")
+    if roles != _ROLES:
         raise _row_error("expected one message each of system, user and assistant")
+    texts = [message.get("content") for message in messages]
+    if not all(map(is_text, texts)):
+        raise _row_error("the content of a message is no text")
+    n_marks = texts[1].count(BBOX) + texts[2].count(BBOX)
     for key in ("images", "videos"):
         names = row.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):

@@ -4,16 +4,14 @@ import json
 import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-from mme_vla.config.sections import Range, read_section
 from mme_vla.errors import UserError
 from mme_vla.utils import read_json, verified, with_checksum, write_atomically
 
 log = logging.getLogger(__name__)
 MOST_TOKENS = 2**40
 """Of one reply. A larger number is no count of tokens."""
-Tokens = Annotated[int, Range(0, MOST_TOKENS - 1)]
 
 
 @dataclass(frozen=True)
@@ -21,8 +19,8 @@ class Reply:
     """A usable reply and the tokens it took; thoughts count as output."""
 
     text: str
-    input_tokens: Tokens
-    output_tokens: Tokens
+    input_tokens: int
+    output_tokens: int
 
 
 class ReplyCache:
@@ -41,7 +39,7 @@ class ReplyCache:
             return None
         try:
             stored = verified(read_json(path, "a stored reply"), str(path))
-            return read_section(Reply, stored, str(path))
+            return _reply_of(stored, path)
         except UserError as error:
             log.warning("%s The question is asked again.", error)
             return None
@@ -53,3 +51,19 @@ class ReplyCache:
                 draft.write_text(json.dumps(with_checksum(asdict(reply))))
         except OSError as error:  # such as a full disk: the reply is used all the same
             log.warning("%s cannot be written: %s", path, error.strerror)
+
+
+def _reply_of(stored: dict[str, Any], path: Path) -> Reply:
+    """The reply that a file holds, beside other keys.
+
+    A model's text may hold half characters, which no section of a configuration may.
+    """
+    text = stored.get("text")
+    counts: list[int] = []
+    for key in ("input_tokens", "output_tokens"):
+        count = stored.get(key)
+        if type(count) is int and 0 <= count < MOST_TOKENS:
+            counts.append(count)
+    if not isinstance(text, str) or len(counts) != 2:
+        raise UserError(f"{path} lacks a text and two numbers of tokens.")
+    return Reply(text, *counts)

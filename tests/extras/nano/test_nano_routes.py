@@ -2,6 +2,8 @@
 those alone.
 """
 
+import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +14,7 @@ from mme_vla import UserError, build_policy
 from mme_vla.data.waypoints import Motions
 from mme_vla.envs.robomme.recording.frames import DECISIONS as AT_DECISIONS
 from mme_vla.envs.robomme.recording.frames import FrameChoice
-from mme_vla.extras.nano.demonstrations import Demonstration
+from mme_vla.extras.nano.demonstrations import Demonstration, Scene
 from mme_vla.extras.nano.learning import Decisions, statistics
 from mme_vla.policy.mme import MMEPolicy
 
@@ -100,3 +102,19 @@ def test_only_decisions_that_a_policy_is_requested_are_rendered(
     steps = [step(number, 3) for number in range(11)]
     selection = FrameChoice(AT_DECISIONS, None, every).render_request(steps)  # type: ignore[arg-type]
     assert set(selection.frames["front"]) == rendered
+
+
+@pytest.mark.parametrize("missing", ["carried_out", "boundaries"])
+def test_a_demonstration_of_an_earlier_version_is_to_be_recorded_again(
+    missing: str, tmp_path: Path
+) -> None:
+    scene = Scene("RouteStick", 3, "easy", tmp_path, ("front",), ())
+    demonstration([0]).save(scene.path)
+    with np.load(scene.path) as file:
+        arrays = {name: file[name] for name in file if name != missing}
+    about = json.loads(str(arrays["about"]))
+    about.pop(missing, None)
+    np.savez(scene.path, **arrays | {"about": np.array(json.dumps(about))})
+    for read in (lambda: Demonstration.load(scene.path), lambda: scene.tried):
+        with pytest.raises(UserError, match="of an earlier version: remove it and record it again"):
+            read()

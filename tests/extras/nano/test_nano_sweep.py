@@ -171,7 +171,7 @@ def test_no_demonstration_is_learned_from_and_measured(
         fitting.Decisions, "of", lambda policy, made, *_, **__: reads.append([f for f, _ in made])
     )
     store = SimpleNamespace(read=lambda file: file)
-    job = SimpleNamespace(learning={}, files=files, store=store, config={"seed": 0})
+    job = SimpleNamespace(learning={}, files=files, store=store, seed=0)
     fitting.prepared(SimpleNamespace(require_processor=SimpleNamespace), job)
     learned, measured = reads
     assert len(measured) == max(1, count // 10) and (count == 1 or not set(learned) & set(measured))

@@ -171,6 +171,14 @@ class Rewarding(ScriptedEnv):
         return observation, 1.0, terminated, truncated, info
 
 
+@pytest.mark.parametrize("name", ["task", "split", "episode", "max_steps", "robot", "oracle"])
+def test_what_another_argument_says_is_no_option_of_the_environment(
+    name: str, policy: MMEPolicy
+) -> None:
+    with pytest.raises(UserError, match=rf"env_options\['{name}'\] is no option.*says it"):
+        next(rollouts(policy, two_choices, JOBS, env_options={name: 7}))
+
+
 def test_the_reward_of_a_chunk_is_the_sum_over_its_actions() -> None:
     env = ChunkEnv(lambda: Rewarding("PickXtimes", 0, 40, 1e9, 0.0, ""), robot=ROBOMME_JOINT)
     env.reset()

@@ -8,9 +8,10 @@ library already.
 import json
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from torch import Tensor
 
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.extras.methods.simplememvla.config import NAME
 from mme_vla.extras.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.extras.methods.simplememvla.processor import TOKENIZER_FILE, processor_settings
@@ -41,31 +42,6 @@ _STATISTICS = ("mean", "std", "q01", "q99", "min", "max")
 _ONE_PERCENT = 2.326
 """Deviations from the mean to a normal distribution's 1 % quantile."""
 
-KEYS = {
-    "action_dim": "backbone.action_dim",
-    "action_horizon": "backbone.horizon",
-    "action_loss_weight": "backbone.action_weight",
-    "vl_loss_weight": "backbone.words_weight",
-    "dit_hidden_size": "backbone.head.width",
-    "dit_depth": "backbone.head.depth",
-    "dit_num_heads": "backbone.head.heads",
-    "dit_mlp_ratio": "backbone.head.mlp_ratio",
-    "dit_dropout": "backbone.head.dropout",
-    "dit_rope_theta": "backbone.head.rope_theta",
-    "dit_mrope_section": "backbone.head.rope_section",
-    "dit_partial_rotary_factor": "backbone.head.rope_factor",
-    "state_dropout_prob": "backbone.head.state_dropout",
-    "timestep_beta_alpha": "backbone.head.time_alpha",
-    "robot_tag": "processor.robot",
-    "control_frequency_hz": "processor.control_hz",
-    "history_video_sec": "processor.seconds",
-    "history_video_fps": "processor.fps",
-    "native_video_fps": "processor.native_fps",
-    "variable_history": "processor.variable",
-}
-"""Keys of a published config.json → keys of a configuration here."""
-
-
 Number = int | float
 """Whole numbers stay whole: compositions of policies are compared by their text."""
 
@@ -76,91 +52,112 @@ class PublishedConfig:
 
     backbone_config: Qwen3.5's own configuration. state_dim: of the robot, also where `use_proprio`
     leaves the state out. image_keys: cameras in the order in which they are shown.
-    history_image_keys: those with a video.
+    history_image_keys: those with a video. The text beside a type is the key of a configuration
+    here that says the same.
     """
 
     backbone_config: Mapping[str, Any]
-    action_dim: int
-    action_horizon: int
-    action_loss_weight: Number
-    vl_loss_weight: Number
+    action_dim: Annotated[int, "backbone.action_dim"]
+    action_horizon: Annotated[int, "backbone.horizon"]
+    action_loss_weight: Annotated[Number, "backbone.action_weight"]
+    vl_loss_weight: Annotated[Number, "backbone.words_weight"]
     use_proprio: bool
-    state_dim: int
-    dit_hidden_size: int
-    dit_depth: int
-    dit_num_heads: int
-    dit_mlp_ratio: Number
-    dit_dropout: Number
-    dit_rope_theta: Number
-    dit_mrope_section: tuple[int, int, int]
-    dit_partial_rotary_factor: Number
-    state_dropout_prob: Number
-    timestep_beta_alpha: Number
-    robot_tag: str
-    control_frequency_hz: Number
-    history_video_sec: Number
-    history_video_fps: Number
-    native_video_fps: Number
-    variable_history: bool
+    state_dim: int | None
+    dit_hidden_size: Annotated[int, "backbone.head.width"]
+    dit_depth: Annotated[int, "backbone.head.depth"]
+    dit_num_heads: Annotated[int, "backbone.head.heads"]
+    dit_mlp_ratio: Annotated[Number, "backbone.head.mlp_ratio"]
+    dit_dropout: Annotated[Number, "backbone.head.dropout"]
+    dit_rope_theta: Annotated[Number, "backbone.head.rope_theta"]
+    dit_mrope_section: Annotated[tuple[int, int, int], "backbone.head.rope_section"]
+    dit_partial_rotary_factor: Annotated[Number, "backbone.head.rope_factor"]
+    state_dropout_prob: Annotated[Number, "backbone.head.state_dropout"]
+    timestep_beta_alpha: Annotated[Number, "backbone.head.time_alpha"]
+    robot_tag: Annotated[str | None, "processor.robot"]
+    control_frequency_hz: Annotated[Number, "processor.control_hz"]
+    history_video_sec: Annotated[Number, "processor.seconds"]
+    history_video_fps: Annotated[Number, "processor.fps"]
+    native_video_fps: Annotated[Number | None, "processor.native_fps"]
+    variable_history: Annotated[bool, "processor.variable"]
     image_keys: tuple[str, ...]
-    history_image_keys: tuple[str, ...] = ()
+    history_image_keys: tuple[str, ...] | None = None
     timestep_beta_beta: float = 1.0
     model_type: Literal["simplememvla"] | None = None
 
-    def __post_init__(self) -> None:
-        if self.timestep_beta_beta != 1.0:
-            raise UserError(
-                f"config.json: timestep_beta_beta={self.timestep_beta_beta:g}; only 1 is supported."
-            )
-
     @classmethod
-    def read(cls, config: Mapping[str, Any]) -> Self:
-        """Read a config.json; keys that say nothing of the network are left out."""
-        return read_section(cls, config, "config.json", others=True)
+    def read(cls, config: Mapping[str, Any], source: str | Path) -> Self:
+        """Read a config.json; keys that say nothing of the network are left out.
+
+        source: its folder, for messages.
+        """
+        where = f"{source}: {CONFIG}"
+        needed = [spec.name for spec in fields(cls) if spec.default is MISSING]
+        lacking = [name for name in needed if name not in config]
+        require(not lacking, f"{where} is no SimpleMemVLA's: it lacks {listed(lacking)}.")
+        published = read_section(cls, config, where, others=True)
+        beta = published.timestep_beta_beta
+        require(beta == 1, f"{where}: timestep_beta_beta={beta:g}; only 1 is supported.")
+        require(
+            published.state_dim is not None or not published.use_proprio,
+            f"{where}: state_dim=None must be a whole number, because use_proprio is true.",
+        )
+        return published
 
     @classmethod
     def of(cls, policy: SimpleMemVlaPolicy) -> Self:
         """What the config.json of a policy says."""
         sizes, robot = policy.sizes, policy.embodiment
         settings = processor_settings(policy.config)
+        values: dict[str, Any] = {}
+        for name, key in KEYS.items():
+            section, _, part = key.partition(".")
+            if section == "backbone":
+                values[name] = attrgetter(part)(sizes)
+                continue
+            value = getattr(settings, part)
+            if isinstance(value, float) and value.is_integer():
+                value = int(value)
+            values[name] = value
         return cls(
+            **values,
             backbone_config=sizes.qwen.to_dict(),
-            action_dim=sizes.action_dim,
-            action_horizon=sizes.horizon,
-            action_loss_weight=sizes.action_weight,
-            vl_loss_weight=sizes.words_weight,
             use_proprio=sizes.state_dim > 0,
             state_dim=sizes.state_dim or robot.state.width,
-            dit_hidden_size=sizes.head.width,
-            dit_depth=sizes.head.depth,
-            dit_num_heads=sizes.head.heads,
-            dit_mlp_ratio=sizes.head.mlp_ratio,
-            dit_dropout=sizes.head.dropout,
-            dit_rope_theta=sizes.head.rope_theta,
-            dit_mrope_section=sizes.head.rope_section,
-            dit_partial_rotary_factor=sizes.head.rope_factor,
-            state_dropout_prob=sizes.head.state_dropout,
-            timestep_beta_alpha=sizes.head.time_alpha,
-            robot_tag=settings.robot,
-            control_frequency_hz=_whole(settings.control_hz),
-            history_video_sec=_whole(settings.seconds),
-            history_video_fps=_whole(settings.fps),
-            native_video_fps=_whole(settings.native_fps),
-            variable_history=settings.variable,
             image_keys=tuple(_IMAGE_KEY + name for name in robot.camera_names),
             history_image_keys=(_IMAGE_KEY + robot.memory_camera,),
             model_type="simplememvla",
         )
 
+    @property
+    def state_inputs(self) -> int:
+        """`backbone.state_dim` of a configuration here."""
+        if not self.use_proprio or self.state_dim is None:
+            return 0
+        return self.state_dim
+
+    def settings(self) -> dict[str, Any]:
+        """Keys of a configuration here → values, as a command line takes them."""
+        values: dict[str, Any] = {}
+        for name, key in KEYS.items():
+            value = getattr(self, name)
+            values[key] = list(value) if isinstance(value, tuple) else value
+        return values
+
     def configure(self, config: DictConfig) -> None:
         """Set the keys of a configuration that it names."""
         with open_dict(config):
-            for name, key in KEYS.items():
-                value = getattr(self, name)
-                OmegaConf.update(config, key, list(value) if isinstance(value, tuple) else value)
+            for key, value in self.settings().items():
+                OmegaConf.update(config, key, value)
             config.backbone.name = NAME
             config.backbone.vlm = dict(self.backbone_config)
-            config.backbone.state_dim = self.state_dim if self.use_proprio else 0
+            config.backbone.state_dim = self.state_inputs
+
+
+KEYS: dict[str, str] = {}
+"""Keys of a published config.json → keys of a configuration here."""
+for _name, _kind in get_type_hints(PublishedConfig, include_extras=True).items():
+    if get_origin(_kind) is Annotated:
+        KEYS[_name] = _kind.__metadata__[0]
 
 
 def is_simplememvla(names: Iterable[str]) -> bool:
@@ -212,10 +209,6 @@ def simplememvla_of(policy: Policy) -> SimpleMemVlaPolicy:
     return policy
 
 
-def _whole(number: float) -> Number:
-    return int(number) if number.is_integer() else number
-
-
 # config.json
 
 
@@ -226,7 +219,7 @@ def configured(cfg: DictConfig, config: Mapping[str, Any], folder: Path) -> Dict
     if (folder / TOKENIZER_FILE).is_file():
         cfg.processor.tokenizer = str(checked_file(folder, TOKENIZER_FILE, "tokenizer"))
     if "backbone_config" in config:
-        published = PublishedConfig.read(config)
+        published = PublishedConfig.read(config, folder)
         published.configure(cfg)
         cfg.embodiment.action.horizon = published.action_horizon
         cfg.embodiment.fps = published.native_video_fps
@@ -246,29 +239,25 @@ def check_config(policy: Policy, config: Mapping[str, Any], source: str) -> None
             " stay unset. To begin training from it use start_from() (on the command line:"
             " init_from=…)."
         )
-    published, expected = PublishedConfig.read(config), PublishedConfig.of(target)
-    for name, key in KEYS.items():
-        value, has = getattr(published, name), getattr(expected, name)
-        if value != has:
+    published, expected = PublishedConfig.read(config, source), PublishedConfig.of(target)
+    settings = published.settings() | {"backbone.state_dim": published.state_inputs}
+    current = expected.settings() | {"backbone.state_dim": target.sizes.state_dim}
+    for key, value in settings.items():
+        if value != current[key]:
             raise UserError(
-                f"{source} was trained with {key}={brief(value)}; this policy has {brief(has)}. Set"
-                f" {key}={brief(value)}."
+                f"{source} was trained with {key}={brief(value)}; this policy has"
+                f" {brief(current[key])}. Set {key}={brief(value)}."
             )
-    state_dim = published.state_dim if published.use_proprio else 0
-    if state_dim != target.sizes.state_dim:
-        raise UserError(
-            f"{source} was trained with backbone.state_dim={state_dim}; this policy has"
-            f" {target.sizes.state_dim}. Set backbone.state_dim={state_dim}."
-        )
     robot = target.embodiment
     if published.image_keys != expected.image_keys:
         raise UserError(
             f"{source} sees {listed(published.image_keys)}; the robot {robot.name!r} has"
             f" {listed(robot.camera_names)}."
         )
-    if published.history_image_keys not in ((), expected.history_image_keys):
+    video_keys = published.history_image_keys or ()
+    if video_keys not in ((), expected.history_image_keys):
         raise UserError(
-            f"{source} shows a video of {listed(published.history_image_keys)}; here it is the"
+            f"{source} shows a video of {listed(video_keys)}; here it is the"
             f" memory camera's, {robot.memory_camera!r} (embodiment.memory_camera)."
         )
 

@@ -14,6 +14,7 @@ pytest.importorskip("transformers", reason="needs the extra `vlm`: uv sync --ine
 from helpers.memory_fakes import same
 from mme_vla import UserError, build_policy
 from mme_vla.cli.weights import convert
+from mme_vla.extras.methods.simplememvla.weights import PublishedConfig
 from mme_vla.policy.base import Policy
 from mme_vla.testing.small import unit_stats
 from mme_vla.weights.load import load_weights, transfer
@@ -123,6 +124,47 @@ def test_a_checkpoint_that_does_not_fit_is_refused(published: Path, tmp_path: Pa
         load_weights(build_policy("pi05"), published)
     with pytest.raises(UserError, match="memory in its place"):
         load_weights(tiny(memory="framesamp", **{"memory.grid": 2, "memory.budget": 8}), published)
+
+
+def changed(published: Path, folder: Path, **changes: Any) -> Path:
+    """A copy of a published folder whose config.json has other values; `...` leaves a key out."""
+    shutil.copytree(published, folder)
+    config = json.loads((published / "config.json").read_text()) | changes
+    kept = {key: value for key, value in config.items() if value is not ...}
+    (folder / "config.json").write_text(json.dumps(kept))
+    return folder
+
+
+def test_an_unused_state_and_no_video_may_be_null(published: Path, tmp_path: Path) -> None:
+    config = json.loads((published / "config.json").read_text())
+    config |= {"use_proprio": False, "state_dim": None, "history_image_keys": None}
+    config |= {"robot_tag": None, "native_video_fps": None}
+    read = PublishedConfig.read(config, published)
+    settings = read.settings()
+    assert (read.state_inputs, settings["processor.robot"], settings["processor.native_fps"]) == (
+        0,
+        None,
+        None,
+    )
+    assert settings["backbone.head.rope_section"] == config["dit_mrope_section"]
+    load_weights(tiny(1), changed(published, tmp_path / "silent", history_image_keys=None))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"use_proprio": True, "state_dim": None}, r"here: config\.json: state_dim=None"),
+        ({"dit_depth": ..., "image_keys": ...}, r"no SimpleMemVLA's: it lacks dit_depth, image_k"),
+        ({"dit_depth": "two"}, r"here: config\.json\.dit_depth='two' must be a whole number"),
+        ({"timestep_beta_beta": 2}, r"here: config\.json: timestep_beta_beta=2; only 1"),
+        ({"dit_mrope_section": [11, 11, 11]}, r"Set backbone\.head\.rope_section=\[11, 11, 11\]"),
+    ],
+)
+def test_what_a_published_configuration_lacks_is_named(
+    changes: dict[str, Any], words: str, published: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match=words):
+        load_weights(tiny(1), changed(published, tmp_path / "here", **changes))
 
 
 def test_a_missing_tokenizer_or_processor_file(tmp_path: Path) -> None:
