@@ -8,7 +8,7 @@ class UserError(ValueError):
     """Something the user gave cannot work: the message names the value, what was expected, and what
     to do.
 
-    Values come from files of strangers, too: the middle of a message that is longer than
+    Values come from foreign files, too: the middle of a message that is longer than
     `LONGEST` characters is left out.
     """
 

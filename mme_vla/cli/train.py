@@ -306,8 +306,8 @@ def config_of(run: TrainRun, place: Run) -> dict[str, Any]:
         return dict(run.config)
     began_with: dict[str, Any] = read_state(place.checkpoint)["config"]
     ranges = {"narrow_ranges": began_with["data"].get("narrow_ranges")}
-    kept = {"init_from": began_with.get("init_from"), "data": {**run.config["data"], **ranges}}
-    return {**run.config, **kept}
+    values = {"init_from": began_with.get("init_from"), "data": {**run.config["data"], **ranges}}
+    return {**run.config, **values}
 
 
 def recipe(config: dict[str, Any]) -> dict[str, Any]:

@@ -242,12 +242,12 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
 
     # The model: the one that is named, else the one that the source is of.
     words = list(overrides)
-    chosen = {}
+    settings = {}
     for word in words:
         key, _, value = word.partition("=")
-        chosen[key] = value
+        settings[key] = value
     variants = opened.variants
-    model = chosen.get("model")
+    model = settings.get("model")
     if model is None:
         model = variants[0] if variants else "pi05"
         require(
@@ -261,11 +261,11 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
         raise UserError(
             f"{opened.folder} says it is {listed(variants)}, but model={model} was given."
         )
-    if opened.lacks_positions and "memory.positions" not in chosen:
+    if opened.lacks_positions and "memory.positions" not in settings:
         words.append("memory.positions=none")
     print(f"Reading {opened.label} as {' '.join(words)}", file=sys.stderr)
     composed = compose("policy", words)
-    if "backbone" not in chosen:
+    if "backbone" not in settings:
         composed = compose("policy", [*words, f"backbone={composed.full_size}"])
 
     method = method_formats().get(opened.format)

@@ -293,20 +293,21 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[Memb
         if isinstance(member, Mapping):
             options = dict(member)
         name = options.pop("name", None)
-        own_budget = options.pop("budget", None)
+        member_budget = options.pop("budget", None)
         require(
             isinstance(name, str) and name != "joined",
             f"memory.members: {brief(member)} is no memory to join; give a name, or {{name: …}}.",
         )
         require(
-            own_budget is None or type(own_budget) is int,
-            f"memory.members: {brief(member)}: budget={brief(own_budget)} must be a whole number.",
+            member_budget is None or type(member_budget) is int,
+            f"memory.members: {brief(member)}: budget={brief(member_budget)} must be a whole"
+            " number.",
         )
-        read.append(Member(name, own_budget, options))
-        if own_budget is None:
+        read.append(Member(name, member_budget, options))
+        if member_budget is None:
             n_open += 1
         else:
-            taken += own_budget
+            taken += member_budget
     share = (budget - taken) // max(n_open, 1)
     if share >= SHARE_UNIT:
         share -= share % SHARE_UNIT

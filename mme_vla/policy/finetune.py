@@ -161,8 +161,10 @@ def add_adapters(
     again.
     """
     has_adapters = any(".lora_" in name for name, _ in policy.named_parameters())
-    is_adapted = PolicySections.of(policy.config).adapters and has_adapters
-    require(not is_adapted, "This policy has adapters already: merge_adapters() first.")
+    adapters = PolicySections.of(policy.config).adapters
+    require(
+        not (adapters and has_adapters), "This policy has adapters already: merge_adapters() first."
+    )
     require(
         rank >= 1 and alpha > 0 and 0 <= dropout < 1,
         f"finetune: rank={rank}, alpha={alpha}, dropout={dropout}: need rank ≥ 1, alpha > 0,"

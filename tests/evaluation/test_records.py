@@ -36,7 +36,7 @@ def test_an_event_without_text_or_step_is_refused(entry: dict[str, Any], tmp_pat
     line = {**json.loads(record().to_json()), "events": [entry]}
     line.pop("crc32", None)
     (tmp_path / "episodes.jsonl").write_text(json.dumps(line) + "\n")
-    with pytest.raises(UserError, match="record.events"):
+    with pytest.raises(UserError, match=r"record\.events"):
         read_records(tmp_path / "episodes.jsonl")
 
 

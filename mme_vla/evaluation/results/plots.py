@@ -70,10 +70,10 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
             shift = (place - (len(having) - 1) / 2) * width
             points: list[tuple[float, Figure]] = []
             for j, name in enumerate(names):
-                shown = method.figures[kind][name]
-                points.append((j + shift, shown))
-                if shown.paper is not None:
-                    lines.append((j + shift, shown.paper.mean))
+                estimate = method.figures[kind][name]
+                points.append((j + shift, estimate))
+                if estimate.paper is not None:
+                    lines.append((j + shift, estimate.paper.mean))
             xs, heights, gaps = _with_intervals(points)
             axes.bar(xs, heights, 0.88 * width, color=_colour(i), label=method.label)
             axes.errorbar(xs, heights, np.maximum(gaps, 0), fmt="none", ecolor=INK, elinewidth=0.9)
@@ -96,11 +96,11 @@ def heat_map(results: Results) -> str:
     rows: list[tuple[str, list[float | None]]] = []
     for method in results.methods:
         figures = [method.figures["task"][task] for task in tasks]
-        rows.append((method.label, [shown.mean for shown in figures]))
+        rows.append((method.label, [estimate.mean for estimate in figures]))
         if method.paper is not None:
             reported: list[float | None] = []
-            for shown in figures:
-                reported.append(None if shown.paper is None else shown.paper.mean)
+            for estimate in figures:
+                reported.append(None if estimate.paper is None else estimate.paper.mean)
             rows.append(("paper", reported))
     values = np.array([row for _, row in rows], float)  # None is NaN
     with figure((0.62 * len(tasks) + 2.4, 0.34 * len(rows) + 1.7)) as (canvas, (axes,)):
@@ -309,9 +309,11 @@ def _with_intervals(
     places = []
     means = []
     gaps = []
-    for at, shown in points:
-        if shown.mean is not None and shown.interval is not None:
+    for at, estimate in points:
+        if estimate.mean is not None and estimate.interval is not None:
             places.append(at)
-            means.append(shown.mean)
-            gaps.append((shown.mean - shown.interval.low, shown.interval.high - shown.mean))
+            means.append(estimate.mean)
+            gaps.append(
+                (estimate.mean - estimate.interval.low, estimate.interval.high - estimate.mean)
+            )
     return places, means, np.array(gaps).reshape(-1, 2).T

@@ -184,8 +184,8 @@ class RunningEpisode:
             if has_one_a_frame:
                 leading = None  # before the first action
                 if self.report.held is not None:
-                    held = np.asarray(self.report.held, np.float32)
-                    leading = np.repeat(held[None], n_frames, axis=0)
+                    target = np.asarray(self.report.held, np.float32)
+                    leading = np.repeat(target[None], n_frames, axis=0)
         self._expect(frames, np.zeros(n_frames, bool), leading)
 
     @property
