@@ -402,7 +402,7 @@ def write_sharded(folder: Path) -> None:
 
 
 def write_without_sums(folder: Path) -> None:
-    """The same as it was written before there were checksums, or by somebody else."""
+    """The same as it was written before there were checksums, or by another program."""
     write_sharded(folder)
     (folder / SUMS).unlink()
 

@@ -133,7 +133,7 @@ def claim_plan(folder: Path, plan: Any) -> bool:
 def drop_plan(folder: Path, *work: str) -> None:
     """Remove a plan's work, the plan last: a removal that was cut off is recognised, and repeated.
 
-    Whatever else somebody has put into the folder stays, and the folder with it. Otherwise the
+    Whatever else lies in the folder stays, and the folder with it. Otherwise the
     release of its lock, which the caller holds, removes it.
 
     Args:

@@ -411,7 +411,7 @@ def test_a_file_beside_those_that_were_loaded_is_noticed(
     finished: Path, checkpoint: Path, tmp_path: Path
 ) -> None:
     copy = shutil.copytree(checkpoint, tmp_path / "copy")
-    (copy / "notes.md").write_text("read by nobody")
+    (copy / "notes.md").write_text("not read")
     assert receipts.verify(finished, copy).word == "agrees"
     (copy / "model.safetensors.index.json").write_text("{}")
     differences = receipts.verify(finished, copy).differences

@@ -1,4 +1,4 @@
-"""Files that somebody adds to a checkpoint: what is read is what was checked, or is refused by
+"""Files that are added to a checkpoint: what is read is what was checked, or is refused by
 name.
 """
 
