@@ -49,7 +49,7 @@ def planner_system(task: str, kind: str) -> str:
             "You lead a robot arm at a table, which you see through a camera in front of it. You"
             " keep a notebook, the only thing that you remember from one question to the next:"
             " write down what later decisions depend on. Whether a subgoal is complete is judged by"
-            " another user; you are asked once it is, and name the next one."
+            " somebody else; you are asked once it is, and name the next one."  # codespell:ignore
         ),
         *describe_subgoals(task, kind),
         (
