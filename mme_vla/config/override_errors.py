@@ -177,12 +177,12 @@ def _unknown_key(key: str, defaults: Any, groups: Sequence[str]) -> str:
 
 
 def _keys_with_word(word: str, keys: Iterable[str]) -> list[str]:
-    """The dotted keys that end in this word; else those whose last part has it, as `max_batch` has
+    """The dotted keys that end in this word, then those whose last part has it, as `max_batch` has
     `batch`.
     """
     last = {key: key.rpartition(".")[2] for key in keys}
     equal = [key for key, name in last.items() if name == word]
-    return equal or [key for key, name in last.items() if word in name.split("_")]
+    return equal + [k for k, name in last.items() if name != word and word in name.split("_")]
 
 
 def unknown_option(option: str, words: Sequence[str], keys: Sequence[str]) -> UserError:

@@ -14,7 +14,6 @@ import pytest
 from helpers import REPOSITORY
 from mme_vla import cli
 from mme_vla.cli import docs
-from mme_vla.cli import help as cli_help
 from mme_vla.config.trees import library_files
 from mme_vla.errors import UserError
 
@@ -111,7 +110,7 @@ def test_words_of_comments_and_outputs_of_notebooks_are_shown(site: Path) -> Non
     for group in config_pages.groups():
         page = text_of(site / "reference" / "configuration" / f"{group}.html")
         for file in library_files(group).values():
-            for key in cli_help.keys(file):
+            for key in config_pages.keys(file):
                 for braces in re.findall(r"\{[^{}]*\}", key.comment.replace("`", "")):
                     assert braces in page, f"{file.name}: {key.name}"
                     shown += 1

@@ -62,7 +62,7 @@ def sections(**processor: Any) -> dict[str, Any]:
     config, pixels = meta["config"], meta["processor"]
     bounds = [pixels["min_pixels"], pixels["max_pixels"]]
     composed = OmegaConf.create({"backbone": {}, "processor": {}})
-    PublishedConfig.read(config).configure(composed)
+    PublishedConfig.read(config, "the golden data").configure(composed)
     read_sections: Any = OmegaConf.to_container(composed)
     backbone = read_sections["backbone"]
     settings = {
