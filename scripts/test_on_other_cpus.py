@@ -13,6 +13,10 @@ import sys
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(REPOSITORY / "tests"))
+
+from helpers.cpu_settings import KERNELS, THREADS, name_of  # noqa: E402
+
 TESTS = (
     "tests/envs/test_scenes_on_other_cpus.py",
     "tests/envs/test_scene_values.py",
@@ -22,29 +26,19 @@ TESTS = (
     "tests/training/test_resume_exactly.py",
     "tests/memory/test_streaming.py",
 )
-AVX512 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
-SETTINGS = (
-    {"ATEN_CPU_CAPABILITY": "default"},
-    {"NPY_DISABLE_CPU_FEATURES": AVX512},
-    {"OPENBLAS_CORETYPE": "Prescott"},
-    {"MKL_CBWR": "COMPATIBLE"},
-    {"MKL_CBWR": "AVX2"},
-    {"OMP_NUM_THREADS": "1"},
-    {"OMP_NUM_THREADS": "2"},
-)
 
 
 def main() -> int:
     """Run all settings, and return how many failed."""
     failed = []
-    for setting in SETTINGS:
-        name = " ".join(f"{variable}={value.split()[0]}" for variable, value in setting.items())
+    for setting in KERNELS + THREADS:
+        name = name_of(setting)
         print(f"+ {name}", flush=True)
         command = [sys.executable, "-m", "pytest", "-q", *TESTS, *sys.argv[1:]]
         variables = {"OMP_NUM_THREADS": "1", **os.environ, **setting}
         if subprocess.run(command, cwd=REPOSITORY, env=variables, check=False).returncode:
             failed.append(name)
-    print("failed: " + ", ".join(failed) if failed else f"all {len(SETTINGS)} settings pass")
+    print("failed: " + ", ".join(failed) if failed else "all settings pass")
     return len(failed)
 
 

@@ -16,19 +16,12 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers import REPOSITORY
+from helpers.cpu_settings import KERNELS, name_of
 from helpers.scene_digest import scene_digest
 
 ALL = "83a1ec626029d931af403d2ff72ae18433d764a68bcde802d00bf4630ee7e499"
 EVERY_TENTH = "57d0bfd8218067932f3a40cc3c174eda2fcba36eb806760c16e9007437167320"
 EVERY_TWELFTH = "c8acb4980eb9f69d22ee29fb7a227e8128feba56a4bb3964bfe8bad97e6fb56e"
-AVX512 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
-SETTINGS = [
-    {"NPY_DISABLE_CPU_FEATURES": AVX512},
-    {"OPENBLAS_CORETYPE": "Prescott"},
-    {"MKL_CBWR": "COMPATIBLE"},
-    {"MKL_CBWR": "AVX2"},
-    {"ATEN_CPU_CAPABILITY": "default"},
-]
 
 
 def digest_in_process(*command: str, every: int = 1, **settings: str) -> str:
@@ -48,9 +41,7 @@ def test_scenes_here_have_the_recorded_bits() -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(
-    "setting", SETTINGS, ids=lambda setting: "-".join(*setting.items()).split()[0]
-)
+@pytest.mark.parametrize("setting", KERNELS, ids=name_of)
 def test_scenes_have_the_same_bits_with_the_kernels_of_another_cpu(setting: dict[str, str]) -> None:
     assert digest_in_process(**setting) == ALL
 

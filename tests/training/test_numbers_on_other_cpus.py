@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from helpers import REPOSITORY, number_digests
+from helpers.cpu_settings import KERNELS, name_of
 
 RECORDED = {
     "noise": "e610e6d0bd84d63c",
@@ -21,17 +22,6 @@ RECORDED = {
     "bootstraps": "c1b6ea722fa1b5b2",
     "tokens": "0d9a53aa3b8de47b",
 }
-SETTINGS = [
-    {
-        "NPY_DISABLE_CPU_FEATURES": (
-            "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
-        )
-    },
-    {"OPENBLAS_CORETYPE": "Prescott"},
-    {"MKL_CBWR": "COMPATIBLE"},
-    {"MKL_CBWR": "AVX2"},
-    {"ATEN_CPU_CAPABILITY": "default"},
-]
 
 
 @pytest.mark.parametrize("name", ["order", "bootstraps", "tokens"])
@@ -46,9 +36,7 @@ def test_noise_of_a_seed_has_the_recorded_bits() -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(
-    "setting", SETTINGS, ids=lambda setting: "-".join(*setting.items()).split()[0]
-)
+@pytest.mark.parametrize("setting", KERNELS, ids=name_of)
 def test_numbers_of_a_seed_do_not_depend_on_the_kernels_of_a_cpu(setting: dict[str, str]) -> None:
     environment = (
         os.environ | setting | {"PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"}
