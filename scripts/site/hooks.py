@@ -53,11 +53,16 @@ LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", "
 
 
 def on_config(config: "MkDocsConfig") -> "MkDocsConfig":
-    """Take version and address of the project from `pyproject.toml`."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    config.extra["version_label"] = project["version"]
-    config.copyright = f"{config.site_name} {project['version']} · {config.copyright}"
-    config.repo_url = config.repo_url or project.get("urls", {}).get("Repository")
+    """Take version and address of the project from `pyproject.toml`. The placeholder of an address
+    is no link.
+    """
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    version = pyproject["project"]["version"]
+    address = pyproject["tool"]["hatch"]["metadata"]["hooks"]["custom"]["repository"]
+    config.extra["version_label"] = version
+    config.copyright = f"{config.site_name} {version} · {config.copyright}"
+    if "/OWNER/" not in address:
+        config.repo_url = address
     return config
 
 
