@@ -1,10 +1,10 @@
-"""How far each dial of `split=stress` goes: who knows everything, does it still solve the test
-scenes?
+"""How far each dial of `split=stress` goes: whether experts with the full state still solve the
+test scenes.
 
 `python benchmarks/stress_dials.py --output benchmarks/results/stress_dials.csv` (continues where
 it was stopped)
 
-Two know everything. The demonstrator moves the arm as it records. The oracle planner is
+There are two experts. The demonstrator moves the arm as it records. The oracle planner is
 `mme_vla.play`'s: it acts from outside, as a policy in an evaluation does, by choices and pixels,
 and has so many control steps after the video.
 """

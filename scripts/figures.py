@@ -3,7 +3,7 @@
     # memory, history, budget, integration
     python scripts/figures.py
     python scripts/figures.py probe --probe outputs/probe      # from the folder of a finished probe
-    python scripts/figures.py memory --output /tmp/figures
+    python scripts/figures.py memory --output outputs/figures
 
 Selections come from the memories themselves, at their full-size options, on episode 0 of
 `dataset=sample` (VideoUnmask, 66 frames of video, 173 in all). No weights are needed, because these

@@ -2,7 +2,7 @@
 docs/benchmark/gallery.md.
 
     python scripts/gallery_videos.py                       # all sixteen, half an hour of one core
-    python scripts/gallery_videos.py StopCube --output /tmp/gallery
+    python scripts/gallery_videos.py StopCube --output outputs/gallery
 
 Episode 2 of the `test` split, front camera. A red border marks frames of the conditioning video.
 Existing files are kept.

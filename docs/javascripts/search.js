@@ -1,5 +1,5 @@
-// The search: finds what was typed as it stands, with its dashes and dots. It takes the place of the theme's worker and
-// has its messages: 0 brings the sections, 1 says that they are read, 2 is a query, 3 brings what was found.
+// The search: finds words as typed, with their dashes and dots. It replaces the theme's worker and has its messages:
+// 0 brings the sections, 1 says that they are read, 2 is a query, 3 brings the results.
 // A word matches where a word of the text begins with it. Every word has to be in a section or in its title.
 const SETUP = 0, READY = 1, QUERY = 2, RESULT = 3;
 const LIMIT = 60; // sections shown
@@ -46,7 +46,7 @@ const count = (text, expression, most = 20) => {
   return found;
 };
 
-// How well a section answers one word. 0: not at all.
+// How well a section matches one word. 0: not at all.
 function score(section, word, expression) {
   const { lowerTitle, lowerText, path } = section;
   let points = 0;

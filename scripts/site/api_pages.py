@@ -17,7 +17,7 @@ REGISTRIES = "registries"
 """The page of the constants."""
 INTRODUCTION = """# API
 
-Everything below is imported from `mme_vla` itself, and loaded when it is first used.
+Names are imported from `mme_vla`, and loaded when they are first used. Types under *Modules* are imported from their module.
 [From Python](../start/python.md) shows it at work.
 """
 FORMER_NAMES = {"Memory": "MemoryModule"}

@@ -71,6 +71,12 @@ def test_ci_runs_the_commands_of_the_readme() -> None:
         assert command in contributing
 
 
+def test_tests_that_the_documentation_names_exist() -> None:
+    for page in (REPOSITORY / "docs").rglob("*.md"):
+        for name in re.findall(r"tests/[\w/]+\.py", page.read_text()):
+            assert (REPOSITORY / name).is_file(), f"{page}: {name}"
+
+
 def test_links_in_the_documentation_lead_to_files() -> None:
     broken = []
     for page in [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("**/*.md")]:
