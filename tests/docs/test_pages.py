@@ -93,7 +93,9 @@ def test_every_page_is_in_the_navigation_once() -> None:
 
 def test_the_documentation_workflow_builds_the_site() -> None:
     runs = list(steps("docs.yml"))
-    assert any(run.endswith("uv run --extra docs --extra harness mme-vla docs --build") for run in runs)
+    assert any(
+        run.endswith("uv run --extra docs --extra harness mme-vla docs --build") for run in runs
+    )
 
 
 def test_the_test_workflow_trains_and_runs_both_tiers() -> None:

@@ -389,17 +389,14 @@ def make_vec_env(
             numbers = list(range(len(source.episodes(name, split))))
         for number in numbers:
             jobs.append(Job(name, split, source.episode(name, split, number).episode))
-    make: Callable[..., Any] = partial(
-        open_episode, env, action_space=action_space, max_steps=max_steps, render=render
-    )
+    make: Callable[..., Any]
+    shared: dict[str, Any] = {
+        "action_space": action_space,
+        "max_steps": max_steps,
+        "render": render,
+    }
     if env == ROBOMME:
-        make = partial(
-            make_env,
-            action_space=action_space,
-            max_steps=max_steps,
-            render=render,
-            reward=reward,
-            include=include,
-            **scene,
-        )
+        make = partial(make_env, **shared, reward=reward, include=include, **scene)
+    else:
+        make = partial(open_episode, env, **shared)
     return VecEnv(jobs, workers, make, timeout)
