@@ -3,9 +3,9 @@ weights.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 from mme_vla.config.naming import digest, flat
 from mme_vla.config.sections import Range, read_section
@@ -56,25 +56,6 @@ class TrainingIdentity:
     weights: str | None = None
 
 
-@dataclass(frozen=True)
-class _Sections:
-    """The sections of a training's configuration that say what its updates are."""
-
-    seed: int
-    train: Mapping[str, Any] = field(default_factory=dict)
-    policy: Mapping[str, Any] = field(default_factory=dict)
-    data: Mapping[str, Any] = field(default_factory=dict)
-    finetune: Mapping[str, Any] | None = None
-    learning: Mapping[str, Any] | None = None
-    init_from: str | None = None
-
-    @classmethod
-    def of(cls, config: Mapping[str, Any]) -> Self:
-        """Name the sections; null means the same as a missing one."""
-        names = [spec.name for spec in fields(cls)]
-        return cls(**{name: config[name] for name in names if config.get(name) is not None})
-
-
 def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any]:
     """The identity of a training before it has weights, as plain values for the policy's
     configuration.
@@ -82,12 +63,13 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
     Args:
         config: the plain configuration of a training. content: fingerprints of its datasets.
     """
-    training = _Sections.of(config)
-    train, policy, data = training.train, training.policy, training.data
+    train = config.get("train") or {}
+    policy = config.get("policy") or {}
+    data = config.get("data") or {}
     settings = {
         "train": {key: train[key] for key in train if key not in _TRAIN_WITHOUT_EFFECT},
-        "finetune": training.finetune,
-        "learning": training.learning,
+        "finetune": config.get("finetune"),
+        "learning": config.get("learning"),
         "policy": {key: policy.get(key) for key in _POLICY},
         "data": {key: data.get(key) for key in _DATA},
     }
@@ -95,7 +77,7 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
     for key, value in flat(settings).items():
         if value not in (None, [], {}):
             recipe[key] = value
-    source = training.init_from
+    source = config.get("init_from")
     if source is not None and source != NONE:
         # The weights to start from: their digest, or the end of their path or hub name.
         folder = newest_checkpoint(Path(source).expanduser())
@@ -105,7 +87,7 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
         "val_fraction": data.get("val_fraction"),
         "val_episodes": data.get("val_episodes"),
     }
-    identity = TrainingIdentity(int(training.seed), digest(recipe, 12), digest(split, 12))
+    identity = TrainingIdentity(int(config["seed"]), digest(recipe, 12), digest(split, 12))
     return {key: value for key, value in asdict(identity).items() if value is not None}
 
 
