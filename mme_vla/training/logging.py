@@ -81,18 +81,13 @@ class Window:
         Args:
             step: updates done. reduce: averages a tensor over all processes (`Accelerator.reduce`).
         """
-        values: dict[str, float] = {}
-        measured: dict[str, Tensor] = {}
+        averages: dict[str, Any] = {}
         for name, total in self._sums.items():
-            average = total / self._counts[name]
-            if isinstance(average, Tensor):
-                measured[f"train/{name}"] = average
-                values[f"train/{name}"] = math.nan  # its place in the order; the number is below
-            else:
-                values[f"train/{name}"] = average
+            averages[f"train/{name}"] = total / self._counts[name]
+        measured = {name: mean for name, mean in averages.items() if isinstance(mean, Tensor)}
         # One transfer from the device for all of them.
         means = reduce(torch.stack(list(measured.values())), reduction="mean").tolist()
-        values |= zip(measured, means, strict=True)
+        values: dict[str, float] = averages | dict(zip(measured, means, strict=True))
         seconds = time.perf_counter() - self._begun - self._paused
         values["speed/samples_per_s"] = self._updates * self._batch_size / seconds
         values["speed/waiting_for_data"] = self._waited / seconds
