@@ -145,8 +145,8 @@ class EpisodeSource:
         self._reader = VideoReader(max_open_videos)
         self._motions: dict[int, Motions] = {}
         image_columns = tuple(dict.fromkeys(images))
-        flags = ["is_demo", "exec_start_idx"]
-        flags += [f"{camera}{RENDERED_SUFFIX}" for camera in self.columns]
+        rendered = {camera: f"{camera}{RENDERED_SUFFIX}" for camera in self.columns}
+        flags = ["is_demo", "exec_start_idx", *rendered.values()]
         rows = read_index_columns(self.root, features, flags)
         self._table = open_table(self.root, columns, features)
         self.tasks = check_consistency(
@@ -157,9 +157,9 @@ class EpisodeSource:
         side_file = None if exec_starts is None else Path(exec_starts)
         self.exec_starts = self._read_exec_starts(rows, side_file)
         self._rendered: dict[str, np.ndarray] = {}
-        for camera in self.columns:
-            if f"{camera}{RENDERED_SUFFIX}" in rows:
-                self._rendered[camera] = rows[f"{camera}{RENDERED_SUFFIX}"].astype(bool)
+        for camera, column in rendered.items():
+            if column in rows:
+                self._rendered[camera] = rows[column].astype(bool)
 
         # The greatest sizes of numbers, and whether they fit their units.
         self.scales: dict[str, np.ndarray] = {}

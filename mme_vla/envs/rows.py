@@ -75,7 +75,7 @@ def _ood() -> dict[str, list[Row]]:
 @cache
 def _read_file(path: str, modified: int, known: tuple[str, ...]) -> dict[str, list[Row]]:
     """Rows by task. modified: time of the last change, so that a changed file is read again."""
-    text = read_text(Path(path), "scenes").replace("\r\n", "\n").replace("\r", "\n")
+    text = read_text(Path(path), "scenes").replace("\r", "\n")
     rows = []
     # Not splitlines(): the values may hold other separators of lines.
     for number, line in enumerate(text.split("\n"), start=1):
