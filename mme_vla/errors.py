@@ -14,7 +14,7 @@ class UserError(ValueError):
 
     LONGEST = 2000
 
-    def __init__(self, message: str = "") -> None:
+    def __init__(self, message: str) -> None:
         if len(message) > self.LONGEST:
             message = f"{message[: self.LONGEST - 500]} … {message[-400:]}"
         super().__init__(message)

@@ -190,7 +190,7 @@ def report_coverage(
     write_json(
         file, {task: episode_goals.to_dict() for task, episode_goals in coverage.items()}, indent=1
     )
-    print(f"{in_words(coverage, 'test')}\n{file}")
+    print(f"{in_words(coverage)}\n{file}")
 
 
 def plan(run: RecordRun) -> list[Job]:

@@ -70,8 +70,6 @@ def join_memories(cfg: DictConfig) -> DictConfig:
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
-DEFAULT_POLICY = "mme"
-"""The policy of configurations that name none: backbone × memory × integration."""
 
 
 def digest(values: Mapping[str, Any], letters: int) -> str:

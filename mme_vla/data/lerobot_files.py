@@ -526,7 +526,7 @@ INDEX_COLUMNS = ("episode_index", "frame_index", "timestamp", "index", "task_ind
 
 
 def read_index_columns(
-    root: Path, features: Mapping[str, Feature], flags: Sequence[str] = ()
+    root: Path, features: Mapping[str, Feature], flags: Sequence[str]
 ) -> dict[str, np.ndarray]:
     """The columns that say which row is which, each [rows]: int64, and `timestamp` float64; those
     that all files have.

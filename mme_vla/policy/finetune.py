@@ -211,9 +211,7 @@ def merge_adapters(policy: "Policy") -> None:
         parameter.requires_grad_(True)
 
 
-def merge_state(
-    tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | None
-) -> dict[str, Tensor]:
+def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any]) -> dict[str, Tensor]:
     """Fold the adapters of saved weights, as `merge_adapters` does of a policy; without adapters
     nothing changes.
     """

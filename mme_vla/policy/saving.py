@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.building import shapes_only
-from mme_vla.config.naming import DECISIVE, DEFAULT_POLICY, digest, flat
+from mme_vla.config.naming import DECISIVE, digest, flat
 from mme_vla.config.plugins import import_trusted
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import embodiment_of
@@ -57,6 +57,10 @@ def composition_digest(config: Mapping[str, Any]) -> str:
     if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):
         settings |= flat({"embodiment": robot.to_dict()})
     return digest(settings, 12)
+
+
+DEFAULT_POLICY = "mme"
+"""The policy of configurations that name none: backbone × memory × integration."""
 
 
 def policy_name(config: Mapping[str, Any]) -> str:

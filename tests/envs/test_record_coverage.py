@@ -47,7 +47,7 @@ def test_goals_without_a_demonstration_are_named_with_their_episodes() -> None:
         "goals": 3, "goals_covered": 1, "episodes": 4, "episodes_covered": 1,
         "missing": {"third": [0, 2], "fifth": [3]},
     }  # fmt: skip
-    assert coverage.in_words({"StopCube": result}, "test").splitlines() == [
+    assert coverage.in_words({"StopCube": result}).splitlines() == [
         "StopCube: 1 of 3 goals of 'test', 1 of 4 episodes",
         "  never shown: third (episode 0, 2)",
         "  never shown: fifth (episode 3)",

@@ -92,14 +92,14 @@ def compare(
     return coverage
 
 
-def in_words(coverage: Mapping[str, TaskCoverage], split: str) -> str:
-    """A line a task, and the missing goals under it."""
+def in_words(coverage: Mapping[str, TaskCoverage]) -> str:
+    """A line a task, and the missing goals of the split `test` under it."""
     lines = []
     for name, task in coverage.items():
         covered = task.goals - len(task.missing)
         episodes = task.episodes - task.missing_episodes
         lines.append(
-            f"{name}: {covered} of {task.goals} goals of {split!r}, {episodes} of {task.episodes}"
+            f"{name}: {covered} of {task.goals} goals of 'test', {episodes} of {task.episodes}"
             " episodes"
         )
         for goal, numbers in task.missing.items():
