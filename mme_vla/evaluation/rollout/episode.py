@@ -52,9 +52,9 @@ class EventCourse:
                 entry["step"] = 0
         return real
 
-    def next(self, episode: Episode, step: int, subtask: int) -> Perturbation | None:
+    def next(self, episode: Episode, step: int, subtask: int) -> None:
         """Let events take place that are due at this decision, up to one that holds the robot,
-        which is returned.
+        which is then `holding`.
 
         Args:
             step: control steps so far. subtask: number of the current sub-task, 0 where the
@@ -74,8 +74,7 @@ class EventCourse:
                 event.perturbation.act(episode)
                 if event.perturbation.hold:
                     self.holding = event.perturbation
-                    return event.perturbation
-        return None
+                    return
 
 
 class RunningEpisode:

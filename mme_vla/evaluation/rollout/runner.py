@@ -307,7 +307,8 @@ class Rollout:
 
     def _proceed(self, running: RunningEpisode) -> None:
         """Have the policy act, unless an event holds the robot first; every frame is read."""
-        event = running.events.next(running.episode, running.steps, running.report.subtask)
+        running.events.next(running.episode, running.steps, running.report.subtask)
+        event = running.events.holding
         if event is None:
             self._scheduler.acting.append(running)
             return
