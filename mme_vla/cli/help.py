@@ -145,11 +145,11 @@ def _group_page(word: str, groups: dict[str, str], trees: Sequence[Path]) -> str
     files = yaml_files(trees, group)
     if name and name not in files:
         raise UserError(f"Unknown {group} {name!r}. {did_you_mean(name, files)}")
+    if name:
+        files = {name: files[name]}
     parts = [f"Group {group}, by default {group}={groups[group]}"]
-    for stem in files:
-        if name and stem != name:
-            continue
-        parts.append(f"{group}={stem}\n{textwrap.indent(files[stem].read_text().rstrip(), '  ')}")
+    for stem, file in files.items():
+        parts.append(f"{group}={stem}\n{textwrap.indent(file.read_text().rstrip(), '  ')}")
     return "\n\n".join(parts)
 
 

@@ -11,7 +11,7 @@ from mme_vla.utils import decoding, require_file
 from mme_vla.utils.media import FPS
 
 VIDEO_FRAMES = 10  # of a video, at most
-SECOND_FRAMES = 2.0  # of a second of video
+FRAMES_PER_SECOND = 2.0  # of video
 LEAST_FRAMES = 4  # of a video, if it has as many
 ENCODING: dict[str, Any] = {"crf": 18, "preset": "medium"}
 """Compression of videos of training data, finer than that of videos for people."""
@@ -79,7 +79,7 @@ def sample_video(length: int, most: int = VIDEO_FRAMES) -> np.ndarray:
     Returns:
         int64 indices, evenly spaced from the first to the last frame.
     """
-    count = max(int(length / FPS * SECOND_FRAMES), LEAST_FRAMES)
+    count = max(int(length / FPS * FRAMES_PER_SECOND), LEAST_FRAMES)
     count = min(count, most, length)
     count -= count % 2
     count = max(count, min(2, length))

@@ -82,16 +82,14 @@ def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:
     return policy
 
 
-PARTS = ("backbone", "memory", "integration", "policy", "embodiment")
-
-
 def tiny_sections(model: str, backbone: str = "tiny") -> dict[str, Any]:
     """The plain sections of a model at a small backbone's size, for `MMEPolicy.from_config`."""
     sections = OmegaConf.to_container(
         _composed(*policy_words(model, {"backbone": backbone})), resolve=True
     )
     assert isinstance(sections, dict)
-    return {str(key): sections[key] for key in PARTS}
+    parts = ("backbone", "memory", "integration", "policy", "embodiment")
+    return {key: sections[key] for key in parts}
 
 
 @cache
