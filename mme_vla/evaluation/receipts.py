@@ -326,7 +326,7 @@ def _compare_records(
         limit += sum(event.perturbation.hold for event in read_events(expected["event"]))
     except UserError as error:
         limit = float("inf")
-        result.not_compared.append(f"steps: the settings name no limit of them ({error}).")
+        result.not_compared.append(f"steps: the receipt's event cannot be read ({error}).")
 
     for record in records:
         values = asdict(record)

@@ -52,7 +52,7 @@ class ChangeScorer(FrameScorer):
         return cells.mean(axis=(1, 3, 4), dtype=np.float32).reshape(-1)
 
 
-# Caches of this scorer had a written key before keys followed from code: they are found by it.
+# Caches made before keys were derived from the code have this key.
 FORMER_KEYS["c7f24220"] = "change{grid}x{grid}-every{stride}"
 
 

@@ -117,8 +117,7 @@ class Evaluation(NamedTuple):
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What a run needs beside its policy, episodes and settings; none of it decides an outcome but
-    the predictor.
+    """What a run needs beside its policy, episodes and settings.
 
     subgoals: predicts the subgoal, where the policy reads one.
     shard: which of how many processes this is; each takes the next episode that is free when it has

@@ -1,8 +1,7 @@
-"""Memory banks (MemoryVLA): learned tokens of past moments that are written, retrieved, fused and
-merged.
+"""Memory banks (MemoryVLA): learned tokens of past frames that are retrieved, fused and merged.
 
 Unlike the memories that choose among stored vision tokens, a bank keeps tokens that the network
-itself made of a moment. The tokens of the current moment are the queries.
+itself computed from a frame. The tokens of the current frame are the queries.
 """
 
 from typing import Any, ClassVar
@@ -162,7 +161,7 @@ class MemoryBank(Retrieval):
         fusion: str = "gate",
         consolidation: str = "tome",
     ) -> None:
-        """Build an empty bank.
+        """Build the layers of a bank.
 
         Args:
             width, retrieval_layers, time_code, fusion: as for `Retrieval`. length: most moments it
