@@ -8,7 +8,7 @@ class UserError(ValueError):
     """Something the user gave cannot work: the message names the value, what was expected, and what
     to do.
 
-    Values come from foreign files, too: the middle of a message that is longer than
+    Values may come from untrusted files: the middle of a message that is longer than
     `LONGEST` characters is left out.
     """
 
@@ -16,7 +16,7 @@ class UserError(ValueError):
 
     def __init__(self, message: str) -> None:
         if len(message) > self.LONGEST:
-            message = f"{message[: self.LONGEST - 500]} … {message[-400:]}"
+            message = f"{message[: self.LONGEST // 2]} … {message[-self.LONGEST // 4 :]}"
         super().__init__(message)
 
 

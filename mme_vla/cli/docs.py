@@ -75,16 +75,16 @@ def check_site(folder: Path) -> None:
     folders: set[str] = set()
     for name in sums:
         folders.update(parent.as_posix() for parent in Path(name).parents)
-    foreign: list[str] = []
+    other_files: list[str] = []
     for path in folder.rglob("*"):
         if not _is_ours(path, folder, sums, folders):
-            foreign.append(path.name)
-        if len(foreign) == 5:  # not all of them: the folder may be somebody's home
+            other_files.append(path.name)
+        if len(other_files) == 5:  # not all of them: the folder may be a home folder
             break
     require(
-        not foreign,
+        not other_files,
         f"--output {folder} holds what is no site of this command, or was changed since, such as"
-        f" {listed(sorted(foreign))}. A new site replaces the whole folder: choose another, or"
+        f" {listed(sorted(other_files))}. A new site replaces the whole folder: choose another, or"
         " remove this one yourself.",
     )
 

@@ -67,7 +67,7 @@ def _number_as_text(value: Any) -> Any:
 
 
 PathText = Annotated[str, BeforeValidator(_number_as_text)]
-"""A path. A command line reads a folder called `7` as a number."""
+"""A path or a name. A command line reads a folder called `7` as a number."""
 
 
 def read_section[T](

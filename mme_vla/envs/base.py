@@ -255,7 +255,7 @@ class EpisodeEnv:
         self._steps = 0
         self._limit = max_steps
         self._choices: dict[str, Actions] = {}
-        self._frames = 0  # seen since the reset
+        self._frames = 0  # since the reset
         self._names: set[str] = set()  # of what the first of them holds
         self.scene_digest = NOT_BUILT
 

@@ -342,7 +342,7 @@ class Claims:
         """Write a claim; False where another process was first, whose claim is noted."""
         path = self.folder / CLAIMS / f"{quote(key.task, safe='')}-{key.episode}.{number}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
-        is_first = not path.exists()  # a look costs less than a draft that is not needed
+        is_first = not path.exists()  # checking costs less than a draft that is not needed
         if is_first:
             try:
                 _write_new(path, json.dumps(asdict(claim)) + "\n")

@@ -256,7 +256,7 @@ def test_events_act_by_sub_task_and_episode_by_episode(memoryless: MMEPolicy) ->
 
 def test_a_place_that_the_environment_does_not_tell_is_refused() -> None:
     with pytest.raises(
-        UserError, match="event=pause:1@subtask:1: this environment tells no sub-tasks"
+        UserError, match="event=pause:1@subtask:1: this environment reports no sub-tasks"
     ):
         EventCourse(read_events("pause:1@subtask:1")).next(Any, step=0, subtask=0)  # type: ignore[arg-type]
 

@@ -58,7 +58,7 @@ class Reply:
     terminated: bool
     truncated: bool
     info: Any
-    """What the environment says: a dictionary, or the `Report` of a rollout's environment."""
+    """What the environment sends: a dictionary, or the `Report` of a rollout's environment."""
     error: Exception | None = None
     """Why there is no result of the policy: the environment raised it, or the worker died or hung
     and was replaced.

@@ -63,18 +63,18 @@ class Command:
 
 @dataclass(frozen=True)
 class Report:
-    """What an environment says of a reset or of a command, beside its frames.
+    """What an environment reports of a reset or of a command, beside its frames.
 
     status: `ongoing`, `success`, `fail`, `timeout` or `error`; None of an environment that gives
     none. goal: the instruction; None if the environment named none yet. error: why the episode
-    failed, where the environment says so. info: what the environment itself reports, for subgoal
+    failed, where the environment reports it. info: what the environment itself sends, for subgoal
     predictors. options: of a robot that chooses, what there is to choose. scene: digest of the
     scene.
     executed: actions. steps: frames. held: the action [w] that keeps the robot where it is after a
     command to hold it; None before the first action. subtask: number of the execution's current
-    sub-task from 1; 0 where the environment tells none. began: frames at which sub-tasks began.
+    sub-task from 1; 0 where the environment has none. began: frames at which sub-tasks began.
     process: where the chain of sub-tasks broke, for the record. oracle: the action [w] that the
-    task's script takes next, if it was asked for. video: name of the finished video's file.
+    task's script takes next, if it was requested. video: name of the finished video's file.
     simulated_s, rendered_s: seconds since the last report.
     """
 

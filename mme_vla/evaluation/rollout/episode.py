@@ -58,7 +58,7 @@ class EventCourse:
 
         Args:
             step: control steps so far. subtask: number of the current sub-task, 0 where the
-                environment tells none.
+                environment has none.
         """
         self.holding = None
         for event, entry in zip(self._events, self.log, strict=True):
@@ -66,7 +66,7 @@ class EventCourse:
                 continue
             if event.unit == "subtask" and not subtask:
                 raise UserError(
-                    f"event={event.text}: this environment tells no sub-tasks; place it by"
+                    f"event={event.text}: this environment reports no sub-tasks; place it by"
                     " @step:<n>."
                 )
             if event.reached(step - self.hold_steps, subtask):
