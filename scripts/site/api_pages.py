@@ -8,6 +8,8 @@ import ast
 from functools import cache
 from typing import Any
 
+from config_pages import REPOSITORY
+
 import mme_vla
 
 FOLDER = "reference/api/"
@@ -17,8 +19,8 @@ REGISTRIES = "registries"
 """The page of the constants."""
 INTRODUCTION = """# API
 
-Names are imported from `mme_vla`, and loaded when they are first used. Types under *Modules* are imported from their module.
-[From Python](../start/python.md) shows it at work.
+Names are imported from `mme_vla`, and loaded when they are first used. Types under *Modules*
+are imported from their module. [From Python](../start/python.md) shows it at work.
 """
 FORMER_NAMES = {"Memory": "MemoryModule"}
 """Public name → the class that it is another name of."""
@@ -158,8 +160,6 @@ def classes(module: str) -> list[str]:
 
 @cache
 def _tree(module: str) -> ast.Module:
-    from config_pages import REPOSITORY
-
     path = REPOSITORY / module.replace(".", "/")
     file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     return ast.parse(file.read_text(encoding="utf-8"))
