@@ -73,7 +73,7 @@ def test_ci_runs_the_commands_of_the_readme() -> None:
 
 def test_links_in_the_documentation_lead_to_files() -> None:
     broken = []
-    for page in [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("**/*.md")]:
+    for page in [*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").glob("**/*.md")]:
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
             if "://" not in target and not (page.parent / target).exists():
                 broken.append(f"{page.relative_to(REPOSITORY)} → {target}")
