@@ -25,11 +25,10 @@ from mme_vla.extras.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.extras.methods.simplememvla.processor import TOKENIZER_FILE, processor_settings
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG
-from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import WEIGHTS, cast
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import checked_file, read_json
-from mme_vla.weights.tables import Adapter, Piece
+from mme_vla.weights.tables import Adapter, Piece, wrong_policy
 
 STATS = "stats.json"
 BASE = "Qwen/Qwen3.5-4B"
@@ -201,11 +200,7 @@ def simplememvla_adapter(policy: Policy) -> Adapter:
 def simplememvla_of(policy: Policy) -> SimpleMemVlaPolicy:
     """The policy, where it is SimpleMemVLA."""
     if not isinstance(policy, SimpleMemVlaPolicy):
-        raise UserError(
-            "This format holds SimpleMemVLA;"
-            f" {PolicySections.of(policy.config).name or 'this'} is a {type(policy).__name__}. Set"
-            " model=simplememvla."
-        )
+        raise wrong_policy(policy, "SimpleMemVLA", "model=simplememvla")
     return policy
 
 
