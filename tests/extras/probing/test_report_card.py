@@ -17,6 +17,7 @@ from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.receipts import verify
 from mme_vla.evaluation.records import EpisodeKey
+from mme_vla.evaluation.rollout.evaluation import RunOptions
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.extras.probing import card as card_module
@@ -295,7 +296,8 @@ def test_a_card_without_another_scene_to_show_has_no_recovery(
     }
     monkeypatch.setattr(card_module, "_scenes", lambda *_: ended)
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
-    card = run_card(reader(TIME), plan, tmp_path, FACTS, RolloutSettings(), base=make_choice_env)
+    options = RunOptions(base=make_choice_env)
+    card = run_card(reader(TIME), plan, tmp_path, FACTS, RolloutSettings(), options)
     assert card.recovery is None and card.notes == [
         "wrong scene first (distract:1) was left out: it needs a camera."
     ]
@@ -308,12 +310,12 @@ def test_a_card_runs_every_arm_and_resumes(tmp_path: Path, monkeypatch: pytest.M
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
     settings = RolloutSettings(max_steps=16, flow_steps=2, workers=1, max_batch=1)
     facts = replace(FACTS, max_steps=settings.max_steps)
-    options: dict[str, Any] = {"base": make_choice_env, "show_progress": False}
-    card = run_card(policy, plan, tmp_path, facts, settings, **options)
+    options = RunOptions(base=make_choice_env, show_progress=False)
+    card = run_card(policy, plan, tmp_path, facts, settings, options)
     assert set(card.arms) == set(ARMS) - {"oracle frames"} and "oracle frames" in card.notes[0]
     assert card.recovery is not None and card.recovery.recordings == 1
     assert verify(tmp_path / "again" / "receipt.json")[0] == []
     references = {"floor": str(tmp_path / "online" / "drop-all")}
-    again = run_card(policy, plan, tmp_path, facts, settings, references=references, **options)
+    again = run_card(policy, plan, tmp_path, facts, settings, options, references)
     assert again.arms == card.arms
     assert again.references == {"floor": card.arms["nothing remembered"].success}
