@@ -115,7 +115,7 @@ class MMEModel(nn.Module):
             if len(losses) > 1:
                 metrics |= {f"losses/{name}": value.detach() for name, value in losses.items()}
             if memory is not None:
-                metrics |= {f"memory/{name}": value for name, value in memory.metrics.items()}
+                metrics |= memory.logged()
         return total
 
     def forward(

@@ -186,6 +186,10 @@ class MemoryTokens(TensorStruct):
     ages: Tensor | None = None
     losses: dict[str, Tensor] = field(default_factory=dict)
 
+    def logged(self) -> dict[str, Tensor]:
+        """The metrics under the names of a training's log, `memory/<name>`."""
+        return {f"memory/{name}": value for name, value in self.metrics.items()}
+
 
 @dataclass
 class Overlap(TensorStruct):

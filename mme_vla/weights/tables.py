@@ -17,6 +17,7 @@ from torch import Tensor
 from mme_vla.backbone.pi05 import Pi05Backbone
 from mme_vla.errors import UserError, listed
 from mme_vla.policy.base import Policy
+from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import check_fit
 
 
@@ -250,6 +251,17 @@ def pi05_of(policy: Policy) -> Pi05Backbone:
             f" backbone is {type(backbone or policy).__name__}."
         )
     return backbone
+
+
+def wrong_policy(policy: Policy, held: str, change: str) -> UserError:
+    """Make the error for a policy that a format does not hold.
+
+    held: the methods it holds. change: what to set instead.
+    """
+    name = PolicySections.of(policy.config).name or "this"
+    return UserError(
+        f"This format holds {held}; {name} is a {type(policy).__name__}. Set {change}."
+    )
 
 
 def memory_parameters(policy: Policy) -> set[str]:

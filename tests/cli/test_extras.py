@@ -23,6 +23,10 @@ from mme_vla.errors import UserError
 from mme_vla.evaluation.store import find_records, read_folders
 
 NEW = "uv sync --inexact --extra {}"
+LONGEST = 1200
+"""Seconds that the commands of one set of extras may take: less than the time limit of a test."""
+NOT_FINISHED = -1
+"""Exit code of a command whose process ended before it did."""
 
 
 class Case(NamedTuple):
@@ -178,8 +182,8 @@ def outcomes(folder: Path) -> Callable[[Case], tuple[int, str]]:
                 continue
             for waiting in [other for other in series if other.wait]:
                 finished[waiting] = run_until(waiting, folder)
-            rest = [o for o in series if not o.wait and (can_draw() or not o.draws)]
-            finished.update(zip(rest, run_series(rest, folder), strict=True))
+            remaining = [o for o in series if not o.wait and (can_draw() or not o.draws)]
+            finished.update(zip(remaining, run_series(remaining, folder), strict=True))
         return finished[case]
 
     return outcome
@@ -193,18 +197,25 @@ def environment(extras: Sequence[str]) -> dict[str, str]:
 
 
 def run_series(cases: Sequence[Case], folder: Path) -> list[tuple[int, str]]:
-    """Run cases of one set of extras in one process."""
+    """Run cases of one set of extras in one process; those that it did not finish end with
+    `NOT_FINISHED`.
+    """
     if not cases:
         return []
     results = folder / "results.json"
-    results.unlink(missing_ok=True)
-    process = subprocess.run(
-        [sys.executable, "-W", "ignore", command_series.__file__, str(results)],
-        input=json.dumps([case.words for case in cases]), env=environment(cases[0].extras),
-        cwd=folder, capture_output=True, text=True,
-    )  # fmt: skip
-    assert results.is_file(), process.stderr[-3000:]
-    return [(code, printed) for code, printed in json.loads(results.read_text())]
+    results.write_text("[]")
+    try:
+        process = subprocess.run(
+            [sys.executable, "-W", "ignore", command_series.__file__, str(results)],
+            input=json.dumps([case.words for case in cases]), env=environment(cases[0].extras),
+            cwd=folder, capture_output=True, text=True, timeout=LONGEST,
+        )  # fmt: skip
+        reason = process.stderr[-3000:]
+    except subprocess.TimeoutExpired:
+        reason = f"The commands took more than {LONGEST} s."
+    finished = [(code, printed) for code, printed in json.loads(results.read_text())]
+    # The process ended in the command after these.
+    return finished + [(NOT_FINISHED, reason)] * (len(cases) - len(finished))
 
 
 def run_until(case: Case, folder: Path) -> tuple[int, str]:

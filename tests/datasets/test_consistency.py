@@ -627,10 +627,10 @@ def test_a_declared_flag_that_one_file_lacks_is_named(tmp_path: Path, flag: str)
     change(write_dataset(tmp_path), ROWS, flag, [0] * 9)
     declare(tmp_path, flag, "int64")
     opened(tmp_path)
-    whole = pq.ParquetFile(tmp_path / ROWS).read()
-    pq.write_table(whole.slice(0, 5), tmp_path / ROWS)
+    full = pq.ParquetFile(tmp_path / ROWS).read()
+    pq.write_table(full.slice(0, 5), tmp_path / ROWS)
     other = tmp_path / ROWS.replace("file-000", "file-001")
-    pq.write_table(whole.slice(5).drop_columns([flag]), other)
+    pq.write_table(full.slice(5).drop_columns([flag]), other)
     with pytest.raises(UserError, match=f"declares {flag}, which not every file in data/ has"):
         opened(tmp_path)
 

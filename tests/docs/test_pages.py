@@ -67,7 +67,7 @@ def test_the_navigation_has_the_tasks_of_a_user() -> None:
 
 
 def test_no_page_hangs_between_groups_of_the_navigation() -> None:
-    """A page without a group stands before the groups of its tab, or it seems to belong to one."""
+    """A page without a group comes before the groups of its tab, or it seems to belong to one."""
     for tab in hooks.navigation():
         for title, entries in tab.items():
             is_group = [
@@ -79,10 +79,12 @@ def test_no_page_hangs_between_groups_of_the_navigation() -> None:
 
 def test_no_page_has_text_art() -> None:
     for page in pages():
-        for block in re.findall(
-            r"^```(?:text)?\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE
-        ):
-            assert not re.search(r"[►◄▼▲]", block), page
+        blocks = re.findall(
+            r"^```(\w*)[^\n]*\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE
+        )
+        for language, block in blocks:
+            if language in ("", "text"):
+                assert not re.search(r"[►◄▼▲]", block), page
 
 
 def test_every_page_is_in_the_navigation_once() -> None:
@@ -106,6 +108,7 @@ def test_the_test_workflow_trains_and_runs_both_tiers() -> None:
         "not slow and not nightly",
         "slow",
     ]
+    assert any('pytest -m "${{ matrix.tier }}"' in run and "--dist loadfile" in run for run in runs)
     assert all("timeout-minutes" in job for job in content["jobs"].values())
 
 

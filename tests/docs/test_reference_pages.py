@@ -29,7 +29,7 @@ def test_every_public_name_has_a_page_and_a_description() -> None:
     assert "| `MEMORIES` | `mme_vla.registry` |" in pages["reference/api/registries.md"]
 
 
-def test_a_public_name_without_a_page_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_public_name_without_a_page_is_an_error() -> None:
     nav = [{"API": ["reference/api.md", {"Mistakes": ["reference/api/UserError.md"]}]}]
     with pytest.raises(ValueError, match="build_policy"):
         api_pages.pages(nav)

@@ -106,15 +106,15 @@ def test_an_installed_package_without_pages_is_an_error(
 
 def test_words_of_comments_and_outputs_of_notebooks_are_shown(site: Path) -> None:
     """Braces, links to pages, computed values, HTML of a notebook."""
-    shown = 0
+    n_braces = 0
     for group in config_pages.groups():
         page = text_of(site / "reference" / "configuration" / f"{group}.html")
         for file in library_files(group).values():
             for key in config_pages.keys(file):
                 for braces in re.findall(r"\{[^{}]*\}", key.comment.replace("`", "")):
                     assert braces in page, f"{file.name}: {key.name}"
-                    shown += 1
-    assert shown > 3
+                    n_braces += 1
+    assert n_braces > 3
     for folder in ("api", "commands", "configuration"):
         for file in (site / "reference" / folder).glob("*.html"):
             assert re.findall(r"\bdocs/[\w/-]+\.md", text_of(file)) == [], file.name

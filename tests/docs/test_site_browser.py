@@ -18,7 +18,7 @@ FIRST_RESULTS = {
     "tokendrop": ("concepts/memory.html",),
     "TokenDrop": ("concepts/memory.html",),
 }
-"""What is typed → where the first page stands."""
+"""What is typed → where the first page is."""
 PAGES = [
     "index.html",
     "reference/api.html",
@@ -50,7 +50,7 @@ def phone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield browser
 
 
-def found(browser: Browser, site: Path, words: str) -> list[str]:
+def search_results(browser: Browser, site: Path, words: str) -> list[str]:
     """Addresses of the sections that a search finds, the best first."""
     browser.open((site / "start" / "install.html").as_uri())
     browser.run(f"{INPUT}.focus()")
@@ -64,7 +64,7 @@ def found(browser: Browser, site: Path, words: str) -> list[str]:
 
 @pytest.mark.parametrize("words", FIRST_RESULTS)
 def test_a_search_finds_what_was_typed(browser: Browser, site: Path, words: str) -> None:
-    first = found(browser, site, words)[0]
+    first = search_results(browser, site, words)[0]
     assert first.startswith(FIRST_RESULTS[words])
     page = (site / unquote(first.partition("#")[0])).read_text().replace("&#x27;", "'")
     assert words.lower() in page.lower()
@@ -72,18 +72,18 @@ def test_a_search_finds_what_was_typed(browser: Browser, site: Path, words: str)
 
 
 def test_every_result_has_the_exact_words(browser: Browser, site: Path) -> None:
-    results = found(browser, site, "--trust-plugins")
+    results = search_results(browser, site, "--trust-plugins")
     assert len(results) > 3
     for result in results:
         assert "--trust-plugins" in (site / unquote(result.partition("#")[0])).read_text()
 
 
 def test_nothing_is_found_for_nonsense(browser: Browser, site: Path) -> None:
-    assert found(browser, site, "qwxzvk") == []
+    assert search_results(browser, site, "qwxzvk") == []
 
 
 def test_a_result_leads_to_its_section(browser: Browser, site: Path) -> None:
-    first = found(browser, site, "from_pretrained")[0]
+    first = search_results(browser, site, "from_pretrained")[0]
     browser.run("document.querySelector('.md-search-result__link').click()")
     name = first.partition("#")[0]
     browser.wait(f"location.pathname.endsWith({name!r}) && document.readyState === 'complete'")

@@ -81,6 +81,16 @@ def marked(model: str) -> Any:
     return pytest.param(model, marks=mark)
 
 
+def test_each_part_is_among_the_models_of_the_slow_tier() -> None:
+    assert EACH_PART_ONCE.issubset([*ALL_MODELS, *BEYOND])
+    parts, expected = set(), set()
+    for model in [*NEURAL, *BEYOND]:
+        expected |= set(model.rsplit("_", 1))
+        if model in EACH_PART_ONCE:
+            parts |= set(model.rsplit("_", 1))
+    assert parts == expected
+
+
 @pytest.mark.parametrize("model", [marked(model) for model in [*ALL_MODELS, *BEYOND]])
 def test_every_model_trains_on_the_sample(model: str, tmp_path: Path, caches: Path) -> None:
     run(model, tmp_path, caches, f"train.steps={STEPS}")

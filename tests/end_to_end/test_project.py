@@ -30,8 +30,8 @@ def test_pins_for_pip_are_written_from_those_for_uv() -> None:
 def test_the_tools_come_with_every_extra() -> None:
     extras = pyproject()["project"]["optional-dependencies"]
     groups = pyproject()["dependency-groups"]
-    own = next(line for line in groups["dev"] if line.startswith("mme-vla["))
-    assert set(re.findall(r"[\w-]+", own.partition("[")[2])) == set(extras)
+    requirement = next(line for line in groups["dev"] if line.startswith("mme-vla["))
+    assert set(re.findall(r"[\w-]+", requirement.partition("[")[2])) == set(extras)
 
 
 def test_the_version_is_the_same_everywhere() -> None:
@@ -46,7 +46,7 @@ def test_the_version_is_the_same_everywhere() -> None:
         assert tomllib.loads(file.read_text())["project"]["version"] == version
 
 
-def test_the_address_of_the_project_stands_in_one_place() -> None:
+def test_the_address_of_the_project_is_in_one_place() -> None:
     address = pyproject()["tool"]["hatch"]["metadata"]["hooks"]["custom"]["repository"]
     owner = address.removeprefix("https://github.com/").partition("/")[0]
     hits = []
@@ -79,7 +79,7 @@ def test_tests_that_the_documentation_names_exist() -> None:
 
 def test_links_in_the_documentation_lead_to_files() -> None:
     broken = []
-    for page in [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("**/*.md")]:
+    for page in [*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").glob("**/*.md")]:
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
             if "://" not in target and not (page.parent / target).exists():
                 broken.append(f"{page.relative_to(REPOSITORY)} → {target}")

@@ -238,14 +238,15 @@ def test_unknown_names_are_refused_before_any_process_starts(
 
 
 def test_the_choice_of_a_scene_reaches_the_environments(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[Any] = []
+    factories: list[Any] = []
     monkeypatch.setattr("mme_vla.envs.make.require_simulator", lambda: None)
-    monkeypatch.setattr(pool, "VecEnv", lambda jobs, workers, make, timeout: made.append(make))
+    monkeypatch.setattr(pool, "VecEnv", lambda jobs, workers, make, timeout: factories.append(make))
     make_vec_env("StopCube", [0], seed=3, difficulty="easy", recovery="z")
     row = {"task": "StopCube", "spec": {}}
     make_vec_env("StopCube", [0], row=row)
-    assert {"seed": 3, "difficulty": "easy", "recovery": "z"}.items() <= made[0].keywords.items()
-    assert made[1].keywords["row"] is row
+    by_seed, by_row = factories
+    assert {"seed": 3, "difficulty": "easy", "recovery": "z"}.items() <= by_seed.keywords.items()
+    assert by_row.keywords["row"] is row
     with pytest.raises(UserError, match="A difficulty needs a seed"):
         make_vec_env("StopCube", [0], difficulty="easy")
 

@@ -25,7 +25,7 @@ def wrapper() -> Iterator[ModuleType]:
         yield importlib.import_module("robomme.env_record_wrapper")
 
 
-def test_it_refuses_to_stand_beside_the_official_package(
+def test_it_is_refused_beside_the_official_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     official = tmp_path / "robomme-0.1.0.dist-info"

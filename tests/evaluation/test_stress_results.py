@@ -13,13 +13,13 @@ from mme_vla.evaluation.results.curves import stress_curves, stress_figures
 
 
 def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
-    made = [
+    stress_records = [
         *records("test", [1, 1, 1, 0]),
         *records("stress:count=2", [1, 0, 0, 0]),
         *records("stress:count=5", [0, 0]),
     ]
-    made += [*records("stress:count=2", [1, 1], "other"), *records("twin", [1, 1])]
-    curves = stress_curves(made)
+    stress_records += [*records("stress:count=2", [1, 1], "other"), *records("twin", [1, 1])]
+    curves = stress_curves(stress_records)
     mine = next(points for (run, *_), points in curves.items() if run.startswith("m,"))
     assert [(p.turned, p.won, p.episodes) for p in mine] == [(0, 2, 2), (2, 1, 2), (5, 0, 2)]
     other = next(points for (run, *_), points in curves.items() if run.startswith("other"))
@@ -28,15 +28,18 @@ def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
 
 
 def test_runs_are_drawn_in_the_order_of_their_records() -> None:
-    made = [record for run in "zab" for record in records("stress:count=2", [1, 0], run)]
-    (figure,) = stress_figures(stress_curves(made)).values()
+    stress_records = [record for run in "zab" for record in records("stress:count=2", [1, 0], run)]
+    (figure,) = stress_figures(stress_curves(stress_records)).values()
     places = [figure.index(f">{run}") for run in "zab"]
     assert places == sorted(places)
 
 
 def test_the_command_saves_the_curve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name, made in (("a", records("test", [1, 0])), ("b", records("stress:count=3", [0, 0]))):
-        save_records(tmp_path / name, made)
+    for name, stress_records in (
+        ("a", records("test", [1, 0])),
+        ("b", records("stress:count=3", [0, 0])),
+    ):
+        save_records(tmp_path / name, stress_records)
     page = tmp_path / "page.html"
     main([str(tmp_path), "--stress", "--html", str(page), "--title", "a < b"])
     assert "Success over the dials" in capsys.readouterr().out

@@ -1,8 +1,8 @@
 """Run commands one after the other in one process: what imports cost is paid once.
 
 `python command_series.py OUTPUT < COMMANDS`: COMMANDS is a JSON list of command lines (`mme_vla
-NAME …` or `mme_vla.NAME …`), OUTPUT becomes a JSON list of `[exit code, printed text]`. A traceback
-is printed as Python prints it, with exit code 1.
+NAME …` or `mme_vla.NAME …`), OUTPUT becomes a JSON list of `[exit code, printed text]`, written
+after each command. A traceback is printed as Python prints it, with exit code 1.
 """
 
 import json
@@ -48,5 +48,7 @@ def run(line: str) -> tuple[int, str]:
 
 if __name__ == "__main__":
     output = Path(sys.argv[1]).resolve()  # commands change sys.argv
-    results = [run(line) for line in json.load(sys.stdin)]
-    output.write_text(json.dumps(results))
+    results = []
+    for line in json.load(sys.stdin):
+        results.append(run(line))
+        output.write_text(json.dumps(results))

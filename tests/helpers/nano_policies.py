@@ -31,5 +31,15 @@ def demonstration(
     subgoals = {"simple": ["pick it up"] * 3, "grounded": ["pick it up at <1, 2>"] * 3}
     goal = "watch the video carefully, then pick up the container hiding the green cube"
     return Demonstration(
-        "VideoUnmask", 3, "easy", goal, 180, 66, states, motions, {"front": images}, subgoals
+        "VideoUnmask",
+        3,
+        "easy",
+        goal,
+        180,
+        66,
+        states,
+        motions,
+        {"front": images},
+        boundaries=np.array([0]),
+        subgoals=subgoals,
     )

@@ -2,8 +2,10 @@
 it.
 """
 
+import pytest
 import torch
 
+from mme_vla.memory.extensions.bank import MemoryBank
 from mme_vla.testing.check_memory import check_memory
 from mme_vla.testing.small import random_batch, small_policy
 
@@ -34,3 +36,41 @@ def test_bank_modul_answers_by_what_it_remembers() -> None:
         "bank.gate.weight",
         "bank.blocks.0.value.weight",
     } <= learned
+
+
+MOMENTS = torch.tensor([[1.0, 0.0], [0.0, 1.0], [3.0, 4.0], [4.0, 3.0], [0.0, -1.0]])
+# Cosines of neighbours are 0, 0.8, 0.96 and −0.6: (3, 4) and (4, 3) become (3.5, 3.5) when a fourth
+# moment comes, and (0, 1) becomes one with that when the fifth comes.
+HELD = {
+    "fifo": ([[3.0, 4.0], [4.0, 3.0], [0.0, -1.0]], [32, 48, 64]),
+    "tome": ([[1.0, 0.0], [1.75, 2.25], [0.0, -1.0]], [0, 16, 64]),
+}
+
+
+@pytest.mark.parametrize("consolidation", HELD)
+def test_a_bank_holds_the_same_whether_it_is_filled_at_once_or_one_by_one(
+    consolidation: str,
+) -> None:
+    bank = MemoryBank(2, length=3, time_code=False, consolidation=consolidation)
+    moments, times = MOMENTS[None, :, None], torch.arange(0, 80, 16)[None]
+    valid = torch.ones(1, 5, dtype=torch.bool)
+    expected, expected_times = HELD[consolidation]
+
+    at_once = bank.replay(moments, times, valid)
+    held = moments[:, :0], times[:, :0], valid[:, :0]
+    for place in range(5):
+        new = slice(place, place + 1)
+        held = bank.replay(
+            torch.cat([held[0], moments[:, new]], 1),
+            torch.cat([held[1], times[:, new]], 1),
+            torch.cat([held[2], valid[:, new]], 1),
+        )
+    padding = torch.tensor([[False]])
+    padded = bank.replay(
+        torch.cat([moments[:, :1], moments], 1),
+        torch.cat([times[:, :1], times], 1),
+        torch.cat([padding, valid], 1),
+    )
+    for entries, entry_times, is_entry in (at_once, held, padded):
+        assert entries[0, :, 0].tolist() == expected
+        assert entry_times[0].tolist() == expected_times and is_entry.all()

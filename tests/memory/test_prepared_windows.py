@@ -144,11 +144,11 @@ def test_policies_without_such_a_memory_have_nothing_to_prepare():
 
 
 def test_preparing_waits_for_everybody_and_keeps_nobody():
-    class Stranger:
+    class Session:
         pass
 
     scheduler: Scheduler = Scheduler(max_batch=2)
-    someone, gone = Stranger(), Stranger()
+    someone, gone = Session(), Session()
     scheduler.later[gone] = scheduler.later[someone] = None
     scheduler.acting.extend("abc")
     assert [step.batch for step in scheduler.next_steps() if isinstance(step, Act)] == [["a", "b"]]

@@ -126,6 +126,5 @@ def test_where_nobody_tells_when_subtasks_begin_the_oracle_is_refused(tmp_path: 
             tmp_path,
             FACTS,
             RolloutSettings(),
-            base=make_moving_env,
-            show_progress=False,
+            RunOptions(base=make_moving_env, show_progress=False),
         )

@@ -40,11 +40,11 @@ def converted_back(target: str) -> list[str]:
     command(
         "weights", Path("exports", target), "ours", f"model={POLICY}", "backbone=tiny", *words(PI05)
     )
-    ours = load_file("ours/model.safetensors")
+    converted = load_file("ours/model.safetensors")
     policy = load_file("policy/model.safetensors")
-    different = sorted(ours.keys() ^ policy.keys())
-    for name in ours.keys() & policy.keys():
-        if not ours[name].equal(policy[name]):
+    different = sorted(converted.keys() ^ policy.keys())
+    for name in converted.keys() & policy.keys():
+        if not converted[name].equal(policy[name]):
             different.append(name)
     return different
 

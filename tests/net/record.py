@@ -41,7 +41,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(REPOSITORY), str(REPOSITORY / "tests")]
+sys.path[:0] = [str(REPOSITORY / folder) for folder in ("", "tests", "scripts")]
 NET = REPOSITORY / "tests" / "data" / "net"
 LONGEST = 120
 """Seconds that a mistake may take to be answered."""

@@ -15,7 +15,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mme_vla.extras.nano.cli.board import published_rows
 from net.archives import EndedError, command, run
 from net.models import PI05, sizes_of, words
 
@@ -67,12 +66,11 @@ SHARD = [
     f"checkpoint={EARLIER}/pretrained/groundsg", "episodes=1", "tasks=[PickXtimes,VideoUnmask]",
     *ROLLOUT, "seed=7", "subgoal=oracle", "shard=1/2", f"output={SHARDS}",
 ]  # fmt: skip
-SHARD_RESULTS = ["--tasks", "PickXtimes", "VideoUnmask", "--episodes", "1"]
 SCRIPTED = EARLIER / "evaluation" / "scripted"
 
 
 def evaluate_scripted() -> Any:
-    """Go on with a finished run in the tests' own environment."""
+    """Resume a finished run in the tests' own environment."""
     import mme_vla
     from helpers.scripted_env import make_moving_env
 
@@ -134,7 +132,9 @@ def train() -> None:
 
 def make_board() -> None:
     """Rows that the repository ships, as rows of one's own."""
-    rows = published_rows("further")
+    from helpers.published import published_folder
+
+    rows = published_folder("nano16/further")
     for row in BOARD:
         shutil.copytree(rows / row, Path("board", row))
     shutil.copy(rows / "scenes.json", "board")
@@ -201,11 +201,11 @@ def cached() -> bool:
     return ": 0 episodes encoded, 2 in all" in command("cache", *FRAMESAMP, *DATA)
 
 
-def result_rows() -> list[dict[str, str]]:
-    """The figures that `results` writes of the evaluation."""
+def result_rows(folder: str | Path = "evaluation") -> list[dict[str, str]]:
+    """The figures that `results` writes of an evaluation of two episodes."""
     command(
         "results",
-        "evaluation",
+        folder,
         "--tasks",
         "PickXtimes",
         "VideoUnmask",

@@ -47,12 +47,12 @@ def test_saved_policy_gives_the_same_loss_and_actions(
 ) -> None:
     folder = shutil.copytree(checkpoints / model, tmp_path / model)
     models.restore(folder)
-    found = models.figures(mme_vla.Policy.from_pretrained(folder))
+    figures = models.figures(mme_vla.Policy.from_pretrained(folder))
     (folder / "model.safetensors").unlink()  # as large as 45 MB
     if MODELS[model]["loss"] is not None:  # else a run records it, below
-        assert found["loss"] == pytest.approx(MODELS[model]["loss"], rel=TOLERANCE)
+        assert figures["loss"] == pytest.approx(MODELS[model]["loss"], rel=TOLERANCE)
     np.testing.assert_allclose(
-        found["actions"], MODELS[model]["actions"], rtol=TOLERANCE, atol=TOLERANCE
+        figures["actions"], MODELS[model]["actions"], rtol=TOLERANCE, atol=TOLERANCE
     )
 
 
@@ -73,10 +73,10 @@ def mistaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_reply_to_a_mistake_says_no_less(line: str, mistaken: Path) -> None:
     if line.startswith("harness"):
         pytest.importorskip("vla_eval", reason="needs the extra harness")
-    found = replies.reply(line, mistaken)
-    shown = replies.difference(REPLIES[line]["text"], found["text"])
-    assert found["code"] == REPLIES[line]["code"], shown
-    assert not replies.missing(REPLIES[line], found["text"]), shown
+    answer = replies.reply(line, mistaken)
+    shown = replies.difference(REPLIES[line]["text"], answer["text"])
+    assert answer["code"] == REPLIES[line]["code"], shown
+    assert not replies.missing(REPLIES[line], answer["text"]), shown
 
 
 # Datasets, runs and what was measured
@@ -92,26 +92,26 @@ def at_runs(tmp_path: Path, checkpoints: Path, monkeypatch: pytest.MonkeyPatch) 
     return tmp_path
 
 
-def assert_close(found: Any, expected: Any, place: str = "") -> None:
+def assert_close(actual: Any, expected: Any, place: str = "") -> None:
     """Equal structures, floats to the tolerance."""
     if isinstance(expected, dict):
-        assert set(found) >= set(expected), place
+        assert set(actual) >= set(expected), place
         for key in expected:
-            assert_close(found[key], expected[key], f"{place}.{key}")
+            assert_close(actual[key], expected[key], f"{place}.{key}")
     elif isinstance(expected, list):
-        assert len(found) == len(expected), place
-        for number, (here, then) in enumerate(zip(found, expected, strict=True)):
+        assert len(actual) == len(expected), place
+        for number, (here, then) in enumerate(zip(actual, expected, strict=True)):
             assert_close(here, then, f"{place}[{number}]")
     elif isinstance(expected, float):
-        assert found == pytest.approx(expected, rel=TOLERANCE, abs=TOLERANCE), place
+        assert actual == pytest.approx(expected, rel=TOLERANCE, abs=TOLERANCE), place
     else:
-        assert found == expected, place
+        assert actual == expected, place
 
 
 @pytest.mark.parametrize("run", runs.RUNS)
 def test_policy_of_a_run_acts_as_before(run: str, at_runs: Path) -> None:
-    found = models.figures(mme_vla.Policy.from_pretrained(Path("training", run)))
-    assert_close(found["actions"], RUNS["actions"][run])
+    figures = models.figures(mme_vla.Policy.from_pretrained(Path("training", run)))
+    assert_close(figures["actions"], RUNS["actions"][run])
 
 
 def test_dataset_has_the_same_frames_goals_and_statistics(at_runs: Path) -> None:
@@ -122,20 +122,18 @@ def test_cache_is_complete(at_runs: Path) -> None:
     assert runs.cached()
 
 
-@pytest.mark.parametrize("run", runs.RUNS)
-def test_run_resumes_with_the_same_losses(run: str, at_runs: Path) -> None:
-    assert_close(runs.resume(run), RUNS["resumed"][run])
-
-
 def contents(folder: Path) -> dict[Path, bytes]:
     """All files below a folder but locks."""
     files = [file for file in folder.rglob("[!.]*") if file.is_file()]
     return {file: file.read_bytes() for file in files}
 
 
-def test_resumed_training_keeps_the_vision_cache(at_runs: Path) -> None:
+@pytest.mark.parametrize("run", runs.RUNS)
+def test_run_resumes_with_the_same_losses_and_keeps_the_vision_cache(
+    run: str, at_runs: Path
+) -> None:
     before = contents(Path("cache"))
-    runs.resume("plain")
+    assert_close(runs.resume(run), RUNS["resumed"][run])
     assert contents(Path("cache")) == before
 
 
@@ -154,9 +152,9 @@ def test_results_have_the_same_figures(at_runs: Path) -> None:
 
 def test_finished_evaluation_is_recognised(at_runs: Path) -> None:
     pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
-    before = {path: path.read_bytes() for path in Path("evaluation").iterdir()}
+    before = contents(Path("evaluation"))
     command("evaluate", *runs.EVALUATE)
-    assert {path: path.read_bytes() for path in Path("evaluation").glob("[!.]*")} == before
+    assert contents(Path("evaluation")) == before
 
 
 @pytest.mark.parametrize("run", runs.RUNS)
@@ -193,8 +191,8 @@ def test_shards_with_claims_are_recognised_and_joined(at_earlier: None) -> None:
     claims = runs.SHARDS / "claims.jsonl"  # the process joined the run
     assert after.pop(claims, before[claims]).startswith(before.pop(claims))
     assert after == before
-    found = command("results", runs.SHARDS, *runs.SHARD_RESULTS, "--csv", "figures.csv")
-    assert found and "average,0.0000,,0.0000,65.7620,1,1,2,2" in Path("figures.csv").read_text()
+    figures = [",".join(row.values()) for row in runs.result_rows(runs.SHARDS)]
+    assert any("average,0.0000,,0.0000,65.7620,1,1,2,2" in row for row in figures), figures
 
 
 def test_finished_run_is_recognised_from_python(at_earlier: None) -> None:
@@ -238,5 +236,5 @@ def test_vision_tower_of_nano_is_the_same() -> None:
 
 @pytest.mark.parametrize("name", times.COMMANDS)
 def test_no_more_modules_are_imported(name: str) -> None:
-    found = times.measure(times.COMMANDS[name])
-    assert found["modules"] <= 1.1 * TIMES[name]["modules"], "an import became heavier"
+    measured = times.measure(times.COMMANDS[name])
+    assert measured["modules"] <= 1.1 * TIMES[name]["modules"], "an import became heavier"

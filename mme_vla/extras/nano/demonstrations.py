@@ -37,9 +37,9 @@ class Demonstration:
     """One episode of a task, with images of some frames.
 
     length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its
-    decisions. subgoals: `simple` and `grounded` → what the simulator says at each decision, as it
-    says it at test time. images: camera → frame → [256, 256, 3] uint8. boundaries: frames at which
-    a sub-task begins, of the video too. carried_out: whether its motions were carried out one by
+    decisions. images: camera → frame → [256, 256, 3] uint8. boundaries: frames at which a sub-task
+    begins, of the video too. subgoals: `simple` and `grounded` → what the simulator says at each
+    decision, as it says it at test time. carried_out: whether its motions were carried out one by
     one, see `record`.
     """
 
@@ -52,8 +52,8 @@ class Demonstration:
     states: np.ndarray
     motions: Motions
     images: dict[str, dict[int, np.ndarray]]
+    boundaries: np.ndarray
     subgoals: dict[str, list[str]] = field(default_factory=dict)
-    boundaries: np.ndarray = field(default_factory=lambda: np.zeros(1, np.int64))
     carried_out: bool = False
 
     def save(self, path: Path) -> None:
@@ -94,8 +94,8 @@ class Demonstration:
             for camera in CAMERAS:
                 if images and f"{camera}_frames" in file:
                     frames = file[f"{camera}_frames"].tolist()
-                    pictures = file[f"{camera}_pictures"]
-                    loaded_images[camera] = dict(zip(frames, pictures, strict=True))
+                    of_camera = file[f"{camera}_pictures"]
+                    loaded_images[camera] = dict(zip(frames, of_camera, strict=True))
             return cls(
                 **about,
                 states=file["states"],
@@ -106,7 +106,7 @@ class Demonstration:
 
 
 def _about(path: Path, file: Any) -> dict[str, Any]:
-    """What an open file of a demonstration says beside its arrays."""
+    """The content of an open file of a demonstration beside its arrays."""
     about: dict[str, Any] = parse_json(str(file["about"]), str(path))
     require(
         "carried_out" in about and "boundaries" in file,
@@ -280,8 +280,8 @@ def record(
             np.stack(taken.states),
             motions,
             images,
-            subgoals,
             _boundaries(taken.texts),
+            subgoals,
             carried_out,
         )
     finally:

@@ -81,8 +81,8 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
         records = evaluate_all(nano, results, jobs, files, rows.robot)
     if nano.shard is not None or len(choose_tasks(nano.task)) > 1:
         for row, of_row in records.items():
-            won = sum(record.success for record in of_row)
-            logger.info("%s: %d of %d episodes", row, won, len(of_row))
+            n_successes = sum(record.success for record in of_row)
+            logger.info("%s: %d of %d episodes", row, n_successes, len(of_row))
         return results
     videos: list[Path] = []
     with minutes.of("videos"):

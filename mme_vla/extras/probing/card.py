@@ -2,7 +2,7 @@
 recovers from a wrong one.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ from mme_vla.extras.probing.run import OFFLINE, ONLINE, ProbePlan, run_probe
 from mme_vla.extras.probing.writing import required_frames, score_writing
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.utils import require_earlier, to_json, write_atomically, write_json
 
 TIME, CONTENT, WRONG_SCENE = "time-shifted", "content-swapped", "wrong scene first"
@@ -149,11 +148,8 @@ def run_card(
     folder: Path,
     facts: RunFacts,
     settings: RolloutSettings,
-    *,
+    options: RunOptions,
     references: Mapping[str, str] | None = None,
-    subgoals: SubgoalPredictor | None = None,
-    base: Callable[..., Any] = make_env,
-    show_progress: bool = True,
 ) -> Card:
     """Run what the folder lacks of a card, and write `card.html` and `card.json`.
 
@@ -165,7 +161,7 @@ def run_card(
     for name, mark in ((PAGE, MARK), (FIGURES, "memory_or_clock")):
         require_earlier(folder / name, mark)
     channel = channel_of(policy)
-    in_simulation = base is make_env and settings.env == "mme_vla"
+    in_simulation = options.base is make_env and settings.env == "mme_vla"
     arms = {label: read_arm(word) for label, word in ARMS.items()}
     possible, notes = [], []
     for label, arm in arms.items():
@@ -178,25 +174,9 @@ def run_card(
 
     # In closed loop: every arm, then the matched run again with other noise.
     plan = replace(plan, arms=[ARMS[label] for label in possible], events=())
-    run_probe(
-        policy,
-        replace(plan, recordings=()),
-        folder,
-        facts,
-        settings,
-        subgoals=subgoals,
-        base=base,
-        show_progress=show_progress,
-    )
+    run_probe(policy, replace(plan, recordings=()), folder, facts, settings, options)
     again = replace(settings, seed=settings.seed + 1)
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
-    options = RunOptions(
-        subgoals=subgoals,
-        shard=plan.shard,
-        source=plan.source,
-        base=base,
-        show_progress=show_progress,
-    )
     evaluate(policy, plan.jobs, folder / AGAIN, renamed, again, options)
 
     # On recorded episodes: how long a wrong scene has an effect.
@@ -204,7 +184,7 @@ def run_card(
     if plan.recordings and len(plan.lend) > 1 and WRONG_SCENE in possible:
         offline = replace(plan.offline, moments=None, scan=False)
         wrong = replace(plan, arms=[ARMS[WRONG_SCENE]], jobs=(), offline=offline)
-        run_probe(policy, wrong, folder, facts, settings, show_progress=show_progress)
+        run_probe(policy, wrong, folder, facts, settings, options)
         recovered = recovery(Findings.of(lines.read_all(folder / OFFLINE)).moments)
     writing = None
     if in_simulation and channel.chooses:

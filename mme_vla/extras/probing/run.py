@@ -23,7 +23,6 @@ from mme_vla.evaluation.results.events import idle_events
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import (
     RunOptions,
-    Shard,
     choose_episodes,
     evaluate,
     evaluate_events,
@@ -62,8 +61,8 @@ class ProbePlan:
     """What is probed.
 
     arms: as in `with`; None for `DEFAULT_ARMS`. recordings: episodes to probe; lend: to take from.
-    jobs: episodes of the closed loop, none for none. source: where the weights are from.
-    events: further arms of the closed loop, in the simulation.
+    jobs: episodes of the closed loop, none for none. events: further arms of the closed loop, in
+    the simulation.
     """
 
     arms: Any = None
@@ -71,8 +70,6 @@ class ProbePlan:
     lend: Sequence[Recording] = ()
     jobs: Sequence[Job] = ()
     offline: OfflineSettings = field(default_factory=OfflineSettings)
-    shard: Shard = field(default_factory=Shard)
-    source: str | None = None
     events: Sequence[str] = ()
 
 
@@ -92,10 +89,7 @@ def run_probe(
     folder: Path,
     facts: RunFacts,
     settings: RolloutSettings,
-    *,
-    subgoals: SubgoalPredictor | None = None,
-    base: Callable[..., Any] = make_env,
-    show_progress: bool = True,
+    options: RunOptions,
 ) -> Probe:
     """Run the parts of the plan that the folder lacks, and write the page."""
     check_outputs(folder, claimed=(folder / OFFLINE / RUN_FILE).is_file())
@@ -108,31 +102,24 @@ def run_probe(
         if any(recording.name in donor_names for recording in plan.recordings):
             n_donors -= 1  # never the probed one
         arms, notes = choose_arms(plan.arms, policy, channel, n_donors, boundaries=has_boundaries)
-        _on_recordings(policy, arms, plan, folder / OFFLINE, facts, show_progress)
+        _on_recordings(policy, arms, plan, folder / OFFLINE, facts, options)
     if plan.jobs:
-        has_boundaries = base is make_env and settings.env == "mme_vla"
+        has_boundaries = options.base is make_env and settings.env == "mme_vla"
         arms, left_out = choose_arms(
             plan.arms, policy, channel, len(plan.lend), boundaries=has_boundaries
         )
         notes += [f"In closed loop {note}" for note in left_out if note not in notes]
         donors = DonorEpisodes(policy, channel, plan.lend) if plan.lend else None
-        options = RunOptions(
-            subgoals=subgoals,
-            shard=plan.shard,
-            source=plan.source,
-            base=base,
-            notes={"arm": UNPROBED.name},
-            show_progress=show_progress,
-        )
         # The unprobed run, with its events; then every arm on the same scenes.
         output = folder / ONLINE / slug(UNPROBED.name)
-        evaluate_events(policy, plan.jobs, output, facts, settings, plan.events, options)
+        arm_options = replace(options, notes={"arm": UNPROBED.name})
+        evaluate_events(policy, plan.jobs, output, facts, settings, plan.events, arm_options)
         for arm in arms:
             probed = ProbedPolicy(policy, arm, plan.lend, donors).eval()
             output = folder / ONLINE / slug(arm.name)
             named_facts = replace(facts, model=named(facts.model, arm))
-            noted = replace(options, notes={"arm": arm.name})
-            evaluate(probed, plan.jobs, output, named_facts, settings, noted)
+            arm_options = replace(options, notes={"arm": arm.name})
+            evaluate(probed, plan.jobs, output, named_facts, settings, arm_options)
 
     # The page on all that the folder holds.
     findings = Findings.of(lines.read_all(folder / OFFLINE))
@@ -154,18 +141,18 @@ def _on_recordings(
     plan: ProbePlan,
     folder: Path,
     facts: RunFacts,
-    show_progress: bool,
+    options: RunOptions,
 ) -> None:
     policy.require_processor().require_stats()
     claim_run(folder, _settings(policy, plan, facts, arms))
-    shard = plan.shard
+    shard = options.shard
     local = list(plan.recordings)[shard.index :: shard.count]
     path = folder / "offline.jsonl"
     if shard.count > 1:
         path = folder / f"offline-{shard.index}of{shard.count}.jsonl"
     with (
         progress("probe", len(local), unit="episodes")
-        if show_progress
+        if options.show_progress
         else nullcontext(lambda _: None) as advance
     ):
         probe_offline(policy, arms, local, plan.lend, path, plan.offline, advance)
@@ -259,18 +246,10 @@ def probe(
         loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None
     )
     offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
-    plan = ProbePlan(arms, recorded, recorded, jobs, offline, source=source, events=arms_of_events)
+    plan = ProbePlan(arms, recorded, recorded, jobs, offline, arms_of_events)
     folder = Path(output).expanduser()
-    return run_probe(
-        loaded.eval(),
-        plan,
-        folder,
-        facts,
-        run_settings,
-        subgoals=predictor,
-        base=base,
-        show_progress=show_progress,
-    )
+    options = RunOptions(predictor, source=source, base=base, show_progress=show_progress)
+    return run_probe(loaded.eval(), plan, folder, facts, run_settings, options)
 
 
 def named(model: str, arm: Arm) -> str:

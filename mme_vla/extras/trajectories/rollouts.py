@@ -32,7 +32,7 @@ from mme_vla.types import Batch, HistoryTokens, Labels, TensorStruct
 
 KEEP = ("observations", "rewards", "log_probs", "oracle")
 
-_NOT_OF_THE_ENVIRONMENT = {
+ARGUMENTS_INSTEAD = {
     "task": "the jobs",
     "split": "the jobs",
     "episode": "the jobs",
@@ -41,7 +41,7 @@ _NOT_OF_THE_ENVIRONMENT = {
     "robot": "the policy's embodiment",
     "oracle": 'rollouts(…, keep=["oracle"]), or oracle_share=…',
 }
-"""Names that `env_options` may not have → what says them instead."""
+"""Names that `env_options` may not have → what sets them instead."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def rollouts(
 
     Raises:
         UserError: an unknown name, something to keep that this policy or environment does not
-            have, or something in `env_options` that another argument says.
+            have, or something in `env_options` that another argument sets.
     """
     require(
         len(set(jobs)) == len(jobs), "jobs has an episode twice: run it again with another seed=…."
@@ -141,10 +141,10 @@ def rollouts(
         RolloutSettings, settings if callable(env) else {**settings, "env": env}
     )
     options = dict(env_options or {})
-    for name, place in _NOT_OF_THE_ENVIRONMENT.items():
+    for name, argument in ARGUMENTS_INSTEAD.items():
         require(
             name not in options,
-            f"env_options[{name!r}] is no option of the environment: {place} says it.",
+            f"env_options[{name!r}] is no option of the environment: set it by {argument}.",
         )
     oracle = "oracle" in keep or oracle_share > 0
     require(

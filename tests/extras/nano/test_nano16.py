@@ -52,8 +52,9 @@ def demonstration_of(letters: str, task: str = "StopCube") -> Demonstration:
     frames = np.arange(len(letters)) * 4
     images = {int(frame): rng.integers(0, 256, (256, 256, 3), dtype=np.uint8) for frame in frames}
     states = rng.uniform(-1, 1, (40, 8)).astype(np.float32)
-    return Demonstration(task, 0, "easy", "press it. Options: a wait, b go (point)", 40, 0, states,
-                         Motions(frames, targets), {"front": images})  # fmt: skip
+    goal = "press it. Options: a wait, b go (point)"
+    return Demonstration(task, 0, "easy", goal, 40, 0, states, Motions(frames, targets),
+                         {"front": images}, np.array([0]))  # fmt: skip
 
 
 def test_present_gives_the_current_frame_and_as_many_parameters_as_a_memory() -> None:

@@ -39,7 +39,16 @@ def demonstration(frames: range | list[int]) -> Demonstration:
     motions = Motions(DECISIONS, rng.uniform(-0.2, 0.2, (5, 7)).astype(np.float32))
     states = rng.uniform(-1, 1, (120, 8)).astype(np.float32)
     return Demonstration(
-        "RouteStick", 3, "easy", "follow the same path", 120, 20, states, motions, {"front": images}
+        "RouteStick",
+        3,
+        "easy",
+        "follow the same path",
+        120,
+        20,
+        states,
+        motions,
+        {"front": images},
+        boundaries=np.array([0]),
     )
 
 

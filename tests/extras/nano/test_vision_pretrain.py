@@ -210,7 +210,6 @@ def test_without_any_scene_it_says_what_to_change(
         record(monkeypatch, tmp_path, {0}, "held_out=4")
 
 
-@pytest.mark.slow
 def test_the_shipped_tower_finds_what_a_scene_shows(tmp_path: Path) -> None:
     """A scene that it was not trained on: most objects, and no other ones."""
     from mme_vla.extras.nano.tower import load_shipped

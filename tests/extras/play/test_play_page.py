@@ -175,7 +175,6 @@ def test_only_this_machine_is_answered_and_the_page_loads_nothing_foreign(tmp_pa
     assert not is_local("0.0.0.0")
 
 
-@pytest.mark.slow
 def test_ctrl_c_frees_the_simulator_and_goes_on_behind_the_page(tmp_path):
     script = (
         "import logging; from pathlib import Path; from helpers.play_fakes import a_session,"
@@ -245,7 +244,6 @@ def test_an_episode_that_cannot_be_saved_is_not_lost(tmp_path, monkeypatch):
 # In a browser -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
     with served(tmp_path / "run") as page, Browser(tmp_path / "profile") as browser:
         browser.open(f"http://127.0.0.1:{page.port}/")
@@ -298,7 +296,6 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
     assert (first.outcome, second.outcome, second.error) == ("success", "error", "no path")
 
 
-@pytest.mark.slow
 def test_the_page_says_when_the_server_is_gone(tmp_path):
     with Browser(tmp_path / "profile") as browser:
         with served(tmp_path / "run") as page:

@@ -235,7 +235,6 @@ def test_the_oracle_needs_this_librarys_tasks():
         OraclePlayer().choose(session)
 
 
-@pytest.mark.slow
 def test_the_oracle_solves_episodes_without_rendering(tmp_path, capsys):
     pytest.importorskip(
         "mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim"

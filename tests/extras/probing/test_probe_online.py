@@ -11,12 +11,15 @@ from helpers.probe_fakes import JOBS, actions, made_up
 from helpers.rollout_fakes import FACTS, quick_policy, use_inline_envs
 from helpers.scripted_env import make_moving_env
 from mme_vla.errors import UserError
+from mme_vla.evaluation.rollout.evaluation import RunOptions, Shard
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.arms import read_arm
 from mme_vla.extras.probing.lines import LINES
 from mme_vla.extras.probing.offline import OfflineSettings
 from mme_vla.extras.probing.report import Findings, table_of
 from mme_vla.extras.probing.run import Probe, ProbePlan, named, probed_folder, run_probe
+
+SILENT = RunOptions(show_progress=False)
 
 
 @pytest.mark.parametrize(
@@ -45,9 +48,8 @@ def probe_both(folder: Path) -> Probe:
         ["shuffle", "nodemo"], recordings[:1], recordings, JOBS, offline, events=events
     )
     settings = RolloutSettings(max_steps=24, flow_steps=2, workers=1, max_batch=1)
-    return run_probe(
-        policy, request, folder, FACTS, settings, base=make_moving_env, show_progress=False
-    )
+    options = RunOptions(base=make_moving_env, show_progress=False)
+    return run_probe(policy, request, folder, FACTS, settings, options)
 
 
 def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(
@@ -86,8 +88,6 @@ def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(
 
 
 def test_shards_of_a_probe_meet_in_one_page(tmp_path: Path) -> None:
-    from mme_vla.evaluation.rollout.evaluation import Shard
-
     policy, recordings = quick_policy("framesamp_modul").eval(), made_up()
     for index in range(2):
         request = ProbePlan(
@@ -96,11 +96,9 @@ def test_shards_of_a_probe_meet_in_one_page(tmp_path: Path) -> None:
             recordings,
             (),
             OfflineSettings(1, 2, 1, False, 2),
-            Shard(index, 2),
         )
-        findings = run_probe(
-            policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False
-        )
+        options = RunOptions(shard=Shard(index, 2), show_progress=False)
+        findings = run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), options)
     assert len(list((tmp_path / "offline").glob(LINES))) == 2
     assert {line.recording for line in findings.findings.moments} == {
         "made-up/0",
@@ -116,10 +114,10 @@ def test_a_folder_of_another_probe_is_refused(tmp_path: Path) -> None:
             words, recordings[:1], recordings, (), OfflineSettings(1, 2, 1, False, 2)
         )
         if words == ["drop:all"]:
-            run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False)
+            run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), SILENT)
         else:
             with pytest.raises(UserError, match="holds a run with other settings"):
-                run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False)
+                run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), SILENT)
     with pytest.raises(UserError, match="holds no probe on recorded episodes"):
         probed_folder(tmp_path / "elsewhere")
 
@@ -135,8 +133,8 @@ def test_a_probe_replaces_no_file_of_somebody_else_and_runs_nothing_before_it_sa
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("mine")
     with pytest.raises(UserError, match=rf"{Path(name).parts[0]} exists"):
-        run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False)
+        run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), SILENT)
     assert (tmp_path / name).read_text() == "mine" and not (tmp_path / "offline").exists()
     (tmp_path / name).unlink()
     for _ in range(2):  # an earlier page of its own is written again
-        run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), show_progress=False)
+        run_probe(policy, request, tmp_path, FACTS, RolloutSettings(), SILENT)

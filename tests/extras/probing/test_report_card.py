@@ -17,6 +17,7 @@ from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.receipts import verify
 from mme_vla.evaluation.records import EpisodeKey
+from mme_vla.evaluation.rollout.evaluation import RunOptions
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.extras.probing import card as card_module
@@ -44,7 +45,6 @@ from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.utils import to_json
 
-CARDS = published_folder("clock") / "nano16" / "cards"
 JOBS = [Job("VideoUnmask", "test", episode) for episode in range(8)]
 VIDEO = (5, 21)  # frames of the video of a scene, by its right choice
 
@@ -222,8 +222,14 @@ def test_each_suite_has_a_score_of_its_own() -> None:
     assert scores["A"].score == 1.0 and scores["B"].undefined == "neither loss is beyond noise"
 
 
-@pytest.mark.parametrize("folder", sorted(CARDS.glob("*")), ids=lambda folder: folder.name)
-def test_a_committed_card_follows_from_its_records(folder: Path) -> None:
+def test_committed_cards_follow_from_their_records() -> None:
+    folders = sorted((published_folder("clock") / "nano16" / "cards").iterdir())
+    assert folders
+    for folder in folders:
+        assert_card_follows_from_its_records(folder)
+
+
+def assert_card_follows_from_its_records(folder: Path) -> None:
     figures = json.loads((folder / "card.json").read_text())
 
     def outcomes(part: str) -> dict[EpisodeKey, float]:
@@ -234,14 +240,21 @@ def test_a_committed_card_follows_from_its_records(folder: Path) -> None:
         label: outcomes(f"online/{slug(read_arm(ARMS[label]).name)}") for label in figures["arms"]
     }
     card = grade(matched, arms, again)
-    assert card.scenes == figures["scenes"]
+    assert card.scenes == figures["scenes"], folder.name
     for label, loss in card.arms.items():
-        assert to_json(asdict(loss)) == pytest.approx(figures["arms"][label]), label
-    assert to_json(asdict(card.memory_or_clock)) == pytest.approx(figures["memory_or_clock"])
+        assert to_json(asdict(loss)) == pytest.approx(figures["arms"][label]), (
+            folder.name,
+            label,
+        )
+    score = to_json(asdict(card.memory_or_clock))
+    assert score == pytest.approx(figures["memory_or_clock"]), folder.name
     scores = clock_scores(matched, arms, again, {})
-    assert scores.keys() == figures["suites"].keys()
-    for suite, score in scores.items():
-        assert to_json(asdict(score)) == pytest.approx(figures["suites"][suite]), suite
+    assert scores.keys() == figures["suites"].keys(), folder.name
+    for suite, of_suite in scores.items():
+        assert to_json(asdict(of_suite)) == pytest.approx(figures["suites"][suite]), (
+            folder.name,
+            suite,
+        )
 
 
 def test_recovery_counts_decisions_until_nothing_changes_any_more() -> None:
@@ -283,26 +296,26 @@ def test_a_card_without_another_scene_to_show_has_no_recovery(
     }
     monkeypatch.setattr(card_module, "_scenes", lambda *_: ended)
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
-    card = run_card(reader(TIME), plan, tmp_path, FACTS, RolloutSettings(), base=make_choice_env)
+    options = RunOptions(base=make_choice_env)
+    card = run_card(reader(TIME), plan, tmp_path, FACTS, RolloutSettings(), options)
     assert card.recovery is None and card.notes == [
         "wrong scene first (distract:1) was left out: it needs a camera."
     ]
     assert all("distract:1" not in plan.arms for plan in plans)
 
 
-@pytest.mark.slow
 def test_a_card_runs_every_arm_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     use_inline_envs(monkeypatch)
     policy, donors = reader(CONTENT), recordings()
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
     settings = RolloutSettings(max_steps=16, flow_steps=2, workers=1, max_batch=1)
     facts = replace(FACTS, max_steps=settings.max_steps)
-    options: dict[str, Any] = {"base": make_choice_env, "show_progress": False}
-    card = run_card(policy, plan, tmp_path, facts, settings, **options)
+    options = RunOptions(base=make_choice_env, show_progress=False)
+    card = run_card(policy, plan, tmp_path, facts, settings, options)
     assert set(card.arms) == set(ARMS) - {"oracle frames"} and "oracle frames" in card.notes[0]
     assert card.recovery is not None and card.recovery.recordings == 1
     assert verify(tmp_path / "again" / "receipt.json")[0] == []
     references = {"floor": str(tmp_path / "online" / "drop-all")}
-    again = run_card(policy, plan, tmp_path, facts, settings, references=references, **options)
+    again = run_card(policy, plan, tmp_path, facts, settings, options, references)
     assert again.arms == card.arms
     assert again.references == {"floor": card.arms["nothing remembered"].success}

@@ -18,7 +18,7 @@ from mme_vla.embodiment.robomme import ROBOMME_JOINT
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.rollout.environment import ChunkEnv, Command
 from mme_vla.extras.trajectories.log_prob import SamplePath, log_prob, path_log_prob
-from mme_vla.extras.trajectories.rollouts import join, rollouts
+from mme_vla.extras.trajectories.rollouts import ARGUMENTS_INSTEAD, join, rollouts
 from mme_vla.processing.normalise import NormStats
 from mme_vla.registry import REWARDS
 from mme_vla.types import Labels
@@ -171,11 +171,11 @@ class Rewarding(ScriptedEnv):
         return observation, 1.0, terminated, truncated, info
 
 
-@pytest.mark.parametrize("name", ["task", "split", "episode", "max_steps", "robot", "oracle"])
-def test_what_another_argument_says_is_no_option_of_the_environment(
+@pytest.mark.parametrize("name", ARGUMENTS_INSTEAD)
+def test_what_another_argument_sets_is_no_option_of_the_environment(
     name: str, policy: MMEPolicy
 ) -> None:
-    with pytest.raises(UserError, match=rf"env_options\['{name}'\] is no option.*says it"):
+    with pytest.raises(UserError, match=rf"env_options\['{name}'\] is no option.*set it by"):
         next(rollouts(policy, two_choices, JOBS, env_options={name: 7}))
 
 

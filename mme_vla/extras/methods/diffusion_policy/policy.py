@@ -170,8 +170,7 @@ class DiffusionPolicy(NetworkPolicy):
         loss = masked_mean(losses, batch.action_mask)
         metrics = {"loss": loss.detach()}
         if memory is not None:
-            for name, value in memory.metrics.items():
-                metrics[f"memory/{name}"] = value
+            metrics |= memory.logged()
         return loss, metrics
 
     def condition(

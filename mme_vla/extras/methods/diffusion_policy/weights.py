@@ -16,11 +16,10 @@ from mme_vla.errors import UserError
 from mme_vla.extras.methods.diffusion_policy.model import cell_centres, map_size
 from mme_vla.extras.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.policy.base import Policy
-from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import cast
 from mme_vla.processing.normalise import NormStats
 from mme_vla.utils import checked_file, read_json
-from mme_vla.weights.tables import Adapter, Derived, Piece
+from mme_vla.weights.tables import Adapter, Derived, Piece, wrong_policy
 
 STATS = "stats.json"
 WEIGHTS = "model.pth"
@@ -59,11 +58,7 @@ def unwrap_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor
 def diffusion_adapter(policy: Policy) -> Adapter:
     """The authors' names of this policy's tensors; a memory and its tower have none."""
     if not isinstance(policy, DiffusionPolicy):
-        raise UserError(
-            "This format holds Diffusion Policy;"
-            f" {PolicySections.of(policy.config).name or 'this'} is a {type(policy).__name__}. Set"
-            " model=diffusion_policy."
-        )
+        raise wrong_policy(policy, "Diffusion Policy", "model=diffusion_policy")
     table = {
         name: [Piece(name.replace(_LOCAL, _UNET).removeprefix("backbone."))]
         for name in policy.state_dict()

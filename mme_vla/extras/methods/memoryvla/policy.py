@@ -244,8 +244,7 @@ class MemoryVlaPolicy(NetworkPolicy):
         loss = masked_mean(losses, counted)
         metrics = {"loss": loss.detach()}
         if memory is not None:
-            for name, value in memory.metrics.items():
-                metrics[f"memory/{name}"] = value
+            metrics |= memory.logged()
         return loss, metrics
 
     def recompute(self, mode: Recompute) -> None:

@@ -7,13 +7,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
 from mme_vla.extras.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.policy.base import Policy
-from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import cast
 from mme_vla.processing.normalise import NormStats
-from mme_vla.weights.tables import Adapter, NameTable, Piece
+from mme_vla.weights.tables import Adapter, NameTable, Piece, wrong_policy
 
 _CONVOLUTION = "o i 1 1 -> o i"
 _BANK = r"(cognition|perceptual)_bank"
@@ -113,10 +111,7 @@ def read_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
 def memoryvla_adapter(policy: Policy) -> Adapter:
     """The authors' names of this policy's tensors; what they start from lacks banks and head."""
     if not isinstance(policy, MemoryVlaPolicy):
-        raise UserError(
-            f"This format holds MemoryVLA; {PolicySections.of(policy.config).name or 'this'} is a"
-            f" {type(policy).__name__}. Set model=memoryvla."
-        )
+        raise wrong_policy(policy, "MemoryVLA", "model=memoryvla")
     names = policy.state_dict()
     return Adapter(
         memoryvla_table(names),

@@ -15,11 +15,10 @@ from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.extras.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.extras.methods.openvla_oft.policy import OpenVlaPolicy
 from mme_vla.policy.base import Policy
-from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import WEIGHTS, cast, read_files
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import check_sums, checked_file, inside, read_json
-from mme_vla.weights.tables import Adapter, Piece
+from mme_vla.weights.tables import Adapter, Piece, wrong_policy
 from mme_vla.weights.torch_files import read_torch_file
 
 VLA, HEAD, STATE = "vla/", "action_head/", "proprio_projector/"
@@ -161,11 +160,8 @@ def openvla_adapter(policy: Policy) -> Adapter:
     Of MemoryVLA the VLM alone has names: banks and head are new where it starts from OpenVLA.
     """
     if not isinstance(policy, OpenVlaPolicy | MemoryVlaPolicy):
-        raise UserError(
-            "This format holds OpenVLA and OpenVLA-OFT;"
-            f" {PolicySections.of(policy.config).name or 'this'} is a {type(policy).__name__}. Set"
-            " model=openvla_oft, or start model=memoryvla from it (init_from=…)."
-        )
+        change = "model=openvla_oft, or start model=memoryvla from it (init_from=…)"
+        raise wrong_policy(policy, "OpenVLA and OpenVLA-OFT", change)
     names = [
         name for name in policy.state_dict() if ".lora_" not in name and ".base_layer." not in name
     ]

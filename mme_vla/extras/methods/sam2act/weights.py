@@ -8,14 +8,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, require
+from mme_vla.errors import require
 from mme_vla.extras.methods.sam2act.model import code_rates
 from mme_vla.extras.methods.sam2act.policy import SAM2ActPolicy
 from mme_vla.policy.base import Policy
-from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import cast
 from mme_vla.processing.normalise import NormStats
-from mme_vla.weights.tables import Adapter, Derived, NameTable, Piece, Unread, prefixed
+from mme_vla.weights.tables import (
+    Adapter,
+    Derived,
+    NameTable,
+    Piece,
+    Unread,
+    prefixed,
+    wrong_policy,
+)
 
 _Rule = tuple[str, str | Callable[[re.Match[str]], str]]
 # Ours → theirs, where a name begins so; the first that matches decides.
@@ -222,10 +229,7 @@ def unwrap_sam2act_names(tensors: Mapping[str, Tensor], source: str) -> dict[str
 def sam2act_adapter(policy: Policy) -> Adapter:
     """The authors' names of this policy's tensors."""
     if not isinstance(policy, SAM2ActPolicy):
-        raise UserError(
-            f"This format holds SAM2Act+; {PolicySections.of(policy.config).name or 'this'} is a"
-            f" {type(policy).__name__}. Set model=sam2act_plus."
-        )
+        raise wrong_policy(policy, "SAM2Act+", "model=sam2act_plus")
     sizes = policy.backbone.sizes
     table = released_names(policy.backbone.state_dict(), sizes.mask_stages)
     unread = released_unread(sizes.encoder.neck)

@@ -5,7 +5,7 @@ is explained.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Final, Self
 
 from mme_vla.config.sections import (
     NonNegative,
@@ -17,7 +17,7 @@ from mme_vla.config.sections import (
 )
 from mme_vla.errors import UserError, brief, missing_extra
 
-NAME = "simplememvla"
+NAME: Final = "simplememvla"
 LARGEST = 2**24
 """Bound of every size: a number of a damaged file exceeds it, and would take memory."""
 

@@ -259,8 +259,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             "words_right": right,
         }
         if memory is not None:
-            for name, value in memory.metrics.items():
-                metrics[f"memory/{name}"] = value
+            metrics |= memory.logged()
         return loss, metrics
 
     def _state(self, batch: VideoBatch) -> Tensor | None:

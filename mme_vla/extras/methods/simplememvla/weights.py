@@ -25,11 +25,10 @@ from mme_vla.extras.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.extras.methods.simplememvla.processor import TOKENIZER_FILE, processor_settings
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG
-from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import WEIGHTS, cast
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import checked_file, read_json
-from mme_vla.weights.tables import Adapter, Piece
+from mme_vla.weights.tables import Adapter, Piece, wrong_policy
 
 STATS = "stats.json"
 BASE = "Qwen/Qwen3.5-4B"
@@ -48,12 +47,12 @@ Number = int | float
 
 @dataclass(frozen=True)
 class PublishedConfig:
-    """What a published config.json says, in its own keys.
+    """The content of a published config.json, in its own keys.
 
     backbone_config: Qwen3.5's own configuration. state_dim: of the robot, also where `use_proprio`
     leaves the state out. image_keys: cameras in the order in which they are shown.
     history_image_keys: those with a video. The text beside a type is the key of a configuration
-    here that says the same.
+    here with the same value.
     """
 
     backbone_config: Mapping[str, Any]
@@ -86,7 +85,7 @@ class PublishedConfig:
 
     @classmethod
     def read(cls, config: Mapping[str, Any], source: str | Path) -> Self:
-        """Read a config.json; keys that say nothing of the network are left out.
+        """Read a config.json; keys that do not concern the network are left out.
 
         source: its folder, for messages.
         """
@@ -105,7 +104,7 @@ class PublishedConfig:
 
     @classmethod
     def of(cls, policy: SimpleMemVlaPolicy) -> Self:
-        """What the config.json of a policy says."""
+        """The content of the config.json of a policy."""
         sizes, robot = policy.sizes, policy.embodiment
         settings = processor_settings(policy.config)
         values: dict[str, Any] = {}
@@ -125,15 +124,8 @@ class PublishedConfig:
             state_dim=sizes.state_dim or robot.state.width,
             image_keys=tuple(_IMAGE_KEY + name for name in robot.camera_names),
             history_image_keys=(_IMAGE_KEY + robot.memory_camera,),
-            model_type="simplememvla",
+            model_type=NAME,
         )
-
-    @property
-    def state_inputs(self) -> int:
-        """`backbone.state_dim` of a configuration here."""
-        if not self.use_proprio or self.state_dim is None:
-            return 0
-        return self.state_dim
 
     def settings(self) -> dict[str, Any]:
         """Keys of a configuration here → values, as a command line takes them."""
@@ -141,6 +133,7 @@ class PublishedConfig:
         for name, key in KEYS.items():
             value = getattr(self, name)
             values[key] = list(value) if isinstance(value, tuple) else value
+        values["backbone.state_dim"] = self.state_dim if self.use_proprio else 0
         return values
 
     def configure(self, config: DictConfig) -> None:
@@ -150,14 +143,14 @@ class PublishedConfig:
                 OmegaConf.update(config, key, value)
             config.backbone.name = NAME
             config.backbone.vlm = dict(self.backbone_config)
-            config.backbone.state_dim = self.state_inputs
 
 
-KEYS: dict[str, str] = {}
+KEYS: dict[str, str] = {
+    name: kind.__metadata__[0]
+    for name, kind in get_type_hints(PublishedConfig, include_extras=True).items()
+    if get_origin(kind) is Annotated
+}
 """Keys of a published config.json → keys of a configuration here."""
-for _name, _kind in get_type_hints(PublishedConfig, include_extras=True).items():
-    if get_origin(_kind) is Annotated:
-        KEYS[_name] = _kind.__metadata__[0]
 
 
 def is_simplememvla(names: Iterable[str]) -> bool:
@@ -201,11 +194,7 @@ def simplememvla_adapter(policy: Policy) -> Adapter:
 def simplememvla_of(policy: Policy) -> SimpleMemVlaPolicy:
     """The policy, where it is SimpleMemVLA."""
     if not isinstance(policy, SimpleMemVlaPolicy):
-        raise UserError(
-            "This format holds SimpleMemVLA;"
-            f" {PolicySections.of(policy.config).name or 'this'} is a {type(policy).__name__}. Set"
-            " model=simplememvla."
-        )
+        raise wrong_policy(policy, "SimpleMemVLA", "model=simplememvla")
     return policy
 
 
@@ -240,9 +229,8 @@ def check_config(policy: Policy, config: Mapping[str, Any], source: str) -> None
             " init_from=…)."
         )
     published, expected = PublishedConfig.read(config, source), PublishedConfig.of(target)
-    settings = published.settings() | {"backbone.state_dim": published.state_inputs}
-    current = expected.settings() | {"backbone.state_dim": target.sizes.state_dim}
-    for key, value in settings.items():
+    current = expected.settings()
+    for key, value in published.settings().items():
         if value != current[key]:
             raise UserError(
                 f"{source} was trained with {key}={brief(value)}; this policy has"

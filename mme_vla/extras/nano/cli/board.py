@@ -10,6 +10,7 @@ import sys
 import tarfile
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -21,12 +22,11 @@ from mme_vla.extras.nano.settings import NanoRun
 from mme_vla.utils import require_replaceable
 
 SHIPPED = Path(__file__).resolve().parents[3] / "assets" / "board"
-"""The published rows: an archive, or a folder, for each table."""
+"""The published rows: an archive for each table."""
 NO_PUBLISHED_ROWS = (
     "There are no published rows of this split and these actions. Rows of your own are ranked"
     " alone, and are not compared with the published settings."
 )
-_UNPACKED: dict[Path, TemporaryDirectory] = {}
 EXAMPLES = (
     "", "rows=outputs/nano16/further --html board.html",
     "--config-dir configs model=mine_modul '+memories.mine={budget: 32, grid: 1}'",
@@ -89,10 +89,12 @@ def row_folders(nano: NanoRun, trees: Sequence[Path]) -> list[Path]:
     rules = rules_of(nano)
     actions = rows.robot.action.answers or rows.robot.name
     shipped = published_rows(table_of(nano.split, actions))
-    if not shipped.is_dir():
+    trainings: list[Path] = []
+    if shipped is None:
         print(NO_PUBLISHED_ROWS)
-    trainings = sorted(file.parent for file in shipped.rglob(TRAINED))
-    if trainings:
+    else:
+        trainings = sorted(file.parent for file in shipped.rglob(TRAINED))
+    if shipped is not None and trainings:
         published = read_training(trainings[0])
         specs = choose_episodes(nano.task, nano.episodes, nano.split)
         values = {
@@ -114,18 +116,23 @@ def row_folders(nano: NanoRun, trees: Sequence[Path]) -> list[Path]:
     return [Path(nano.output) / nano.split / row for row in rows.composed]
 
 
-def published_rows(table: str) -> Path:
-    """The folder of a table's published rows, which exists where there are any. An archive is
-    unpacked until the process ends.
+def published_rows(table: str) -> Path | None:
+    """The folder of a table's published rows, unpacked until the process ends; None where there are
+    none.
     """
     archive = SHIPPED / f"{table}.tar.xz"
     if not archive.is_file():
-        return SHIPPED / table
-    if archive not in _UNPACKED:
-        _UNPACKED[archive] = TemporaryDirectory(prefix="mme-vla-board-")
-        with tarfile.open(archive) as file:
-            file.extractall(_UNPACKED[archive].name, filter="data")
-    return Path(_UNPACKED[archive].name) / table
+        return None
+    return Path(_unpacked(archive).name) / table
+
+
+@cache
+def _unpacked(archive: Path) -> TemporaryDirectory:
+    """The files of an archive, until the process ends."""
+    folder = TemporaryDirectory(prefix="mme-vla-board-")
+    with tarfile.open(archive) as file:
+        file.extractall(folder.name, filter="data")
+    return folder
 
 
 def alone(words: Sequence[str]) -> list[str]:
@@ -149,7 +156,7 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
     folders = [Path(word.removeprefix("rows=")) for word in args.words if word.startswith("rows=")]
     local = read_rows([], local=[*folders, *trained])
     shipped = published_rows(next((row[0].table for row in local.values()), split))
-    if shipped.is_dir():
+    if shipped is not None:
         rows = read_rows([shipped], local=[*folders, *trained])
     else:
         rows = local

@@ -31,7 +31,12 @@ def probe(cfg: DictConfig) -> None:
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import choose_numbers, named_tasks
-    from mme_vla.evaluation.rollout.evaluation import choose_episodes, choose_shard, facts_of
+    from mme_vla.evaluation.rollout.evaluation import (
+        RunOptions,
+        choose_episodes,
+        choose_shard,
+        facts_of,
+    )
     from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.extras.probing.card import PAGE, card_text, run_card
@@ -95,21 +100,16 @@ def probe(cfg: DictConfig) -> None:
     )
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
-    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source, events)
+    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, events)
+    options = RunOptions(subgoals, shard, source)
     try:
         if card:
             graded = run_card(
-                policy.eval(),
-                plan,
-                folder,
-                facts,
-                settings,
-                references=values["references"],
-                subgoals=subgoals,
+                policy.eval(), plan, folder, facts, settings, options, values["references"]
             )
             text, page = card_text(graded), folder / PAGE
         else:
-            page = run_probe(policy.eval(), plan, folder, facts, settings, subgoals=subgoals).page
+            page = run_probe(policy.eval(), plan, folder, facts, settings, options).page
             text = (folder / "table.md").read_text(encoding="utf-8")
     finally:
         if subgoals is not None:

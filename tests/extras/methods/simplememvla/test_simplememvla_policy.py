@@ -249,7 +249,6 @@ def test_a_language_model_without_delta_nets_generates() -> None:
     assert np.isfinite(policy.act(episode)).all()
 
 
-@pytest.mark.slow
 def test_a_lora_training_lowers_the_loss_and_changes_adapters_and_the_head_alone(
     tmp_path: Path,
 ) -> None:
