@@ -24,6 +24,10 @@ class SceneError(RuntimeError):
     """A scene that cannot be laid out from its seed: an object found no place."""
 
 
+class PluginError(RuntimeError):
+    """An error in the code of an environment that is a plugin: its text ends with file and line."""
+
+
 def require(holds: object, message: str, error: type[Exception] = UserError) -> None:
     """Raise an error with this message unless something holds.
 

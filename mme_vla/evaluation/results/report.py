@@ -14,7 +14,14 @@ from mme_vla.evaluation.results.aggregate import Method, Results, Run
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.curves import CAPTION, process_tables
 from mme_vla.evaluation.results.paper import chunk_flops
-from mme_vla.evaluation.results.tables import Table, comparison_table, detail, overview, runs_table
+from mme_vla.evaluation.results.tables import (
+    Table,
+    comparison_table,
+    detail,
+    grouping_tables,
+    overview,
+    runs_table,
+)
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 from mme_vla.evaluation.store import RUN_FILE, read_run
 from mme_vla.utils.pages import render
@@ -89,6 +96,8 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
             "Efficiency", plots.efficiency(results, chunk_flops()), caption=rings, half=bool(points)
         ),
     ]
+    if groupings := grouping_tables(results):
+        sections.append(Section("Groups of tasks", tables=groupings, headed=True))
     if points:
         curve = plots.budget_curve(results, points)
         sections.append(

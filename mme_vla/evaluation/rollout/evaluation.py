@@ -254,7 +254,7 @@ def _environments(
     make = partial(
         make_rollout_env,
         base=base,
-        max_steps=settings.max_steps,
+        max_steps=settings.limit_of,
         videos=videos,
         robot=robot,
         max_actions=settings.max_actions or policy.info.max_actions,
