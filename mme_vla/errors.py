@@ -24,8 +24,18 @@ class SceneError(RuntimeError):
     """A scene that cannot be laid out from its seed: an object found no place."""
 
 
-class PluginError(RuntimeError):
-    """An error in the code of an environment that is a plugin: its text ends with file and line."""
+def place_of(error: BaseException | None) -> str | None:
+    """File and line of an error in a plugin's code, which worker processes note; None of others."""
+    notes = getattr(error, "__notes__", ())
+    return notes[0] if notes else None
+
+
+def text_of(error: BaseException) -> str:
+    """The message of an error, with its place if it is a plugin's."""
+    place = place_of(error)
+    if place is None:
+        return str(error)
+    return f"{type(error).__name__}: {error} ({place})"
 
 
 def require(holds: object, message: str, error: type[Exception] = UserError) -> None:

@@ -18,7 +18,7 @@ from mme_vla.envs.base import Environment, EpisodeEnv
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
-from mme_vla.errors import PluginError, UserError
+from mme_vla.errors import UserError, text_of
 from mme_vla.evaluation.records import EpisodeRecord, by_run
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.tables import grouping_tables
@@ -294,8 +294,9 @@ def test_an_error_of_a_plugin_names_its_file_and_line() -> None:
     line = 1 + Path(__file__).read_text().split("\n").index(
         '        return {}["missing"]  # the line that is named'
     )
-    assert isinstance(reply.error, PluginError)
-    assert str(reply.error) == f"KeyError: 'missing' ({__file__}, line {line})"
+    assert type(reply.error) is KeyError
+    assert text_of(reply.error) == f"KeyError: 'missing' ({__file__}, line {line})"
+    assert reply.info["error_message"] == f"A test episode 0: {text_of(reply.error)}"
 
 
 class Failing(InlineEnvs):
@@ -321,11 +322,17 @@ def _roll(errors: list[Exception | None], retries: int = 0) -> list[EpisodeRecor
     return made
 
 
+def noted(key: str) -> KeyError:
+    error = KeyError(key)
+    error.add_note("x.py, line 3")
+    return error
+
+
 def test_the_second_equal_error_of_a_plugin_stops_the_run() -> None:
-    same = [PluginError("KeyError: 'a' (x.py, line 3)") for _ in range(4)]
+    same = [noted("a") for _ in range(4)]
     with pytest.raises(UserError, match=r"2 episodes in a row .* KeyError: 'a' \(x.py, line 3\)"):
         _roll(list(same))
-    other = [PluginError(f"KeyError: {number} (x.py, line 3)") for number in range(4)]
+    other = [noted(str(number)) for number in range(4)]
     assert [record.outcome for record in _roll(other)] == ["error"] * 4
     crashes: list[Exception | None] = [RuntimeError("died of signal 9") for _ in range(4)]
     assert [record.outcome for record in _roll(crashes)] == ["error"] * 4

@@ -161,18 +161,20 @@ def serve(connection: Any, block: Any, factory: Callable[..., Any]) -> None:
 
 
 def _portable(error: Exception) -> Exception:
-    """The error, or a RuntimeError of its text if the reader would have to import its class."""
-    if not isinstance(error, errors.UserError | errors.SceneError):
-        place = _plugin_line(error)
-        if place is not None:
-            return errors.PluginError(f"{type(error).__name__}: {error} ({place})")
+    """The error, or a RuntimeError of its text if the reader would have to import its class; its
+    place in a plugin's code is noted.
+    """
+    place = _plugin_line(error)
+    portable: Exception = RuntimeError(f"{type(error).__name__}: {error}")
     if type(error).__module__ in ("builtins", errors.__name__):
         try:
             pickle.loads(pickle.dumps(error))
-            return error
+            portable = error
         except Exception:
             pass  # its arguments do not survive the way
-    return RuntimeError(f"{type(error).__name__}: {error}")
+    if place is not None and not isinstance(error, errors.UserError | errors.SceneError):
+        portable.add_note(place)
+    return portable
 
 
 def _plugin_line(error: Exception) -> str | None:

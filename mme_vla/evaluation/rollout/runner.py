@@ -18,7 +18,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.errors import PluginError, SceneError, UserError
+from mme_vla.errors import SceneError, UserError, place_of, text_of
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.environment import Command
 from mme_vla.evaluation.rollout.episode import RunningEpisode
@@ -263,7 +263,7 @@ class Rollout:
             message = running.report.error
         else:
             status = "error"
-            message = f"{reply.job}: {reply.error}"
+            message = f"{reply.job}: {text_of(reply.error)}"
         if isinstance(reply.error, UserError):
             raise UserError(str(message))
         # A scene in which an object finds no place finds none again, and says nothing of the
@@ -286,9 +286,10 @@ class Rollout:
         """
         if reply.error is None:
             self._same_errors = 0
-        if not isinstance(reply.error, PluginError) or self._tries[running.job] > 1:
             return
-        text = str(reply.error)
+        if place_of(reply.error) is None or self._tries[running.job] > 1:
+            return
+        text = text_of(reply.error)
         if text != self._last_error:
             self._last_error = text
             self._same_errors = 0
