@@ -25,7 +25,9 @@ class SceneError(RuntimeError):
 
 
 def place_of(error: BaseException | None) -> str | None:
-    """File and line of an error in a plugin's code, which worker processes note; None of others."""
+    """Kind, file and line of an error in a plugin's code, which worker processes note; None of
+    others.
+    """
     notes = getattr(error, "__notes__", ())
     return notes[0] if notes else None
 
@@ -35,7 +37,7 @@ def text_of(error: BaseException) -> str:
     place = place_of(error)
     if place is None:
         return str(error)
-    return f"{type(error).__name__}: {error} ({place})"
+    return f"{error} ({place})"
 
 
 def require(holds: object, message: str, error: type[Exception] = UserError) -> None:

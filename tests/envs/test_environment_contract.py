@@ -295,7 +295,7 @@ def test_an_error_of_a_plugin_names_its_file_and_line() -> None:
         '        return {}["missing"]  # the line that is named'
     )
     assert type(reply.error) is KeyError
-    assert text_of(reply.error) == f"KeyError: 'missing' ({__file__}, line {line})"
+    assert text_of(reply.error) == f"'missing' (KeyError, {__file__}, line {line})"
     assert reply.info["error_message"] == f"A test episode 0: {text_of(reply.error)}"
 
 
@@ -324,13 +324,13 @@ def _roll(errors: list[Exception | None], retries: int = 0) -> list[EpisodeRecor
 
 def noted(key: str) -> KeyError:
     error = KeyError(key)
-    error.add_note("x.py, line 3")
+    error.add_note("KeyError, x.py, line 3")
     return error
 
 
 def test_the_second_equal_error_of_a_plugin_stops_the_run() -> None:
     same = [noted("a") for _ in range(4)]
-    with pytest.raises(UserError, match=r"2 episodes in a row .* KeyError: 'a' \(x.py, line 3\)"):
+    with pytest.raises(UserError, match=r"2 episodes in a row .* 'a' \(KeyError, x.py, line 3\)"):
         _roll(list(same))
     other = [noted(str(number)) for number in range(4)]
     assert [record.outcome for record in _roll(other)] == ["error"] * 4

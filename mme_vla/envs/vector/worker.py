@@ -173,7 +173,7 @@ def _portable(error: Exception) -> Exception:
         except Exception:
             pass  # its arguments do not survive the way
     if place is not None and not isinstance(error, errors.UserError | errors.SceneError):
-        portable.add_note(place)
+        portable.add_note(f"{type(error).__name__}, {place}")
     return portable
 
 
