@@ -1,0 +1,252 @@
+"""Demonstrations of MIKASA-Robo-VLA: scripts that read the simulator's state and move the hand.
+
+Each is a generator of actions [7]; `env.step` is called between two of them, so positions are read
+anew for each.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import require
+
+REACH = 0.1  # metres, and radians, that an action of 1 moves the hand
+OPEN, CLOSED = 1.0, -1.0
+_STEP_SECONDS = 0.05  # of one control step
+
+Actions = Iterator[np.ndarray]
+
+
+def demonstrate(env: Any) -> Actions:
+    """Solve the episode of an environment, just reset; the last action repeats until it is over.
+
+    Raises:
+        UserError: there is no script for its task.
+    """
+    scene = env.scene
+    name = type(scene).__name__
+    for beginning, script in _SCRIPTS.items():
+        if name.startswith(beginning):
+            break
+    else:
+        require(False, f"There is no script that demonstrates {name}.")
+    hand = Hand(scene)
+    while env.time < env.cue_end:
+        yield hand.action(gripper=OPEN)
+    yield from script(hand)
+    while True:
+        yield hand.action(gripper=hand.gripper)
+
+
+class Hand:
+    """The hand of a scene: where it is, and the action that brings it closer to a place."""
+
+    def __init__(self, scene: Any) -> None:
+        self.scene = scene
+        self.gripper = OPEN
+        """The last command."""
+
+    @property
+    def position(self) -> np.ndarray:
+        """Of the point between the fingers [3], metres."""
+        return place_of(self.scene.agent.tcp)
+
+    @property
+    def yaw(self) -> float:
+        """Angle of the axis along which the fingers open, about the vertical, radians."""
+        matrix = self.scene.agent.tcp.pose.to_transformation_matrix()[0].cpu().numpy()
+        return float(np.arctan2(matrix[1, 1], matrix[0, 1]))
+
+    @property
+    def is_still(self) -> bool:
+        """As the tasks judge it."""
+        return bool(self.scene.agent.is_static(0.2)[0])
+
+    def action(
+        self, motion: Any = (0, 0, 0), turn: float = 0.0, gripper: float | None = None
+    ) -> np.ndarray:
+        """Displace the hand by `motion` [3] metres and turn it by `turn` radians about the
+        vertical, as far as one action can.
+        """
+        if gripper is not None:
+            self.gripper = gripper
+        values = np.zeros(7, np.float32)
+        motion = np.asarray(motion, np.float64)
+        longest = np.abs(motion).max()
+        if longest > REACH:
+            motion = motion * (REACH / longest)
+        values[:3] = motion / REACH
+        values[5] = np.clip(-turn / REACH, -1, 1)  # the hand looks down
+        values[6] = self.gripper
+        return values
+
+    def go(
+        self, place: Any, within: float, gripper: float, steps: int = 40, fraction: float = 1.0
+    ) -> Actions:
+        """Move until the hand is within so many metres of a place, at most so many steps.
+
+        place: [3], or a function that gives it anew at each step. fraction: of the way that each
+        action goes.
+        """
+        for _ in range(steps):
+            goal = place() if callable(place) else place
+            offset = np.asarray(goal) - self.position
+            if np.linalg.norm(offset) < within:
+                return
+            yield self.action(fraction * offset, gripper=gripper)
+
+    def rest(self, steps: int, gripper: float) -> Actions:
+        """Stay for so many steps."""
+        for _ in range(steps):
+            yield self.action(gripper=gripper)
+
+    def settle(self, steps: int = 10) -> Actions:
+        """Stay until the hand is still, at most so many steps."""
+        for _ in range(steps):
+            if self.is_still:
+                return
+            yield self.action(gripper=self.gripper)
+
+
+def place_of(thing: Any) -> np.ndarray:
+    """Position of an actor or a link [3], metres."""
+    position: np.ndarray = thing.pose.p[0].cpu().numpy().astype(np.float64)
+    return position
+
+
+def touch(hand: Hand) -> Actions:
+    """Remember* and FindImposter*: bring the hand to the right object."""
+    while True:
+        offset = hand.scene.obj_to_goal_pos[0].cpu().numpy()  # from the hand, in the world
+        yield hand.action(offset, gripper=OPEN)
+
+
+_ABOVE_CUBE = 0.012  # metres over the point that counts, less than the radius of a touch
+_TRAVEL = 0.16  # height at which the hand passes over cubes and button
+
+
+def touch_several(hand: Hand) -> Actions:
+    """Bunch, Seq and ChainOfColors: touch the cubes one after the other, and press the button."""
+    scene = hand.scene
+    yield from hand.rest(6, CLOSED)  # cubes are put back into place for some steps
+    for key in scene.true_color_indices[0].tolist():
+        cube = scene.cubes[key]
+        top = place_of(cube) + [0, 0, scene.CUBE_HALFSIZE + 0.005 + _ABOVE_CUBE]
+        above = np.array([top[0], top[1], _TRAVEL])
+        yield from hand.go(hand.position * [1, 1, 0] + [0, 0, _TRAVEL], 0.03, CLOSED)
+        yield from hand.go(above, 0.02, CLOSED)
+        for _ in range(30):
+            if bool(scene.touched_cubes[0, key]):
+                break
+            yield hand.action(0.7 * (top - hand.position), gripper=CLOSED)
+    button = np.array([*scene.button_xy[0].tolist(), float(scene.button_top_z[0])])
+    yield from hand.go(hand.position * [1, 1, 0] + [0, 0, _TRAVEL], 0.03, CLOSED)
+    yield from hand.go(button * [1, 1, 0] + [0, 0, _TRAVEL], 0.02, CLOSED)
+    for _ in range(30):
+        if bool(scene.pending_press[0]):
+            break
+        yield hand.action((0, 0, -0.02), gripper=CLOSED)
+    yield from hand.go(hand.position + [0, 0, scene.REQUIRED_LIFT_HEIGHT + 0.03], 0.005, CLOSED)
+
+
+def take_back(hand: Hand) -> Actions:
+    """TakeItBack: carry the cube to the target, and back to where it was."""
+    scene = hand.scene
+    begin = place_of(scene.initial_region)
+    goal = place_of(scene.goal_region)
+    yield from grasp(hand, lambda: place_of(scene.cube))
+    for target in (goal, begin):
+        yield from hand.go([target[0], target[1], hand.position[2]], 0.02, CLOSED)
+
+
+def grasp(hand: Hand, place: Any) -> Actions:
+    """Go over a thing, down to it, and close the fingers.
+
+    place: a function that gives its position [3].
+    """
+    yield from hand.go(lambda: place() + [0, 0, 0.08], 0.015, OPEN)
+    yield from hand.go(place, 0.008, OPEN, steps=15)
+    yield from hand.rest(3, CLOSED)
+
+
+def turn(hand: Hand) -> Actions:
+    """RotateLenient and RotateStrict: take the peg in its middle and turn it."""
+    scene = hand.scene
+    peg = scene.peg
+    asked = float(scene.target_angle[0])
+    # The fingers close across the peg, whose two ends are alike
+    across = _yaw_of(peg) + np.pi / 2
+    ways = []
+    for half_turns in (-1, 0, 1):
+        way = _wrapped(across - hand.yaw) + half_turns * np.pi
+        ways.append(way)
+    to_grasp = min(ways, key=lambda way: max(abs(way), abs(way + asked)))
+    goal = hand.yaw + to_grasp
+    for _ in range(40):
+        left = _wrapped(goal - hand.yaw)
+        offset = place_of(peg) + [0, 0, 0.08] - hand.position
+        if abs(left) < 0.03 and np.linalg.norm(offset) < 0.015:
+            break
+        yield hand.action(offset, left)
+    yield from hand.go(lambda: place_of(peg), 0.01, OPEN, steps=12)
+    yield from hand.rest(3, CLOSED)
+    height = hand.position
+    while True:
+        left = float(scene.angle_diff[0])
+        yield hand.action(height - hand.position, 0.8 * left, CLOSED)
+
+
+def catch(hand: Hand) -> Actions:
+    """InterceptGrab: follow the ball from above at its speed, and close the fingers around it."""
+    scene = hand.scene
+    ball = scene.ball
+    lead = 1.0
+    for _ in range(60):
+        speed = ball.linear_velocity[0].cpu().numpy().astype(np.float64)
+        ahead = place_of(ball) + lead * speed * _STEP_SECONDS
+        offset = ahead - hand.position
+        aside = np.linalg.norm(offset[:2])
+        if aside > 0.02:
+            offset[2] = max(offset[2], 0.07 - hand.position[2])
+        yield hand.action(offset, gripper=OPEN)
+        gap = place_of(ball) - hand.position
+        if np.abs(gap[:2]).max() < 0.02 and abs(gap[2]) < 0.012:
+            break
+    for _ in range(5):
+        speed = ball.linear_velocity[0].cpu().numpy().astype(np.float64)
+        yield hand.action(speed * _STEP_SECONDS * 0.6, gripper=CLOSED)
+
+
+def catch_and_carry(hand: Hand) -> Actions:
+    """Intercept: catch the ball, and bring it to the target."""
+    yield from catch(hand)
+    target = place_of(hand.scene.goal_region)
+    while True:
+        offset = target - hand.position
+        offset[2] = 0
+        yield hand.action(offset, gripper=CLOSED)
+
+
+def _wrapped(angle: float) -> float:
+    """The same angle in (−π, π]."""
+    return float(np.arctan2(np.sin(angle), np.cos(angle)))
+
+
+def _yaw_of(thing: Any) -> float:
+    matrix = thing.pose.to_transformation_matrix()[0].cpu().numpy()
+    return float(np.arctan2(matrix[1, 0], matrix[0, 0]))
+
+
+_SCRIPTS = {
+    "Remember": touch,
+    "FindImposter": touch,
+    "BunchOfColors": touch_several,
+    "SeqOfColors": touch_several,
+    "ChainOfColors": touch_several,
+    "InterceptGrab": catch,
+    "Intercept": catch_and_carry,
+    "Rotate": turn,
+    "TakeItBack": take_back,
+}
+"""Beginning of the name of a task's class → its script; the longer ones first."""
