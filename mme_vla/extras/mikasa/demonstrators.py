@@ -151,13 +151,32 @@ def touch_several(hand: Hand) -> Actions:
 
 
 def take_back(hand: Hand) -> Actions:
-    """TakeItBack: carry the cube to the target, and back to where it was."""
+    """TakeItBack: carry the cube to the target, and back to where it was.
+
+    The target is at the end of the arm's reach, so the hand leans outward on the way there.
+    """
     scene = hand.scene
     begin = place_of(scene.initial_region)
     goal = place_of(scene.goal_region)
     yield from grasp(hand, lambda: place_of(scene.cube))
-    for target in (goal, begin):
-        yield from hand.go([target[0], target[1], hand.position[2]], 0.02, CLOSED)
+    for _ in range(25):
+        if bool(scene.goal_reached_status[0]):
+            break
+        action = hand.action(_level(goal - hand.position, _EDGE), gripper=CLOSED)
+        action[4] = 1.0
+        yield action
+    for _ in range(30):
+        yield hand.action(_level(begin - hand.position, REACH), gripper=CLOSED)
+
+
+_EDGE = 0.06  # metres an action asks for at the end of the reach: what cannot be reached moves nothing
+
+
+def _level(offset: np.ndarray, most: float) -> np.ndarray:
+    """The level part of an offset [3], at most so long."""
+    offset = offset * [1, 1, 0]
+    length = float(np.linalg.norm(offset))
+    return offset * min(1.0, most / max(length, 1e-9))
 
 
 def grasp(hand: Hand, place: Any) -> Actions:
@@ -170,52 +189,107 @@ def grasp(hand: Hand, place: Any) -> Actions:
     yield from hand.rest(3, CLOSED)
 
 
-def turn(hand: Hand) -> Actions:
-    """RotateLenient and RotateStrict: take the peg in its middle and turn it."""
+def turn_in_place(hand: Hand) -> Actions:
+    """RotateStrict: take the peg in its middle and turn it.
+
+    Fingers that close askew turn the peg until it lies between them, so the hand need not be right
+    across it: of all ways to take it, the one with the least turning is chosen.
+    """
     scene = hand.scene
     peg = scene.peg
     asked = float(scene.target_angle[0])
-    # The fingers close across the peg, whose two ends are alike
-    across = _yaw_of(peg) + np.pi / 2
+    across = _wrapped(_yaw_of(peg) + np.pi / 2 - hand.yaw)
     ways = []
     for half_turns in (-1, 0, 1):
-        way = _wrapped(across - hand.yaw) + half_turns * np.pi
-        ways.append(way)
-    to_grasp = min(ways, key=lambda way: max(abs(way), abs(way + asked)))
-    goal = hand.yaw + to_grasp
-    for _ in range(40):
+        for askew in np.linspace(-_ASKEW, _ASKEW, 9):
+            to_grasp = across + half_turns * np.pi + askew
+            to_end = asked - askew
+            ways.append((abs(to_grasp) + abs(to_end), to_grasp))
+    goal = hand.yaw + min(ways)[1]
+    for _ in range(60):
         left = _wrapped(goal - hand.yaw)
-        offset = place_of(peg) + [0, 0, 0.08] - hand.position
-        if abs(left) < 0.03 and np.linalg.norm(offset) < 0.015:
+        offset = place_of(peg) + [0, 0, 0.07] - hand.position
+        if abs(left) < 0.05 and np.linalg.norm(offset) < 0.015:
             break
         yield hand.action(offset, left)
-    yield from hand.go(lambda: place_of(peg), 0.01, OPEN, steps=12)
+    yield from hand.go(lambda: place_of(peg), 0.01, OPEN, steps=8)
     yield from hand.rest(3, CLOSED)
-    height = hand.position
+    place = hand.position
     while True:
         left = float(scene.angle_diff[0])
-        yield hand.action(height - hand.position, 0.8 * left, CLOSED)
+        yield hand.action(place - hand.position, 1.5 * left, CLOSED)
+
+
+_ASKEW = 0.45  # radians that the fingers may be off when they close
+_LEVER = 0.085  # metres from the peg's middle
+
+
+def turn_by_pushing(hand: Hand) -> Actions:
+    """RotateLenient: push one end of the peg sideways with the closed fingers."""
+    scene = hand.scene
+    peg = scene.peg
+    direction = np.sign(float(scene.target_angle[0]))
+
+    def ends() -> list[tuple[np.ndarray, np.ndarray]]:
+        """Of both ends: where they are, and where the wanted turn moves them."""
+        yaw = _yaw_of(peg)
+        axis = np.array([np.cos(yaw), np.sin(yaw), 0])
+        aside = np.array([-np.sin(yaw), np.cos(yaw), 0])
+        middle = place_of(peg)
+        found = []
+        for sign in (1, -1):
+            found.append((middle + sign * _LEVER * axis, sign * direction * aside))
+        return found
+
+    # The end whose side to push from is nearer to the arm's base
+    base = place_of(scene.agent.robot)
+    reaches = [np.linalg.norm(end - 0.06 * way - base) for end, way in ends()]
+    number = int(np.argmin(reaches))
+    end, way = ends()[number]
+    beside = end - 0.065 * way
+    yield from hand.go([beside[0], beside[1], 0.1], 0.02, CLOSED)
+    yield from hand.go([beside[0], beside[1], 0.025], 0.012, CLOSED, steps=12)
+    while True:
+        left = float(scene.angle_diff[0])
+        end, way = ends()[number]
+        offset = end - 0.035 * way - hand.position
+        if left * direction > 0.06:
+            offset = offset + min(0.06, 0.02 + 0.12 * abs(left)) * way
+        else:
+            offset = -0.01 * way
+        offset[2] = 0.025 - hand.position[2]
+        yield hand.action(offset, gripper=CLOSED)
+
+
+_RATE = 0.038  # metres that the hand moves in a step at most
+_LAG = 2.5  # steps by which the hand is behind what it is told
 
 
 def catch(hand: Hand) -> Actions:
-    """InterceptGrab: follow the ball from above at its speed, and close the fingers around it."""
+    """InterceptGrab: meet the ball from above, follow it at its speed, and close the fingers."""
     scene = hand.scene
     ball = scene.ball
-    lead = 1.0
-    for _ in range(60):
-        speed = ball.linear_velocity[0].cpu().numpy().astype(np.float64)
-        ahead = place_of(ball) + lead * speed * _STEP_SECONDS
-        offset = ahead - hand.position
-        aside = np.linalg.norm(offset[:2])
-        if aside > 0.02:
-            offset[2] = max(offset[2], 0.07 - hand.position[2])
+    for _ in range(70):
+        place = place_of(ball)
+        step = ball.linear_velocity[0].cpu().numpy().astype(np.float64) * _STEP_SECONDS
+        step[2] = 0
+        # The earliest time at which the hand can be over the ball
+        ahead = _LAG
+        for wait in range(60):
+            if np.linalg.norm((place + wait * step - hand.position)[:2]) <= _RATE * wait:
+                ahead = max(ahead, float(wait))
+                break
+        offset = place + ahead * step - hand.position
+        gap = place - hand.position
+        if np.linalg.norm(gap[:2]) > 0.015:
+            offset[2] = 0.065 - hand.position[2]
         yield hand.action(offset, gripper=OPEN)
         gap = place_of(ball) - hand.position
-        if np.abs(gap[:2]).max() < 0.02 and abs(gap[2]) < 0.012:
+        if np.linalg.norm(gap[:2]) < 0.018 and abs(gap[2]) < 0.012:
             break
-    for _ in range(5):
-        speed = ball.linear_velocity[0].cpu().numpy().astype(np.float64)
-        yield hand.action(speed * _STEP_SECONDS * 0.6, gripper=CLOSED)
+    step = ball.linear_velocity[0].cpu().numpy().astype(np.float64) * _STEP_SECONDS
+    for number in range(4):
+        yield hand.action(_LAG * step * (0.8, 0.8, 0.4, 0)[number] * [1, 1, 0], gripper=CLOSED)
 
 
 def catch_and_carry(hand: Hand) -> Actions:
@@ -223,9 +297,7 @@ def catch_and_carry(hand: Hand) -> Actions:
     yield from catch(hand)
     target = place_of(hand.scene.goal_region)
     while True:
-        offset = target - hand.position
-        offset[2] = 0
-        yield hand.action(offset, gripper=CLOSED)
+        yield hand.action(_level(target - hand.position, REACH), gripper=CLOSED)
 
 
 def _wrapped(angle: float) -> float:
@@ -246,7 +318,8 @@ _SCRIPTS = {
     "ChainOfColors": touch_several,
     "InterceptGrab": catch,
     "Intercept": catch_and_carry,
-    "Rotate": turn,
+    "RotateLenient": turn_by_pushing,
+    "RotateStrict": turn_in_place,
     "TakeItBack": take_back,
 }
 """Beginning of the name of a task's class → its script; the longer ones first."""
