@@ -4,7 +4,7 @@ Each is a generator of actions [7]; `env.step` is called between two of them, so
 anew for each.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -24,14 +24,11 @@ def demonstrate(env: Any) -> Actions:
     Raises:
         UserError: there is no script for its task.
     """
-    scene = env.scene
-    name = type(scene).__name__
-    for beginning, script in _SCRIPTS.items():
-        if name.startswith(beginning):
-            break
-    else:
-        require(False, f"There is no script that demonstrates {name}.")
-    hand = Hand(scene)
+    name = type(env.scene).__name__
+    scripts = [script for beginning, script in _SCRIPTS.items() if name.startswith(beginning)]
+    require(scripts, f"There is no script that demonstrates {name}.")
+    script = scripts[0]
+    hand = Hand(env.scene)
     while env.time < env.cue_end:
         yield hand.action(gripper=OPEN)
     yield from script(hand)
@@ -58,15 +55,10 @@ class Hand:
         matrix = self.scene.agent.tcp.pose.to_transformation_matrix()[0].cpu().numpy()
         return float(np.arctan2(matrix[1, 1], matrix[0, 1]))
 
-    @property
-    def is_still(self) -> bool:
-        """As the tasks judge it."""
-        return bool(self.scene.agent.is_static(0.2)[0])
-
     def action(
-        self, motion: Any = (0, 0, 0), turn: float = 0.0, gripper: float | None = None
+        self, motion: Any = (0, 0, 0), turned: float = 0.0, gripper: float | None = None
     ) -> np.ndarray:
-        """Displace the hand by `motion` [3] metres and turn it by `turn` radians about the
+        """Displace the hand by `motion` [3] metres and turn it by `turned` radians about the
         vertical, as far as one action can.
         """
         if gripper is not None:
@@ -77,36 +69,26 @@ class Hand:
         if longest > REACH:
             motion = motion * (REACH / longest)
         values[:3] = motion / REACH
-        values[5] = np.clip(-turn / REACH, -1, 1)  # the hand looks down
+        values[5] = np.clip(-turned / REACH, -1, 1)  # the hand looks down
         values[6] = self.gripper
         return values
 
-    def go(
-        self, place: Any, within: float, gripper: float, steps: int = 40, fraction: float = 1.0
-    ) -> Actions:
+    def go(self, place: Any, within: float, gripper: float, steps: int = 40) -> Actions:
         """Move until the hand is within so many metres of a place, at most so many steps.
 
-        place: [3], or a function that gives it anew at each step. fraction: of the way that each
-        action goes.
+        place: [3], or a function that gives it anew at each step.
         """
         for _ in range(steps):
             goal = place() if callable(place) else place
             offset = np.asarray(goal) - self.position
             if np.linalg.norm(offset) < within:
                 return
-            yield self.action(fraction * offset, gripper=gripper)
+            yield self.action(offset, gripper=gripper)
 
     def rest(self, steps: int, gripper: float) -> Actions:
         """Stay for so many steps."""
         for _ in range(steps):
             yield self.action(gripper=gripper)
-
-    def settle(self, steps: int = 10) -> Actions:
-        """Stay until the hand is still, at most so many steps."""
-        for _ in range(steps):
-            if self.is_still:
-                return
-            yield self.action(gripper=self.gripper)
 
 
 def place_of(thing: Any) -> np.ndarray:
@@ -116,12 +98,15 @@ def place_of(thing: Any) -> np.ndarray:
 
 
 def touch(hand: Hand) -> Actions:
-    """Remember* and FindImposter*: bring the hand to the right object."""
+    """Remember* and FindImposter*: bring the hand over the right object, so near that it counts."""
     while True:
         offset = hand.scene.obj_to_goal_pos[0].cpu().numpy()  # from the hand, in the world
-        yield hand.action(offset, gripper=OPEN)
+        offset = offset + _up(_OVER)
+        # In every direction as fast as it goes: there are few steps
+        yield hand.action(np.clip(offset, -REACH, REACH), gripper=OPEN)
 
 
+_OVER = 0.025  # metres over the middle of an object; a touch counts within 0.05
 _ABOVE_CUBE = 0.012  # metres over the point that counts, less than the radius of a touch
 _TRAVEL = 0.16  # height at which the hand passes over cubes and button
 
@@ -132,22 +117,22 @@ def touch_several(hand: Hand) -> Actions:
     yield from hand.rest(6, CLOSED)  # cubes are put back into place for some steps
     for key in scene.true_color_indices[0].tolist():
         cube = scene.cubes[key]
-        top = place_of(cube) + [0, 0, scene.CUBE_HALFSIZE + 0.005 + _ABOVE_CUBE]
+        top = place_of(cube) + _up(scene.CUBE_HALFSIZE + 0.005 + _ABOVE_CUBE)
         above = np.array([top[0], top[1], _TRAVEL])
-        yield from hand.go(hand.position * [1, 1, 0] + [0, 0, _TRAVEL], 0.03, CLOSED)
+        yield from hand.go(hand.position * [1, 1, 0] + _up(_TRAVEL), 0.03, CLOSED)
         yield from hand.go(above, 0.02, CLOSED)
         for _ in range(30):
             if bool(scene.touched_cubes[0, key]):
                 break
             yield hand.action(0.7 * (top - hand.position), gripper=CLOSED)
     button = np.array([*scene.button_xy[0].tolist(), float(scene.button_top_z[0])])
-    yield from hand.go(hand.position * [1, 1, 0] + [0, 0, _TRAVEL], 0.03, CLOSED)
-    yield from hand.go(button * [1, 1, 0] + [0, 0, _TRAVEL], 0.02, CLOSED)
+    yield from hand.go(hand.position * [1, 1, 0] + _up(_TRAVEL), 0.03, CLOSED)
+    yield from hand.go(button * [1, 1, 0] + _up(_TRAVEL), 0.02, CLOSED)
     for _ in range(30):
         if bool(scene.pending_press[0]):
             break
         yield hand.action((0, 0, -0.02), gripper=CLOSED)
-    yield from hand.go(hand.position + [0, 0, scene.REQUIRED_LIFT_HEIGHT + 0.03], 0.005, CLOSED)
+    yield from hand.go(hand.position + _up(scene.REQUIRED_LIFT_HEIGHT + 0.03), 0.005, CLOSED)
 
 
 def take_back(hand: Hand) -> Actions:
@@ -169,7 +154,9 @@ def take_back(hand: Hand) -> Actions:
         yield hand.action(_level(begin - hand.position, REACH), gripper=CLOSED)
 
 
-_EDGE = 0.06  # metres an action asks for at the end of the reach: what cannot be reached moves nothing
+_EDGE = (
+    0.06  # metres an action asks for at the end of the reach: what cannot be reached moves nothing
+)
 
 
 def _level(offset: np.ndarray, most: float) -> np.ndarray:
@@ -184,13 +171,13 @@ def grasp(hand: Hand, place: Any) -> Actions:
 
     place: a function that gives its position [3].
     """
-    yield from hand.go(lambda: place() + [0, 0, 0.08], 0.015, OPEN)
+    yield from hand.go(lambda: place() + _up(0.08), 0.015, OPEN)
     yield from hand.go(place, 0.008, OPEN, steps=15)
     yield from hand.rest(3, CLOSED)
 
 
-def turn_in_place(hand: Hand) -> Actions:
-    """RotateStrict: take the peg in its middle and turn it.
+def turn(hand: Hand) -> Actions:
+    """RotateLenient and RotateStrict: take the peg in its middle and turn it.
 
     Fingers that close askew turn the peg until it lies between them, so the hand need not be right
     across it: of all ways to take it, the one with the least turning is chosen.
@@ -208,7 +195,7 @@ def turn_in_place(hand: Hand) -> Actions:
     goal = hand.yaw + min(ways)[1]
     for _ in range(60):
         left = _wrapped(goal - hand.yaw)
-        offset = place_of(peg) + [0, 0, 0.07] - hand.position
+        offset = place_of(peg) + _up(0.07) - hand.position
         if abs(left) < 0.05 and np.linalg.norm(offset) < 0.015:
             break
         yield hand.action(offset, left)
@@ -221,46 +208,6 @@ def turn_in_place(hand: Hand) -> Actions:
 
 
 _ASKEW = 0.45  # radians that the fingers may be off when they close
-_LEVER = 0.085  # metres from the peg's middle
-
-
-def turn_by_pushing(hand: Hand) -> Actions:
-    """RotateLenient: push one end of the peg sideways with the closed fingers."""
-    scene = hand.scene
-    peg = scene.peg
-    direction = np.sign(float(scene.target_angle[0]))
-
-    def ends() -> list[tuple[np.ndarray, np.ndarray]]:
-        """Of both ends: where they are, and where the wanted turn moves them."""
-        yaw = _yaw_of(peg)
-        axis = np.array([np.cos(yaw), np.sin(yaw), 0])
-        aside = np.array([-np.sin(yaw), np.cos(yaw), 0])
-        middle = place_of(peg)
-        found = []
-        for sign in (1, -1):
-            found.append((middle + sign * _LEVER * axis, sign * direction * aside))
-        return found
-
-    # The end whose side to push from is nearer to the arm's base
-    base = place_of(scene.agent.robot)
-    reaches = [np.linalg.norm(end - 0.06 * way - base) for end, way in ends()]
-    number = int(np.argmin(reaches))
-    end, way = ends()[number]
-    beside = end - 0.065 * way
-    yield from hand.go([beside[0], beside[1], 0.1], 0.02, CLOSED)
-    yield from hand.go([beside[0], beside[1], 0.025], 0.012, CLOSED, steps=12)
-    while True:
-        left = float(scene.angle_diff[0])
-        end, way = ends()[number]
-        offset = end - 0.035 * way - hand.position
-        if left * direction > 0.06:
-            offset = offset + min(0.06, 0.02 + 0.12 * abs(left)) * way
-        else:
-            offset = -0.01 * way
-        offset[2] = 0.025 - hand.position[2]
-        yield hand.action(offset, gripper=CLOSED)
-
-
 _RATE = 0.038  # metres that the hand moves in a step at most
 _LAG = 2.5  # steps by which the hand is behind what it is told
 
@@ -300,6 +247,10 @@ def catch_and_carry(hand: Hand) -> Actions:
         yield hand.action(_level(target - hand.position, REACH), gripper=CLOSED)
 
 
+def _up(height: float) -> np.ndarray:
+    return np.array([0.0, 0.0, height])
+
+
 def _wrapped(angle: float) -> float:
     """The same angle in (−π, π]."""
     return float(np.arctan2(np.sin(angle), np.cos(angle)))
@@ -310,7 +261,7 @@ def _yaw_of(thing: Any) -> float:
     return float(np.arctan2(matrix[1, 0], matrix[0, 0]))
 
 
-_SCRIPTS = {
+_SCRIPTS: dict[str, Callable[[Hand], Actions]] = {
     "Remember": touch,
     "FindImposter": touch,
     "BunchOfColors": touch_several,
@@ -318,8 +269,7 @@ _SCRIPTS = {
     "ChainOfColors": touch_several,
     "InterceptGrab": catch,
     "Intercept": catch_and_carry,
-    "RotateLenient": turn_by_pushing,
-    "RotateStrict": turn_in_place,
+    "Rotate": turn,
     "TakeItBack": take_back,
 }
 """Beginning of the name of a task's class → its script; the longer ones first."""

@@ -84,7 +84,13 @@ class MikasaScene(gymnasium.Env[Any, Any]):
         _, reward, terminated, truncated, info = self._env.step(action)
         self.time += 1
         success = bool(info["success"])
-        return self.observe(), float(reward), bool(terminated), bool(truncated), {"success": success}
+        return (
+            self.observe(),
+            float(reward),
+            bool(terminated),
+            bool(truncated),
+            {"success": success},
+        )
 
     def observe(self) -> dict[str, Any]:
         """The state [7], and for each camera the function that takes its image [128, 128, 3]."""
