@@ -161,13 +161,19 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
         else:
             columns[name] = column
     plural = "" if len(missing) == 1 else "s"
+    poses = ""
+    if robot.action.space is not None and all(name in columns for name in robot.camera_names):
+        poses = (
+            " (RoboMME's poses and waypoints are columns of datasets that this library converts or"
+            " records.)"
+        )
     require(
         not missing,
         f"{root} lacks the feature{plural} {', '.join(missing)}; it has"
         f" {listed(features)}. These are the names of the robot {robot.name!r}: choose"
         " embodiment=<the robot this dataset is of>, or name its columns in a configs/embodiment"
-        " file of your own. (RoboMME's poses and waypoints are columns of datasets that this"
-        " library converts or records.)",
+        f" file of your own. `mme-vla inspect dataset={root}` drafts that file, and"
+        f" docs/extend/your-robot.md explains it.{poses}",
     )
 
     cameras = {name: columns[name] for name in robot.camera_names}

@@ -4,12 +4,14 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mme_vla.data.consistency import compare_names
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, did_you_mean, require
 
@@ -80,7 +82,31 @@ def split_episodes(
     return split
 
 
+def default_val_episodes(sources: Sequence[EpisodeSource]) -> list[str]:
+    """The episodes that are held out where none is named: number 3 of the embedded sample."""
+    return [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
+
+
 _KEYS = ("root", "name", "exec_starts")
+
+
+def listed_sources(
+    entries: str | Mapping[str, Any] | Sequence[str | Mapping[str, Any]],
+) -> list[str | Mapping[str, Any]]:
+    """`data.sources` as a list; one entry may stand without a list around it."""
+    listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
+    require(listed, "data.sources is empty: name at least one dataset folder, or 'sample'.")
+    return listed
+
+
+def source_name(entry: str | Mapping[str, Any]) -> str:
+    """The short name of the dataset of an entry of `data.sources`, as `EpisodeSource` gives it."""
+    root, name = str(entry), None
+    if isinstance(entry, Mapping):
+        root, name = str(entry.get("root")), entry.get("name")
+    if name:
+        return str(name)
+    return root if root == "sample" else Path(root).resolve().name
 
 
 def open_sources(
@@ -92,10 +118,8 @@ def open_sources(
 
     `robot` says which columns hold its images, states and actions.
     """
-    listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
-    require(listed, "data.sources is empty: name at least one dataset folder, or 'sample'.")
     sources = []
-    for entry in listed:
+    for entry in listed_sources(entries):
         options = {"root": entry} if isinstance(entry, str) else dict(entry)
         for key in options:
             require(

@@ -19,6 +19,8 @@ from mme_vla.training.order import seed_of
 STILL = "holding still"
 LAST = "last action"
 MEAN = "mean action"
+_SPOKEN = {STILL: STILL, LAST: f"the {LAST}", MEAN: f"the {MEAN}"}
+"""In a sentence."""
 ALL = "all"
 """The row of a table that holds means over the numbers."""
 
@@ -97,18 +99,20 @@ class OpenLoop:
         own = self.error(self.predicted) / self.scale
         best = self.baseline_error(name) / self.scale
         worse = [self.names[d] for d in np.flatnonzero(own > best)]
-        means = f"mean normalised error {own.mean():.3f} against {best.mean():.3f}"
+        means = (
+            f"mean normalised error {own.mean():.3f}, against {best.mean():.3f} of {_SPOKEN[name]}"
+        )
         if own.mean() >= best.mean():
             return (
-                f"No better than {name}, the best baseline: {means}, and {len(worse)} of"
-                f" {len(own)} numbers are predicted worse."
+                f"No better than the best baseline: {means}. {len(worse)} of {len(own)} numbers are"
+                " predicted worse."
             )
         if worse:
             return (
-                f"Better than every baseline on average: {means} of {name}, but {len(worse)} of"
-                f" {len(own)} numbers are predicted worse: {', '.join(worse)}."
+                f"Better than every baseline on average: {means}. {len(worse)} of {len(own)}"
+                f" numbers are predicted worse: {', '.join(worse)}."
             )
-        return f"Better than every baseline in all {len(own)} numbers: {means} of {name}."
+        return f"Better than every baseline in all {len(own)} numbers: {means}."
 
 
 def decisions_of(recording: Recording, execute: int, most: int | None) -> list[int]:
