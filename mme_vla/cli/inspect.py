@@ -28,9 +28,9 @@ from mme_vla.data.recording import Recording
 from mme_vla.data.robot_draft import CHECK, draft_robot, save_draft
 from mme_vla.data.sources import (
     default_val_episodes,
+    held_out_in,
     listed_sources,
     source_name,
-    split_episodes,
 )
 from mme_vla.data.statistics import normalised_states
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
@@ -202,16 +202,15 @@ def held_out_episodes(
     entry = entries[content.index(source.fingerprint)]
     # The split goes by the name that the dataset had then.
     source.name = source_name(entry)
-    val_episodes = data.val_episodes
-    if val_episodes is None:
-        val_episodes = default_val_episodes([source])
-    own = []
-    for text in val_episodes:
-        name, _, _ = str(text).rpartition("/")
+    texts: Sequence[int | str] | None = data.val_episodes
+    if texts is None:
+        texts = default_val_episodes([source])
+    named = []
+    for text in texts:
+        name, _, number = str(text).rpartition("/")
         if name in ("", source.name):
-            own.append(text)
-    (held_out,) = split_episodes([source], data.val_fraction, own).val
-    return np.isin(np.arange(len(source)), held_out)
+            named.append(int(number))
+    return held_out_in(source, named or None, data.val_fraction)
 
 
 def show_unknown_robot(dataset: str, robot: Embodiment, output: Path, console: Console) -> bool:

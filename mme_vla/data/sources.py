@@ -57,22 +57,8 @@ def split_episodes(
     require(0 <= val_fraction < 1, f"val_fraction={val_fraction} must lie in [0, 1).")
     split = Split([], [])
     for source in sources:
+        held_out = held_out_in(source, named.get(source.name), val_fraction)
         episodes = np.arange(len(source))
-        if source.name in named:
-            wrong = [number for number in named[source.name] if not 0 <= number < len(source)]
-            require(
-                not wrong,
-                f"val_episodes names {wrong} of {source.name}, which has episodes"
-                f" 0…{len(source) - 1}. Name others, or hold out a share: data.val_episodes=[]"
-                " data.val_fraction=0.1",
-            )
-            held_out = np.isin(episodes, named[source.name])
-        else:
-            held_out = np.zeros(len(source), bool)
-            for episode in range(len(source)):
-                digest = sha256(f"{source.name}/{episode}".encode()).digest()
-                share = int.from_bytes(digest[:8], "big") / 2**64
-                held_out[episode] = share < val_fraction
         split.train.append(episodes[~held_out])
         split.val.append(episodes[held_out])
     if not sum(map(len, split.train)):
@@ -80,6 +66,32 @@ def split_episodes(
             "The split leaves no episode to train on; lower val_fraction or shorten val_episodes."
         )
     return split
+
+
+def held_out_in(
+    source: EpisodeSource, named: Sequence[int] | None, val_fraction: float
+) -> np.ndarray:
+    """Which episodes of one dataset are held out, bool [e]; see `split_episodes`.
+
+    Args:
+        named: the episodes that are held out; None where none of this dataset is named.
+    """
+    episodes = np.arange(len(source))
+    if named is not None:
+        wrong = [number for number in named if not 0 <= number < len(source)]
+        require(
+            not wrong,
+            f"val_episodes names {wrong} of {source.name}, which has episodes"
+            f" 0…{len(source) - 1}. Name others, or hold out a share: data.val_episodes=[]"
+            " data.val_fraction=0.1",
+        )
+        return np.isin(episodes, named)
+    held_out = np.zeros(len(source), bool)
+    for episode in range(len(source)):
+        digest = sha256(f"{source.name}/{episode}".encode()).digest()
+        share = int.from_bytes(digest[:8], "big") / 2**64
+        held_out[episode] = share < val_fraction
+    return held_out
 
 
 def default_val_episodes(sources: Sequence[EpisodeSource]) -> list[str]:
