@@ -14,6 +14,7 @@ from mme_vla.cli.inspect import (
     build_memory,
     check_place,
     draw_memory,
+    held_out_episodes,
     main,
     show_checkpoint,
     show_dataset,
@@ -23,7 +24,7 @@ from mme_vla.cli.train import train
 from mme_vla.config.composition import compose, resolved
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.testing.small import unit_stats
-from mme_vla.training.settings import TrainRun
+from mme_vla.training.settings import DataSettings, TrainRun
 
 
 @pytest.fixture
@@ -94,7 +95,7 @@ def test_all_shows_the_configuration_and_statistics(tmp_path: Path, console: Con
 
 @pytest.fixture
 def squid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with a dataset of a robot that nobody described."""
+    """The current folder, with a dataset of a robot that no file describes."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MME_VLA_CACHE", str(tmp_path / "caches"))
     write_dataset(tmp_path / "squid", (30, 25), names=["a", "b", "gripper"])
@@ -109,6 +110,19 @@ def test_unknown_robot_is_drafted(squid: Path, capsys: pytest.CaptureFixture[str
     assert "mme-vla train --config-dir outputs/inspect embodiment=squid" in printed
     with pytest.raises(UserError, match=r"mme-vla inspect dataset=squid.*your-robot"):
         EpisodeSource("squid")
+
+
+def test_held_out_episodes_are_those_of_the_training(sample: EpisodeSource) -> None:
+    named = DataSettings(sources=["sample", "other"], val_episodes=("sample/1", "other/0"))
+    content = [sample.fingerprint, "another"]
+    held_out = held_out_episodes(sample, named, content)
+    assert held_out is not None and held_out.tolist() == [False, True, False, False]
+    default = held_out_episodes(sample, DataSettings(sources="sample"), content)
+    assert default is not None and default.tolist() == [False, False, False, True]
+    whole = DataSettings(sources=["sample", "other"], val_episodes=(), val_fraction=0.999999)
+    every = held_out_episodes(sample, whole, content)
+    assert every is not None and every.all(), "another source was trained on"
+    assert held_out_episodes(sample, named, ["another"]) is None
 
 
 @pytest.mark.slow
