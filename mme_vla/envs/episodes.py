@@ -63,6 +63,18 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
     return numbers
 
 
+def read_episodes(text: str) -> Any:
+    """The value of `--episodes`, as `episodes=` of a configuration has it: a number is the first so
+    many, brackets are a list, anything else stays text.
+    """
+    text = text.strip()
+    if text.isdecimal():
+        return int(text)
+    if text.startswith("[") and text.endswith("]"):
+        return [part.strip() for part in text[1:-1].split(",")]
+    return text
+
+
 def choose_episodes(
     tasks: str | Sequence[str] = ALL,
     episodes: Any = None,
