@@ -79,20 +79,19 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
                 if estimate.paper is not None:
                     lines.append((j + shift, estimate.paper.mean))
             xs, heights, gaps = _with_intervals(points)
-            axes.bar([], [], color=_colour(i), label=method.label)
+            axes.scatter([], [], s=70, marker="s", color=_colour(i), label=method.label)
             for at, estimate in points:
                 if estimate.value is None:
                     continue
                 alpha = PALE if estimate.is_pale else 1.0
                 axes.bar(at, estimate.value, 0.88 * width, color=_colour(i), alpha=alpha)
                 if estimate.is_pale:
-                    # At the foot, where no whisker ends
+                    # At the foot, beside the whisker
                     axes.annotate(
                         f"n={estimate.done}",
-                        (at, 0),
+                        (at - 0.42 * width, 0),
                         (0, 3),
                         textcoords="offset points",
-                        ha="center",
                         fontsize=8,
                     )
             axes.errorbar(xs, heights, np.maximum(gaps, 0), fmt="none", ecolor=INK, elinewidth=0.9)

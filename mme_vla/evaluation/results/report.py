@@ -89,23 +89,24 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     )
     sections = [Section("Overview", tables=[average], caption=f"{average.title}.")]
 
-    # A chart of one bar a method says what the one of the tasks says.
-    n_suites = len(protocol.suites)
-    n_levels = len(
-        {name for method in results.methods for name in method.figures.get("difficulty", {})}
-    )
-    n_groups = len(results.methods[0].figures.get("group", {}))
-    if n_suites > 1:
+    # A chart is left out where it has one bar a method, or the same bars as the one of the tasks.
+    n_tasks = len(protocol.tasks)
+    levels: set[str] = set()
+    for method in results.methods:
+        levels.update(method.figures.get("difficulty", {}))
+    has_suites = 1 < len(protocol.suites) < n_tasks
+    has_groups = 1 < len(results.methods[0].figures.get("group", {})) < n_tasks
+    if has_suites:
         chart = plots.bars(results, "suite")
-        sections.append(Section("Suites", chart, caption=whiskers + pale, half=n_levels > 1))
-    if n_levels > 1:
+        sections.append(Section("Suites", chart, caption=whiskers + pale, half=len(levels) > 1))
+    if len(levels) > 1:
         chart = plots.bars(results, "difficulty")
-        sections.append(Section("Difficulty", chart, caption=difficulty + pale, half=n_suites > 1))
-    if n_groups > 1 and n_suites > 1:
+        sections.append(Section("Difficulty", chart, caption=difficulty + pale, half=has_suites))
+    if has_groups:
         chart = plots.bars(results, "group", wide=True)
         sections.append(Section("Functional groups", chart, caption=whiskers + pale))
-    if len(protocol.tasks) <= plots.MOST_TASK_BARS and len(results.methods) <= plots.MOST_BARS:
-        chart = plots.bars(results, "task", wide=len(protocol.tasks) > 2)
+    if n_tasks <= plots.MOST_TASK_BARS and len(results.methods) <= plots.MOST_BARS:
+        chart = plots.bars(results, "task", wide=n_tasks > 2)
         sections.append(Section("Tasks", chart, caption=whiskers + pale))
     else:
         text = f"Success rate in percent.{pale.replace('n:', 'in brackets')}"
@@ -134,9 +135,14 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
         sections.append(
             Section("Where the chain broke", tables=chains, headed=True, caption=CAPTION)
         )
-    details = [(method.label, detail(method, results)) for method in results.methods]
+    details = []
+    for method in results.methods:
+        table = detail(method, results)
+        if len(table.rows) > 1:  # one row is in the overview
+            details.append((method.label, table))
+    if details:
+        sections.append(Section("Every method in full", folded=details))
     sections += [
-        Section("Every method in full", folded=details),
         Section("Runs", folded=[(counted(runs, "run"), runs_table(results))]),
         Section("How the numbers are made", paragraphs=_method_text(results)),
     ]
