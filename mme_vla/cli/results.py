@@ -13,7 +13,7 @@ from pathlib import Path
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
-from mme_vla.envs.episodes import ALL, GRAMMAR, choose_numbers, read_episodes
+from mme_vla.envs.episodes import ALL, GRAMMAR, check_episodes, choose_numbers, read_episodes
 from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
 from mme_vla.errors import UserError, printable, require
 from mme_vla.evaluation.records import EpisodeRecord
@@ -132,6 +132,8 @@ def run(args: argparse.Namespace) -> None:
             "Name files or folders of episode records, or --demo for synthetic ones (not both)."
         )
     _check_outputs(args)
+    if args.episodes is not None:
+        check_episodes(read_episodes(args.episodes), "--episodes")
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
     protocol = _protocol(records, args)
     _check_views(args)

@@ -35,6 +35,16 @@ def choose_tasks(tasks: str | Sequence[str], env: str = "mme_vla") -> list[str]:
     return names
 
 
+def check_episodes(episodes: Any, key: str = "episodes") -> None:
+    """Refuse what `choose_numbers` does not understand, before it is known how many there are.
+
+    key: for the message.
+    """
+    if episodes is None or episodes == ALL or type(episodes) is int:
+        return
+    spans(episodes, key, GRAMMAR)
+
+
 def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[int]:
     """Numbers of episodes.
 

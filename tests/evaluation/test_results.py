@@ -389,7 +389,7 @@ def test_the_command_reads_shards_and_saves_every_format(
     assert "pi05 2 of 8 against ttt_modul 6 of 8: no significant difference (p = 0.125)" in printed
     page = files["html"].read_text()
     assert page.count("<svg") == 1  # of the tasks; others would have their bars, or one a method
-    assert '<p class="conclusion">pi05 2 of 8 against ttt_modul 6 of 8: no significant' in page
+    assert '<p class="lead">pi05 2 of 8 against ttt_modul 6 of 8: no significant' in page
     assert "<script" not in page
     assert 'src="http' not in page
     assert all(path.stat().st_size > 100 for path in files.values())
@@ -444,7 +444,10 @@ def test_tasks_and_episodes_are_named_as_everywhere(
 def test_wrong_episodes_are_refused_in_a_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for words, message in (("0-x", "episodes='0-x' is not understood"), ("[60]", "no episode 60")):
+    for words, message in (
+        ("0-x", "--episodes='0-x' is not understood"),
+        ("[60]", "no episode 60"),
+    ):
         with pytest.raises(SystemExit):
             main([*small_runs(tmp_path / words[:2]), "--episodes", words])
         assert message in capsys.readouterr().err

@@ -47,19 +47,19 @@ def html_page(
     subtitle: str = "",
     notes: Sequence[str] = (),
     sortable: bool = False,
-    conclusions: Sequence[str] = (),
+    lead: str = "",
 ) -> str:
-    """One self-contained page of these sections. conclusions: what was found, a sentence each, on
-    top. sortable: whether a click on a heading sorts its table.
+    """One self-contained page of these sections. sortable: whether a click on a heading sorts its
+    table. lead: what was found, in a sentence.
     """
     return render(
         "page.html",
         title=title,
         subtitle=subtitle,
         notes=notes,
-        conclusions=conclusions,
         sections=sections,
         sortable=sortable,
+        lead=lead,
     )
 
 
@@ -146,9 +146,8 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
         Section("Runs", folded=[(counted(runs, "run"), runs_table(results))]),
         Section("How the numbers are made", paragraphs=_method_text(results)),
     ]
-    return html_page(
-        title, sections, subtitle, results.notes, conclusions=conclude(results, comparisons)
-    )
+    lead = " ".join(conclude(results, comparisons))
+    return html_page(title, sections, subtitle, results.notes, lead=lead)
 
 
 def conclude(results: Results, comparisons: Sequence[Comparison]) -> list[str]:
