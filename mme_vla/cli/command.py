@@ -1,5 +1,6 @@
 """Run a function as a command with a Hydra configuration."""
 
+import argparse
 import functools
 import logging
 import os
@@ -7,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -27,9 +29,11 @@ from mme_vla.config.composition import (
     parse,
 )
 from mme_vla.config.naming import join_memories, several_memories
-from mme_vla.config.override_errors import paths, unknown_option
+from mme_vla.config.override_errors import Names, badly_spaced, bare_word, paths, unknown_option
+from mme_vla.config.plugins import TRUST_FLAG
 from mme_vla.config.trees import config_dir, library_trees
 from mme_vla.errors import UserError, printable, require
+from mme_vla.policy.run_folders import shipped_checkpoints
 
 
 def run_configured(
@@ -81,7 +85,10 @@ def options_first(words: Sequence[str]) -> list[str]:
 
     A command line with an unknown option stays as it is.
     """
-    args, unknown = get_args_parser().parse_known_intermixed_args(words)
+    try:
+        args, unknown = _parser().parse_known_intermixed_args(words)
+    except _ParserError:
+        return list(words)  # `_check_command_line` says what is wrong
     if unknown:
         return list(words)
     options = list(words)
@@ -92,11 +99,13 @@ def options_first(words: Sequence[str]) -> list[str]:
 
 
 def _check_command_line(config_name: str, tree: Path) -> None:
-    args, unknown = get_args_parser().parse_known_intermixed_args()
+    try:
+        args, unknown = _parser().parse_known_intermixed_args()
+    except _ParserError as error:
+        # an option with too few words, or the beginning of several
+        raise _explained(error, _names(config_name, tree, [])) from None
     if unknown:
-        with local_hydra(tree, []):
-            known = list(paths(OmegaConf.to_container(hydra.compose(config_name))))
-        raise unknown_option(unknown[0], sys.argv[1:], known)
+        raise unknown_option(unknown[0], sys.argv[1:], _names(config_name, tree, []))
     modes = []
     for mode in ("run", "multirun", "cfg", "info", "shell_completion"):
         if getattr(args, mode):
@@ -112,9 +121,63 @@ def _check_command_line(config_name: str, tree: Path) -> None:
         raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
+    _check_bare_words(args.overrides, args.config_name or config_name, tree, extra)
     check_overrides(
         args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra
     )
+
+
+class _ParserError(Exception):
+    """What Hydra's parser of options says of a command line."""
+
+
+def _parser() -> argparse.ArgumentParser:
+    """Hydra's parser of options, which raises instead of printing its usage."""
+
+    def refuse(message: str) -> NoReturn:
+        raise _ParserError(message)
+
+    parser = get_args_parser()
+    parser.error = refuse  # type: ignore[method-assign]
+    return parser
+
+
+def _explained(error: _ParserError, names: Names) -> UserError:
+    for word in sys.argv[1:]:
+        option = word.partition("=")[0]
+        if option.startswith("--") and option not in names.options:
+            return unknown_option(word, sys.argv[1:], names)
+    # such as "argument --config-dir/-cd: expected one argument"
+    return UserError(f"{str(error).capitalize()}. --help lists the options.")
+
+
+def _names(config_name: str, tree: Path, extra_dirs: Sequence[Path]) -> Names:
+    """What the words of a command line may name."""
+    options = [TRUST_FLAG]
+    for action in get_args_parser()._actions:
+        options += [option for option in action.option_strings if option.startswith("--")]
+    with local_hydra(tree, extra_dirs) as engine:
+        loader = engine.config_loader
+        keys = list(paths(OmegaConf.to_container(hydra.compose(config_name))))
+        groups = {group: loader.get_group_options(group) for group in loader.list_groups("")}
+    groups.pop("hydra", None)
+    return Names(keys, groups, options, list(shipped_checkpoints()))
+
+
+def _check_bare_words(
+    words: Sequence[str], config_name: str, tree: Path, extra_dirs: Sequence[Path]
+) -> None:
+    """Refuse words without `=`, with what they may mean."""
+    for number, word in enumerate(words):
+        mistake = badly_spaced(words, number)
+        if "=" in word or word.startswith("~"):
+            # It may only be cut where a word follows that cannot stand alone.
+            following = words[number + 1 : number + 2]
+            if mistake is None or not following or "=" in following[0]:
+                continue
+        raise UserError(
+            mistake or bare_word(words, number, _names(config_name, tree, extra_dirs))
+        )
 
 
 def check_overrides(
