@@ -42,7 +42,7 @@ def run(name: str) -> None:
             return load_main(command)(cfg)
 
         main.__module__ = command.module
-        run_configured(command.config, main)
+        run_configured(command.config, main, check=command.check)
 
 
 def load_main(command: Command) -> Callable[..., object]:

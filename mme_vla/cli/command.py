@@ -4,20 +4,23 @@ import argparse
 import functools
 import logging
 import os
+import pkgutil
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import ClassVar, NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.cli.errors import print_user_errors
+from mme_vla.cli.errors import MISTAKE, print_user_errors
 from mme_vla.cli.help import help_page
 from mme_vla.config import plugins
 from mme_vla.config.composition import (
@@ -27,17 +30,21 @@ from mme_vla.config.composition import (
     join_plugins,
     local_hydra,
     parse,
+    resolved,
 )
 from mme_vla.config.naming import join_memories, several_memories
 from mme_vla.config.override_errors import Names, badly_spaced, bare_word, paths, unknown_option
 from mme_vla.config.plugins import TRUST_FLAG
 from mme_vla.config.trees import config_dir, library_trees
 from mme_vla.errors import UserError, printable, require
-from mme_vla.policy.run_folders import shipped_checkpoints
+from mme_vla.policy.run_folders import check_output, shipped_checkpoints
 
 
 def run_configured(
-    config_name: str, main: Callable[[DictConfig], object], directory: Path | None = None
+    config_name: str,
+    main: Callable[[DictConfig], object],
+    directory: Path | None = None,
+    check: str = "",
 ) -> None:
     """Run a command under Hydra: run folder, `--multirun`, `--help`, `--cfg job`, `--config-dir`.
 
@@ -48,6 +55,7 @@ def run_configured(
         config_name: a YAML of the tree's top level, without its suffix.
         main: takes the composed configuration.
         directory: the tree; the library's own by default.
+        check: `module:function` that is given the plain configuration before `main` is called.
     """
     tree = directory or config_dir()
     sys.argv[1:] = options_first(several_memories(plugins.trust_as_override(sys.argv[1:])))
@@ -64,10 +72,12 @@ def run_configured(
             name = str(hydra_cfg.job.config_name)
             join_plugins(cfg, name, command_trees(), hydra_cfg.overrides.task)
             plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
+            if check:
+                pkgutil.resolve_name(check)(resolved(cfg))
             return main(cfg)
 
     with print_user_errors():
-        _check_command_line(config_name, tree)
+        _check_command_line(config_name, tree, check)
         start = hydra.main(
             version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name
         )
@@ -78,6 +88,27 @@ def run_configured(
             start(job)()
         except HydraException as error:
             raise UserError(str(error)) from error
+        except SystemExit as ended:
+            if ended.code == MISTAKE:
+                for folder in NewFolders.made:
+                    with suppress(OSError):
+                        folder.rmdir()  # it stays if it holds anything
+            raise
+
+
+class NewFolders(Callback):
+    """Notes which folders Hydra makes for a run, so that a command that is refused leaves none.
+
+    `hydra.callbacks` of a command's file names it.
+    """
+
+    made: ClassVar[list[Path]] = []
+    """The run's folder and those above it that were not there, from the inside."""
+
+    def on_run_start(self, config: DictConfig, **_: object) -> None:
+        """Called by Hydra before it makes the folder."""
+        folder = Path(str(config.hydra.run.dir)).absolute()
+        NewFolders.made = [path for path in (folder, *folder.parents) if not path.exists()]
 
 
 def options_first(words: Sequence[str]) -> list[str]:
@@ -98,7 +129,7 @@ def options_first(words: Sequence[str]) -> list[str]:
     return [*reversed(options), *args.overrides]
 
 
-def _check_command_line(config_name: str, tree: Path) -> None:
+def _check_command_line(config_name: str, tree: Path, check: str) -> None:
     try:
         args, unknown = _parser().parse_known_intermixed_args()
     except _ParserError as error:
@@ -122,9 +153,17 @@ def _check_command_line(config_name: str, tree: Path) -> None:
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
     _check_bare_words(args.overrides, args.config_name or config_name, tree, extra)
-    check_overrides(
+    for word in args.overrides:
+        key, _, value = word.partition("=")
+        if key == "output":
+            check_output(Path(value))
+    composed = check_overrides(
         args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra
     )
+    for cfg in composed:
+        # What a plugin registers is known only once it is imported, which `job` does.
+        if check and not args.cfg and not cfg.get("plugins") and not OmegaConf.missing_keys(cfg):
+            pkgutil.resolve_name(check)(resolved(cfg))
 
 
 class _ParserError(Exception):
@@ -186,18 +225,20 @@ def check_overrides(
     *,
     directory: Path | None = None,
     extra_dirs: Sequence[Path] = (),
-) -> None:
+) -> list[DictConfig]:
     """Compose once to see that the overrides fit, every choice of a sweep
-    (`model=a,b`) included.
+    (`model=a,b`) included. Returns the configurations.
     """
     columns = [_choices(override) for override in parse(overrides)]
     columns = [column for column in columns if column]
     n_rows = max((len(column) for column in columns), default=1)
+    composed = []
     for row in range(n_rows):
         # A column shorter than the longest stays at its first choice: every choice is seen once,
         # not their product.
         words = [column[row] if row < len(column) else column[0] for column in columns]
-        compose(config_name, words, directory=directory, extra_dirs=extra_dirs)
+        composed.append(compose(config_name, words, directory=directory, extra_dirs=extra_dirs))
+    return composed
 
 
 def _choices(override: Override) -> list[str]:

@@ -56,8 +56,8 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
     """
     until = STAGES.index(nano.stage)
     folder = Path(nano.output)
-    folder.mkdir(parents=True, exist_ok=True)
     rows = compose_rows(nano, extra_dirs)
+    folder.mkdir(parents=True, exist_ok=True)
     minutes = Minutes(folder / "clock.json")
     with minutes.of("demonstrations"):
         files = record_all(nano, folder / "demonstrations", rows.choices, rows.robot)
