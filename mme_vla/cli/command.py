@@ -214,9 +214,7 @@ def _check_bare_words(
             following = words[number + 1 : number + 2]
             if mistake is None or not following or "=" in following[0]:
                 continue
-        raise UserError(
-            mistake or bare_word(words, number, _names(config_name, tree, extra_dirs))
-        )
+        raise UserError(mistake or bare_word(words, number, _names(config_name, tree, extra_dirs)))
 
 
 def check_overrides(

@@ -251,9 +251,7 @@ def _as_option(word: str) -> str:
     return f"--{key} {value or '…'}"
 
 
-def argument_parser(
-    command: str, text: str | None, examples: Sequence[str]
-) -> CommandParser:
+def argument_parser(command: str, text: str | None, examples: Sequence[str]) -> CommandParser:
     """A parser for commands that read options instead of a configuration, with the same kind of
     `--help`.
 

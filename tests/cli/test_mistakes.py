@@ -166,3 +166,19 @@ def test_a_training_that_is_refused_late_leaves_the_folders_that_were_there(
     assert ended.value.code == 2
     assert "No checkpoint at missing" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.slow
+def test_nothing_follows_a_result_where_the_planner_leaves_objects() -> None:
+    pytest.importorskip("ompl", reason="needs the simulator: uv sync --inexact --extra sim")
+    leak = (
+        "import ctypes\nfrom ompl import base\n"
+        "ctypes.pythonapi.Py_IncRef(ctypes.py_object(base.RealVectorStateSpace(7)))\n"
+    )
+    quiet = "import atexit\nfrom mme_vla import cli\natexit.register(cli._end_quietly)\n"
+    reports = []
+    for code in (leak, quiet + leak):
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        reports.append(done.stderr)
+    assert "leaked" in reports[0]
+    assert not reports[1]

@@ -91,9 +91,7 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
             of_first = records[row][: len(records[row]) // (1 + len(others))]
             videos = record_videos(first.checkpoint, folder / "videos", of_first, rules_of(nano))
     trained = {row: [job.folder for job in of_row] for row, of_row in jobs.items()}
-    page = write_page(
-        folder, nano, records, rows.blind, minutes.spent, videos, trained, len(files)
-    )
+    page = write_page(folder, nano, records, rows.blind, minutes.spent, videos, trained, len(files))
     print(page)
     for line in outcome_lines(records, ends_of(trained)):
         print(line)
