@@ -1,4 +1,6 @@
-"""Mistaken command lines: each reply says what to type, comes before PyTorch, and leaves no folder."""
+"""Mistaken command lines: each reply says what to type, comes before PyTorch, and leaves no
+folder.
+"""
 
 import subprocess
 import sys

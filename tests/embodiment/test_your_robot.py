@@ -202,7 +202,9 @@ def test_columns_are_detected_in_both_spellings_joined_or_by_name(place: Path) -
     ):
         EpisodeSource("demonstrations")
     shortened = {"cameras": {"eye": {"key": "images.left_wrst"}}, "memory_camera": "eye"}
-    with pytest.raises(UserError, match="Did you mean `key: (.*)left_wrist` for images.left_wrst"):
+    with pytest.raises(
+        UserError, match=r"Did you mean `key: (.*)left_wrist` for images\.left_wrst"
+    ):
         EpisodeSource(
             "demonstrations", robot=Embodiment.from_dict({**robot.to_dict(), **shortened})
         )
