@@ -50,10 +50,9 @@ def write_page(
     folders of its trainings. demonstrations: how many they learned from.
     """
     results, comparisons = compared(records, nano.task, nano.split, without)
-    ends: dict[str, list[Any]] = {}
+    ends = ends_of(runs)
     curves: dict[str, list[dict[str, float]]] = {}
     for model, folders in runs.items():
-        ends[model] = [read_json(run / TRAINED, "a training's end") for run in folders]
         for run in folders:
             label = model if len(folders) == 1 else f"{model}, {run.name}"
             curves[label] = learning_curve(run)
@@ -76,6 +75,31 @@ def write_page(
     with write_atomically(folder / PAGE) as draft:
         draft.write_text(text, encoding="utf-8")
     return folder / PAGE
+
+
+def ends_of(runs: Mapping[str, Sequence[Path]]) -> dict[str, list[Any]]:
+    """Of each model, what each of its trainings wrote at its end. runs: the trainings' folders."""
+    ends: dict[str, list[Any]] = {}
+    for model, folders in runs.items():
+        ends[model] = [read_json(run / TRAINED, "a training's end") for run in folders]
+    return ends
+
+
+def outcome_lines(
+    records: Mapping[str, Sequence[EpisodeRecord]], ends: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> list[str]:
+    """What came out, a line a model: how far off its held-out decisions were, and its episodes."""
+    lines = []
+    for model, model_records in records.items():
+        parts = []
+        measured = [end["off_by_m"] for end in ends.get(model, ()) if end.get("off_by_m")]
+        if measured:
+            centimetres = 100 * np.median(np.concatenate(measured))
+            parts.append(f"off by {centimetres:.1f} cm on held-out decisions")
+        won = sum(record.success for record in model_records)
+        parts.append(f"{won} of {len(model_records)} episodes solved")
+        lines.append(f"{model}: {', '.join(parts)}")
+    return lines
 
 
 def compared(

@@ -20,7 +20,7 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.extras.nano import demonstrations, tokens
 from mme_vla.extras.nano.demonstrations import Demonstration, Scene
 from mme_vla.extras.nano.learning import Decisions, position_error, statistics
-from mme_vla.extras.nano.page import write_page
+from mme_vla.extras.nano.page import ends_of, outcome_lines, write_page
 from mme_vla.extras.nano.rows import TRAINED
 from mme_vla.extras.nano.runs import Group, demonstrate
 from mme_vla.extras.nano.settings import NanoRun
@@ -278,3 +278,8 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
     assert "framesamp_modul@4 is significantly better than pi05 (p < 0.001)" in page
     assert page.count("Incomplete") == 1 and "7 demonstrations" in page
     assert "| videos | 2.0 |" in page and (tmp_path / "learning.png").is_file()
+    lines = outcome_lines(runs, ends_of(folders))
+    assert lines[0] == (
+        "framesamp_modul: off by 2.0 cm on held-out decisions, 60 of 100 episodes solved"
+    )
+    assert lines[-1] == "planner: 100 of 100 episodes solved"
