@@ -25,8 +25,8 @@ class Section:
     """A box of a page.
 
     figure: SVG from `plots.svg`. headed: whether tables stand under their titles. folded: tables
-    behind a summary. images: name and WEBP in base64. half: whether it takes half the width, beside
-    another.
+    behind a summary. images: name and WEBP in base64. terms: words that its tables and figure use,
+    and what each means. half: whether it takes half the width, beside another.
     """
 
     title: str
@@ -37,6 +37,7 @@ class Section:
     paragraphs: Sequence[str] = ()
     folded: Sequence[tuple[str, Table]] = ()
     images: Sequence[tuple[str, str]] = ()
+    terms: Sequence[tuple[str, str]] = ()
     half: bool = False
 
 
@@ -46,9 +47,11 @@ def html_page(
     subtitle: str = "",
     notes: Sequence[str] = (),
     sortable: bool = False,
+    lead: str = "",
+    footnotes: Sequence[str] = (),
 ) -> str:
-    """One self-contained page of these sections. sortable: whether a click on a heading sorts its
-    table.
+    """One self-contained page of these sections. notes: warnings. sortable: whether a click on a
+    heading sorts its table. lead: what was found, in a sentence. footnotes: small print.
     """
     return render(
         "page.html",
@@ -57,6 +60,8 @@ def html_page(
         notes=notes,
         sections=sections,
         sortable=sortable,
+        lead=lead,
+        footnotes=footnotes,
     )
 
 
@@ -67,7 +72,7 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     protocol = results.protocol
     runs = sum(len(method.runs) for method in results.methods)
     subtitle = (
-        f"{_count(len(results.methods), 'method')}, {_count(runs, 'run')} of"
+        f"{counted(len(results.methods), 'method')}, {counted(runs, 'run')} of"
         f" {len(protocol.averaged)} tasks × {protocol.episodes} episodes ·"
         f" {datetime.now(UTC):%Y-%m-%d}"
     )
@@ -118,7 +123,8 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     return html_page(title, sections, subtitle, results.notes)
 
 
-def _count(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
+    """A number of things, such as `1 task` or `2 tasks`."""
     return f"1 {noun}" if number == 1 else f"{number} {noun}s"
 
 
