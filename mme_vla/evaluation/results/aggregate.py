@@ -209,10 +209,13 @@ class Results:
     notes: list[str]
 
     def method(self, label: str) -> Method:
-        """Find a method."""
+        """Find a method by its label, or by the name of its model where one method alone has it."""
         for method in self.methods:
             if method.label == label:
                 return method
+        of_model = [method for method in self.methods if method.model == label]
+        if len(of_model) == 1:
+            return of_model[0]
         raise UserError(
             f"No results of {label!r}. {did_you_mean(label, [m.label for m in self.methods])}"
         )
@@ -277,7 +280,9 @@ def _method_key(run: RunKey) -> RunKey:
     training = run.training
     if training is not None:
         training = replace(training, seed=None, weights=None)
-    return run._replace(checkpoint="", model_seed=0, split="", training=training)
+    # Shipped policies of one recipe, such as two sizes, are two methods.
+    checkpoint = run.checkpoint if run.is_shipped else ""
+    return run._replace(checkpoint=checkpoint, model_seed=0, split="", training=training)
 
 
 def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[int, int]]:
@@ -353,15 +358,8 @@ def _method(table: pd.DataFrame, protocol: Protocol) -> Method:
     other_scenes = any(is_other(run.key.split) for run in runs)
     if key.event is None and key.memory_budget in (None, DEFAULT_BUDGET) and not other_scenes:
         known = paper.paper_method(key.model, key.subgoal)
-    label = key.model
-    if key.subgoal is not None:
-        label += f"+{key.subgoal}"
-    if key.memory_budget is not None:
-        label += f"@{key.memory_budget}"
-    if key.event is not None:
-        label += f" · {key.event}"
     method = Method(
-        label,
+        key.label,
         key.model,
         key.subgoal,
         key.memory_budget,
