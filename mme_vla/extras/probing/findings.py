@@ -82,8 +82,7 @@ class Findings:
         episodes = {line.recording for line in self.moments}
         decisions = {(line.recording, line.step) for line in self.moments}
         return (
-            f"{counted(len(decisions), 'decision')} of"
-            f" {counted(len(episodes), 'recorded episode')}"
+            f"{counted(len(decisions), 'decision')} of {counted(len(episodes), 'recorded episode')}"
         )
 
     def families(self) -> dict[str, list[tuple[float, Effect]]]:

@@ -69,7 +69,6 @@ class Shuffle(Perturbation):
     def meaning(self) -> str:
         return "what is remembered changes places, the times stay"
 
-
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         slots = store.occupied
         order = moment.rng.permutation(slots)
@@ -97,7 +96,6 @@ class Drop(Perturbation):
         entries = "entry" if self.count == 1 else "entries"
         kind = "most used" if self.which == "used" else self.which
         return f"{self.count} {entries} of what is remembered removed: {kind}"
-
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         slots = store.occupied
@@ -133,7 +131,6 @@ class Swap(Perturbation):
         entries = "every entry" if self.count is None else f"{self.count} at random"
         return f"what is remembered shows another episode ({entries}), the times stay"
 
-
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         occupied = store.occupied
         donor = moment.donor(store.name)
@@ -165,7 +162,6 @@ class Delay(Perturbation):
         direction = "earlier" if self.frames < 0 else "later"
         return f"every entry seems to be {abs(self.frames)} frames {direction} than it was"
 
-
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         shifted = list(store.entries)
         for slot in store.occupied:
@@ -188,7 +184,6 @@ class Recent(Perturbation):
     def meaning(self) -> str:
         return f"only the last {self.frames} frames can be remembered"
 
-
     def only(self, moment: Moment) -> np.ndarray | None:
         inside = moment.stored[moment.stored > moment.now - self.frames]
         return inside if len(inside) else moment.stored[-1:]
@@ -206,7 +201,6 @@ class Oracle(Perturbation):
     @property
     def meaning(self) -> str:
         return "only the frames where sub-tasks begin can be remembered"
-
 
     def only(self, moment: Moment) -> np.ndarray | None:
         past = [frame for frame in moment.boundaries if frame <= moment.now]
@@ -228,7 +222,6 @@ class Distract(Perturbation):
         others = "another episode" if self.sessions == 1 else f"{self.sessions} other episodes"
         return f"{others} seen first, as if part of this one"
 
-
     @property
     def n_sessions(self) -> int:
         return self.sessions
@@ -244,7 +237,6 @@ class NoDemo(Perturbation):
     @property
     def meaning(self) -> str:
         return "the video before the episode is not shown"
-
 
 
 class _Perturbed(History):
@@ -317,7 +309,6 @@ class SubgoalSwap(Perturbation):
     def meaning(self) -> str:
         return "the subgoal is that of another episode"
 
-
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         return subgoal if moment.donor_subgoal is None else moment.donor_subgoal
 
@@ -334,7 +325,6 @@ class SubgoalDelay(Perturbation):
     @property
     def meaning(self) -> str:
         return f"the subgoal is the one of {self.decisions} chunks ago"
-
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         if not moment.subgoals:
@@ -356,7 +346,6 @@ class SubgoalCount(Perturbation):
     @property
     def meaning(self) -> str:
         return f"every count in the subgoal is wrong by {self.by}"
-
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         return None if subgoal is None else _COUNT.sub(self._wrong, subgoal)

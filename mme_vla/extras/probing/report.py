@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 MEASURES = {
     "evidence": ("drop:all", "everything remembered is removed: is the memory read at all?"),
     "order": ("shuffle", "what is remembered changes places: does it matter when it was?"),
-    "clock": ("delay:64", "entries seem to be 64 frames later: are they found by their time?"),
-    "pause": ("pause", "time stands still for 64 frames: does standing still disturb?"),
+    "clock": ("delay:64", "entries seem to be later: are they found by their time?"),
+    "pause": ("pause", "time stands still for a while: does that disturb?"),
     "interference": ("distract:1", "another episode is seen first: does it disturb?"),
 }
 """What a probe's table has one column for: the arm that measures it, and what that does."""
@@ -345,8 +345,8 @@ PAGE, TABLE, IMAGES = "page.html", "table.md", "remembered"
 VIDEO, EXECUTION, NOW = (122, 162, 205), (233, 148, 62), (200, 40, 40)
 UNITS = (
     "Change: distance of two chunks of actions that start from the same noise, in normalised"
-    " actions (1 is half of what the training data span). In brackets: how many times the distance"
-    " of two chunks that differ in noise alone."
+    " actions (one is half of what the training data span). In brackets: how many times the"
+    " distance of two chunks that differ in noise alone."
 )
 
 
@@ -523,11 +523,8 @@ def _offline_sections(findings: Findings, meanings: Mapping[str, str]) -> list[S
 def table_of(findings: Mapping[str, Findings]) -> str:
     """Several checkpoints beside each other, in Markdown, and what the columns mean."""
     measures = ((name, question) for name, (_, question) in MEASURES.items())
-    return render(
-        "probes.md",
-        table=to_markdown(checkpoints_table(dict(findings))),
-        terms=[*measures, REACH, FROM_VIDEO],
-    )
+    terms = [f"- {name}: {meaning}" for name, meaning in (*measures, REACH, FROM_VIDEO)]
+    return "\n".join([to_markdown(checkpoints_table(dict(findings))), *terms, "", UNITS])
 
 
 def _encoded(path: Path) -> str:

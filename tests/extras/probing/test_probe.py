@@ -14,11 +14,11 @@ from helpers.rollout_fakes import quick_policy
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.extras.probing.channels import channel_of
+from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.interventions import NoDemo
 from mme_vla.extras.probing.lines import EntryLine, MomentLine, append, read
 from mme_vla.extras.probing.offline import compare_chunks
 from mme_vla.extras.probing.probed import ProbedPolicy
-from mme_vla.extras.probing.report import Findings
 from mme_vla.memory.perturbation import Pause
 
 NEURAL_ARMS = [

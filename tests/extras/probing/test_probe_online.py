@@ -13,11 +13,11 @@ from helpers.scripted_env import make_moving_env
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.evaluation import RunOptions, Shard
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.extras.probing.arms import read_arm
+from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.lines import LINES
 from mme_vla.extras.probing.offline import OfflineSettings
-from mme_vla.extras.probing.report import Findings, table_of
-from mme_vla.extras.probing.run import Probe, ProbePlan, named, probed_folder, run_probe
+from mme_vla.extras.probing.report import table_of
+from mme_vla.extras.probing.run import Probe, ProbePlan, probed_folder, run_probe
 
 SILENT = RunOptions(show_progress=False)
 
@@ -57,22 +57,23 @@ def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(
 ) -> None:
     use_inline_envs(monkeypatch)
     findings = probe_both(tmp_path)
-    arms = {named("tiny", read_arm(w)) for w in ("shuffle", "nodemo")}
     assert {c.first for c in findings.comparisons} == {
-        *arms,
-        "tiny · pause:4",
-        "tiny · pause:4@step:99",
+        "shuffle",
+        "nodemo",
+        "event pause:4",
+        "event pause:4@step:99",
     }
-    assert all(c.second == "tiny" and c.episodes == 2 for c in findings.comparisons)
+    assert all(c.second == "unprobed" and c.episodes == 2 for c in findings.comparisons)
     assert findings.notes == [
         "event=pause:4@step:99 did not act in 2 episodes: its place never came."
     ]
     assert set(findings.findings.arms()) == {"shuffle", "nodemo"}
     page = findings.page.read_text()
     for words in (
-        "Decay with distance",
+        "How old what matters is",
         "In closed loop",
-        "tiny · shuffle",
+        "what is remembered changes places",
+        "1 decision of 1 recorded episode",
         "data:image/webp;base64,",
     ):
         assert words in page
