@@ -27,7 +27,7 @@ def conclude(findings: Findings, comparisons: Sequence[Comparison]) -> str:
 def _on_recordings(findings: Findings) -> str:
     arms = findings.arms()
     if not findings.changed:
-        tried = "The intervention changes"
+        tried = "The intervention does not change"
         if len(arms) > 1:
             tried = f"None of the {len(arms)} interventions changes"
         reads = "this policy does not read its memory"
@@ -91,40 +91,34 @@ def _against_noise(episodes: Sequence[Effect], mean: Effect, reads: str) -> str:
 
 
 def _in_closed_loop(comparisons: Sequence[Comparison]) -> str:
+    """One arm gets its verdict, of several those that cost success, or why none is known to."""
     named = [comparison for comparison in comparisons if comparison.first == EVERYTHING]
-    if named or len(comparisons) == 1:
-        first = [*named, *comparisons][0]
-        sentence = f"In closed loop {first.verdict}."
-        others = [comparison for comparison in comparisons if comparison is not first]
+    if len(comparisons) == 1 or (named and not named[0].significant):
+        verdict = f"In closed loop: {[*named, *comparisons][0].verdict}."
+        if len(comparisons) == 1:
+            return verdict
     else:
-        sentence = ""
-        others = list(comparisons)
-    if not others:
-        return sentence
-    return f"{sentence} {_of_several(others, bool(sentence))}".strip()
-
-
-def _of_several(comparisons: Sequence[Comparison], continues: bool) -> str:
-    """A sentence on several arms. continues: whether one on another arm precedes it."""
-    what = "other interventions" if continues else "interventions in closed loop"
-    n_arms = len(comparisons)
-    if n_arms == 1:
-        what = "other intervention" if continues else "intervention in closed loop"
+        verdict = ""
+    n_arms = f"the {len(comparisons)} interventions in closed loop"
     worse = [c.first for c in comparisons if c.significant and c.losses > c.wins]
     better = [c.first for c in comparisons if c.significant and c.wins > c.losses]
-    found = []
-    if worse:
-        found.append(f"{', '.join(worse)} cost success significantly")
-    if better:
-        found.append(f"{', '.join(better)} gain success significantly")
-    if found:
-        return f"Of {n_arms} {what}, {' and '.join(found)}."
-    if not any(c.wins or c.losses for c in comparisons):
-        episodes = max(c.episodes for c in comparisons)
-        return f"{n_arms} {what} leave every outcome as it is ({counted(episodes, 'episode')})."
-    if not any(c.testable for c in comparisons):
-        return f"For {n_arms} {what} there are too few episodes to tell."
-    return f"Of {n_arms} {what} none changes success significantly."
+    if worse or better:
+        found = []
+        if worse:
+            verb = "costs" if len(worse) == 1 else "cost"
+            found.append(f"{', '.join(worse)} {verb} success significantly")
+        if better:
+            verb = "raises" if len(better) == 1 else "raise"
+            found.append(f"{', '.join(better)} {verb} success significantly")
+        sentence = f"Of {n_arms}, {' and '.join(found)}."
+    elif not any(c.wins or c.losses for c in comparisons):
+        episodes = counted(max(c.episodes for c in comparisons), "scene")
+        return f"None of {n_arms} changes the outcome of any of {episodes}."
+    elif not any(c.testable for c in comparisons):
+        sentence = f"For all of {n_arms} there are too few episodes to tell."
+    else:
+        sentence = f"None of {n_arms} changes success significantly."
+    return f"{verdict} {sentence}".strip()
 
 
 def show_times(times: float) -> str:

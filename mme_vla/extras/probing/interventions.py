@@ -95,7 +95,7 @@ class Drop(Perturbation):
             return "everything remembered is removed"
         entries = "entry" if self.count == 1 else "entries"
         kind = "most used" if self.which == "used" else self.which
-        return f"{self.count} {entries} of what is remembered removed: {kind}"
+        return f"{self.count} {entries} removed: {kind}"
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         slots = store.occupied
@@ -128,8 +128,9 @@ class Swap(Perturbation):
 
     @property
     def meaning(self) -> str:
-        entries = "every entry" if self.count is None else f"{self.count} at random"
-        return f"what is remembered shows another episode ({entries}), the times stay"
+        if self.count is None:
+            return "what is remembered is of another episode, the times stay"
+        return f"of what is remembered, {self.count} at random is of another episode"
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         occupied = store.occupied
@@ -220,7 +221,7 @@ class Distract(Perturbation):
     @property
     def meaning(self) -> str:
         others = "another episode" if self.sessions == 1 else f"{self.sessions} other episodes"
-        return f"{others} seen first, as if part of this one"
+        return f"{others} first, as if part of this one"
 
     @property
     def n_sessions(self) -> int:

@@ -152,8 +152,10 @@ def checkpoints_table(findings: dict[str, Findings]) -> Table:
     )
 
 
-def measures_table(findings: Findings) -> Table:
-    """The measures of one checkpoint, a row each, without those that were not probed."""
+def measures_table(findings: Findings, explained: bool = False) -> Table:
+    """The measures of one checkpoint, a row each, without those that were not probed. explained:
+    with a column that says what each measures.
+    """
     arms = findings.arms()
     rows = []
     for measure, (arm, question) in MEASURES.items():
@@ -161,10 +163,14 @@ def measures_table(findings: Findings) -> Table:
             rows.append([measure, question, arm, show(arms[arm])])
     reach, video = findings.reach(), findings.from_video()
     if reach is not None:
-        rows.append([*REACH, "each entry", f"{reach:.0f} frames"])
+        rows.append([*REACH, "each entry removed", f"{reach:.0f} frames"])
     if video is not None:
-        rows.append([*FROM_VIDEO, "each entry", f"{100 * video:.0f} %"])
-    return Table("In short", ("", "what is measured", "left out or changed", "change"), rows)
+        rows.append([*FROM_VIDEO, "each entry removed", f"{100 * video:.0f} %"])
+    columns = ["measure", "what is measured", "intervention", "change"]
+    if not explained:
+        del columns[1]
+        rows = [[row[0], *row[2:]] for row in rows]
+    return Table("In short", columns, rows)
 
 
 def loop_table(comparisons: Sequence[Comparison], meanings: Mapping[str, str] | None) -> Table:
@@ -233,7 +239,7 @@ def effects(findings: Findings) -> str:
     """
     arms = findings.arms()
     places = np.arange(len(arms))[::-1]
-    with figure((7.2, 1.3 + 0.34 * len(arms))) as (canvas, (axes,)):
+    with figure((5.8, 1.3 + 0.3 * len(arms))) as (canvas, (axes,)):
         axes.barh(places, [arm.change for arm in arms.values()], 0.62, color=COLOURS[0])
         label = "one recorded episode"
         for place, (name, arm) in zip(places, arms.items(), strict=True):
@@ -244,7 +250,7 @@ def effects(findings: Findings) -> str:
             )
             label = ""
             if arm.times is not None:
-                right = max([arm.change, *values])
+                right = max([arm.change, arm.spread, *values])
                 axes.annotate(
                     f"{arm.times:.1f}×",
                     (right, place),
@@ -477,7 +483,7 @@ def write_page(
         sizes=" · ".join(sizes),
         lead=lead,
         tables=map(to_markdown, tables),
-        arms=[(arm, meanings.get(arm, "")) for arm in _arms_of(tables)],
+        terms=_terms_of(tables, meanings),
         notes=[*notes.warnings, *notes.left_out],
     )
     for file, content in ((PAGE, page), (TABLE, text)):
@@ -486,18 +492,20 @@ def write_page(
     return folder / PAGE
 
 
-def _arms_of(tables: Sequence[Table]) -> list[str]:
-    """The arms that some tables have a row of, once each."""
+def _terms_of(tables: Sequence[Table], meanings: Mapping[str, str]) -> list[tuple[str, str]]:
+    """The measures and arms that some tables have a row of, and what they mean."""
+    questions = {name: question for name, (_, question) in MEASURES.items()}
+    known = {**questions, **dict([REACH, FROM_VIDEO]), **meanings}
     names: dict[str, None] = {}
     for table in tables:
-        if table.columns[0] == "arm":
+        if table.columns[0] in ("arm", "measure"):
             names |= dict.fromkeys(row[0] for row in table.rows)
-    return list(names)
+    return [(name, known[name]) for name in names if known.get(name)]
 
 
 def _offline_sections(findings: Findings, meanings: Mapping[str, str]) -> list[Section]:
     """The sections on recorded episodes, the short one first."""
-    measures = measures_table(findings)
+    measures = measures_table(findings, explained=True)
     sections = []
     if measures.rows:
         sections.append(Section("In short", tables=[measures], caption=UNITS))
@@ -506,7 +514,7 @@ def _offline_sections(findings: Findings, meanings: Mapping[str, str]) -> list[S
     curves = []
     if findings.entries:
         caption = "Each entry left out by itself: dots single entries, lines means."
-        curves.append(Section("How old what matters is", decay(findings), caption=caption))
+        curves.append(Section("At what age an entry matters", decay(findings), caption=caption))
     curves += dials(findings)
     in_pairs = len(curves) - len(curves) % 2
     sections += [replace(curve, half=True) for curve in curves[:in_pairs]]
