@@ -118,6 +118,7 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
     log_to_terminal(logger)
     device = process_device(run.policy.device)
     policy, name, source = load_policy(run.policy, "evaluate", logger, device)
+    environment(settings.env).check_embodiment(policy.embodiment)
     prepare_sampling(policy, run.sampling, logger)
     subgoals = choose_subgoals(policy, run.subgoal, run.subgoal_mode, device)
     predictor = None

@@ -230,7 +230,7 @@ def evaluate(
                 claims = Claims(output, shard.file) if shard.count > 1 else None
                 folder = output / SUBGOALS if settings.subgoal_log else None
                 with (
-                    _environments(policy, output, settings, options.base, workers) as envs,
+                    _environments(policy, output, facts, settings, options.base, workers) as envs,
                     receipt(output / shard.file, policy, run, options.source, renders),
                 ):
                     rollout = Rollout(
@@ -249,7 +249,12 @@ def evaluate(
 
 
 def _environments(
-    policy: Policy, output: Path, settings: RolloutSettings, base: Callable[..., Any], workers: int
+    policy: Policy,
+    output: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    base: Callable[..., Any],
+    workers: int,
 ) -> VecEnv:
     robot = policy.embodiment
     sessions = 0
@@ -264,6 +269,7 @@ def _environments(
         base=base,
         max_steps=settings.max_steps,
         videos=videos,
+        run=facts.run.label,
         robot=robot,
         max_actions=settings.max_actions or policy.info.max_actions,
         sessions=sessions,

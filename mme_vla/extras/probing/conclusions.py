@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from mme_vla.evaluation.results.compare import Comparison
-from mme_vla.evaluation.results.report import counted
+from mme_vla.evaluation.results.scopes import counted
 from mme_vla.evaluation.results.statistics import sign_test
 from mme_vla.extras.probing.findings import UNCHANGED, Effect, Findings, by_recording
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mme_vla.evaluation.results.report import counted
+from mme_vla.evaluation.results.scopes import counted
 from mme_vla.extras.probing.lines import EntryLine, Line, MomentLine
 
 AGES = (0, 16, 32, 64, 128, 256, 512)  # Where the bins of an entry's age begin, in frames

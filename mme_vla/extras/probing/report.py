@@ -12,7 +12,8 @@ import numpy as np
 from mme_vla.errors import require
 from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
-from mme_vla.evaluation.results.report import Section, counted, html_page
+from mme_vla.evaluation.results.report import Section, html_page
+from mme_vla.evaluation.results.scopes import counted
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.extras.probing.arms import UNPROBED, meanings_of
 from mme_vla.extras.probing.conclusions import conclude
