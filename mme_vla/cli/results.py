@@ -136,6 +136,9 @@ def run(args: argparse.Namespace) -> None:
         check_episodes(read_episodes(args.episodes), "--episodes")
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
     protocol = _protocol(records, args)
+    if args.title is None:
+        is_benchmark = any(task in TASK_FACTS for task in protocol.tasks)
+        args.title = "RoboMME results" if is_benchmark else "Results"
     _check_views(args)
     if args.stress:
         curves = stress_curves(records, args.confidence, args.conflicts)
@@ -181,9 +184,11 @@ def _protocol(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> Pro
         "seed": args.seed,
     }
     recorded = Protocol.of_records(of_split or records, full, **how)
-    tasks = _tasks(args.tasks)
-    if tasks is None:
-        tasks = tasks_of(records) if args.all else recorded.tasks
+    tasks = recorded.tasks
+    if args.tasks is not None:
+        tasks = _tasks(args.tasks)
+    elif args.all:
+        tasks = tasks_of(records)
     if args.episodes is not None:
         last = max(record.episode for record in records)
         named = choose_numbers(read_episodes(args.episodes), max(full, last + 1), "the split")
@@ -193,19 +198,17 @@ def _protocol(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> Pro
     else:
         # A task that is named and has no records is to have all episodes.
         numbers = {task: recorded.numbers[task] for task in tasks if task in recorded.numbers}
-    return replace(recorded, tasks=tuple(tasks), numbers=numbers)
+    return replace(recorded, tasks=tasks, numbers=numbers)
 
 
-def _tasks(words: Sequence[str] | None) -> list[str] | None:
-    """The names of `--tasks`, as `tasks=` takes them; None for those that have records."""
-    if words is None:
-        return None
-    names = []
+def _tasks(words: Sequence[str]) -> tuple[str, ...]:
+    """The names of `--tasks`, as `tasks=` takes them."""
+    names: list[str] = []
     for word in words:
         names += [name.strip() for name in word.strip("[]").split(",") if name.strip()]
     if names == [ALL]:
-        return list(PAPER_ORDER)
-    return names
+        return PAPER_ORDER
+    return tuple(names)
 
 
 def _check_views(args: argparse.Namespace) -> None:
@@ -423,7 +426,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--latex", type=Path, help="tables for a paper (booktabs)")
     parser.add_argument("--markdown", type=Path, help="tables in the leaderboard's format")
     parser.add_argument("--html", type=Path, help="one self-contained page with plots")
-    parser.add_argument("--title", default="RoboMME results", help="of the page")
+    parser.add_argument(
+        "--title", help="of the page (default: RoboMME results, of other tasks Results)"
+    )
     parser.add_argument(
         "--stress", action="store_true", help="success over the dials of split=stress:… instead"
     )

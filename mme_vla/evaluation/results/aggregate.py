@@ -15,7 +15,7 @@ import pandas as pd
 from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.envs.metadata import is_other
 from mme_vla.envs.rows import DIFFICULTIES
-from mme_vla.errors import UserError, did_you_mean, require
+from mme_vla.errors import UserError, counted, did_you_mean, require
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import (
     EpisodeKey,
@@ -33,7 +33,6 @@ from mme_vla.evaluation.results.scopes import (
     TASK_FACTS,
     Protocol,
     Scope,
-    counted,
     scopes,
     suites_of,
     tasks_of,

@@ -197,7 +197,7 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
                     label=label,
                 )
         for i, method in enumerate(results.methods):
-            if has_place[i]:
+            if has_place[i] and method.average.mean is not None:
                 axes.errorbar(
                     flops[method.model] / 1e12,
                     method.average.mean,

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.config.naming import DEFAULT_BUDGET
+from mme_vla.errors import counted
 from mme_vla.evaluation.results import plots
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results, Run
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.curves import CAPTION, process_tables
 from mme_vla.evaluation.results.paper import chunk_flops
-from mme_vla.evaluation.results.scopes import counted
 from mme_vla.evaluation.results.tables import Table, comparison_table, detail, overview, runs_table
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 from mme_vla.evaluation.store import RUN_FILE, read_run

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
-from mme_vla.errors import require
+from mme_vla.errors import counted, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 
 SUITES = ("Counting", "Permanence", "Reference", "Imitation")
@@ -216,13 +216,6 @@ def tasks_of(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
     return (
         (*PAPER_ORDER, *user_tasks) if names & TASK_FACTS.keys() or not user_tasks else user_tasks
     )
-
-
-def counted(number: int, noun: str) -> str:
-    """A number of things as text: `1 run`, `1,200 runs`."""
-    if number == 1:
-        return f"1 {noun}"
-    return f"{number:,} {noun}s"
 
 
 class Scope(NamedTuple):

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from mme_vla.errors import printable
+from mme_vla.errors import counted, printable
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results, by_training
 from mme_vla.evaluation.results.compare import Comparison, show_p
-from mme_vla.evaluation.results.scopes import PAPER_SEEDS, counted, scopes
+from mme_vla.evaluation.results.scopes import PAPER_SEEDS, scopes
 from mme_vla.evaluation.results.statistics import Interval
 from mme_vla.utils.pages import escape_markdown
 
