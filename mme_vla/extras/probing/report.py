@@ -119,7 +119,7 @@ def phase_name(task: str, phase: int, lines: Sequence[MomentLine]) -> str:
     words = [text.split() for text in texts]
     if len({len(of_one) for of_one in words}) > 1:
         return f"{name}: {texts[0]}" if len(texts) == 1 else f"{name}: {_common_start(words)}"
-    shared = []
+    shared: list[str] = []
     for column in zip(*words, strict=True):
         word = column[0] if len(set(column)) == 1 else "…"
         if word != "…" or shared[-1:] != ["…"]:
