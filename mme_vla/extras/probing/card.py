@@ -475,7 +475,7 @@ def conclude_card(card: Card) -> str:
             losses.append(f"{label} entries cost {100 * card.arms[label].loss:.0f} points")
     text = f"This policy solves {_percent(card.matched)} of {scenes}"
     if losses:
-        text += f"; {' and '.join(losses)}"
+        text += f", {' and '.join(losses)}"
     if score.score is None or score.low is None or score.high is None:
         return f"{text}: too little to tell whether its memory is a clock ({score.undefined})."
     if score.low > 0.5:

@@ -419,7 +419,7 @@ def write_images(findings: Findings, recordings: Sequence[Recording], folder: Pa
 class Notes:
     """What a reader has to know beside the figures.
 
-    warnings: sentences on what was run. left_out: why arms that nobody asked for are not there.
+    warnings: sentences on what was run. left_out: why some of the default arms are not there.
     """
 
     warnings: Sequence[str] = ()

@@ -181,7 +181,7 @@ def test_a_card_says_first_what_it_shows_or_that_it_is_too_little(tmp_path: Path
     matched = scenes([1] * 12)
     clock = grade(matched, {TIME: scenes([0] * 12), CONTENT: matched}, matched)
     assert conclude_card(clock).startswith(
-        "This policy solves 100 % of 12 scenes; time-shifted entries cost 100 points and"
+        "This policy solves 100 % of 12 scenes, time-shifted entries cost 100 points and"
         " content-swapped entries cost 0 points: its memory serves mostly as a clock"
     )
     content = grade(matched, {TIME: matched, CONTENT: scenes([0] * 12)}, matched)
