@@ -11,7 +11,6 @@ import numpy as np
 
 from mme_vla.errors import require
 from mme_vla.evaluation.results.compare import Comparison
-from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, comparison_table, to_markdown
 from mme_vla.extras.probing.lines import EntryLine, Line, MomentLine
@@ -19,6 +18,7 @@ from mme_vla.extras.probing.recordings import Recording
 from mme_vla.utils import require_earlier, write_atomically
 from mme_vla.utils.media import Tile, contact_sheet
 from mme_vla.utils.pages import render
+from mme_vla.utils.style import COLOURS, FAINT, figure, legend, rgb, svg
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -305,13 +305,12 @@ def dials(findings: Findings) -> dict[str, str]:
             axes.axhline(points[0][1].spread, color=COLOURS[1], lw=1, ls="--")
             axes.set_xlabel(_ON.get(name, name))
             axes.set_ylabel("change of the chunk")
-            axes.tick_params(colors=INK)
             figures[name] = svg(canvas)
     return figures
 
 
 PAGE, TABLE, IMAGES = "page.html", "table.md", "remembered"
-VIDEO, EXECUTION, NOW = (122, 162, 205), (233, 148, 62), (200, 40, 40)
+VIDEO, EXECUTION, NOW = rgb("video"), rgb("series-1"), rgb("border")
 UNITS = (
     "Change: root mean square distance of two chunks of the same noise, in normalised actions (1 is"
     " half of what the training data span). In brackets: how many times what chunks differ by that"
