@@ -259,7 +259,9 @@ def integration(source: EpisodeSource) -> Figure:
             side.set_visible(False)
     for axes in panels[:, 0]:
         axes.set_ylabel("this block attends to …", fontsize=9)
-    note = "and every layer of the\naction expert: cross-\nattention to memory,\nscale and shift"
+    note = (
+        "and every layer\nof the action expert:\ncross-attention to\nmemory, then scale\nand shift"
+    )
     panels[1, 1].text(3.15, 1.5, note, va="center", fontsize=9, color=COLOURS[1])
     return figure
 

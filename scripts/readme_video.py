@@ -21,7 +21,7 @@ from mme_vla.evaluation.results.scopes import TASK_FACTS
 from mme_vla.evaluation.store import read_records
 from mme_vla.utils import write_atomically
 from mme_vla.utils.media import bordered, evenly_spaced, font
-from mme_vla.utils.style import rgb
+from mme_vla.utils.style import PALETTE
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "images" / "suites.webp"
 SIDE, CAPTION, GAP = 256, 62, 8  # pixels of an image, of the text below it, between episodes
@@ -57,18 +57,19 @@ def wrapped(text: str, width: int, size: int, lines: int) -> list[str]:
 
 def panel(image: np.ndarray, record: EpisodeRecord, is_last: bool) -> Image.Image:
     """One image of an episode above its suite, goal and, at the end, outcome."""
-    canvas = Image.new("RGB", (SIDE, SIDE + CAPTION), "white")
+    canvas = Image.new("RGB", (SIDE, SIDE + CAPTION), PALETTE["card"][1])
     canvas.paste(Image.fromarray(image))
     draw = ImageDraw.Draw(canvas)
     title = f"{TASK_FACTS[record.task].suite}: {record.task}"
-    draw.text((2, SIDE + 3), title, rgb("accent"), font(13))
+    # A dark ground, which suits pages of both grounds.
+    draw.text((4, SIDE + 3), title, PALETTE["accent"][1], font(13))
     if is_last:
         solved = record.outcome == "success"
         outcome, colour = ("solved", "good") if solved else (record.outcome, "bad")
-        draw.text((SIDE - 2, SIDE + 3), outcome, rgb(colour), font(13), anchor="ra")
+        draw.text((SIDE - 4, SIDE + 3), outcome, PALETTE[colour][1], font(13), anchor="ra")
     goal = str(record.goal).removeprefix("watch the video carefully, then ")
-    for row, line in enumerate(wrapped(goal, SIDE - 4, 12, 3)):
-        draw.text((2, SIDE + 19 + 14 * row), line, rgb("ink"), font(12))
+    for row, line in enumerate(wrapped(goal, SIDE - 8, 12, 3)):
+        draw.text((4, SIDE + 19 + 14 * row), line, PALETTE["ink"][1], font(12))
     return canvas
 
 
@@ -85,7 +86,7 @@ def compose(folders: Sequence[Path]) -> list[Image.Image]:
     size = (2 * SIDE + GAP, rows * (SIDE + CAPTION + GAP) - GAP)
     frames = []
     for t in range(FRAMES):
-        frame = Image.new("RGB", size, "white")
+        frame = Image.new("RGB", size, PALETTE["card"][1])
         for place, (record, images) in enumerate(episodes):
             row, column = divmod(place, 2)
             image = panel(images[t], record, is_last=t == FRAMES - 1)

@@ -15,6 +15,7 @@ from mme_vla.embodiment import ActionSpace
 from mme_vla.policy.base import Policy
 from mme_vla.training.order import generator_for
 from mme_vla.types import stack_noise
+from mme_vla.utils.style import EXECUTION, FAINT, look
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,7 @@ def open_loop(
     )
 
 
+@look()
 def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
     """Draw the recorded actions as a line and each predicted chunk on top, one panel a number."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -127,7 +129,7 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
     for joint, panel in enumerate(panels[: result.space.width]):
         panel.plot(
             *_unbroken(time, result.recorded[..., joint], result.valid),
-            color="0.25",
+            color=FAINT,
             lw=2.2,
             label="recorded",
         )
@@ -136,11 +138,11 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
             panel.plot(
                 time[i, valid],
                 chunk,
-                color="tab:orange",
+                color=EXECUTION,
                 lw=1.5,
                 label="predicted chunk" if i == 0 else None,
             )
-            panel.plot(time[i, :1], chunk[:1], "o", color="tab:orange", ms=4)
+            panel.plot(time[i, :1], chunk[:1], "o", color=EXECUTION, ms=4)
         panel.set_title(
             f"{result.space.names[joint]}: mean error {errors[joint]:.3f} ({scaled[joint]:.2f}"
             " normalised)",
@@ -148,7 +150,6 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
             loc="left",
         )
         panel.set_ylabel(result.space.units[joint], fontsize=9)
-        panel.grid(alpha=0.25)
         panel.margins(x=0.01)
     for panel in panels[-2:]:
         panel.set_xlabel("step of the episode; a dot marks where a chunk was predicted", fontsize=9)
