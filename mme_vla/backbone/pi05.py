@@ -206,15 +206,15 @@ class Pi05Backbone(
         x = self.head.start(noise, steps, batch.overlap)
         times = self.head.times(steps, x.device)
 
-        # Prefill: one pass over images, prompt and memory leaves their keys and values.
-        layout = self.transformer.layout(injection.blocks, injection.visibility)
-        _, prefix = self.transformer(injection.blocks, layout, keep=True)
-
-        # What all steps share: mask and angles, a cache with space for a step's own keys, and the
-        # time modulations of every layer.
+        # Prefill: one pass over images, prompt and memory leaves their keys and values in a cache
+        # with space for a step's own.
         blocks = [*injection.beside, self.action_block(x)]
+        space = self.transformer.cache_space(injection.blocks, sum(len(block) for block in blocks))
+        layout = self.transformer.layout(injection.blocks, injection.visibility)
+        _, prefix = self.transformer(injection.blocks, layout, past=space, keep=True)
+
+        # What all steps share: mask and angles, and the time modulations of every layer.
         layout = self.transformer.layout(blocks, injection.visibility, prefix)
-        past = prefix.preallocate(sum(len(block) for block in blocks))
         if injection.condition is None:
             rows = 1
             conditions = self.conditions(len(times))
@@ -228,7 +228,7 @@ class Pi05Backbone(
         def output(x_t: Tensor, index: int) -> Tensor:
             blocks = [*injection.beside, self.action_block(x_t)]
             condition = conditions.at(index, rows)
-            hidden, _ = self.transformer(blocks, layout, condition, injection.hook, past)
+            hidden, _ = self.transformer(blocks, layout, condition, injection.hook, prefix)
             return self.read_velocity(hidden)
 
         velocity = self.head.velocity(output, times, noise)
