@@ -30,9 +30,7 @@ COUNTERS = {"launches": "n_launch", "products": "n_gemm", "waits": "n_sync"}
 def counted() -> dict[str, int]:
     """The counters of the mock driver."""
     driver = ctypes.CDLL(None)
-    return {
-        what: ctypes.c_long.in_dll(driver, counter).value for what, counter in COUNTERS.items()
-    }
+    return {what: ctypes.c_long.in_dll(driver, counter).value for what, counter in COUNTERS.items()}
 
 
 def full_size(model: str, way: str, backbone: str = "pi05") -> MMEPolicy:
@@ -41,10 +39,9 @@ def full_size(model: str, way: str, backbone: str = "pi05") -> MMEPolicy:
     """
     policy = on_meta(model, backbone).to(torch.bfloat16).to_empty(device=DEVICE)
     policy.eval().requires_grad_(False)
-    assert hasattr(policy.backbone, "compile_sampling")
-    policy.backbone.compile_sampling()
-    if way == "compiled":
-        policy.backbone.compile(dynamic=False)
+    policy.processor = None  # without prompts to come, no graph is captured beforehand
+    policy.compile_sampling(layers=way == "compiled")
+    policy._sampler = None
     return policy
 
 

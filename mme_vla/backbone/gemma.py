@@ -45,7 +45,7 @@ class StaticKV(NamedTuple):
     start: int
 
     def filled(self, k: Tensor, v: Tensor) -> KeyValue:
-        """The past's keys and values and this pass's [b, n, K, h], which are written behind them."""
+        """The past's keys and values, and this pass's [b, n, K, h] written behind them."""
         stop = self.start + k.shape[1]
         for buffer, new in ((self.k, k), (self.v, v)):
             buffer[:, self.start : stop].copy_(new)
@@ -176,7 +176,7 @@ class ExpertLayer(nn.Module):
 
 
 def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
-    return x + update if gate is None else torch.addcmul(x, update, gate)
+    return x + update if gate is None else torch.addcmul(x, update, gate.to(x.dtype))
 
 
 class JointBlock(nn.Module):
@@ -252,7 +252,7 @@ class JointBlock(nn.Module):
 
         # All queries read all keys, those of earlier passes first.
         k, v = _join(keys), _join(values)
-        all_k, all_v = _after(past, k, v)
+        all_k, all_v = _after(past, k, v)  # a cache is filled even where nothing reads it yet
         if not querying:
             return [], (k, v)
         if len(querying) < len(segments):
@@ -332,6 +332,7 @@ class JointTransformer(nn.Module):
         self.experts = experts
         self.gradient_checkpointing: Recompute = False
         self.attention = "auto"
+        self.read_out: Callable[..., Tensor] = read_out
         self.layers = nn.ModuleList(
             JointBlock(config, experts, action_expert, last=i == config.depth - 1)
             for i in range(config.depth)
@@ -419,8 +420,9 @@ class JointTransformer(nn.Module):
             `blocks`) and the cache (None unless kept).
         """
         segments = _segments(blocks, layout.dtype, self._compiled)
-        if self._compiled and not torch.is_grad_enabled():
-            segments = [_with_update(segment, self.action_expert) for segment in segments]
+        is_sampling = not torch.is_grad_enabled() and not isinstance(condition, Tensor)
+        if self._compiled and is_sampling:
+            segments = [self._with_update(segment, condition) for segment in segments]
         cached: list[KeyValue | StaticKV] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
@@ -444,23 +446,25 @@ class JointTransformer(nn.Module):
         output = None
         if segments:
             final = condition.final if isinstance(condition, Conditioning) else condition
-            output = self.read_out(segments[-1], final)
+            output = self.read_out(self.final_norm, segments[-1], final)
         if not keep:
             return output, None
         return output, KVCache(cached, layout.spans, layout.valid)
 
-    def read_out(self, segment: Segment, condition: Tensor | Modulation | None) -> Tensor:
-        """The output [b, n, d] of the action expert."""
-        return self.final_norm(segment.summed(), condition)[0]
+    def _with_update(self, segment: Segment, condition: Conditioning | None) -> Segment:
+        """A segment with an update of zeros: the first layer then shares the compiled code of the
+        others.
+        """
+        gate = None
+        if segment.expert == self.action_expert and condition is not None:
+            gate = condition.final.gate  # of any value; this one is no other input of the layer
+        return segment._replace(update=torch.zeros_like(segment.tokens), gate=gate)
 
 
-def _with_update(segment: Segment, action_expert: str) -> Segment:
-    """A segment with an update of zeros: the first layer then shares the compiled code of the
-    others.
-    """
-    nothing = torch.zeros_like(segment.tokens)
-    gate = nothing[:1, :1] if segment.expert == action_expert else None
-    return segment._replace(update=nothing, gate=gate)
+def read_out(norm: AdaRMSNorm, segment: Segment, condition: Tensor | Modulation) -> Tensor:
+    """The output [b, n, d] of the last layer behind the final norm."""
+    output, _ = norm(segment.summed(), condition)
+    return output
 
 
 def _after(past: KeyValue | StaticKV | None, k: Tensor, v: Tensor) -> KeyValue:

@@ -34,7 +34,14 @@ from mme_vla.policy.saving import policy_options
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
-from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes
+from mme_vla.speed import (
+    SAMPLING_OPTIONS,
+    CapturableSampling,
+    CompilesParts,
+    HasAttentionBackends,
+    Recompute,
+    Recomputes,
+)
 from mme_vla.speed.graphs import CapturedSampling
 from mme_vla.speed.sharding import ShardGroup, backbone_groups
 from mme_vla.types import Batch, MemoryTokens, Noise, map_noise, named_noise, send, stack_noise
@@ -269,12 +276,12 @@ class MMEPolicy(NetworkPolicy):
         self.backbone.recompute(mode)
 
     def compile(self, **options: Any) -> None:
-        """Compile the backbone's tower and layers in place, each by itself, and the recurrence of a
-        memory.
+        """Compile the backbone's tower and layers in place, each by itself, and what memory and
+        integration name (`CompilesParts`).
         """
         self.backbone.compile(**options)
         for module in self.modules():
-            if isinstance(module, RecurrentMemory):
+            if isinstance(module, CompilesParts):
                 module.compile(**options)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
@@ -341,9 +348,9 @@ class MMEPolicy(NetworkPolicy):
         """
         if not isinstance(self.backbone, CapturableSampling):
             return False
-        stamp = self.backbone.compile_sampling()
-        if layers:
-            self.backbone.compile(dynamic=False)
+        stamp = self.backbone.compile_sampling(layers)
+        if layers and isinstance(self.integration, CompilesParts):
+            self.integration.compile(**SAMPLING_OPTIONS)
         if self.device.type != "cuda":
             return True
         self._sampler = CapturedSampling(self.model.sample, stamp)
