@@ -1,6 +1,7 @@
 """`MMEPolicy`: the network `MMEModel` with a processor, episodes and checkpoints."""
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -332,16 +333,19 @@ class MMEPolicy(NetworkPolicy):
             memory = self.model.memory_tokens(batch)
         return self._sampler(batch, values, steps or self.info.sample_steps, memory)
 
-    def compile_sampling(self, layers: bool = False) -> bool:
+    def compile_sampling(
+        self, layers: bool = False, report: Callable[[str], object] = lambda text: None
+    ) -> bool:
         """Speed up sampling with fixed weights; chunks are equal up to the rounding of other
         kernels.
 
         What depends on the flow time alone is computed once and kept. On a GPU a chunk becomes one
         CUDA graph for each batch size, captured when it first occurs; here for one episode and
-        every length of prompt.
+        every length of prompt. Layers are compiled for the same lengths.
 
         Args:
             layers: compile the tower and the layers too, which takes a minute or more at full size.
+            report: gets a line for each length that is ready.
 
         Returns:
             Whether this backbone has a sampler that can be captured.
@@ -351,16 +355,22 @@ class MMEPolicy(NetworkPolicy):
         stamp = self.backbone.compile_sampling(layers)
         if layers and isinstance(self.integration, CompilesParts):
             self.integration.compile(**SAMPLING_OPTIONS)
-        if self.device.type != "cuda":
-            return True
-        self._sampler = CapturedSampling(self.model.sample, stamp)
-        if self.processor is None:
+        on_gpu = self.device.type == "cuda"
+        if on_gpu:
+            self._sampler = CapturedSampling(self.model.sample, stamp)
+        if self.processor is None or not (on_gpu or layers):
             return True
         full = self.full_batch(self.device)
-        for length in range(16, self._prompt_length() + 16, 16):
+        lengths = range(16, self._prompt_length() + 16, 16)
+        for index, length in enumerate(lengths):
+            begun = time.perf_counter()
             prompt = full.prompt[:, :length]
             prompt_mask = full.prompt_mask[:, :length]
             self.sample_actions(replace(full, prompt=prompt, prompt_mask=prompt_mask))
+            took = time.perf_counter() - begun
+            report(
+                f"prompts of {length} tokens are ready: {index + 1} of {len(lengths)}, {took:.1f} s"
+            )
         return True
 
     # Episodes
