@@ -142,6 +142,14 @@ def test_the_page_from_the_dataset_to_a_served_policy(
     summary = json.loads((checkpoint.parents[1] / "summary.json").read_text())
     assert summary["open_loop"]["names"][0] == "left_0"
 
+    checking = shlex.split(blocks("bash")[1])
+    assert checking[:3] == ["python", "-m", "mme_vla.inspect"]
+    capsys.readouterr()
+    inspect_main(compose("inspect", checking[3:]))
+    checked = capsys.readouterr().out
+    assert "episode 1 of demonstrations" in checked and "right_6" in checked
+    assert "baseline" in checked.splitlines()[-3]
+
     acting, asking = blocks("python")
     robot = Robot()
     names: dict[str, Any] = {"robot": robot, "chunks": 3}
@@ -201,6 +209,13 @@ def test_columns_are_detected_in_both_spellings_joined_or_by_name(place: Path) -
         UserError, match=r"lacks the features image, wrist_image.*choose embodiment="
     ):
         EpisodeSource("demonstrations")
+    shortened = {"cameras": {"eye": {"key": "images.left_wrst"}}, "memory_camera": "eye"}
+    with pytest.raises(
+        UserError, match=r"Did you mean `key: (.*)left_wrist` for images\.left_wrst"
+    ):
+        EpisodeSource(
+            "demonstrations", robot=Embodiment.from_dict({**robot.to_dict(), **shortened})
+        )
     hand = EpisodeSource(
         "demonstrations",
         robot=Embodiment.from_dict({**robot.to_dict(), "memory_camera": "left_wrist"}),
