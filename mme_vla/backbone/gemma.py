@@ -420,8 +420,8 @@ class JointTransformer(nn.Module):
             `blocks`) and the cache (None unless kept).
         """
         segments = _segments(blocks, layout.dtype, self._compiled)
-        is_sampling = not torch.is_grad_enabled() and not isinstance(condition, Tensor)
-        if self._compiled and is_sampling:
+        is_compiled = self._compiled and not torch.is_grad_enabled()
+        if is_compiled and not isinstance(condition, Tensor):  # while sampling
             segments = [self._with_update(segment, condition) for segment in segments]
         cached: list[KeyValue | StaticKV] = []
         for i, block in enumerate(self.layers):
