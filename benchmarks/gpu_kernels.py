@@ -1,7 +1,7 @@
 """Kernels that one chunk launches at full size: their number is most of its time.
 
     python benchmarks/gpu_kernels.py pi05 framesamp_modul
-    python benchmarks/gpu_kernels.py --ways eager --steps 1 pi05
+    python benchmarks/gpu_kernels.py pi05 --ways eager --steps 1
 
 One line of JSON for each model and way: launches and matrix products after the memory tokens. It
 asks for a mock CUDA driver, as docs/evidence/hardware.md has it: the driver counts, and computes

@@ -93,7 +93,7 @@ def test_a_full_size_chunk_launches_few_kernels(
         "PYTHONPATH": str(REPOSITORY),
     }
     program = REPOSITORY / "benchmarks" / "gpu_kernels.py"
-    command = [sys.executable, str(program), "--ways", "compiled", model]
+    command = [sys.executable, str(program), model, "--ways", "compiled"]
     lines = subprocess.run(
         command, env=environment, check=True, stdout=subprocess.PIPE, text=True
     ).stdout.splitlines()
