@@ -20,6 +20,7 @@ from mme_vla.policy.build import build_from_config
 from mme_vla.policy.run_folders import locate_checkpoint
 from mme_vla.policy.sections import SECTIONS, PolicySections
 from mme_vla.processing.normalise import NormStats
+from mme_vla.speed.compiler import keep_compiled_code, missing_compiler
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,20 @@ def prepare_sampling(policy: Policy, sampling: str, logger: logging.Logger) -> N
     if sampling == "eager" or (sampling == "auto" and not on_gpu):
         return
     begun = time.perf_counter()
-    if not policy.compile_sampling(layers=sampling == "compiled"):
+    layers = sampling == "compiled"
+    if layers:
+        folder = keep_compiled_code()
+        missing = missing_compiler(policy.device)
+        if missing is None:
+            logger.info("compiling layers: a minute or more at first, later starts read %s", folder)
+        else:
+            layers = False
+            logger.warning(
+                "sampling=compiled: layers stay eager, since %s is missing. Install it, or set"
+                " sampling=auto.",
+                missing,
+            )
+    if not policy.compile_sampling(layers, logger.info if layers else lambda text: None):
         require(
             sampling == "auto",
             f"sampling={sampling}: {type(policy).__name__} has no sampler that can be compiled. Set"

@@ -184,11 +184,14 @@ class Policy(nn.Module):
         """
         raise NotImplementedError
 
-    def compile_sampling(self, layers: bool = False) -> bool:
+    def compile_sampling(
+        self, layers: bool = False, report: Callable[[str], object] = lambda text: None
+    ) -> bool:
         """Compile the sampler of a policy whose weights are final.
 
         Args:
             layers: compile the network's layers too.
+            report: gets a line on each part that is ready.
 
         Returns:
             Whether the policy has a sampler that can be compiled.
