@@ -299,7 +299,7 @@ def test_a_comparison_pairs_the_episodes() -> None:
     assert (result.wins, result.losses, result.difference) == (10, 0, pytest.approx(20))
     assert result.p == pytest.approx(2 / 2**10)
     assert result.interval.low > 0
-    assert "a is significantly better than b" in result.verdict
+    assert result.verdict == "a 30 of 50 against b 20 of 50: a is significantly better (p = 0.002)"
     # The same two rates on other episodes: 30 against 20 differing pairs are no longer significant.
     shifted = aggregate(records("a", {"BinFill": a}) + records("b", {"BinFill": b[::-1]}), protocol)
     other = compare(*shifted.methods, protocol)
@@ -314,7 +314,7 @@ def test_three_episodes_are_too_few_to_tell(first: list[int], low: float) -> Non
     made = records("a", {"BinFill": first}) + records("b", {"BinFill": [1, 1, 1]})
     (result,) = compare_all([tuple(aggregate(made, protocol).methods)], protocol)
     assert result.interval.low == pytest.approx(low, abs=0.01) and result.interval.high > 40
-    assert "a against b: too few episodes to tell (p = " in result.verdict
+    assert f"a {sum(first)} of 3 against b 3 of 3: too few episodes to tell (p = " in result.verdict
     assert comparison_table([result]).rows[0][-1] == "too few episodes"
 
 
@@ -386,7 +386,7 @@ def test_the_command_reads_shards_and_saves_every_format(
     printed = capsys.readouterr().out
     assert "75.00" in printed
     # two methods are compared unasked
-    assert "no significant difference between pi05 and ttt_modul" in printed
+    assert "pi05 2 of 8 against ttt_modul 6 of 8: no significant difference (p = 0.125)" in printed
     page = files["html"].read_text()
     assert page.count("<svg") >= 5
     assert "<script" not in page

@@ -25,7 +25,8 @@ from mme_vla.evaluation.results.statistics import (
 class Comparison:
     """`first` minus `second`, in percentage points, over the episodes that all runs of both have.
 
-    first_rate, second_rate, difference: means over tasks. interval: of the difference
+    first_rate, second_rate, difference: means over tasks. first_solved, second_solved: of
+    `episodes`, a mean over runs. interval: of the difference
     (`paired_interval`), with several trainings at least as wide as a paired bootstrap over episodes
     and trainings. wins, losses: episodes that the first, or the second, solved in a larger share of
     its runs; the rest are ties. p: exact two-sided test on wins and losses (McNemar's where each
@@ -61,6 +62,8 @@ class Comparison:
     paired: bool = True
     notes: tuple[str, ...] = ()
     gaps: tuple[str, ...] = ()
+    first_solved: float = 0.0
+    second_solved: float = 0.0
 
     @property
     def better_worse(self) -> str:
@@ -69,22 +72,28 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
-        p = f"p = {show_p(self.corrected)}"
-        if self.corrected < 0.001:
-            p = f"p {show_p(self.corrected)}"
+        """One sentence: what each side solved, and what that says."""
+        sides = [f"{self.first} {self.first_rate:.1f} %", f"{self.second} {self.second_rate:.1f} %"]
+        if self.paired:
+            sides = [
+                f"{self.first} {round(self.first_solved, 1):g} of {self.episodes}",
+                f"{self.second} {round(self.second_solved, 1):g} of {self.episodes}",
+            ]
+        text = " against ".join(sides)
         if self.significant:
             first_is_better = self.difference > 0
             if self.paired:
                 first_is_better = self.wins > self.losses
-            names = [self.first, self.second]
-            if not first_is_better:
-                names.reverse()
-            text = f"{names[0]} is significantly better than {names[1]} ({p})"
+            better = self.first if first_is_better else self.second
+            text += f": {better} is significantly better"
         elif not self.testable:
-            text = f"{self.first} against {self.second}: too few episodes to tell ({p})"
+            text += ": too few episodes to tell"
         else:
-            text = f"no significant difference between {self.first} and {self.second} ({p})"
+            text += ": no significant difference"
+        p = show_p(self.corrected)
+        if self.corrected >= 0.001:
+            p = f"= {p}"
+        text += f" (p {p})"
         if self.flipped:
             text += (
                 f"; of {self.repeated:,} episodes run twice alike, {self.flipped:,} ended otherwise"
@@ -194,6 +203,8 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
         smallest_p < 1 - protocol.confidence,
         first.repeated + second.repeated,
         first.flipped + second.flipped,
+        first_solved=float(first_rates.mean(axis=1).sum()),
+        second_solved=float(second_rates.mean(axis=1).sum()),
     )
     return _noted(comparison, pairing)
 

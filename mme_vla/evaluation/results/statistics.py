@@ -234,6 +234,17 @@ def percentiles(values: np.ndarray, confidence: float = 0.95) -> Interval:
     return Interval(float(low), float(high))
 
 
+def sampled_interval(values: np.ndarray, exact: Interval) -> Interval:
+    """`percentiles` of resampled values; where no sample differs, an exact interval.
+
+    Equal outcomes of few episodes give equal samples. They are no certainty.
+    """
+    interval = percentiles(values)
+    if interval.low < interval.high:
+        return interval
+    return exact
+
+
 def resampled_means(
     tasks: Mapping[str, Sequence[np.ndarray]], samples: int, seed: int
 ) -> np.ndarray:

@@ -33,6 +33,7 @@ from mme_vla.evaluation.results.statistics import (
     holm,
     percentiles,
     resampled_means,
+    sampled_interval,
     wilson,
 )
 from mme_vla.extras.nano.rows import CHOICES, Trained, Training
@@ -246,12 +247,9 @@ class Board:
 
     def interval(self, row: Row) -> Interval:
         """Of a row's success over all tasks, in percent; Wilson's where no draw differs."""
-        interval = percentiles(self.sampled[row.name])
-        if interval.low < interval.high:
-            return interval
         scenes = len(self.protocol.tasks) * self.protocol.episodes
-        low, high = wilson(self.success(row) / 100, scenes)
-        return Interval(100 * low, 100 * high)
+        exact = wilson(self.success(row) / 100, scenes).percent
+        return sampled_interval(self.sampled[row.name], exact)
 
     @cached_property
     def places(self) -> dict[str, tuple[int, Interval]]:
@@ -306,7 +304,8 @@ class Board:
         comparisons = []
         for comparison in compare_all(methods, self._once, _compare):
             difference = self.sampled[comparison.first] - self.sampled[comparison.second]
-            comparisons.append(replace(comparison, interval=percentiles(difference)))
+            interval = sampled_interval(difference, comparison.interval)
+            comparisons.append(replace(comparison, interval=interval))
         return comparisons
 
     @cached_property

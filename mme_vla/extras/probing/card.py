@@ -16,7 +16,12 @@ from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.results.statistics import percentiles, resampled_means
+from mme_vla.evaluation.results.statistics import (
+    paired_interval,
+    percentiles,
+    resampled_means,
+    sampled_interval,
+)
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.rollout.evaluation import RunOptions, evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -247,7 +252,8 @@ def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> C
     sampled = dict(zip(table, _bootstrap(list(table.values())), strict=True))
     losses = {}
     for label, differences in table.items():
-        loss, interval = _mean(differences), percentiles(sampled[label])
+        loss = _mean(differences)
+        interval = sampled_interval(sampled[label], paired_interval(_by_task(differences)))
         signs = np.sign(list(differences.values()))
         losses[label] = Loss(
             success=_mean({key: arms[label][key] for key in keys}),
