@@ -170,7 +170,10 @@ def run_card(
     arms = {label: read_arm(word) for label, word in ARMS.items()}
     possible, notes = [], []
     for label, arm in arms.items():
-        why = lacking(arm, policy, channel, len(plan.lend), boundaries=in_simulation)
+        n_goals = len({recording.goal for recording in plan.lend})
+        why = lacking(
+            arm, policy, channel, len(plan.lend), boundaries=in_simulation, n_goals=n_goals
+        )
         if why is None:
             possible.append(label)
         else:

@@ -251,6 +251,7 @@ class RemotePolicy(Policy):
         self.info = PolicyInfo(
             sample_steps=sample_steps if isinstance(sample_steps, int) else 1,
             max_actions=max_actions if isinstance(max_actions, int) else None,
+            resamples=False,
             max_running=running,
             identity=identity,
         )
