@@ -45,8 +45,8 @@ def probe(policy: Policy, folder: Path, arms: list[str], **plan: Any) -> Any:
 
 
 def numbers(request: dict[str, Any]) -> list[int]:
-    """Which frames of the episode a request shows: their brightness says it. A donor's frames, which
-    lack the square at the joints' place, are −1.
+    """Which frames of the episode a request shows: their brightness says it. A donor's frames lack
+    the square at the joints' place, and are −1.
     """
     shown = []
     for image in request["front_rgb_list"]:
