@@ -121,6 +121,13 @@ def brief(value: object, most: int = 80, quote: bool = True) -> str:
     return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things as text: `1 run`, `1,200 runs`."""
+    if number == 1:
+        return f"1 {noun}"
+    return f"{number:,} {noun}s"
+
+
 def printable(text: str) -> str:
     r"""Text for a terminal: escape sequences and other characters that cannot be seen, spelled out.
     Lines stay lines.

@@ -22,7 +22,7 @@ from mme_vla.config.devices import process_device
 from mme_vla.config.sections import PathText, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
-from mme_vla.errors import check_choice
+from mme_vla.errors import check_choice, counted
 from mme_vla.evaluation.api import policy_of_split
 from mme_vla.evaluation.records import EpisodeRecord, count_outcomes
 from mme_vla.evaluation.results.events import event_table, idle_events
@@ -118,6 +118,7 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
     log_to_terminal(logger)
     device = process_device(run.policy.device)
     policy, name, source = load_policy(run.policy, "evaluate", logger, device)
+    environment(settings.env).check_embodiment(policy.embodiment)
     prepare_sampling(policy, run.sampling, logger)
     subgoals = choose_subgoals(policy, run.subgoal, run.subgoal_mode, device)
     predictor = None
@@ -131,7 +132,7 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
         )
     output = default_output(facts) if run.output is None else Path(run.output).expanduser()
     output = output / training
-    count = "1 episode" if len(jobs) == 1 else f"{len(jobs)} episodes"
+    count = counted(len(jobs), "episode")
     if shard.count > 1:
         count += f", shared as {shard.index}/{shard.count},"
     logger.info("%s into %s", count, output)

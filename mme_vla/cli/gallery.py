@@ -17,7 +17,7 @@ from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.observations import Include, Observer
 from mme_vla.envs.subtasks import NO_RECORD
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, counted, require
 from mme_vla.utils import read_text
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced
 from mme_vla.utils.pages import render
@@ -120,7 +120,7 @@ def main(cfg: DictConfig) -> None:
             env.close()
             advance(1)
     page.write_text(render("gallery.md", entries=entries))
-    print(f"{page}: {len(entries)} tasks.")
+    print(f"{page}: {counted(len(entries), 'task')}.")
 
 
 def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:

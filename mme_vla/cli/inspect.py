@@ -1,7 +1,8 @@
-"""`python -m mme_vla.inspect`: what is in a checkpoint, a dataset or an episode, and what a memory
-remembers of it.
+"""`python -m mme_vla.inspect`: what is in a checkpoint, a dataset or an episode, what a memory
+remembers of it, and what a policy predicts along it.
 """
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,21 +15,45 @@ from rich.console import Console
 from rich.table import Table
 
 from mme_vla.backbone.building import shape_of
+from mme_vla.cli.loading import words_of
 from mme_vla.config.composition import resolved
-from mme_vla.config.sections import PathText, read_section
+from mme_vla.config.devices import find_device
+from mme_vla.config.sections import PathText, PositiveInt, read_section
+from mme_vla.config.trees import library_trees, yaml_files
+from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource, check_episode
-from mme_vla.data.lerobot_files import SAMPLE
+from mme_vla.data.lerobot_files import SAMPLE, find_columns, read_info, resolve_root
 from mme_vla.data.memory_image import memory_sheet
+from mme_vla.data.recording import Recording
+from mme_vla.data.robot_draft import CHECK, draft_robot, save_draft
+from mme_vla.data.sources import (
+    default_val_episodes,
+    held_out_in,
+    listed_sources,
+    source_name,
+)
 from mme_vla.data.statistics import normalised_states
-from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.action_space import numbered
-from mme_vla.errors import UserError, printable
+from mme_vla.errors import UserError, printable, require
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.policy import mme
 from mme_vla.policy.base import Policy
-from mme_vla.policy.run_folders import STATE, resolve_checkpoint
+from mme_vla.policy.run_folders import CHECKPOINTS, STATE, resolve_checkpoint
+from mme_vla.policy.sections import PolicySections
 from mme_vla.training.checkpoint import read_state
+from mme_vla.training.open_loop import (
+    LEGEND,
+    OpenLoop,
+    decisions_of,
+    error_lines,
+    open_loop,
+    plot_open_loop,
+)
+from mme_vla.training.runs import SUMMARY
+from mme_vla.training.settings import DataSettings
+from mme_vla.utils import read_json
 
 
 @dataclass(frozen=True)
@@ -43,7 +68,11 @@ class Inspection:
     exec_starts: str | None
     episode: int | None
     step: int | None
+    chunks: PositiveInt | None
+    seed: int
+    device: str
     output: PathText
+    all: bool
     trust_plugins: bool
     embodiment: Mapping[str, Any]
     backbone: Mapping[str, Any]
@@ -56,21 +85,29 @@ class Inspection:
 
 
 def main(cfg: DictConfig) -> None:
-    """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw its
-    memory.
+    """Print what `checkpoint`, `dataset` or `episode` holds, and for an episode draw its memory.
+
+    With `checkpoint` and `dataset` the policy is checked open loop on an episode.
     """
     inspection = Inspection.from_config(resolved(cfg))
     console = Console(markup=False)
-    if (inspection.checkpoint is None) == (inspection.dataset is None):
-        raise UserError(
-            "Name one thing to inspect: checkpoint=<folder>, or dataset=<folder> (`sample` is built"
-            " in)."
-        )
-    if inspection.checkpoint is not None:
-        show_checkpoint(Path(inspection.checkpoint), console, inspection.trust_plugins)
+    if inspection.checkpoint is not None and inspection.dataset is not None:
+        check_open_loop(inspection, console)
         return
+    if inspection.checkpoint is not None:
+        show_checkpoint(
+            Path(inspection.checkpoint), console, inspection.trust_plugins, inspection.all
+        )
+        return
+    require(
+        inspection.dataset is not None,
+        "Name one thing to inspect: checkpoint=<folder>, or dataset=<folder> (`sample` is built"
+        " in). Both together compare predicted with recorded actions.",
+    )
     assert inspection.dataset is not None
     robot = Embodiment.from_dict(inspection.embodiment)
+    if show_unknown_robot(inspection.dataset, robot, Path(inspection.output), console):
+        return
     source = EpisodeSource(inspection.dataset, inspection.exec_starts, robot=robot)
     if inspection.episode is None:
         show_dataset(source, console)
@@ -85,14 +122,240 @@ def main(cfg: DictConfig) -> None:
     console.print(f"image: {image}", highlight=False, soft_wrap=True)
 
 
-def show_checkpoint(folder: Path, console: Console, trust_plugins: bool = False) -> None:
-    """Print a checkpoint's parts, training state and normalisation statistics.
+def check_open_loop(inspection: Inspection, console: Console) -> OpenLoop:
+    """Print and draw predicted against recorded actions along an episode of `dataset`, with the
+    robot and the memory of `checkpoint`.
+    """
+    assert inspection.checkpoint is not None and inspection.dataset is not None
+    named = words_of("embodiment", "backbone", "memory")
+    require(
+        not named, f"A checkpoint brings its own robot and memory: leave out {' '.join(named)}."
+    )
+    require(
+        inspection.step is None,
+        "step= chooses the frame at which a memory is drawn: leave it out, or leave out"
+        " checkpoint=.",
+    )
+    folder = resolve_checkpoint(Path(inspection.checkpoint))
+    device = find_device(inspection.device)
+    policy = Policy.from_pretrained(folder, device=device, trust_plugins=inspection.trust_plugins)
+    name = str(PolicySections.of(policy.config).name or "policy")
+    source = EpisodeSource(inspection.dataset, inspection.exec_starts, robot=policy.embodiment)
+    data = data_of(folder)
+    held_out = None if data is None else held_out_episodes(source, *data)
+    episode = inspection.episode
+    if episode is None:
+        episode = 0
+        if held_out is not None and held_out.any():
+            episode = int(np.flatnonzero(held_out)[0])
+    check_episode(source, episode)
+    kind = "new"
+    if data is None:
+        kind = ""
+    elif held_out is not None:
+        kind = "held-out" if held_out[episode] else "training"
+    offset = 0 if data is None else data[0].action_offset
+    recording = Recording(source, episode, offset)
+    title = f"{kind} {recording.described}".strip()
+    total = len(decisions_of(recording, policy.embodiment.action.execute, inspection.chunks))
+    with progress("chunks", total) as advance:
+        result = open_loop(policy, recording, title, inspection.chunks, inspection.seed, advance)
+    summary = result.summary()
+    console.print(f"{name}, open loop on {title}", style="bold", soft_wrap=True, highlight=False)
+    for line in (*error_lines(summary), LEGEND, result.verdict()):
+        console.print(printable(line), highlight=False, soft_wrap=True)
+    if kind == "training":
+        console.print(
+            "The policy was trained on this episode: a held-out one says more.", highlight=False
+        )
+    output = Path(inspection.output)
+    output.mkdir(parents=True, exist_ok=True)
+    path = output / f"{name}_{source.name}_episode{episode}_open_loop.png"
+    plot_open_loop(result, path, name)
+    console.print(f"plot: {path}", highlight=False, soft_wrap=True)
+    return result
 
-    With `trust_plugins` the modules that the checkpoint names are imported.
+
+def data_of(checkpoint: Path) -> tuple[DataSettings, list[str]] | None:
+    """The data that a checkpoint was trained on, with the fingerprint of each source; None where it
+    does not tell, as weights without their training do not.
+    """
+    if not (checkpoint / STATE).is_file():
+        return None
+    section = read_state(checkpoint)["config"].get("data")
+    if not isinstance(section, Mapping):
+        return None
+    settings = {key: value for key, value in section.items() if key != "content"}
+    content = section.get("content") or []
+    return DataSettings.from_dict(settings), [str(text) for text in content]
+
+
+def held_out_episodes(
+    source: EpisodeSource, data: DataSettings, content: Sequence[str]
+) -> np.ndarray | None:
+    """Which episodes of a dataset a training held out, bool [e]; None where it is not among the
+    training's data.
+    """
+    if source.fingerprint not in content:
+        return None
+    entries = listed_sources(data.sources)
+    entry = entries[content.index(source.fingerprint)]
+    # The split goes by the name that the dataset had then.
+    source.name = source_name(entry)
+    texts: Sequence[int | str] | None = data.val_episodes
+    if texts is None:
+        texts = default_val_episodes([source])
+    named = []
+    for text in texts:
+        name, _, number = str(text).rpartition("/")
+        if name in ("", source.name):
+            named.append(int(number))
+    return held_out_in(source, named or None, data.val_fraction)
+
+
+def show_unknown_robot(dataset: str, robot: Embodiment, output: Path, console: Console) -> bool:
+    """Draft the YAML file of the robot that a dataset is of, where it does not fit the default one;
+    whether it was so.
+    """
+    root = resolve_root(dataset)
+    if robot.name != ROBOMME_JOINT.name:
+        return False
+    info = read_info(root)
+    try:
+        find_columns(root, info.features, robot)
+    except UserError as reason:
+        draft = draft_robot(root, info, list(yaml_files(library_trees(), "embodiment")))
+        if draft is None:
+            raise reason
+    else:
+        return False
+    path, is_new = save_draft(draft, output)
+    console.print(
+        f"{printable(str(root))} is of another robot than {robot.name}. A draft of its file:",
+        highlight=False,
+        soft_wrap=True,
+    )
+    console.print(f"\n{draft.text}", highlight=False, soft_wrap=True)
+    if is_new:
+        console.print(f"written to {path}", highlight=False, soft_wrap=True)
+    else:
+        console.print(f"not written: {path} exists and stays", highlight=False, soft_wrap=True)
+    common = ["--config-dir", str(output), f"embodiment={draft.name}"]
+    inspecting = shlex.join(["mme-vla", "inspect", *common, f"dataset={dataset}"])
+    training = ["mme-vla", "train", *common, "model=framesamp_modul", "data=lerobot"]
+    console.print(
+        f"Check the {len(draft.open_lines)} lines marked “{CHECK}” (docs/extend/your-robot.md"
+        f" explains them), then:\n  {inspecting}\n"
+        f"  {shlex.join(training)} {shlex.quote(f'data.sources=[{dataset}]')}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    return True
+
+
+def show_checkpoint(
+    folder: Path, console: Console, trust_plugins: bool = False, everything: bool = False
+) -> None:
+    """Print a summary of a checkpoint: robot, memory, budget, data, steps and error.
+
+    Args:
+        folder: of a checkpoint or a run.
+        trust_plugins: import the modules that the checkpoint names.
+        everything: print its whole configuration and its statistics too.
     """
     folder = resolve_checkpoint(folder)
     policy = Policy.from_pretrained(folder, trust_plugins=trust_plugins)
-    table = _table(str(folder), "part", "tensors", "parameters", "dtype")
+    console.print(str(folder), style="bold", highlight=False, soft_wrap=True)
+    grid = Table.grid(padding=(0, 2))
+    for row in summary_rows(policy, folder):
+        grid.add_row(*map(printable, row))
+    console.print(grid, highlight=False)
+    if everything:
+        show_details(policy, folder, console)
+    else:
+        console.print("all=true shows the whole configuration and the statistics", style="dim")
+
+
+def summary_rows(policy: Policy, folder: Path) -> list[tuple[str, str]]:
+    """What a checkpoint is, a title and a text each."""
+    sections = PolicySections.of(policy.config)
+    robot = policy.embodiment
+    space = robot.action
+    parts: dict[str, int] = {}
+    for name, parameter in policy.named_parameters():
+        part = policy.finetune_spec.component_of(name)
+        parts[part] = parts.get(part, 0) + parameter.numel()
+    sizes = ", ".join(f"{part} {count:,}" for part, count in parts.items())
+    names = [str(sections.name or "policy"), str(sections.backbone.get("name", "pi05"))]
+    rate = "any rate" if robot.fps is None else f"{robot.fps:g} frames per second"
+    relative = f"{len(space.relative)} of them relative to the state"
+    if space.of_pose:
+        relative = f"{len(space.of_pose)} of them differences to the tool's pose"
+    memory = "none"
+    if policy.memory is not None:
+        budget = f"{policy.memory.budget} tokens" if policy.memory.budget else "no tokens"
+        parts_of = [str(sections.memory.get("name", "memory")), budget]
+        parts_of.append(f"of the camera {robot.memory_camera}")
+        parts_of.append(f"integration {sections.integration.get('name', 'none')}")
+        memory = ", ".join(parts_of)
+    rows = [
+        ("model", f"{names[0]}, backbone {names[1]} ({type(policy).__name__})"),
+        ("parameters", f"{sum(parts.values()):,}: {sizes}"),
+        ("robot", f"{robot.name}: cameras {', '.join(robot.camera_names)}, {rate}"),
+        ("state", f"{robot.state.width} numbers"),
+        ("action", f"{space.width} numbers, {relative}"),
+        ("chunk", f"{space.horizon} actions, of which {space.execute} are executed"),
+        ("memory", memory),
+        ("text", policy.require_processor().prompt_spec.encoder),
+    ]
+    return rows + training_rows(folder, sections)
+
+
+def training_rows(folder: Path, sections: PolicySections) -> list[tuple[str, str]]:
+    """What is known of a checkpoint's training: data, steps, and errors."""
+    card = sections.card
+    known = str(card.get("data") or "not recorded")
+    steps = _summary(card.get("recipe") or "not recorded")
+    if (folder / STATE).is_file():
+        state = read_state(folder)
+        data = state["config"].get("data", {})
+        train = state["config"].get("train", {})
+        sources = [source_name(entry) for entry in listed_sources(data.get("sources"))]
+        known = f"{data.get('name', 'data')}: {', '.join(sources)}"
+        steps = f"{state['step']:,} of {train.get('steps', 0):,} updates"
+        steps += f", batches of {train.get('batch_size')}, learning rate {train.get('lr')}"
+        steps += f", seed {state['config'].get('seed')}"
+    rows = [("data", known), ("training", steps)]
+    results = _summary(card.get("results") or {})
+    rows.append(("error", results or "not recorded"))
+    found = _open_loop_of(folder)
+    if found is not None:
+        rows.append(("open loop", f"{found.get('episode', 'an episode')}. {found['verdict']}"))
+    else:
+        rows.append(
+            ("open loop", "not recorded; mme-vla inspect checkpoint=… dataset=… compares actions")
+        )
+    return rows
+
+
+def _open_loop_of(folder: Path) -> Mapping[str, Any] | None:
+    """The open-loop check of a finished run, if this is its last checkpoint."""
+    if len(folder.parents) < 2:
+        return None
+    path = folder.parents[1] / SUMMARY
+    if folder.parent.name != CHECKPOINTS or not path.is_file():
+        return None
+    summary = read_json(path, "the summary of a run")
+    found = summary.get("open_loop")
+    is_last = Path(str(summary.get("checkpoint", ""))).name == folder.name
+    if not is_last or not isinstance(found, Mapping) or "verdict" not in found:
+        return None
+    return found
+
+
+def show_details(policy: Policy, folder: Path, console: Console) -> None:
+    """Print a checkpoint's parts, whole configuration, training state and statistics."""
+    table = _table("parts", "part", "tensors", "parameters", "dtype")
     parts: dict[str, list[Any]] = {}
     for name, parameter in policy.named_parameters():
         parts.setdefault(policy.finetune_spec.component_of(name), []).append(parameter)
@@ -122,7 +385,7 @@ def show_checkpoint(folder: Path, console: Console, trust_plugins: bool = False)
         space = policy.embodiment.action
         action = "action delta" if space.relative or space.of_pose else "action"
         for title, of, names in (
-            ("state", stats.state, numbered(len(stats.state))),
+            ("state", stats.state, state_names(policy.embodiment)),
             (action, stats.actions, space.names),
         ):
             # Extremes are kept where a policy normalises by them.
@@ -134,6 +397,14 @@ def show_checkpoint(folder: Path, console: Console, trust_plugins: bool = False)
             for i, name in enumerate(names):
                 numbers.add_row(name, *(f"{values[i]:.3f}" for values in bounds.values()))
             _show(numbers, console)
+
+
+def state_names(robot: Embodiment) -> tuple[str, ...]:
+    """Names of the state's numbers: the action's where an action is relative to them."""
+    names = list(numbered(robot.state.width))
+    for place in robot.action.relative:
+        names[place] = robot.action.names[place]
+    return tuple(names)
 
 
 MOST_EPISODES = 40  # in the table of a dataset

@@ -24,7 +24,7 @@ from mme_vla.envs.robomme.recording.outputs import EpisodeWriter, Job, Recording
 from mme_vla.envs.robomme.recording.own import DRAFT, episode_file, record_own
 from mme_vla.envs.robomme.recording.processes import carry_out, simulation_pool
 from mme_vla.envs.rows import task_options
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, counted, require
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
 from mme_vla.utils.processes import signals_deferred
 
@@ -243,7 +243,7 @@ def main(cfg: DictConfig) -> None:
     places = ", ".join(map(str, recording_plan.places))
     work = _work_folder(run.output)
     if not recording_plan.missing(options) and not work.exists():
-        print(f"{places}: {len(jobs)} episodes, all there already.")
+        print(f"{places}: {counted(len(jobs), 'episode')}, all there already.")
         if run.coverage is not None:
             require_simulator()
             report_coverage(run.tasks, recording_plan, Path(run.coverage), run.workers)
@@ -269,13 +269,13 @@ def main(cfg: DictConfig) -> None:
                     n_new += 1
                     n_new_steps += recorded["stored"]
             print(
-                f"{places}: {len(done)} episodes, {n_steps} steps; {n_failed} seeds failed and were"
-                " replaced by the next."
+                f"{places}: {counted(len(done), 'episode')}, {counted(n_steps, 'step')};"
+                f" {counted(n_failed, 'seed')} failed, replaced by the next."
             )
             if n_new:
                 print(_throughput(n_new, n_new_steps, seconds, run.workers))
         else:
-            print(f"{places}: {len(jobs)} episodes, all there already.")
+            print(f"{places}: {counted(len(jobs), 'episode')}, all there already.")
         recording_plan.tidy()
         drafts = []
         for job in jobs:
@@ -302,18 +302,18 @@ def record_environment(run: RecordRun) -> None:
         frames, failures = record_own(source, specs, output, work, run.fps)
         drop_plan(work, DRAFT, *(glob.escape(episode_file(spec)) for spec in specs))
     print(
-        f"{run.output}: {len(specs) - len(failures)} episodes, {frames} steps; {len(failures)} did"
-        " not succeed."
+        f"{run.output}: {counted(len(specs) - len(failures), 'episode')},"
+        f" {counted(frames, 'step')}; {len(failures)} did not succeed."
     )
 
 
 def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
     """A line on the speed; of a resumed recording, on what was added."""
     hours = max(seconds, 1e-9) / 3600
-    named = "1 worker" if workers == 1 else f"{workers} workers"
+    named = counted(workers, "worker")
     return (
-        f"{episodes} episodes in {seconds:.0f} s with {named}: {episodes / hours:,.0f} episodes and"
-        f" {steps / hours:,.0f} steps an hour."
+        f"{counted(episodes, 'episode')} in {seconds:.0f} s with {named}:"
+        f" {episodes / hours:,.0f} episodes and {steps / hours:,.0f} steps an hour."
     )
 
 

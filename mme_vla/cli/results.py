@@ -8,10 +8,12 @@ are merged.
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
+from mme_vla.envs.episodes import ALL, GRAMMAR, check_episodes, choose_numbers, read_episodes
 from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
 from mme_vla.errors import UserError, printable, require
 from mme_vla.evaluation.records import EpisodeRecord
@@ -31,8 +33,14 @@ from mme_vla.evaluation.results.curves import (
 )
 from mme_vla.evaluation.results.events import event_curves, event_table, matched_methods
 from mme_vla.evaluation.results.paper import demo_records
-from mme_vla.evaluation.results.report import read_runs, training_details
-from mme_vla.evaluation.results.scopes import TASK_FACTS, TEST_EPISODES, Protocol, tasks_of
+from mme_vla.evaluation.results.report import conclude, read_runs, training_details
+from mme_vla.evaluation.results.scopes import (
+    PAPER_ORDER,
+    TASK_FACTS,
+    TEST_EPISODES,
+    Protocol,
+    tasks_of,
+)
 from mme_vla.evaluation.results.tables import (
     Table,
     comparison_table,
@@ -124,15 +132,13 @@ def run(args: argparse.Namespace) -> None:
             "Name files or folders of episode records, or --demo for synthetic ones (not both)."
         )
     _check_outputs(args)
+    if args.episodes is not None:
+        check_episodes(read_episodes(args.episodes), "--episodes")
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
-    protocol = Protocol(
-        tuple(args.tasks or tasks_of(records)),
-        args.episodes or _episodes(records, args.split),
-        args.errors,
-        args.confidence,
-        args.samples,
-        args.seed,
-    )
+    protocol = _protocol(records, args)
+    if args.title is None:
+        is_benchmark = any(task in TASK_FACTS for task in protocol.tasks)
+        args.title = "RoboMME results" if is_benchmark else "Results"
     _check_views(args)
     if args.stress:
         curves = stress_curves(records, args.confidence, args.conflicts)
@@ -156,16 +162,53 @@ def run(args: argparse.Namespace) -> None:
         )
     comparisons = compare_all(_pairs(results, args.compare), protocol)
     results.notes += [note for comparison in comparisons for note in comparison.notes]
-    # Piped into a file there is no terminal to fit: as wide as the tables are.
-    console = Console(width=None if sys.stdout.isatty() else 200)
+    console = Console()
     for table in _tables(results, comparisons, detailed=not args.brief):
         print_table(table, console.width)
-    for comparison in comparisons:
-        console.print(printable(comparison.verdict), markup=False, highlight=False)
+    for sentence in conclude(results, comparisons):
+        console.print(printable(sentence), markup=False, highlight=False, soft_wrap=True)
     for note in results.notes:
         console.print(printable(f"• {note}"), markup=False, highlight=False, soft_wrap=True)
     for path in write(results, comparisons, args):
         console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _protocol(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> Protocol:
+    """What counts: by default what has records; with `--all`, or by name, what a run is to have."""
+    of_split = [record for record in records if args.split in (None, record.split)]
+    full = _episodes(records, args.split)
+    how = {
+        "errors": args.errors,
+        "confidence": args.confidence,
+        "samples": args.samples,
+        "seed": args.seed,
+    }
+    recorded = Protocol.of_records(of_split or records, full, **how)
+    tasks = recorded.tasks
+    if args.tasks is not None:
+        tasks = _tasks(args.tasks)
+    elif args.all:
+        tasks = tasks_of(records)
+    if args.episodes is not None:
+        last = max(record.episode for record in records)
+        named = choose_numbers(read_episodes(args.episodes), max(full, last + 1), "the split")
+        numbers = dict.fromkeys(tasks, tuple(named))
+    elif args.all:
+        numbers = {}
+    else:
+        # A task that is named and has no records is to have all episodes.
+        numbers = {task: recorded.numbers[task] for task in tasks if task in recorded.numbers}
+    return replace(recorded, tasks=tasks, numbers=numbers)
+
+
+def _tasks(words: Sequence[str]) -> tuple[str, ...]:
+    """The names of `--tasks`, as `tasks=` takes them."""
+    names: list[str] = []
+    for word in words:
+        names += [name.strip() for name in word.strip("[]").split(",") if name.strip()]
+    if names == [ALL]:
+        return PAPER_ORDER
+    return tuple(names)
 
 
 def _check_views(args: argparse.Namespace) -> None:
@@ -235,6 +278,8 @@ def show_tables(
     """Print tables that have rows, and all notes, and write them, with figures, where a file is
     named.
     """
+    from rich.console import Console
+
     from mme_vla.evaluation.results.report import Section, html_page
 
     texts: dict[Path, str] = {}
@@ -244,7 +289,7 @@ def show_tables(
     for table in tables:
         notes += table.notes
         if table.rows:
-            print_table(table, 200)
+            print_table(table, Console().width)
             blocks.append(to_markdown(table))
             sections.append(Section(table.title, tables=[table]))
     for note in notes:
@@ -303,7 +348,11 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
 def _tables(results: Results, comparisons: list[Comparison], detailed: bool = True) -> list[Table]:
     tables = [overview(results)]
     if detailed:
-        details = [detail(method, results) for method in results.methods]
+        details = []
+        for method in results.methods:
+            table = detail(method, results)
+            if len(table.rows) > 1:  # one row is in the overview
+                details.append(table)
         tables = [
             *details,
             *process_tables(results),
@@ -377,7 +426,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--latex", type=Path, help="tables for a paper (booktabs)")
     parser.add_argument("--markdown", type=Path, help="tables in the leaderboard's format")
     parser.add_argument("--html", type=Path, help="one self-contained page with plots")
-    parser.add_argument("--title", default="RoboMME results", help="of the page")
+    parser.add_argument(
+        "--title", help="of the page (default: RoboMME results, of other tasks Results)"
+    )
     parser.add_argument(
         "--stress", action="store_true", help="success over the dials of split=stress:… instead"
     )
@@ -391,11 +442,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--brief", action="store_true", help="print the overview only")
     parser.add_argument(
-        "--tasks", nargs="+", metavar="TASK", help="of a whole run (default: all 16, and your own)"
+        "--all",
+        action="store_true",
+        help="the whole benchmark, with what is missing (default: what has records)",
     )
     parser.add_argument(
-        "--episodes", type=int, help="episodes of a task (default: as the split has)"
+        "--tasks",
+        nargs="+",
+        metavar="TASK",
+        help="these alone, such as StopCube,BinFill, or all 16 (default: those with records)",
     )
+    parser.add_argument("--episodes", help=f"of each task: {GRAMMAR} (default: those with records)")
     parser.add_argument("--split", help="test, val or train, where there are records of several")
     parser.add_argument(
         "--errors",

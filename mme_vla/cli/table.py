@@ -25,7 +25,7 @@ COMMANDS = {
     ),
     "inspect": Command(
         "mme_vla.cli.inspect",
-        "what is in a checkpoint, a dataset or an episode, and what a memory remembers of it",
+        "what a checkpoint or a dataset holds, and predicted against recorded actions",
         config="inspect",
         usage="python -m mme_vla.inspect",
         processes="any",

@@ -161,13 +161,21 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
         else:
             columns[name] = column
     plural = "" if len(missing) == 1 else "s"
+    remedy = (
+        f" `mme-vla inspect dataset={root}` drafts that file, and docs/extend/your-robot.md"
+        " explains it."
+    )
+    if robot.action.space is not None and all(name in columns for name in robot.camera_names):
+        remedy = (
+            " (RoboMME's poses and waypoints are columns of datasets that this library converts or"
+            " records.)"
+        )
     require(
         not missing,
         f"{root} lacks the feature{plural} {', '.join(missing)}; it has"
         f" {listed(features)}. These are the names of the robot {robot.name!r}: choose"
         " embodiment=<the robot this dataset is of>, or name its columns in a configs/embodiment"
-        " file of your own. (RoboMME's poses and waypoints are columns of datasets that this"
-        " library converts or records.)",
+        f" file of your own.{remedy}",
     )
 
     cameras = {name: columns[name] for name in robot.camera_names}

@@ -4,12 +4,14 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mme_vla.data.consistency import compare_names
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, did_you_mean, require
 
@@ -55,22 +57,8 @@ def split_episodes(
     require(0 <= val_fraction < 1, f"val_fraction={val_fraction} must lie in [0, 1).")
     split = Split([], [])
     for source in sources:
+        held_out = held_out_in(source, named.get(source.name), val_fraction)
         episodes = np.arange(len(source))
-        if source.name in named:
-            wrong = [number for number in named[source.name] if not 0 <= number < len(source)]
-            require(
-                not wrong,
-                f"val_episodes names {wrong} of {source.name}, which has episodes"
-                f" 0…{len(source) - 1}. Name others, or hold out a share: data.val_episodes=[]"
-                " data.val_fraction=0.1",
-            )
-            held_out = np.isin(episodes, named[source.name])
-        else:
-            held_out = np.zeros(len(source), bool)
-            for episode in range(len(source)):
-                digest = sha256(f"{source.name}/{episode}".encode()).digest()
-                share = int.from_bytes(digest[:8], "big") / 2**64
-                held_out[episode] = share < val_fraction
         split.train.append(episodes[~held_out])
         split.val.append(episodes[held_out])
     if not sum(map(len, split.train)):
@@ -80,7 +68,57 @@ def split_episodes(
     return split
 
 
+def held_out_in(
+    source: EpisodeSource, named: Sequence[int] | None, val_fraction: float
+) -> np.ndarray:
+    """Which episodes of one dataset are held out, bool [e]; see `split_episodes`.
+
+    Args:
+        named: the episodes that are held out; None where none of this dataset is named.
+    """
+    episodes = np.arange(len(source))
+    if named is not None:
+        wrong = [number for number in named if not 0 <= number < len(source)]
+        require(
+            not wrong,
+            f"val_episodes names {wrong} of {source.name}, which has episodes"
+            f" 0…{len(source) - 1}. Name others, or hold out a share: data.val_episodes=[]"
+            " data.val_fraction=0.1",
+        )
+        return np.isin(episodes, named)
+    held_out = np.zeros(len(source), bool)
+    for episode in range(len(source)):
+        digest = sha256(f"{source.name}/{episode}".encode()).digest()
+        share = int.from_bytes(digest[:8], "big") / 2**64
+        held_out[episode] = share < val_fraction
+    return held_out
+
+
+def default_val_episodes(sources: Sequence[EpisodeSource]) -> list[str]:
+    """The episodes that are held out where none is named: number 3 of the embedded sample."""
+    return [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
+
+
 _KEYS = ("root", "name", "exec_starts")
+
+
+def listed_sources(
+    entries: str | Mapping[str, Any] | Sequence[str | Mapping[str, Any]],
+) -> list[str | Mapping[str, Any]]:
+    """`data.sources` as a list; one entry may stand without a list around it."""
+    listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
+    require(listed, "data.sources is empty: name at least one dataset folder, or 'sample'.")
+    return listed
+
+
+def source_name(entry: str | Mapping[str, Any]) -> str:
+    """The short name of the dataset of an entry of `data.sources`, as `EpisodeSource` gives it."""
+    root, name = str(entry), None
+    if isinstance(entry, Mapping):
+        root, name = str(entry.get("root")), entry.get("name")
+    if name:
+        return str(name)
+    return root if root == "sample" else Path(root).resolve().name
 
 
 def open_sources(
@@ -92,10 +130,8 @@ def open_sources(
 
     `robot` says which columns hold its images, states and actions.
     """
-    listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
-    require(listed, "data.sources is empty: name at least one dataset folder, or 'sample'.")
     sources = []
-    for entry in listed:
+    for entry in listed_sources(entries):
         options = {"root": entry} if isinstance(entry, str) else dict(entry)
         for key in options:
             require(

@@ -35,6 +35,16 @@ def choose_tasks(tasks: str | Sequence[str], env: str = "mme_vla") -> list[str]:
     return names
 
 
+def check_episodes(episodes: Any, key: str = "episodes") -> None:
+    """Refuse what `choose_numbers` does not understand, before it is known how many there are.
+
+    key: for the message.
+    """
+    if episodes is None or episodes == ALL or type(episodes) is int:
+        return
+    spans(episodes, key, GRAMMAR)
+
+
 def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[int]:
     """Numbers of episodes.
 
@@ -61,6 +71,18 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
     once = numbers and len(set(numbers)) == len(numbers)
     require(once, f"episodes={episodes} must name each episode once, and at least one.")
     return numbers
+
+
+def read_episodes(text: str) -> Any:
+    """The value of `--episodes`, as `episodes=` of a configuration has it: a number is the first so
+    many, brackets are a list, anything else stays text.
+    """
+    text = text.strip()
+    if text.isdecimal():
+        return int(text)
+    if text.startswith("[") and text.endswith("]"):
+        return [part.strip() for part in text[1:-1].split(",")]
+    return text
 
 
 def choose_episodes(

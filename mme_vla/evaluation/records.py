@@ -9,12 +9,28 @@ from mme_vla.config.sections import Range, read_section
 from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, check_choice, require
+from mme_vla.policy.run_folders import shipped_checkpoints
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import parse_json, to_line, verified
 
 Integer = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
 Number = Annotated[float, Range(-(2.0**63), 2.0**63)]
 OUTCOMES = ("success", "fail", "timeout", "error")
+
+
+def display_name(model: str, checkpoint: int | str) -> str:
+    """What people call a policy: a shipped one by its checkpoint (`nano`), others by their model.
+
+    model: as records have it; what follows ` · `, the arm of a probe, stays.
+    """
+    if str(checkpoint) not in shipped_checkpoints():
+        return model
+    _, dot, arm = model.partition(ARM)
+    return f"{checkpoint}{dot}{arm}"
+
+
+ARM = " · "
+"""Between a model and what was done to it, in records and labels."""
 
 
 class RunKey(NamedTuple):
@@ -32,18 +48,37 @@ class RunKey(NamedTuple):
     training: TrainingIdentity | None = None
     event: str | None = None
 
-    def __str__(self) -> str:
-        text = self.model
+    @property
+    def label(self) -> str:
+        """What headings and tables call the policy: a shipped one by the name of its checkpoint."""
+        text = display_name(self.model, self.checkpoint)
         if self.subgoal is not None:
             text += f"+{self.subgoal}"
-        if self.memory_budget is not None:
+        if self.memory_budget is not None and not self.is_shipped:
+            text += f"@{self.memory_budget}"
+        if self.event is not None:
+            text += f" · {self.event}"
+        return text
+
+    @property
+    def is_shipped(self) -> bool:
+        """Whether the checkpoint is one that comes with the library or an installed package."""
+        return str(self.checkpoint) in shipped_checkpoints()
+
+    def __str__(self) -> str:
+        text = display_name(self.model, self.checkpoint)
+        if self.subgoal is not None:
+            text += f"+{self.subgoal}"
+        if self.memory_budget is not None and not self.is_shipped:
             text += f", {self.memory_budget} memory tokens"
         if self.training is not None:
             recipe = f"recipe {str(self.training.recipe)[:6]}"
             if self.training.seed is not None:
                 recipe = f"training seed {self.training.seed} of {recipe}"
             text += f", {recipe}"
-        text += f", checkpoint {self.checkpoint}, seed {self.model_seed}, {self.split}"
+        if not self.is_shipped:
+            text += f", checkpoint {self.checkpoint}"
+        text += f", seed {self.model_seed}, {self.split}"
         if self.event:
             text += f", event {self.event}"
         return text

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.errors import counted
+
 
 def check_task(task: str, seed: int = 1, difficulty: str | None = None, **options: Any) -> None:
     """Run every check on the task that is registered under `task`, and print a line for each that
@@ -25,7 +27,8 @@ def check_task(task: str, seed: int = 1, difficulty: str | None = None, **option
     assert first["success"], (
         f"the task's own sub-tasks, demonstrated with seed {seed}, do not end in success."
     )
-    print(f"{task}: {first['subtasks']} sub-tasks, demonstrated with seed {seed}, end in success")
+    n_subtasks = counted(first["subtasks"], "sub-task")
+    print(f"{task}: {n_subtasks}, demonstrated with seed {seed}: success")
     assert np.array_equal(first["qpos"], second["qpos"]), (
         "two demonstrations of one seed differ: a draw is not seeded."
     )

@@ -13,8 +13,7 @@ from mme_vla.data.cache import COMMAND
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.dataset import GroupDataset, TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.lerobot_files import SAMPLE
-from mme_vla.data.sources import Split, open_sources, split_episodes
+from mme_vla.data.sources import Split, default_val_episodes, open_sources, split_episodes
 from mme_vla.data.statistics import check_ranges, compute_norm_stats
 from mme_vla.errors import UserError, require
 from mme_vla.memory.perturbation import build_transforms
@@ -69,8 +68,8 @@ def prepare_data(
     check_changes(policy, data)
     sources = open_sources(data.sources, policy.embodiment)
     val_episodes: Sequence[int | str] | None = data.val_episodes
-    if val_episodes is None:  # of the sample, episode 3; of any other dataset, none
-        val_episodes = [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
+    if val_episodes is None:
+        val_episodes = default_val_episodes(sources)
     split = split_episodes(sources, data.val_fraction, val_episodes)
 
     processor = policy.require_processor()

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from mme_vla.data.dataset import TrainingDataset
+from mme_vla.data.recording import Recording
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
@@ -362,9 +363,7 @@ def finish(
         loggers.log_image(settings.steps, "open_loop", folder / PLOT)
         summary["open_loop"] = result.summary()
         line.say("\n".join([f"open loop on {result.title}", *error_lines(summary["open_loop"])]))
-        verdict = worse_than_still(summary["open_loop"], settings.steps)
-        if verdict:
-            line.say(verdict)
+        line.say(advice(summary["open_loop"], settings.steps))
         line.say(f"plot: {folder / PLOT}")
     summary |= {"checkpoint": str(trainer.last_checkpoint), "seconds": round(seconds, 1)}
     with write_atomically(folder / SUMMARY) as draft:  # a run that has one is finished
@@ -392,39 +391,41 @@ def _check_open_loop(trainer: Trainer, data: SplitData, line: ProgressLine) -> O
     if not (is_first or trainer.sharded):
         return None
     settings = trainer.settings
+    source, episode, _ = samples.locate(0)
+    recording = Recording(samples.sources[source], episode, samples.action_offset)
+    kind = "training" if data.val is None else "held-out"
     with trainer.ema.applied(), gathered(trainer.policy):
         if not is_first:
             return None
         trainer.policy.eval()
-        return open_loop(
-            trainer.policy,
-            samples,
-            settings.open_loop_chunks,
-            settings.seed,
-            data.val is not None,
-        )
+        try:
+            return open_loop(
+                trainer.policy,
+                recording,
+                f"{kind} {recording.described}",
+                settings.open_loop_chunks,
+                settings.seed,
+            )
+        except UserError as error:
+            # The run is finished: data that cannot be shown to the policy do not undo it.
+            line.say(f"no open-loop check: {error}")
+            return None
 
 
-def worse_than_still(summary: Mapping[str, Any], steps: int) -> str:
-    """A sentence on the numbers that holding still would predict better; empty where there are
-    none.
+def advice(summary: Mapping[str, Any], steps: int) -> str:
+    """The verdict of an open-loop check, and what to do about a bad one.
 
     Args:
-        summary: of the open-loop check; without `mean_abs_error_holding_still` where the state is
-            no action.
+        summary: of `OpenLoop.summary`.
         steps: updates of the run.
     """
-    if "mean_abs_error_holding_still" not in summary:
-        return ""
-    pairs = zip(summary["mean_abs_error"], summary["mean_abs_error_holding_still"], strict=True)
-    worse = sum(error > still for error, still in pairs)
-    if not worse:
-        return ""
+    verdict: str = summary["verdict"]
+    best = summary["baselines_normalised"][summary["best_baseline"]]
+    if sum(summary["mean_abs_error_normalised"]) < sum(best):
+        return verdict
     return (
-        f"{worse} of {len(summary['names'])} numbers of the action are predicted worse than by"
-        f" holding still (the robot moves little within a chunk): {steps:,} updates on this data"
-        " are too few for a policy. They show that everything runs; raise train.steps, or train on"
-        " more data, before evaluating."
+        f"{verdict} {steps:,} updates on this data are too few for a policy. They show that"
+        " everything runs; raise train.steps, or train on more data, before evaluating."
     )
 
 

@@ -1,8 +1,8 @@
-"""The open-loop check: predicted against recorded chunks along held-out episodes, as numbers and as
-an image.
+"""The open-loop check: predicted against recorded chunks along an episode, beside baselines that
+know nothing of it, as numbers, as an image and in one sentence.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,24 +10,32 @@ from typing import Any
 import numpy as np
 import torch
 
-from mme_vla.data.dataset import TrainingDataset
-from mme_vla.embodiment import ActionSpace
+from mme_vla.data.recording import Recording
+from mme_vla.errors import require
 from mme_vla.policy.base import Policy
-from mme_vla.training.order import generator_for
-from mme_vla.types import stack_noise
+from mme_vla.processing.prompt import subgoal_kind
+from mme_vla.training.order import seed_of
+
+STILL = "holding still"
+LAST = "last action"
+MEAN = "mean action"
+_SPOKEN = {STILL: STILL, LAST: f"the {LAST}", MEAN: f"the {MEAN}"}
+"""In a sentence."""
+ALL = "all"
+"""The row of a table that holds means over the numbers."""
 
 
 @dataclass(frozen=True)
 class OpenLoop:
     """Chunks of n steps along one episode.
 
-    steps: [n] frames they start at. predicted, recorded: [n, h, w] absolute actions of the robot's
-    `space`. valid: [n, h] False on actions beyond the episode's end. scale: [w] half the (q01, q99)
-    range of each
-        dimension; 1 where it never changes.
-    still: [n, w] the state held, which a policy that does not move would answer; None where an
-    action is not a state
-        to come.
+    title: which episode of which data. steps: [n] frames they start at.
+    predicted, recorded: [n, h, w] absolute actions of the robot.
+    valid: [n, h] False on actions beyond the episode's end.
+    scale: [w] half the (q01, q99) range of each number in the training data; 1 where it never
+        changes.
+    baselines: name → [n, w], the action repeated over a chunk.
+    names, units: [w] texts. execute: actions of a chunk that are executed before the next one.
     """
 
     title: str
@@ -36,120 +44,250 @@ class OpenLoop:
     recorded: np.ndarray
     valid: np.ndarray
     scale: np.ndarray
-    still: np.ndarray | None
-    space: ActionSpace
+    baselines: Mapping[str, np.ndarray]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    execute: int
 
-    def error(self, predicted: np.ndarray) -> np.ndarray:
-        """Mean absolute error [w] of chunks [n, h, w] in the units of the actions."""
-        difference = np.abs(predicted - self.recorded)
-        return (difference * self.valid[..., None]).sum((0, 1)) / self.valid.sum()
+    def error(self, predicted: np.ndarray, first: int | None = None) -> np.ndarray:
+        """Mean absolute error [w] of chunks [n, h, w] in the units of the actions.
+
+        Args:
+            first: actions of each chunk that count; None for all.
+        """
+        difference = np.abs(predicted - self.recorded)[:, :first]
+        valid = self.valid[:, :first]
+        return (difference * valid[..., None]).sum((0, 1)) / valid.sum()
+
+    def baseline_error(self, name: str) -> np.ndarray:
+        """Mean absolute error [w] of a baseline in the units of the actions."""
+        return self.error(np.broadcast_to(self.baselines[name][:, None], self.recorded.shape))
+
+    @property
+    def best_baseline(self) -> str:
+        """The baseline of the least normalised error over all numbers."""
+        means = {name: (self.baseline_error(name) / self.scale).mean() for name in self.baselines}
+        return min(means, key=lambda name: means[name])
 
     def summary(self) -> dict[str, Any]:
-        """The errors, plain: physical and normalised (1 = half the range of the training data's
-        deltas).
-        """
+        """The errors, plain: physical and normalised (1 = half the range of the training data)."""
         physical = self.error(self.predicted)
+        executed = self.error(self.predicted, self.execute)
+        baselines = {}
+        for name in self.baselines:
+            baselines[name] = (self.baseline_error(name) / self.scale).round(5).tolist()
         summary: dict[str, Any] = {
-            "names": list(self.space.names),
+            "episode": self.title,
+            "names": list(self.names),
             "mean_abs_error": physical.round(5).tolist(),
             "mean_abs_error_normalised": (physical / self.scale).round(5).tolist(),
+            "executed_error_normalised": (executed / self.scale).round(5).tolist(),
+            "baselines_normalised": baselines,
+            "best_baseline": self.best_baseline,
             "chunks": len(self.steps),
+            "execute": self.execute,
+            "verdict": self.verdict(),
         }
-        if self.still is not None:
-            still_error = self.error(np.broadcast_to(self.still[:, None], self.recorded.shape))
-            summary["mean_abs_error_holding_still"] = still_error.round(5).tolist()
+        if STILL in self.baselines:
+            still = self.baseline_error(STILL)
+            summary["mean_abs_error_holding_still"] = still.round(5).tolist()
         return summary
+
+    def verdict(self) -> str:
+        """What the numbers say, in one sentence: the policy against the best baseline."""
+        name = self.best_baseline
+        own = self.error(self.predicted) / self.scale
+        best = self.baseline_error(name) / self.scale
+        worse = [self.names[d] for d in np.flatnonzero(own > best)]
+        means = (
+            f"mean normalised error {own.mean():.3f}, against {best.mean():.3f} of {_SPOKEN[name]}"
+        )
+        if own.mean() >= best.mean():
+            return (
+                f"No better than the best baseline: {means}. {len(worse)} of {len(own)} numbers are"
+                " predicted worse."
+            )
+        if worse:
+            return (
+                f"Better than every baseline on average: {means}. {len(worse)} of {len(own)}"
+                f" numbers are predicted worse: {', '.join(worse)}."
+            )
+        return f"Better than every baseline in all {len(own)} numbers: {means}."
+
+
+def decisions_of(recording: Recording, execute: int, most: int | None) -> list[int]:
+    """The frames at which the policy acts in an open-loop check: every `execute`-th step, as in a
+    real episode, spread evenly where they are more than `most`.
+
+    Raises:
+        UserError: the episode has none.
+    """
+    steps = recording.decisions(execute, most)
+    require(
+        steps,
+        f"Episode {recording.episode} of {recording.source.name} has no step at which this robot"
+        " decides: choose another episode.",
+    )
+    return steps
 
 
 @torch.compiler.set_stance("force_eager")  # a few chunks are not worth compiling for
 def open_loop(
-    policy: Policy, samples: TrainingDataset, chunks: int, seed: int, held_out: bool = True
+    policy: Policy,
+    recording: Recording,
+    title: str,
+    most: int | None = None,
+    seed: int = 0,
+    advance: Callable[[int], object] | None = None,
 ) -> OpenLoop:
-    """Predict chunks that tile the first of the samples' episodes, at most `chunks` of them.
+    """Show a recorded episode to a policy as if it were running, and predict a chunk at each step
+    at which the robot would ask for one.
+
+    The policy sees what it sees when it acts: every frame once, in order, with states and recorded
+    actions. Its memory is filled by the frames, never by its own actions.
 
     Args:
-        policy: its averaged weights and mode are the caller's business.
-        samples: the held-out steps; or the training steps, where there are none (`held_out` False
-            says so).
+        policy: with statistics. Its averaged weights are the caller's business.
+        recording: whose dataset was opened for the policy's robot.
+        title: of the episode, for the reader.
+        most: chunks at most; None for one every `execute` steps, as in a real episode. With fewer a
+            memory that is written when chunks are chosen (MemoryVLA) is written less often.
+        seed: of the noise.
+        advance: called with 1 after each chunk.
+
+    Raises:
+        UserError: no step to decide at, subgoals that the policy reads and the data lack, or
+            states far beyond the training data's.
     """
-    processor = policy.require_processor()
-    horizon = policy.horizon
-    source, episode, _ = samples.locate(0)
-    count = len(samples.decisions(source, episode))
-    tiles = np.arange(0, count, horizon)
-    places = np.linspace(0, len(tiles) - 1, min(chunks, len(tiles))).round().astype(int)
-    starts = tiles[places].tolist()
-    recorded = [samples.step(start) for start in starts]
-    all_states = np.stack([step.state for step in recorded])
-    predicted = []
-    generator = generator_for(seed, "open loop")
-    for first in range(0, len(starts), 8):
-        group = starts[first : first + 8]
-        batch = processor.collate([samples.observation(start) for start in group])
-        draws = stack_noise([policy.sampling_noise(generator) for _ in group], policy.device)
-        chunk = policy.sample_actions(batch.to(policy.device), draws).float().cpu()
-        states = torch.from_numpy(all_states[first : first + 8])
-        predicted.append(processor.absolute_actions(chunk, states))
-    stats = processor.stats
-    assert stats is not None
+    space = recording.source.robot.action
+    subgoal = subgoal_kind(policy)
+    require(
+        subgoal is None or subgoal in recording.source.subgoal_names,
+        f"This policy reads {subgoal}, and {recording.source.name} has no such column: record its"
+        " subgoals, or choose a policy without them.",
+    )
+    steps = decisions_of(recording, space.execute, most)
+    required = policy.frames_read(np.array(steps), recording.exec_start)
+    source, number = recording.source, recording.episode
+    episode = policy.start_episode(source.goal(number, steps[0]), seed_of(seed, "open loop"))
+    predicted: list[np.ndarray] = []
+    recorded: list[np.ndarray] = []
+    valid: list[np.ndarray] = []
+    baselines: dict[str, list[np.ndarray]] = {}
+    n_observed = 0
+    for step in steps:
+        recording.show(episode, n_observed, step + 1, required)
+        n_observed = step + 1
+        # An episode may have several tasks, one after the other.
+        episode.goal = source.goal(number, step)
+        if subgoal is not None:
+            episode.subgoal = recording.subgoal(step, subgoal)
+        with torch.no_grad():
+            chunk = policy.act(episode)
+        actions, is_known = source.action_chunk(number, step, len(chunk), recording.action_offset)
+        predicted.append(chunk)
+        recorded.append(actions)
+        valid.append(is_known)
+        for name, action in _baselines(policy, recording, step).items():
+            baselines.setdefault(name, []).append(action)
+        if advance is not None:
+            advance(1)
+
+    stats = policy.require_processor().require_stats()
     half_range = (stats.actions.q99 - stats.actions.q01) / 2
-    robot = processor.embodiment
-    state_is_command = bool(robot.action.relative) and robot.action.width == robot.state.width
-    kind = "held-out" if held_out else "training"
-    data = samples.sources[source]
     return OpenLoop(
-        title=f"{kind} episode {episode} of {data.name}: “{' → '.join(data.goals(episode))}”",
-        steps=np.array([step.index for step in recorded]),
-        predicted=torch.cat(predicted).numpy(),
-        recorded=np.stack([step.actions for step in recorded]),
-        valid=np.stack([step.recorded for step in recorded]),
+        title=title,
+        steps=np.array(steps),
+        predicted=np.stack(predicted),
+        recorded=np.stack(recorded),
+        valid=np.stack(valid),
         scale=np.where(half_range > 0, half_range, 1),
-        still=all_states if state_is_command else None,
-        space=data.robot.action,
+        baselines={name: np.stack(rows) for name, rows in baselines.items()},
+        names=space.names,
+        units=space.units,
+        execute=min(space.execute, len(predicted[0])),
     )
 
 
+def _baselines(policy: Policy, recording: Recording, step: int) -> dict[str, np.ndarray]:
+    """What policies that know nothing would answer at a step, [w] each.
+
+    Holding still exists where numbers are relative to the state, or differences to the tool's pose.
+    Numbers that are neither (a gripper) keep their last action. Before the first action of an
+    episode the last one is what holding still is, else the mean.
+    """
+    source, number = recording.source, recording.episode
+    space = source.robot.action
+    state = source.states(number, step, step + 1)[0]
+    stats = policy.require_processor().require_stats()
+    mean = torch.from_numpy(np.asarray(stats.actions.mean, np.float32))[None]
+    expected = space.to_absolute(mean, torch.from_numpy(state))[0].numpy()
+
+    before = source.past_actions(number, step, 1, recording.action_offset)
+    last = expected.copy()
+    if len(before):
+        last = before[-1].copy()
+    still = last.copy()
+    if space.relative:
+        places = list(space.relative)
+        still[places] = state[places]
+    if space.of_pose:
+        still[list(space.of_pose)] = 0
+    if not len(before):
+        last = still
+    if space.relative or space.of_pose:
+        return {STILL: still, LAST: last, MEAN: expected}
+    return {LAST: last, MEAN: expected}
+
+
 def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
-    """Draw the recorded actions as a line and each predicted chunk on top, one panel a number."""
+    """Draw the recorded actions as a line, and each predicted chunk and the best baseline on top,
+    one panel a number. What of a chunk is not executed is pale.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows = -(-result.space.width // 2)
+    width = len(result.names)
+    rows = -(-width // 2)
     height = 2.4 * rows + 1.1
     figure = Figure(figsize=(13, height))
     FigureCanvasAgg(figure)
     # Margins in inches: laying them out by the texts' extents would draw everything twice.
     figure.subplots_adjust(0.06, 0.75 / height, 0.99, 1 - 0.7 / height, wspace=0.14, hspace=0.25)
     panels = figure.subplots(rows, 2, sharex=True, squeeze=False).flatten()
-    errors = result.error(result.predicted)
-    scaled = errors / result.scale
+    best = result.best_baseline
+    scaled = result.error(result.predicted) / result.scale
+    scaled_best = result.baseline_error(best) / result.scale
     time = result.steps[:, None] + np.arange(result.recorded.shape[1])
-    for joint, panel in enumerate(panels[: result.space.width]):
-        panel.plot(
-            *_unbroken(time, result.recorded[..., joint], result.valid),
-            color="0.25",
-            lw=2.2,
-            label="recorded",
-        )
+    labels: dict[str, Any] = {}
+    for d, panel in enumerate(panels[:width]):
+        line = _unbroken(time, result.recorded[..., d], result.valid)
+        (labels["recorded"],) = panel.plot(*line, color="0.25", lw=2.2)
         for i, valid in enumerate(result.valid):
-            chunk = result.predicted[i, valid, joint]
-            panel.plot(
-                time[i, valid],
-                chunk,
-                color="tab:orange",
-                lw=1.5,
-                label="predicted chunk" if i == 0 else None,
+            known = int(valid.sum())
+            executed = min(result.execute, known)
+            chunk = result.predicted[i, :known, d]
+            # The rest begins at the last executed action, so that the line is not broken.
+            rest = slice(max(executed - 1, 0), known)
+            panel.plot(time[i, rest], chunk[rest], color="tab:orange", lw=1.2, alpha=0.35)
+            (labels[f"predicted, {result.execute} actions executed"],) = panel.plot(
+                time[i, :executed], chunk[:executed], color="tab:orange", lw=1.6
             )
             panel.plot(time[i, :1], chunk[:1], "o", color="tab:orange", ms=4)
+            held = np.full(executed, result.baselines[best][i, d])
+            (labels[f"best baseline: {best}"],) = panel.plot(
+                time[i, :executed], held, color="tab:blue", lw=1.8, ls=":", zorder=4
+            )
         panel.set_title(
-            f"{result.space.names[joint]}: mean error {errors[joint]:.3f} ({scaled[joint]:.2f}"
-            " normalised)",
+            f"{result.names[d]}: normalised error {scaled[d]:.2f}, {best} {scaled_best[d]:.2f}",
             fontsize=10,
             loc="left",
         )
-        panel.set_ylabel(result.space.units[joint], fontsize=9)
+        panel.set_ylabel(result.units[d], fontsize=9)
         panel.grid(alpha=0.25)
         panel.margins(x=0.01)
+    for panel in panels[width:]:
+        panel.set_axis_off()
     for panel in panels[-2:]:
         panel.set_xlabel("step of the episode; a dot marks where a chunk was predicted", fontsize=9)
     figure.suptitle(
@@ -160,30 +298,63 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
         va="top",
         fontsize=12,
     )
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="lower right", ncols=2, frameon=False)
+    figure.legend(
+        list(labels.values()), list(labels), loc="lower right", ncols=len(labels), frameon=False
+    )
     figure.savefig(path, dpi=110)
 
 
 def _unbroken(
     time: np.ndarray, values: np.ndarray, valid: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Chunks [n, h] as one line that is cut only where no chunk tells what was recorded."""
-    t, y = time[valid].astype(float), values[valid].astype(float)
+    """Chunks [n, h], which may overlap, as one line that is cut only where no chunk tells what was
+    recorded.
+    """
+    t, first = np.unique(time[valid], return_index=True)
+    y = values[valid].astype(float)[first]
     gaps = np.flatnonzero(np.diff(t) > 1) + 1
-    return np.insert(t, gaps, np.nan), np.insert(y, gaps, np.nan)
+    return np.insert(t.astype(float), gaps, np.nan), np.insert(y, gaps, np.nan)
+
+
+NAME_WIDTH = 18
+"""Of the first column of the table; a longer name is cut."""
+_COLUMNS = {"normalised": 12, "executed": 10, STILL: 8, LAST: 8, MEAN: 8}
+"""Widths of the columns of normalised errors."""
+_TITLES = {STILL: "still", LAST: "last", MEAN: "mean"}
 
 
 def error_lines(summary: Mapping[str, Any]) -> Sequence[str]:
-    """The errors as a small table for the console."""
-    columns = {"error": "mean_abs_error", "normalised": "mean_abs_error_normalised"}
-    if "mean_abs_error_holding_still" in summary:
-        columns["holding still"] = "mean_abs_error_holding_still"
-    width = max(map(len, [*summary["names"], " " * 8]))
-    lines = ["  ".join([" " * width, *(f"{title:>13}" for title in columns)])]
-    for i, name in enumerate(summary["names"]):
-        lines.append(
-            "  ".join(
-                [f"{name:{width}}", *(f"{summary[key][i]:13.4f}" for key in columns.values())]
-            )
-        )
-    return lines
+    """The errors as a table of at most 80 columns for the console, one row a number.
+
+    Args:
+        summary: of `OpenLoop.summary`.
+    """
+    names = list(summary["names"])
+    columns: dict[str, list[float]] = {
+        "normalised": summary["mean_abs_error_normalised"],
+        "executed": summary["executed_error_normalised"],
+        **summary["baselines_normalised"],
+    }
+    width = min(max(map(len, [*names, ALL])), NAME_WIDTH)
+    header = " " * width + f"{'error':>11}"
+    means = f"{ALL:{width}}" + " " * 11
+    for title, values in columns.items():
+        header += f"{_TITLES.get(title, title):>{_COLUMNS[title]}}"
+        means += f"{np.mean(values):{_COLUMNS[title]}.3f}"
+    lines = [header]
+    for d, name in enumerate(names):
+        shown = name
+        if len(name) > width:
+            shown = f"{name[: width - 1]}…"
+        row = f"{shown:{width}}{summary['mean_abs_error'][d]:11.4f}"
+        for title, values in columns.items():
+            row += f"{values[d]:{_COLUMNS[title]}.3f}"
+        lines.append(row)
+    return [*lines, means]
+
+
+LEGEND = (
+    "error: in the action's unit, all others normalised (1 = half the range of the training data)."
+    " executed: of the actions that are executed. still, last, mean: baselines that repeat the"
+    " state, the last action, the mean action of the training data."
+)

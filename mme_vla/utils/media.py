@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 FPS = 30  # of videos; the simulator's steps simply play faster
 RED = (255, 0, 0)  # the border of a conditioning video's images
 BORDER = 10  # pixels
-CAPTION = 24  # pixels below a video's images
+CAPTION = 20  # pixels of a line of text below a video's images
 INK, FAINT = (40, 40, 40), (150, 150, 150)
 TILE, GAP, MARGIN, LABEL = 160, 12, 20, 20  # pixels of a contact sheet
 
@@ -121,32 +121,38 @@ def bordered(image: np.ndarray) -> np.ndarray:
 def video_frame(
     views: Sequence[np.ndarray], caption: str | None = None, video: bool = False
 ) -> np.ndarray:
-    """One frame [H + 24, W, 3] of a robot's views of one moment.
+    """One frame [H, W, 3] of a robot's views of one moment, in a margin of `BORDER` pixels.
 
     Args:
         views: side by side in this order; those of other heights stand on the upper edge.
-        caption: below them. video: they belong to a conditioning video, and get its border.
+        caption: lines of a band below them; None for no band. Every frame of a video needs as many.
+        video: they belong to a conditioning video: the margin is red, else black.
 
     Returns:
         Sides are even, as the format wants them.
     """
     height = max(len(view) for view in views)
     width = sum(view.shape[1] for view in views)
-    canvas = np.zeros((height + height % 2 + CAPTION, width + width % 2, 3), np.uint8)
-    left = 0
-    for view in views:
-        canvas[: len(view), left : left + view.shape[1]] = view
-        left += view.shape[1]
+    lines = [] if caption is None else caption.split("\n")
+    framed_height = height + height % 2 + 2 * BORDER
+    framed_width = width + width % 2 + 2 * BORDER
+    canvas = np.zeros((framed_height + CAPTION * len(lines), framed_width, 3), np.uint8)
     if video:
-        canvas[:height, :width] = bordered(canvas[:height, :width])
-    if not caption:
+        canvas[:framed_height] = RED
+        canvas[BORDER : BORDER + height, BORDER : BORDER + width] = 0
+    left = BORDER
+    for view in views:
+        canvas[BORDER : BORDER + len(view), left : left + view.shape[1]] = view
+        left += view.shape[1]
+    if not any(lines):
         return canvas
     from PIL import Image, ImageDraw
 
     image = Image.fromarray(canvas)
-    ImageDraw.Draw(image).text(
-        (6, height + 5), fitted(caption, width - 12, 13), (255, 255, 255), font(13)
-    )
+    draw = ImageDraw.Draw(image)
+    for number, line in enumerate(lines):
+        place = (BORDER, framed_height + CAPTION * number + 2)
+        draw.text(place, fitted(line, width, 13), (255, 255, 255), font(13))
     return np.asarray(image)
 
 

@@ -1,24 +1,30 @@
 """`python -m mme_vla.inspect` shows what is there."""
 
+import time
 from pathlib import Path
 
 import pytest
 from PIL import Image
 from rich.console import Console
 
+from helpers.lerobot_tables import write_dataset
 from mme_vla import UserError, build_policy
 from mme_vla.cli.inspect import (
     Inspection,
     build_memory,
     check_place,
     draw_memory,
+    held_out_episodes,
     main,
     show_checkpoint,
     show_dataset,
     show_episode,
 )
+from mme_vla.cli.train import train
 from mme_vla.config.composition import compose, resolved
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.testing.small import unit_stats
+from mme_vla.training.settings import DataSettings, TrainRun
 
 
 @pytest.fixture
@@ -63,14 +69,101 @@ def test_a_checkpoint_shows_its_parts(tmp_path: Path, console: Console) -> None:
     text = console.export_text()
     assert f"{sum(p.numel() for p in policy.parameters()):,}" in text
     assert all(part in text for part in ("vision", "vlm", "memory", "action"))
-    assert "budget=64" in text
+    assert "framesamp, 64 tokens" in text and "robomme_joint" in text
+    assert "budget=64" not in text
+    assert "not recorded" in text, "these weights were not trained"
+
+
+def test_summary_fits_a_screen(tmp_path: Path) -> None:
+    build_policy("framesamp_modul").save_pretrained(tmp_path)
+    with Path("/dev/null").open("w") as nowhere:
+        console = Console(record=True, width=80, file=nowhere)
+        show_checkpoint(tmp_path, console)
+    lines = console.export_text().splitlines()
+    assert len(lines) <= 24 and max(map(len, lines[1:])) <= 80
+
+
+def test_all_shows_the_configuration_and_statistics(tmp_path: Path, console: Console) -> None:
+    policy = build_policy("framesamp_modul", memory={"budget": 64})
+    policy.require_processor().stats = unit_stats(policy.embodiment)
+    policy.save_pretrained(tmp_path)
+    show_checkpoint(tmp_path, console, everything=True)
+    text = console.export_text()
+    assert "budget=64" in text and "normalisation of the state" in text
+    assert text.count("│ joint 1") == 2, "the state's numbers have the names of the action's"
+
+
+@pytest.fixture
+def squid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with a dataset of a robot that no file describes."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MME_VLA_CACHE", str(tmp_path / "caches"))
+    write_dataset(tmp_path / "squid", (30, 25), names=["a", "b", "gripper"])
+    return tmp_path
+
+
+def test_unknown_robot_is_drafted(squid: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(compose("inspect", ["dataset=squid"]))
+    printed = capsys.readouterr().out
+    draft = squid / "outputs" / "inspect" / "embodiment" / "squid.yaml"
+    assert draft.read_text() in printed
+    assert "mme-vla train --config-dir outputs/inspect embodiment=squid" in printed
+    with pytest.raises(UserError, match=r"mme-vla inspect dataset=squid.*your-robot"):
+        EpisodeSource("squid")
+
+
+def test_held_out_episodes_are_those_of_the_training(sample: EpisodeSource) -> None:
+    named = DataSettings(sources=["sample", "other"], val_episodes=("sample/1", "other/0"))
+    content = [sample.fingerprint, "another"]
+    held_out = held_out_episodes(sample, named, content)
+    assert held_out is not None and held_out.tolist() == [False, True, False, False]
+    default = held_out_episodes(sample, DataSettings(sources="sample"), content)
+    assert default is not None and default.tolist() == [False, False, False, True]
+    whole = DataSettings(sources=["sample", "other"], val_episodes=(), val_fraction=0.999999)
+    every = held_out_episodes(sample, whole, content)
+    assert every is not None and every.all(), "another source was trained on"
+    assert held_out_episodes(sample, named, ["another"]) is None
+
+
+@pytest.mark.slow
+def test_draft_trains_and_the_checkpoint_is_checked_open_loop(
+    squid: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(compose("inspect", ["dataset=squid"]))
+    words = [
+        "embodiment=squid", "model=framesamp_modul", "data=lerobot", "data.sources=[squid]",
+        "data.val_episodes=[1]", "train.steps=1", "train.batch_size=2", "train.val_samples=0",
+        "train.workers=0", "train.device=cpu", "logger=none", "output=run", "backbone.depth=1",
+    ]  # fmt: skip
+    cfg = compose("train", words, extra_dirs=[squid / "outputs" / "inspect"])
+    run = TrainRun.from_config(resolved(cfg))
+    train(run, squid / "run", begun=time.perf_counter())
+    printed = capsys.readouterr().out
+    assert "open loop on held-out episode 1 of squid" in printed and "baseline" in printed
+
+    main(compose("inspect", ["checkpoint=run", "dataset=squid"]))
+    printed = capsys.readouterr().out
+    assert "open loop on held-out episode 1 of squid" in printed and "baseline" in printed
+    assert (squid / "outputs/inspect/framesamp_modul_squid_episode1_open_loop.png").is_file()
+    main(compose("inspect", ["checkpoint=run", "dataset=squid", "episode=0"]))
+    printed = capsys.readouterr().out
+    assert "training episode 0" in printed and "was trained on this episode" in printed
+    main(compose("inspect", ["checkpoint=run"]))
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "squid: cameras top" in printed and "1 of 1 updates" in printed
+    assert "held-out episode 1 of squid" in printed, "the check at the end of training"
+
+    with pytest.raises(UserError, match="step= chooses"):
+        main(compose("inspect", ["checkpoint=run", "dataset=squid", "step=3"]))
+    with pytest.raises(UserError, match="squid has episodes 0 … 1"):
+        main(compose("inspect", ["checkpoint=run", "dataset=squid", "episode=2"]))
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         ([], "Name one thing"),
-        (["dataset=sample", "checkpoint=x"], "Name one thing"),
+        (["dataset=sample", "checkpoint=/nowhere"], "No checkpoint at /nowhere"),
         (["checkpoint=/nowhere"], "No checkpoint at /nowhere"),
         (["dataset=/nowhere"], "No LeRobot dataset"),
     ],

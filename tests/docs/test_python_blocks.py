@@ -192,7 +192,7 @@ def test_the_blocks_of_a_page_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["page"])
-    space: dict[str, Any] = {"__name__": "page"}
+    space: dict[str, Any] = {"__name__": "page", "__file__": str(tmp_path / "page.py")}
     if page in PREPARE:
         PREPARE[page](space)
     for block in blocks(page):

@@ -142,6 +142,14 @@ def test_the_page_from_the_dataset_to_a_served_policy(
     summary = json.loads((checkpoint.parents[1] / "summary.json").read_text())
     assert summary["open_loop"]["names"][0] == "left_0"
 
+    checking = shlex.split(blocks("bash")[1])
+    assert checking[:3] == ["python", "-m", "mme_vla.inspect"]
+    capsys.readouterr()
+    inspect_main(compose("inspect", checking[3:]))
+    checked = capsys.readouterr().out
+    assert "episode 1 of demonstrations" in checked and "right_6" in checked
+    assert "baseline" in checked.splitlines()[-3]
+
     acting, asking = blocks("python")
     robot = Robot()
     names: dict[str, Any] = {"robot": robot, "chunks": 3}

@@ -203,7 +203,7 @@ def test_episodes_that_end_otherwise_between_equal_runs_are_counted() -> None:
     results = aggregate([*twice, *other], protocol, conflicts="first")
     method = results.method("tiny")
     assert (method.repeated, method.flipped) == (2, 1)
-    assert any("2 episodes were run more than once" in note for note in results.notes)
+    assert any("of 2 episodes run more than once" in note for note in results.notes)
     comparison = compare(method, results.method("else"), protocol)
     assert (comparison.repeated, comparison.flipped) == (2, 1)
     assert comparison.verdict.endswith("of 2 episodes run twice alike, 1 ended otherwise")

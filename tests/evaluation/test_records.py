@@ -53,6 +53,16 @@ def test_a_record_survives_its_line() -> None:
     assert EpisodeRecord.from_json(line) == made
 
 
+def test_a_shipped_policy_is_called_by_its_checkpoint_and_records_keep_its_model() -> None:
+    made = record(model="framesamp_modul-every_8-grid_1", checkpoint="nano", memory_budget=4)
+    assert made.run.label == "nano" and str(made.run) == "nano, seed 7, test"
+    arm = replace(made, model="framesamp_modul-every_8-grid_1 · drop:all", event="pause:9")
+    assert arm.run.label == "nano · drop:all · pause:9"
+    trained = replace(made, checkpoint=800)
+    assert trained.run.label == "framesamp_modul-every_8-grid_1@4"
+    assert made.run.model == trained.run.model
+
+
 def test_wrong_values_are_named() -> None:
     good = asdict(record())
     for values, message in (

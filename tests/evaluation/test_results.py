@@ -218,12 +218,12 @@ def test_an_incomplete_run_is_reported_as_incomplete_and_never_averaged() -> Non
     results = aggregate(complete + part, SMALL)
     average = results.methods[0].average
     assert (average.mean, average.std, average.complete, average.runs) == (37.5, None, 1, 2)
-    assert "(1 of 2 runs)" in overview(results).rows[0][-3]
+    assert "(1 of 2 runs)" in overview(results).rows[0][-2]
     assert any("6 of 8 episodes" in note for note in results.notes)
     assert results.methods[0].figures["task"]["BinFill"].complete == 2  # that task is whole in both
     alone = aggregate(part, SMALL)
     assert alone.methods[0].average.mean is None
-    assert overview(alone).rows[0][-3] == "incomplete (6 of 8)"
+    assert overview(alone).rows[0][-2:] == ["100.0 (6 of 8)", ""]
     (board,) = leaderboard(alone.methods[0], alone)
     assert board.rows[1][1:] == ["2 of 4 episodes", "incomplete"]
     assert board.rows[-1][1:] == ["incomplete", "incomplete"]
@@ -234,7 +234,7 @@ def test_errors_are_failures_or_missing_as_requested() -> None:
     made[0] = replace(made[0], outcome="error")
     results = aggregate(made, SMALL)
     assert results.methods[0].average.mean == 87.5
-    assert any("1 episodes ended in an error" in note for note in results.notes)
+    assert any("1 episode ended in an error" in note for note in results.notes)
     assert aggregate(made, replace(SMALL, errors="missing")).methods[0].average.mean is None
 
 
@@ -388,10 +388,84 @@ def test_the_command_reads_shards_and_saves_every_format(
     # two methods are compared unasked
     assert "pi05 2 of 8 against ttt_modul 6 of 8: no significant difference (p = 0.125)" in printed
     page = files["html"].read_text()
-    assert page.count("<svg") >= 5
+    assert page.count("<svg") == 1  # of the tasks; others would have their bars, or one a method
+    assert '<p class="lead">pi05 2 of 8 against ttt_modul 6 of 8: no significant' in page
     assert "<script" not in page
     assert 'src="http' not in page
     assert all(path.stat().st_size > 100 for path in files.values())
+
+
+def small_runs(folder: Path) -> list[str]:
+    """Three episodes of one task with a memory and without, as the first hour makes them."""
+    model = "framesamp_modul-every_8-grid_1"
+    for name, won in ((model, True), (f"{model} · drop:all", False)):
+        made = records(name, {"VideoUnmask": [won] * 6}, checkpoint="nano")
+        save_records(
+            folder / ("with" if won else "without"), [made[number] for number in (0, 4, 5)]
+        )
+    return [str(folder), "--samples", "20"]
+
+
+def test_a_small_run_shows_what_it_has_within_eighty_columns(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.html"
+    main([*small_runs(tmp_path / "runs"), "--html", str(page)])
+    tables, _, sentences = capsys.readouterr().out.partition("nano 3 of 3 against")
+    assert max(map(len, tables.splitlines())) <= 80
+    assert "StopCube" not in tables and "paper" not in tables and " of 50" not in tables
+    assert "[43.9, 100.0]" in tables and "[0.0, 56.1]" in tables
+    assert sentences.startswith(" nano · drop:all 0 of 3: too few episodes to tell (p = 0.250).")
+    text = page.read_text()
+    assert text.count("<svg") == 1 and text.count("n=3") == 2, "one pale bar a method"
+    assert "VideoUnmask, 3 of 50 episodes" in text and "framesamp_modul-every" not in text
+
+
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        (["--all"], ["100.0 (3 of 800)", "StopCube"]),
+        (["--tasks", "[StopCube,VideoUnmask]"], ["100.0 (3 of 53)", "StopCube"]),
+        (["--episodes", "[0,4,5]"], ["100.00"]),
+        (["--episodes", "0,4-5"], ["100.00"]),
+        (["--tasks", "VideoUnmask", "--episodes", "5"], ["100.0 (2 of 5)"]),
+        (["--episodes", "[5]"], ["100.00"]),
+    ],
+)
+def test_tasks_and_episodes_are_named_as_everywhere(
+    words: list[str], shown: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main([*small_runs(tmp_path), *words])
+    printed = capsys.readouterr().out
+    for text in shown:
+        assert text in printed
+
+
+def test_wrong_episodes_are_refused_in_a_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words, message in (
+        ("0-x", "--episodes='0-x' is not understood"),
+        ("[60]", "no episode 60"),
+    ):
+        with pytest.raises(SystemExit):
+            main([*small_runs(tmp_path / words[:2]), "--episodes", words])
+        assert message in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*small_runs(tmp_path / "of"), "--episodes", "7-9"])
+    assert "they are of VideoUnmask 0,4,5." in capsys.readouterr().err
+
+
+def test_results_of_another_environment_have_nothing_of_the_paper(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # A model that the paper reports, on a task that it does not have
+    made = records("framesamp_modul", {"FirstLight": [1, 0, 0]}, suite="Lights", max_steps=25)
+    save_records(tmp_path, made)
+    main([str(tmp_path), "--samples", "20"])
+    printed = capsys.readouterr().out
+    assert "paper" not in printed and "difference" not in printed
+    assert "framesamp_modul solves 33.3 % of 3 episodes of FirstLight" in printed
 
 
 def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
@@ -465,7 +539,7 @@ def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
     ]
     main(options)
     printed = capsys.readouterr().out
-    assert "incomplete (2 of 4)" in printed
+    assert "50.0 (2 of 4)" in printed
     assert "pi05 and ttt_modul have no episode in common, and are not compared." in printed
     with pytest.raises(SystemExit) as ended:
         main([*options, "--compare", "pi05", "ttt_modul"])

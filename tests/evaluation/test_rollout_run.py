@@ -14,6 +14,7 @@ from helpers.rollout_fakes import (
     quick_policy,
     roll,
     run_evaluation,
+    save_records,
     use_inline_envs,
 )
 from helpers.scripted_env import make_mortal_env, make_moving_env
@@ -21,8 +22,16 @@ from mme_vla import UserError
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import RunOptions, Shard, choose_shard, evaluate
+from mme_vla.evaluation.rollout.evaluation import (
+    RunOptions,
+    Shard,
+    choose_shard,
+    default_output,
+    evaluate,
+    evaluate_events,
+)
 from mme_vla.evaluation.rollout.progress import RolloutProgress
+from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import Claims, find_records, read_records
 from mme_vla.policy.mme import MMEPolicy
@@ -220,3 +229,41 @@ def test_progress_counts_errors_apart_and_retries_not_at_all(capsys: pytest.Capt
         progress.episode(record("error", error="it died"))
         assert progress.summary == "success 1/3 = 33.3 % · 1 errors"
     assert "tried again" in capsys.readouterr().err
+
+
+def test_progress_names_the_run_and_no_difficulty_where_there_is_none(
+    capsys: pytest.CaptureFixture,
+) -> None:
+    with RolloutProgress(1, name="nano · drop:all") as progress:
+        progress.say("forecast")
+        progress.episode(EpisodeRecord("m", 1, 0, "FirstLight", 31, 1, "", "timeout", 25))
+    forecast, line = capsys.readouterr().err.splitlines()
+    assert forecast == "nano · drop:all: forecast"
+    assert line.startswith("nano · drop:all: FirstLight 31: timeout, 25 steps")
+
+
+def test_only_the_first_of_several_arms_forecasts_its_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_inline_envs(monkeypatch)
+    settings = RolloutSettings(max_steps=16, workers=1, max_batch=1)
+    save_records(tmp_path / "earlier", roll(quick_policy("pi05"), JOBS[:1], InlineEnvs()))
+    options = RunOptions(base=make_moving_env, times_from=tmp_path / "earlier")
+    events = ["pause:4"]
+    evaluate_events(
+        quick_policy("pi05"), JOBS[:1], tmp_path / "run", FACTS, settings, events, options
+    )
+    assert capsys.readouterr().err.count("forecast") == 1
+
+
+def test_a_shipped_policy_has_a_folder_of_its_name_and_old_runs_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    facts = RunFacts("framesamp_modul-every_8-grid_1", "nano", 7, memory_budget=4)
+    assert default_output(facts) == Path("outputs/evaluation/nano/seed7")
+    earlier = Path("outputs/evaluation/framesamp_modul-every_8-grid_1-4/nano/seed7")
+    earlier.mkdir(parents=True)
+    assert default_output(facts) == earlier
+    trained = RunFacts("framesamp_modul", 80000, 7)
+    assert default_output(trained) == Path("outputs/evaluation/framesamp_modul/80000/seed7")

@@ -29,11 +29,11 @@ def test_the_video_is_the_one_that_is_compressed_at_once(
     monkeypatch.setattr(VideoWriter, "add", check_frame)
     recorder = video(tmp_path)
     for views in VIEWS:
-        recorder.add(views, "a caption")
+        recorder.add(views, "a goal", "step 3")
     path = recorder.finish("success", "")
     assert path == tmp_path / "success.mp4"
     assert len(threads) == len(VIEWS) and all(thread.startswith("video") for thread in threads)
-    assert path.read_bytes() == video_bytes(video_frame(views, "a caption") for views in VIEWS)
+    assert path.read_bytes() == video_bytes(video_frame(views, "a goal\nstep 3") for views in VIEWS)
 
 
 def test_what_goes_wrong_beside_the_simulation_is_raised(

@@ -45,14 +45,21 @@ class MadeUpSource:
     def task(self, episode: int) -> str:
         return "VideoUnmask"
 
-    def goal(self, episode: int) -> str:
+    def goal(self, episode: int, frame: int | None = None) -> str:
         return f"pick up the cube number {episode}"
 
     def options(self, episode: int) -> tuple[Option, ...]:
         offered = Option("a", f"pick up cube {episode}", True), Option("c", "drop it")
         return offered if self.robot.action.choice else ()
 
-    def past_actions(self, episode: int, start: int, most: int) -> np.ndarray:
+    def action_chunk(
+        self, episode: int, start: int, horizon: int, offset: int = 0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Zeros, known up to the episode's end."""
+        chunk = np.zeros((horizon, self.robot.action.width), np.float32)
+        return chunk, start + offset + np.arange(horizon) < self.lengths[episode]
+
+    def past_actions(self, episode: int, start: int, most: int, offset: int = 0) -> np.ndarray:
         """One motion a frame of the execution, all of its numbers that frame's."""
         frames = np.arange(self.exec_starts[episode], max(start, self.exec_starts[episode]))
         return np.repeat(frames[-most:, None], self.robot.action.width, 1).astype(np.float32)

@@ -65,8 +65,9 @@ def test_an_episodes_video_shows_every_camera_of_the_robot(
     env.step(Command(np.zeros((1, 8), np.float32)))
     env.close()
     frames = decoded(tmp_path / "a.mp4")
-    assert len(frames) == 3 and frames[0].shape == (64 + CAPTION, 3 * 64, 3)
-    inside = [frames[2][24, 64 * view + 32] for view in range(3)]
+    side = 2 * BORDER
+    assert len(frames) == 3 and frames[0].shape == (64 + side + 2 * CAPTION, 3 * 64 + side, 3)
+    inside = [frames[2][BORDER + 24, BORDER + 64 * view + 32] for view in range(3)]
     order = [
         *names,
         *(name for name in ("front", "wrist") if name not in names),
@@ -75,27 +76,37 @@ def test_an_episodes_video_shows_every_camera_of_the_robot(
         assert np.abs(colour - {"front": GREEN, "wrist": BLUE, "side": YELLOW}[name]).max() < 25, (
             name
         )
-    assert frames[2][56, 32].max() < 25, "a lower image stands on the upper edge, on black"
+    assert frames[2][BORDER + 56, BORDER + 32].max() < 25, (
+        "a lower image stands on the upper edge, on black"
+    )
 
 
-def test_the_border_lies_around_all_views_and_nowhere_else() -> None:
+def test_the_border_lies_around_all_views_and_covers_none_of_their_pixels() -> None:
     views = [baseline(GREEN), baseline(BLUE, 63, 33)]
     framed, bare = (video_frame(views, video=video) for video in (True, False))
-    assert framed.shape == bare.shape == (64 + CAPTION, 98, 3), "sides are even"
+    assert framed.shape == bare.shape == (64 + 2 * BORDER, 98 + 2 * BORDER, 3), "sides are even"
     changed = (framed != bare).any(-1)
-    assert (
-        changed[:BORDER, :97].all()
-        and changed[:64, :BORDER].all()
-        and not changed[BORDER:54, BORDER:87].any()
-    )
+    assert changed[:BORDER].all() and changed[:, :BORDER].all()
+    assert changed[-BORDER:].all() and changed[:, -BORDER:].all()
     assert (framed[changed] == RED).all()
+    for image in (framed, bare):
+        inside = image[BORDER:-BORDER, BORDER:-BORDER]
+        assert (inside[:, :64] == views[0]).all() and (inside[:63, 64:97] == views[1]).all()
 
 
 def test_a_caption_that_is_too_long_ends_within_the_image() -> None:
     captioned = video_frame(
         [baseline(GREEN)], "pick up the red cube and place it on the target " * 5
     )
-    assert captioned[64:, :58].max() > 200 and captioned[64:, -4:].max() == 0
+    below = captioned[64 + 2 * BORDER :]
+    assert below[:, :58].max() > 200 and below[:, -4:].max() == 0
+
+
+def test_a_band_has_a_line_for_the_goal_and_one_for_the_step_or_is_not_there() -> None:
+    assert video_frame([baseline(GREEN)]).shape[0] == 64 + 2 * BORDER
+    lines = video_frame([baseline(GREEN, width=256)], "pick up the cube\nstep 12 · success")
+    goal, step = np.split(lines[64 + 2 * BORDER :], 2)
+    assert len(goal) == len(step) == CAPTION and goal.max() > 200 and step.max() > 200
 
 
 def test_a_video_has_its_name_only_when_it_is_complete(tmp_path: Path) -> None:

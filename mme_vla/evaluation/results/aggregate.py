@@ -15,7 +15,7 @@ import pandas as pd
 from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.envs.metadata import is_other
 from mme_vla.envs.rows import DIFFICULTIES
-from mme_vla.errors import UserError, did_you_mean, require
+from mme_vla.errors import UserError, counted, did_you_mean, require
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import (
     EpisodeKey,
@@ -61,7 +61,8 @@ class Figure:
     (`std` needs two). interval: over episodes, and over trainings where there are several.
     runs, complete: runs there are, and those that have every episode of this figure.
     done, expected: episodes of all runs. partial: rate of the episodes that are done, if no run is
-    complete. paper: what the paper reports here.
+    complete. paper: what the paper reports here. full: whether the protocol has all episodes of the
+    tasks here, not only some.
     """
 
     mean: float | None
@@ -73,6 +74,17 @@ class Figure:
     expected: int
     partial: float | None = None
     paper: PaperResult | None = None
+    full: bool = True
+
+    @property
+    def value(self) -> float | None:
+        """The mean, or the rate of the episodes that are done."""
+        return self.partial if self.mean is None else self.mean
+
+    @property
+    def is_pale(self) -> bool:
+        """Whether episodes are missing, so that the value says little of the whole."""
+        return self.mean is None or not self.full
 
 
 @dataclass
@@ -97,7 +109,7 @@ class Run:
 
     @property
     def expected(self) -> int:
-        return len(self.protocol.averaged) * self.protocol.episodes
+        return self.protocol.count(self.protocol.averaged)
 
     @property
     def complete(self) -> bool:
@@ -110,7 +122,7 @@ class Run:
     def successes(self, task: str) -> list[bool] | None:
         """Outcomes of a task's episodes in order, or None if some are missing."""
         outcomes = []
-        for episode in range(self.protocol.episodes):
+        for episode in self.protocol.numbers_of(task):
             record = self.records.get(EpisodeKey(task, episode))
             if record is None:
                 return None
@@ -209,10 +221,13 @@ class Results:
     notes: list[str]
 
     def method(self, label: str) -> Method:
-        """Find a method."""
+        """Find a method by its label, or by the name of its model where one method alone has it."""
         for method in self.methods:
             if method.label == label:
                 return method
+        of_model = [method for method in self.methods if method.model == label]
+        if len(of_model) == 1:
+            return of_model[0]
         raise UserError(
             f"No results of {label!r}. {did_you_mean(label, [m.label for m in self.methods])}"
         )
@@ -250,15 +265,17 @@ def aggregate(
         of_split = f" of split {split!r}" if split else ""
         raise UserError(f"There is no record{of_split}; there are: {splits or 'none'}.")
     inside = [r for r in selected if protocol.expects(r.key)]
-    counted = [r for r in inside if not (protocol.errors == "missing" and r.outcome == "error")]
+    included = [r for r in inside if not (protocol.errors == "missing" and r.outcome == "error")]
+    there = Protocol.of_records(selected)
+    listed = [f"{task} {_numbers_text(there.numbers_of(task))}" for task in there.tasks]
     require(
-        counted,
-        f"None of the {len(selected)} records is of the tasks and episodes asked for (0 …"
-        f" {protocol.episodes - 1}).",
+        included,
+        f"None of the {len(selected)} records is of the tasks and episodes asked for; they are of"
+        f" {'; '.join(listed)}.",
     )
-    _check_environments(counted)
-    by_run(counted)  # refuses runs of mixed settings
-    table = record_table(counted)
+    _check_environments(included)
+    by_run(included)  # refuses runs of mixed settings
+    table = record_table(included)
     table["method"] = [_method_key(run) for run in table["run"]]
     methods = [_method(members, protocol) for _, members in table.groupby("method", sort=False)]
     repeats = repeated_episodes(records)
@@ -272,12 +289,21 @@ def aggregate(
     return Results(methods, protocol, notes)
 
 
+def _numbers_text(numbers: Sequence[int]) -> str:
+    """Numbers of episodes, ascending, as `episodes=` takes them: `0-9`, or `0,4,5`."""
+    if len(numbers) > 2 and len(numbers) == numbers[-1] - numbers[0] + 1:
+        return f"{numbers[0]}-{numbers[-1]}"
+    return ",".join(map(str, numbers))
+
+
 def _method_key(run: RunKey) -> RunKey:
     """What the runs of one method share: not the checkpoint, the seeds or the split."""
     training = run.training
     if training is not None:
         training = replace(training, seed=None, weights=None)
-    return run._replace(checkpoint="", model_seed=0, split="", training=training)
+    # Shipped policies of one recipe, such as two sizes, are two methods.
+    checkpoint = run.checkpoint if run.is_shipped else ""
+    return run._replace(checkpoint=checkpoint, model_seed=0, split="", training=training)
 
 
 def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[int, int]]:
@@ -351,17 +377,12 @@ def _method(table: pd.DataFrame, protocol: Protocol) -> Method:
     key = runs[0].key
     known = None
     other_scenes = any(is_other(run.key.split) for run in runs)
-    if key.event is None and key.memory_budget in (None, DEFAULT_BUDGET) and not other_scenes:
+    of_benchmark = any(record.task in TASK_FACTS for record in table["record"])
+    is_plain = key.event is None and key.memory_budget in (None, DEFAULT_BUDGET)
+    if is_plain and of_benchmark and not other_scenes:
         known = paper.paper_method(key.model, key.subgoal)
-    label = key.model
-    if key.subgoal is not None:
-        label += f"+{key.subgoal}"
-    if key.memory_budget is not None:
-        label += f"@{key.memory_budget}"
-    if key.event is not None:
-        label += f" · {key.event}"
     method = Method(
-        label,
+        key.label,
         key.model,
         key.subgoal,
         key.memory_budget,
@@ -374,11 +395,12 @@ def _method(table: pd.DataFrame, protocol: Protocol) -> Method:
         event=key.event,
     )
     # Every episode that a run is to have, in order; NaN where it lacks it.
-    expected = pd.MultiIndex.from_product([protocol.tasks, range(protocol.episodes)])
-    success = method.success.reindex(expected.set_names(["task", "episode"]))
+    keys = [(task, number) for task in protocol.tasks for number in protocol.numbers_of(task)]
+    success = method.success.reindex(pd.MultiIndex.from_tuples(keys, names=["task", "episode"]))
     for scope in scopes(protocol):
-        reported = _reported(known, scope, protocol)
+        reported = _reported(known, scope)
         figure = _figure(success.loc[list(scope.tasks)], method, protocol, reported)
+        figure = replace(figure, full=protocol.has_all(scope.tasks))
         method.figures.setdefault(scope.kind, {})[scope.name] = figure
     # An episode that no run has may be of any difficulty, and keeps the figures incomplete.
     levels = table.groupby(["task", "episode"])["difficulty"].first().reindex(success.index)
@@ -387,6 +409,7 @@ def _method(table: pd.DataFrame, protocol: Protocol) -> Method:
         if (averaged & (levels == level)).any():
             rows = averaged & (levels.isna() | (levels == level))
             figure = _figure(success[rows], method, protocol, None)
+            figure = replace(figure, full=protocol.has_all(protocol.averaged))
             method.figures.setdefault("difficulty", {})[level] = figure
     return method
 
@@ -437,14 +460,12 @@ def by_task(success: pd.DataFrame) -> dict[str, np.ndarray]:
     }
 
 
-def _reported(known: PaperMethod | None, scope: Scope, protocol: Protocol) -> PaperResult | None:
+def _reported(known: PaperMethod | None, scope: Scope) -> PaperResult | None:
     """The paper's number, where it is about the same tasks."""
-    if known is None or not TASK_FACTS.keys() >= set(scope.tasks):
+    if known is None or not TASK_FACTS.keys() >= set(scope.tasks) or not scope.is_whole:
         return None
     if scope.kind == "task":
         return paper.per_task(known.name)[scope.name]
-    if not set(protocol.tasks) >= set(PAPER_ORDER):
-        return None
     if scope.kind == "average":
         return paper.average(known.name)
     if scope.kind == "suite":
@@ -476,12 +497,13 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
             errors = run.outcomes["error"]
             if errors:
                 notes.append(
-                    f"{run.key}: {errors} episodes ended in an error and count as failures."
+                    f"{run.key}: {counted(errors, 'episode')} ended in an error, which counts as a"
+                    " failure."
                 )
         if method.flipped:
             notes.append(
-                f"{method.label}: {method.repeated:,} episodes were run more than once with the"
-                f" same weights and seed; {method.flipped:,} of them did not always end alike"
+                f"{method.label}: of {counted(method.repeated, 'episode')} run more than once with"
+                f" the same weights and seed, {method.flipped:,} did not always end alike"
                 " (deterministic=true repeats runs)."
             )
         limits = {record.max_steps for record in method.table["record"]}
@@ -510,7 +532,6 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
             )
     if outside:
         notes.append(
-            f"{outside} records of other tasks, or of episodes from {protocol.episodes} on, are"
-            " left out."
+            f"Left out: {counted(outside, 'record')} of other tasks, or of other episodes."
         )
     return notes

@@ -74,10 +74,13 @@ class Comparison:
     def verdict(self) -> str:
         """One sentence: what each side solved, and what that says."""
         sides = [f"{self.first} {self.first_rate:.1f} %", f"{self.second} {self.second_rate:.1f} %"]
-        if self.paired:
+        # Means over several runs are no counts.
+        first = round(self.first_solved, 6)
+        second = round(self.second_solved, 6)
+        if self.paired and first.is_integer() and second.is_integer():
             sides = [
-                f"{self.first} {round(self.first_solved, 1):g} of {self.episodes}",
-                f"{self.second} {round(self.second_solved, 1):g} of {self.episodes}",
+                f"{self.first} {first:g} of {self.episodes}",
+                f"{self.second} {second:g} of {self.episodes}",
             ]
         text = " against ".join(sides)
         if self.significant:
@@ -188,7 +191,7 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
         first.label,
         second.label,
         len(gaps),
-        len(protocol.averaged) * protocol.episodes,
+        protocol.count(protocol.averaged),
         first_rate,
         second_rate,
         first_rate - second_rate,
@@ -237,7 +240,7 @@ def compare_unpaired(first: Method, second: Method, protocol: Protocol) -> Compa
         first.label,
         second.label,
         min(len(first.rates), len(second.rates)),
-        len(protocol.averaged) * protocol.episodes,
+        protocol.count(protocol.averaged),
         first_rate,
         second_rate,
         round(first_rate - second_rate, 9),

@@ -24,7 +24,9 @@ FAMILIES = {
 }
 INK = "#2b2d42"
 FAINT = "#8d99ae"
+PALE = 0.35  # opacity of what lacks episodes
 MOST_BARS = 8
+MOST_TASK_BARS = 6  # tasks that have bars; more are in the heat map
 SWEPT = ("framesamp_modul", "tokendrop_modul")  # Models whose memory budget the paper varies
 _STYLE = {
     "svg.fonttype": "none",
@@ -48,16 +50,16 @@ _STYLE = {
 
 
 def bars(results: Results, kind: str, wide: bool = False) -> str:
-    """Success of every suite, functional group or difficulty, a bar a method; black lines are the
-    paper's numbers.
+    """Success of every task, suite, functional group or difficulty, a bar a method; black lines are
+    the paper's numbers.
 
-    Whiskers are the confidence intervals; a method without a complete run has no bar. Beyond
-    `MOST_BARS` methods the tables and the heat map have to do.
+    Whiskers are the confidence intervals. A bar without all episodes is pale, and says how many
+    there are. Beyond `MOST_BARS` methods the tables and the heat map have to do.
     """
     # The number of a method decides its colour, in all figures.
     having: list[tuple[int, Method]] = []
     for i, method in enumerate(results.methods):
-        if any(figure.complete for figure in method.figures.get(kind, {}).values()):
+        if any(figure.done for figure in method.figures.get(kind, {}).values()):
             having.append((i, method))
     having = having[:MOST_BARS]
     names: dict[str, None] = {}
@@ -70,12 +72,28 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
             shift = (place - (len(having) - 1) / 2) * width
             points: list[tuple[float, Figure]] = []
             for j, name in enumerate(names):
-                estimate = method.figures[kind][name]
+                estimate = method.figures[kind].get(name)
+                if estimate is None:
+                    continue
                 points.append((j + shift, estimate))
                 if estimate.paper is not None:
                     lines.append((j + shift, estimate.paper.mean))
             xs, heights, gaps = _with_intervals(points)
-            axes.bar(xs, heights, 0.88 * width, color=_colour(i), label=method.label)
+            axes.scatter([], [], s=70, marker="s", color=_colour(i), label=method.label)
+            for at, estimate in points:
+                if estimate.value is None:
+                    continue
+                alpha = PALE if estimate.is_pale else 1.0
+                axes.bar(at, estimate.value, 0.88 * width, color=_colour(i), alpha=alpha)
+                if estimate.is_pale:
+                    # At the foot, beside the whisker
+                    axes.annotate(
+                        f"n={estimate.done}",
+                        (at - 0.42 * width, 0),
+                        (0, 3),
+                        textcoords="offset points",
+                        fontsize=8,
+                    )
             axes.errorbar(xs, heights, np.maximum(gaps, 0), fmt="none", ecolor=INK, elinewidth=0.9)
         if lines:
             at, means = np.array(lines).T
@@ -94,9 +112,13 @@ def heat_map(results: Results) -> str:
     """Methods × tasks; under each method that the paper reports, the paper's numbers."""
     tasks = results.protocol.tasks
     rows: list[tuple[str, list[float | None]]] = []
+    pale: dict[tuple[int, int], int] = {}  # row and column of a pale cell → its episodes
     for method in results.methods:
         figures = [method.figures["task"][task] for task in tasks]
-        rows.append((method.label, [estimate.mean for estimate in figures]))
+        for column, estimate in enumerate(figures):
+            if estimate.is_pale and estimate.value is not None:
+                pale[len(rows), column] = estimate.done
+        rows.append((method.label, [estimate.value for estimate in figures]))
         if method.paper is not None:
             reported: list[float | None] = []
             for estimate in figures:
@@ -104,13 +126,18 @@ def heat_map(results: Results) -> str:
             rows.append(("paper", reported))
     values = np.array([row for _, row in rows], float)  # None is NaN
     with figure((0.62 * len(tasks) + 2.4, 0.34 * len(rows) + 1.7)) as (canvas, (axes,)):
-        axes.imshow(values, cmap="GnBu", vmin=0, vmax=100, aspect="auto")
+        opacity = np.ones(values.shape)
+        for place in pale:
+            opacity[place] = PALE
+        axes.imshow(values, cmap="GnBu", vmin=0, vmax=100, aspect="auto", alpha=opacity)
         for i, j in np.ndindex(values.shape):
             text = f"{values[i, j]:.0f}"
             colour = INK
             if np.isnan(values[i, j]):
                 text = "–"
                 colour = FAINT
+            elif (i, j) in pale:
+                text += f" ({pale[i, j]})"
             elif values[i, j] > 62:
                 colour = "white"
             axes.text(j, i, text, ha="center", va="center", color=colour, fontsize=8.5)
@@ -142,7 +169,16 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
     """Success over what a chunk costs: one's own models filled, the paper's numbers as rings.
 
     flops: of a sampled chunk at full size, by model.
+
+    Returns:
+        Empty text where no model of one's own has a place.
     """
+    has_place = [
+        method.model in flops and method.memory_budget is None and method.average.mean is not None
+        for method in results.methods
+    ]
+    if not any(has_place):
+        return ""
     with figure((5.6, 3.9)) as (canvas, (axes,)):
         named = set()
         for known in paper.paper_methods().values():
@@ -161,11 +197,7 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
                     label=label,
                 )
         for i, method in enumerate(results.methods):
-            if (
-                method.model in flops
-                and method.memory_budget is None
-                and method.average.mean is not None
-            ):
+            if has_place[i] and method.average.mean is not None:
                 axes.errorbar(
                     flops[method.model] / 1e12,
                     method.average.mean,

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.config.naming import DEFAULT_BUDGET
+from mme_vla.errors import counted
 from mme_vla.evaluation.results import plots
-from mme_vla.evaluation.results.aggregate import Method, Results, Run
+from mme_vla.evaluation.results.aggregate import Figure, Method, Results, Run
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.curves import CAPTION, process_tables
 from mme_vla.evaluation.results.paper import chunk_flops
@@ -46,9 +47,10 @@ def html_page(
     subtitle: str = "",
     notes: Sequence[str] = (),
     sortable: bool = False,
+    lead: str = "",
 ) -> str:
     """One self-contained page of these sections. sortable: whether a click on a heading sorts its
-    table.
+    table. lead: what was found, in a sentence.
     """
     return render(
         "page.html",
@@ -57,6 +59,7 @@ def html_page(
         notes=notes,
         sections=sections,
         sortable=sortable,
+        lead=lead,
     )
 
 
@@ -67,38 +70,61 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     protocol = results.protocol
     runs = sum(len(method.runs) for method in results.methods)
     subtitle = (
-        f"{_count(len(results.methods), 'method')}, {_count(runs, 'run')} of"
-        f" {len(protocol.averaged)} tasks × {protocol.episodes} episodes ·"
+        f"{counted(len(results.methods), 'method')}, {counted(runs, 'run')} of {protocol.extent} ·"
         f" {datetime.now(UTC):%Y-%m-%d}"
     )
     average = overview(results)
-    whiskers = f"Whiskers: {100 * protocol.confidence:g} % intervals. Black lines: the paper."
+    whiskers = f"Whiskers: {100 * protocol.confidence:g} % intervals."
+    if any(method.paper for method in results.methods):
+        whiskers += " Black lines: the paper."
+    pale = ""
+    if any(
+        figure.is_pale for method in results.methods for figure in method.figures["task"].values()
+    ):
+        pale = " Pale: not all episodes of the split; n: how many."
     difficulty = "Mean over tasks of the episodes of a difficulty."
     rings = (
         "Rings: the paper's averages. Neither subgoal predictors nor the encoding of past frames"
         " are counted."
     )
-    points = plots.budget_points(results.methods, DEFAULT_BUDGET)
-    sections = [
-        Section("Overview", tables=[average], caption=f"{average.title}."),
-        Section("Suites", plots.bars(results, "suite"), caption=whiskers, half=True),
-        Section("Difficulty", plots.bars(results, "difficulty"), caption=difficulty, half=True),
-        Section("Functional groups", plots.bars(results, "group", wide=True), caption=whiskers),
-        Section("Tasks", plots.heat_map(results), caption="Success rate in percent."),
-        Section(
-            "Efficiency", plots.efficiency(results, chunk_flops()), caption=rings, half=bool(points)
-        ),
-    ]
+    sections = [Section("Overview", tables=[average], caption=f"{average.title}.")]
+
+    # A chart is left out where it has one bar a method, or the same bars as the one of the tasks.
+    n_tasks = len(protocol.tasks)
+    levels: set[str] = set()
+    for method in results.methods:
+        levels.update(method.figures.get("difficulty", {}))
+    has_suites = 1 < len(protocol.suites) < n_tasks
+    has_groups = 1 < len(results.methods[0].figures.get("group", {})) < n_tasks
+    if has_suites:
+        chart = plots.bars(results, "suite")
+        sections.append(Section("Suites", chart, caption=whiskers + pale, half=len(levels) > 1))
+    if len(levels) > 1:
+        chart = plots.bars(results, "difficulty")
+        sections.append(Section("Difficulty", chart, caption=difficulty + pale, half=has_suites))
+    if has_groups:
+        chart = plots.bars(results, "group", wide=True)
+        sections.append(Section("Functional groups", chart, caption=whiskers + pale))
+    if n_tasks <= plots.MOST_TASK_BARS and len(results.methods) <= plots.MOST_BARS:
+        chart = plots.bars(results, "task", wide=n_tasks > 2)
+        sections.append(Section("Tasks", chart, caption=whiskers + pale))
+    else:
+        text = f"Success rate in percent.{pale.replace('n:', 'in brackets')}"
+        sections.append(Section("Tasks", plots.heat_map(results), caption=text))
+
+    # Averages beside the paper's: of the whole benchmark alone
+    points: dict[str, list[tuple[int, Figure]]] = {}
+    if protocol.is_benchmark:
+        points = plots.budget_points(results.methods, DEFAULT_BUDGET)
+        if chart := plots.efficiency(results, chunk_flops()):
+            sections.append(Section("Efficiency", chart, caption=rings, half=bool(points)))
     if points:
         curve = plots.budget_curve(results, points)
         sections.append(
             Section("Memory budget", curve, caption="Dashed: the paper's sweep.", half=True)
         )
     if comparisons:
-        verdicts = "; ".join(comparison.verdict for comparison in comparisons) + "."
-        sections.append(
-            Section("Paired comparison", tables=[comparison_table(comparisons)], caption=verdicts)
-        )
+        sections.append(Section("Paired comparison", tables=[comparison_table(comparisons)]))
     if subgoals := subgoal_tables(results):
         text = (
             "Words are right when they equal the environment's, points aside; distances are of the"
@@ -109,17 +135,46 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
         sections.append(
             Section("Where the chain broke", tables=chains, headed=True, caption=CAPTION)
         )
-    details = [(method.label, detail(method, results)) for method in results.methods]
+    details = []
+    for method in results.methods:
+        table = detail(method, results)
+        if len(table.rows) > 1:  # one row is in the overview
+            details.append((method.label, table))
+    if details:
+        sections.append(Section("Every method in full", folded=details))
     sections += [
-        Section("Every method in full", folded=details),
-        Section("Runs", folded=[(f"{runs} runs", runs_table(results))]),
+        Section("Runs", folded=[(counted(runs, "run"), runs_table(results))]),
         Section("How the numbers are made", paragraphs=_method_text(results)),
     ]
-    return html_page(title, sections, subtitle, results.notes)
+    lead = " ".join(conclude(results, comparisons))
+    return html_page(title, sections, subtitle, results.notes, lead=lead)
 
 
-def _count(number: int, noun: str) -> str:
-    return f"1 {noun}" if number == 1 else f"{number} {noun}s"
+def conclude(results: Results, comparisons: Sequence[Comparison]) -> list[str]:
+    """What the results say, of comparisons their verdicts, else of the best method."""
+    if comparisons:
+        return [f"{comparison.verdict}." for comparison in comparisons]
+    protocol = results.protocol
+    ranked = [method for method in results.methods if method.average.value is not None]
+    ranked.sort(key=lambda method: -(method.average.value or 0))
+    if not ranked:
+        return []
+    best = ranked[0]
+    n_episodes = protocol.count(protocol.averaged)
+    if best.average.mean is None:
+        n_episodes = best.average.done
+    tasks = counted(len(protocol.averaged), "task")
+    if len(protocol.averaged) == 1:
+        tasks = protocol.averaged[0]
+    text = f"{best.label} solves {best.average.value:.1f} % of {counted(n_episodes, 'episode')}"
+    text += f" of {tasks}"
+    if best.average.interval is not None:
+        low, high = best.average.interval
+        text += f" ({100 * protocol.confidence:g} % interval {low:.1f} to {high:.1f})"
+    if len(ranked) > 1:
+        text += f", the most of {len(ranked)} methods; next is {ranked[1].label} with"
+        text += f" {ranked[1].average.value:.1f} %"
+    return [f"{text}."]
 
 
 def _method_text(results: Results) -> list[str]:

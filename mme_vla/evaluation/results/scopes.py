@@ -1,10 +1,10 @@
 """What a whole run consists of, and the sets of tasks that figures are made over."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
-from mme_vla.errors import require
+from mme_vla.errors import counted, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 
 SUITES = ("Counting", "Permanence", "Reference", "Imitation")
@@ -83,6 +83,7 @@ class Protocol:
     tasks, episodes: a run is complete with episodes 0 … episodes − 1 of every task; where some are
     the benchmark's, of
         these: tasks of one's own have figures of their own, beside the average.
+    numbers: task → the numbers of its episodes that count, where these are not all `episodes`.
     task_suites: task → suite, of environments that are not RoboMME (`suites_of`).
     errors: whether an episode that ended in an error is a `failure`, as in the official evaluation,
     or `missing`. confidence, samples, seed: of the intervals; samples and seed are the bootstrap's.
@@ -95,6 +96,29 @@ class Protocol:
     samples: int = 10_000
     seed: int = 0
     task_suites: Mapping[str, str] = field(default_factory=dict)
+    numbers: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def of_records(
+        cls, records: Iterable[EpisodeRecord], episodes: int | None = None, **how: Any
+    ) -> Self:
+        """The protocol of what has records: their tasks, and of each the episodes of any run.
+
+        episodes: how many a task has in all; by default up to the last that is recorded. how:
+        further fields.
+        """
+        recorded: dict[str, set[int]] = {}
+        for record in records:
+            recorded.setdefault(record.task, set()).add(record.episode)
+        if episodes is None:
+            episodes = 1 + max(max(numbers) for numbers in recorded.values())
+        ordered = [task for task in PAPER_ORDER if task in recorded]
+        ordered += sorted(recorded.keys() - TASK_FACTS.keys())
+        numbers = {}
+        for task in ordered:
+            if recorded[task] != set(range(episodes)):
+                numbers[task] = tuple(sorted(recorded[task]))
+        return cls(tuple(ordered), episodes, numbers=numbers, **how)
 
     def __post_init__(self) -> None:
         for holds, message in (
@@ -118,7 +142,35 @@ class Protocol:
             require(holds, message)
 
     def expects(self, key: EpisodeKey) -> bool:
-        return key.task in self.tasks and 0 <= key.episode < self.episodes
+        return key.task in self.tasks and key.episode in self.numbers_of(key.task)
+
+    def numbers_of(self, task: str) -> Sequence[int]:
+        """The numbers of a task's episodes that count."""
+        return self.numbers.get(task, range(self.episodes))
+
+    def count(self, tasks: Iterable[str]) -> int:
+        """How many episodes of these tasks count."""
+        return sum(len(self.numbers_of(task)) for task in tasks)
+
+    def has_all(self, tasks: Iterable[str]) -> bool:
+        """Whether all episodes of these tasks count."""
+        return all(len(self.numbers_of(task)) >= self.episodes for task in tasks)
+
+    @property
+    def is_benchmark(self) -> bool:
+        """Whether it has all the benchmark's tasks, with all their episodes."""
+        return set(self.tasks) >= set(PAPER_ORDER) and self.has_all(PAPER_ORDER)
+
+    @property
+    def extent(self) -> str:
+        """What the average is over, such as `16 tasks × 50 episodes`."""
+        tasks = self.averaged
+        what = counted(len(tasks), "task")
+        if len(tasks) == 1:
+            what = tasks[0]
+        if self.has_all(tasks):
+            return f"{what} × {counted(self.episodes, 'episode')}"
+        return f"{what}, {self.count(tasks):,} of {counted(len(tasks) * self.episodes, 'episode')}"
 
     @property
     def averaged(self) -> tuple[str, ...]:
@@ -172,6 +224,16 @@ class Scope(NamedTuple):
     kind: str
     name: str
     tasks: tuple[str, ...]
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all the benchmark's tasks of this name are in it."""
+        if self.kind == "average":
+            return set(self.tasks) >= set(PAPER_ORDER)
+        if self.kind in ("suite", "group"):
+            of_name = [task.name for task in _TASKS if getattr(task, self.kind) == self.name]
+            return set(self.tasks) >= set(of_name)
+        return True
 
 
 def scopes(protocol: Protocol) -> list[Scope]:

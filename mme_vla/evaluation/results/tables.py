@@ -1,16 +1,17 @@
 """The result tables, and their spellings: terminal, Markdown, LaTeX, CSV."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from mme_vla.errors import printable
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.errors import counted, printable
+from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results, by_training
 from mme_vla.evaluation.results.compare import Comparison, show_p
-from mme_vla.evaluation.results.scopes import PAPER_SEEDS
+from mme_vla.evaluation.results.scopes import PAPER_SEEDS, scopes
 from mme_vla.evaluation.results.statistics import Interval
 from mme_vla.utils.pages import escape_markdown
 
@@ -59,16 +60,14 @@ def task_tables(
     return tables
 
 
-def show(figure: Figure, short: bool = False) -> str:
-    """A figure as text: mean ± deviation, or how far it is.
+def show(figure: Figure) -> str:
+    """A figure as text: mean ± deviation, or the rate so far and how many episodes it is of.
 
     A mean without the incomplete runs states its number of runs.
     """
     if figure.mean is None:
-        if short:
-            return f"incomplete ({figure.done:,} of {figure.expected:,})"
-        partial = "" if figure.partial is None else f" ({figure.partial:.1f} so far)"
-        return f"{figure.done:,} of {figure.expected:,} episodes{partial}"
+        so_far = "–" if figure.partial is None else f"{figure.partial:.1f}"
+        return f"{so_far} ({figure.done:,} of {figure.expected:,})"
     text = show_mean(figure.mean, figure.std)
     if figure.complete < figure.runs:
         text += f" ({figure.complete} of {figure.runs} runs)"
@@ -95,12 +94,19 @@ def show_paper(figure: Figure) -> str:
 
 
 def overview(results: Results) -> Table:
-    """Methods × suites, as the paper's suite table."""
+    """Methods × suites, as the paper's suite table; of a single suite the average alone."""
     suites = results.protocol.suites
+    if len(suites) == 1:
+        suites = []
+    averaged = results.protocol.averaged
     level = f"{100 * results.protocol.confidence:g} %"
     nested = any(len(method.trainings) > 1 for method in results.methods)
+    reported = any(method.average.paper for method in results.methods)
     over = "runs"
-    columns = ["method", "runs", "episodes", *suites, "average", level, "paper"]
+    average_name = averaged[0] if len(averaged) == 1 else "average"
+    columns = ["method", "runs", "episodes", *suites, average_name, level]
+    if reported:
+        columns.append("paper")
     if nested:
         over = "trainings, or over the runs of one"
         columns.insert(1, "trainings")
@@ -113,17 +119,26 @@ def overview(results: Results) -> Table:
         row = [method.label, str(average.runs), episodes]
         if nested:
             row.insert(1, str(len(method.trainings)))
-        row += [show(method.figures["suite"][suite], short=True) for suite in suites]
-        row += [show(average, short=True), span(average.interval), show_paper(average)]
+        row += [show(method.figures["suite"][suite]) for suite in suites]
+        row += [show(average), span(average.interval)]
+        if reported:
+            row.append(show_paper(average))
         rows.append(row)
-    return Table(f"Success rate (%), mean ± sample standard deviation over {over}", columns, rows)
+    title = "Success rate (%)"
+    if any(len(method.runs) > 1 for method in results.methods):
+        title += f", mean ± sample standard deviation over {over}"
+    return Table(title, columns, rows)
 
 
 def detail(method: Method, results: Results) -> Table:
     """One method: tasks by suite, suites, functional groups, difficulties, average, beside the
     paper's numbers.
+
+    What has a single task here, and more in the benchmark, is left out beside that task.
     """
-    level = f"{100 * results.protocol.confidence:g} %"
+    protocol = results.protocol
+    level = f"{100 * protocol.confidence:g} %"
+    reported = any(figure.paper for figure in method.figures["task"].values())
     rows: list[list[str]] = []
     rules, strong = set(), set()
 
@@ -133,28 +148,43 @@ def detail(method: Method, results: Results) -> Table:
             gap = f"{figure.mean - figure.paper.mean:+.2f}"
         if mark:
             strong.add(len(rows))
-        rows.append([name, show(figure), span(figure.interval), show_paper(figure), gap])
+        row = [name, show(figure), f"{figure.done:,}", span(figure.interval)]
+        if reported:
+            row += [show_paper(figure), gap]
+        rows.append(row)
 
-    for suite in results.protocol.suites:
-        for task in results.protocol.choose("suite", suite):
+    for suite in protocol.suites:
+        tasks = protocol.choose("suite", suite)
+        for task in tasks:
             add(task, method.figures["task"][task])
-        add(suite, method.figures["suite"][suite], True)
-        rules.add(len(rows))
-    for kind in ("group", "difficulty"):
-        for name, figure in method.figures.get(kind, {}).items():
+        if len(tasks) > 1:
+            add(suite, method.figures["suite"][suite], True)
+            rules.add(len(rows))
+    rules.add(len(rows))
+    for scope in scopes(protocol):
+        if scope.kind == "group" and (len(scope.tasks) > 1 or protocol.is_benchmark):
+            add(scope.name, method.figures["group"][scope.name])
+    rules.add(len(rows))
+    difficulties = method.figures.get("difficulty", {})
+    if len(difficulties) > 1:
+        for name, figure in difficulties.items():
             add(name, figure)
-        rules.add(len(rows))
-    add("average", method.average, True)
-    title = f"{method.label}: {len(method.runs)} runs"
-    return Table(
-        title, ["", "success (%)", level, "paper", "difference"], rows, rules - {len(rows)}, strong
-    )
+    rules.add(len(rows))
+    if len(protocol.averaged) > 1:
+        add("average", method.average, True)
+    columns = ["", "success (%)", "episodes", level]
+    if reported:
+        columns += ["paper", "difference"]
+    title = f"{method.label}: {counted(len(method.runs), 'run')}"
+    return Table(title, columns, rows, rules - {len(rows)}, strong)
 
 
 def runs_table(results: Results) -> Table:
     """Every run: how far it is, how its episodes ended, and its average."""
     columns = ["method", "checkpoint", "seed", "episodes"]
-    columns += ["success", "fail", "timeout", "error", "average (%)"]
+    counts = sum((Counter(run.outcomes) for m in results.methods for run in m.runs), Counter())
+    outcome_names = ["success", *(name for name in OUTCOMES[1:] if counts[name])]
+    columns += [*outcome_names, "average (%)"]
     named = any(run.key.training for method in results.methods for run in method.runs)
     if named:
         columns.insert(1, "training seed")
@@ -164,7 +194,7 @@ def runs_table(results: Results) -> Table:
             outcomes = run.outcomes
             row = [method.label, str(run.key.checkpoint), str(run.key.model_seed)]
             row.append(f"{len(run.averaged)} of {run.expected}")
-            row += [str(outcomes[name]) for name in ("success", "fail", "timeout", "error")]
+            row += [str(outcomes[name]) for name in outcome_names]
             if run.complete:
                 row.append(f"{100 * outcomes['success'] / run.expected:.2f}")
             else:
@@ -249,40 +279,76 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
                 for number, run in enumerate(runs):
                     if pd.isna(values[number]):
                         done = sum(key.task == name for key in run.records)
-                        cells[number] = f"{done} of {results.protocol.episodes} episodes"
+                        expected = len(results.protocol.numbers_of(name))
+                        cells[number] = f"{done} of {expected} episodes"
             rows.append([str(name), *cells])
         tables.append(Table(f"{method.label}, checkpoint {checkpoint}", columns, rows))
     return tables
 
 
-def to_rich(table: Table) -> "RichTable":
-    """For the terminal, which obeys no escape sequence of a name."""
+_NAME = 18  # Characters of a table's first column that are not broken into lines
+_LONGEST = 24  # Characters of any other cell that are not
+_PADDING = 3  # Characters of a column beside its text
+
+
+def print_table(table: Table, width: int) -> None:
+    """Print for people, `width` characters wide: columns that do not fit follow below, with the
+    first one again. No number is ever cut, and no escape sequence of a name is obeyed.
+    """
+    from rich.cells import cell_len
+    from rich.console import Console
+    from rich.text import Text
+
+    # What each column needs: its cells, and the words of its heading
+    columns = list(zip(table.columns, *table.rows, strict=True))
+    needs = []
+    for heading, *cells in columns:
+        longest = max((cell_len(printable(cell)) for cell in cells), default=0)
+        words = [cell_len(printable(word)) for word in heading.split()]
+        needs.append(max([min(longest, _LONGEST), *words]))
+    name = max(cell_len(printable(cell)) for cell in columns[0])
+    least = min(name, _NAME)
+
+    # As many columns as fit at a time
+    blocks: list[list[int]] = [[]]
+    used = least + _PADDING + 1
+    for number in range(1, len(columns)):
+        need = needs[number] + _PADDING
+        if blocks[-1] and used + need > width:
+            blocks.append([])
+            used = least + _PADDING + 1
+        blocks[-1].append(number)
+        used += need
+
+    console = Console(width=10_000)
+    console.print(Text(printable(table.title), style="bold italic"), soft_wrap=True)
+    for block in blocks:
+        others = sum(needs[number] + _PADDING for number in block)
+        room = width - others - _PADDING - 1
+        console.print(
+            _to_rich(table, [0, *block], [max(least, min(name, room)), *(needs[i] for i in block)])
+        )
+
+
+def _to_rich(table: Table, columns: Sequence[int], widths: Sequence[int]) -> "RichTable":
+    """Some of the columns, of these widths."""
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    made = RichTable(title=Text(printable(table.title)), title_justify="left", title_style="bold")
-    for i, column in enumerate(table.columns):
+    made = RichTable()
+    for column, width in zip(columns, widths, strict=True):
         made.add_column(
-            Text(printable(column)), justify="left" if i == 0 else "right", overflow="fold"
+            Text(printable(table.columns[column])),
+            justify="left" if column == 0 else "right",
+            overflow="fold",
+            width=width,
         )
     for i, row in enumerate(table.rows):
         if i in table.rules:
             made.add_section()
-        made.add_row(
-            *(Text(printable(cell)) for cell in row), style="bold" if i in table.strong else None
-        )
+        cells = [Text(printable(row[column])) for column in columns]
+        made.add_row(*cells, style="bold" if i in table.strong else None)
     return made
-
-
-def print_table(table: Table, width: int) -> None:
-    """Print for people: `width` columns, or as many as the table needs, so that no number is ever
-    cut.
-    """
-    from rich.console import Console
-
-    made = to_rich(table)
-    needed = Console(width=10_000).measure(made).maximum
-    Console(width=max(width, needed)).print(made)
 
 
 def to_markdown(table: Table) -> str:

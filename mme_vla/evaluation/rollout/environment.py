@@ -184,7 +184,8 @@ class ChunkEnv:
         count = frames.add(observation)
         self._note_pose(observation)
         self._note_subgoal(info)
-        self._draw(frames, count, demo=count - 1)
+        self._note_goal(info)
+        self._draw_reset(frames, count)
         self._returned = frames.leave(draw, 0)
         # Environments of other packages do not know their scene.
         self._scene = getattr(self._env, "scene_digest", NO_VALUES)
@@ -235,12 +236,14 @@ class ChunkEnv:
             n_frames += count
             # A choice that moves nothing takes time too, or it could continue for ever.
             self._steps += max(count, 1)
-            self._draw(frames, count, caption=command.subgoal)
-            if terminated or truncated:
-                break
-            if self._executed == self._max_actions or self._steps > self._max_steps:
+            is_last = self._executed == self._max_actions or self._steps > self._max_steps
+            if is_last and not (terminated or truncated):
                 truncated = True
                 info = {**info, "status": "timeout"}
+            self._note_goal(info)
+            outcome = str(info.get("status")) if terminated or truncated else None
+            self._draw(frames, count, command.subgoal, outcome)
+            if terminated or truncated:
                 break
         self._returned = frames.leave(draw, self._returned)
         report = replace(self._report(info), executed=executed, steps=n_frames)
@@ -281,6 +284,10 @@ class ChunkEnv:
         self._n_subgoals += text != self._subgoal
         self._subgoal = text
 
+    def _note_goal(self, info: dict[str, Any]) -> None:
+        if goals := info.get("task_goal"):
+            self._goal = str(goals[0])
+
     def _note_pose(self, observation: dict[str, list[Any]]) -> None:
         if not self._robot.action.of_pose:
             return
@@ -310,8 +317,7 @@ class ChunkEnv:
 
     def _report(self, info: dict[str, Any]) -> Report:
         status = info.get("status")
-        if goals := info.get("task_goal"):
-            self._goal = str(goals[0])
+        self._note_goal(info)
         subtask = self._n_subgoals
         process = None
         progress = getattr(getattr(self._env, "task", None), "progress", None)
@@ -339,12 +345,28 @@ class ChunkEnv:
         self._simulating = self._rendered = 0.0
         return report
 
+    def _draw_reset(self, frames: "_Frames", count: int) -> None:
+        """Add the conditioning video, and the current frame, to the episode's video."""
+        if self._video is None:
+            return
+        for number, views in enumerate(frames.newest(count), 1):
+            caption = f"conditioning video, frame {number} of {count - 1}"
+            if number == count:
+                caption = "step 0"
+            self._video.add(views, self._goal, caption, demo=number < count)
+
     def _draw(
-        self, frames: "_Frames", count: int, demo: int = 0, caption: str | None = None
+        self, frames: "_Frames", count: int, subgoal: str | None, outcome: str | None
     ) -> None:
-        if self._video is not None:
-            for index, views in enumerate(frames.newest(count)):
-                self._video.add(views, caption, demo=index < demo)
+        """Add the frames of an action. outcome: of the episode that it ended."""
+        if self._video is None:
+            return
+        first = self._steps - count + 1
+        for step, views in enumerate(frames.newest(count), first):
+            parts = [f"step {step}", subgoal]
+            if step == self._steps:
+                parts.append(outcome)
+            self._video.add(views, self._goal, " · ".join(part for part in parts if part))
 
 
 MISSING = "which this environment does not deliver"
@@ -455,6 +477,7 @@ def make_rollout_env(
     base: Callable[..., Any] = make_env,
     max_steps: int = DEFAULT_STEPS,
     videos: tuple[str, str] | None = None,
+    run: str = "",
     robot: Embodiment = ROBOMME_JOINT,
     max_actions: int | None = None,
     oracle: bool = False,
@@ -465,8 +488,8 @@ def make_rollout_env(
     base: makes the environment itself from `task`, `split`, `episode` and `max_steps`
     (`base_env`). sessions: unrelated episodes that the caller shows the policy before, as
     `split=stress:sessions=<n>` requires; the scenes of such a split are those of the test split.
-    videos: folder, and which outcomes are kept: `all`, `success` or `failure`. robot, max_actions:
-    the policy's. oracle: see `ChunkEnv`.
+    videos: folder, and which outcomes are kept: `all`, `success` or `failure`. run: its name, in
+    the videos. robot, max_actions: the policy's. oracle: see `ChunkEnv`.
     """
     if sessions:
         check_sessions(split, sessions)
@@ -475,7 +498,9 @@ def make_rollout_env(
     if videos is not None:
         folder, save_on = videos
         video = EpisodeVideo(
-            lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal), save_on
+            lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal),
+            save_on,
+            run,
         )
     stick = task in STICK_TASKS
     if task in TASKS:  # once its module is imported

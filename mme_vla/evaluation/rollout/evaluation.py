@@ -16,7 +16,7 @@ from mme_vla.envs.make import ROBOMME, check_sessions, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError
 from mme_vla.evaluation.receipts import receipt
-from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
+from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
 from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
@@ -125,6 +125,7 @@ class RunOptions:
     notes: kept in `run.json` and never compared.
     times_from: earlier records, of any policy: the longest episodes begin first, and say how long
     all will take; by default those in the run's folder and in the folders beside it.
+    show_forecast: whether that is printed: of several arms on the same episodes by the first.
     """
 
     subgoals: SubgoalPredictor | None = None
@@ -134,6 +135,7 @@ class RunOptions:
     notes: Mapping[str, Any] | None = None
     times_from: Path | None = None
     show_progress: bool = True
+    show_forecast: bool = True
 
 
 def evaluate_events(
@@ -158,7 +160,7 @@ def evaluate_events(
     matched = evaluate(policy, jobs, output, facts, settings, options)
     if not events:
         return matched
-    options = replace(options, times_from=options.times_from or output)
+    options = replace(options, times_from=options.times_from or output, show_forecast=False)
     records: list[EpisodeRecord] = []
     for event in events:
         folder = output / ("event-" + re.sub(r"[^\w.+-]", "-", event))
@@ -209,19 +211,22 @@ def evaluate(
         workers = min(workers, policy.info.max_running or workers)
 
         completed = [record for record in done if record.outcome != "error"]
-        with RolloutProgress(len(jobs), completed, options.show_progress) as progress:
+        with RolloutProgress(
+            len(jobs), completed, options.show_progress, facts.run.label
+        ) as progress:
             if completed:
                 progress.say(
                     f"{output} holds {len(completed)} of {len(jobs)} episodes: continuing with the"
                     " others"
                 )
-            if forecast := durations.forecast(missing, workers, shard.count):
+            forecast = durations.forecast(missing, workers, shard.count)
+            if forecast and options.show_forecast:
                 progress.say(str(forecast))
             if missing:
                 claims = Claims(output, shard.file) if shard.count > 1 else None
                 folder = output / SUBGOALS if settings.subgoal_log else None
                 with (
-                    _environments(policy, output, settings, options.base, workers) as envs,
+                    _environments(policy, output, facts, settings, options.base, workers) as envs,
                     receipt(output / shard.file, policy, run, options.source, renders),
                 ):
                     rollout = Rollout(
@@ -240,7 +245,12 @@ def evaluate(
 
 
 def _environments(
-    policy: Policy, output: Path, settings: RolloutSettings, base: Callable[..., Any], workers: int
+    policy: Policy,
+    output: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    base: Callable[..., Any],
+    workers: int,
 ) -> VecEnv:
     robot = policy.embodiment
     sessions = 0
@@ -255,6 +265,7 @@ def _environments(
         base=base,
         max_steps=settings.max_steps,
         videos=videos,
+        run=facts.run.label,
         robot=robot,
         max_actions=settings.max_actions or policy.info.max_actions,
         sessions=sessions,
@@ -377,7 +388,8 @@ def facts_of(
 
 def default_output(facts: RunFacts) -> Path:
     """A folder that the same command finds again:
-    `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`.
+    `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`, or `outputs/evaluation/nano/seed<seed>…`
+    of a shipped policy. A run that earlier versions began under its model's name continues there.
     """
     model = safe_name(facts.model, "the policy's name")  # which a checkpoint may have brought
     if facts.memory_budget is not None:
@@ -387,25 +399,16 @@ def default_output(facts: RunFacts) -> Path:
         run += f"-{facts.subgoal}"
     if facts.split != "test":
         run += f"-{re.sub('[:=]', '-', facts.split)}"
-    return Path("outputs", "evaluation", model, str(facts.checkpoint), run)
+    folder = Path("outputs", "evaluation", model, str(facts.checkpoint), run)
+    if facts.run.is_shipped and not folder.exists():
+        folder = Path("outputs", "evaluation", str(facts.checkpoint), run)
+    return folder
 
 
 def _done(
     output: Path, jobs: Sequence[Job], facts: RunFacts, shard: Shard | None = None
 ) -> list[EpisodeRecord]:
     """The folder's records of these episodes; with a shard, only those of its own file."""
-    checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
-    run = RunKey(
-        facts.model,
-        facts.subgoal,
-        facts.memory_budget,
-        checkpoint,
-        facts.model_seed,
-        facts.split,
-        facts.composition,
-        facts.training,
-        facts.event,
-    )
     keys = {(job.task, job.episode) for job in jobs}
     files = sorted(output.glob("episodes*.jsonl"))
     if shard is not None and shard.count > 1:
@@ -419,4 +422,4 @@ def _done(
                 record = replace(record, composition=facts.composition)
             records.append(record)
     merged = merge(records, "first")
-    return [record for record in merged if record.run == run and record.key in keys]
+    return [record for record in merged if record.run == facts.run and record.key in keys]

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Self
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -21,7 +22,7 @@ from rich.progress import (
 )
 
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, printable
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import find_records, read_records
 
@@ -30,13 +31,19 @@ class RolloutProgress:
     """A bar on a terminal; anywhere else the lines alone. A context manager.
 
     total: episodes of this process. before: records of those that an earlier run has finished.
+    name: of the run, such as `nano · drop:all`: every line and the bar begin with it.
     """
 
     def __init__(
-        self, total: int, before: Sequence[EpisodeRecord] = (), visible: bool = True
+        self,
+        total: int,
+        before: Sequence[EpisodeRecord] = (),
+        visible: bool = True,
+        name: str = "",
     ) -> None:
         self.console = Console(quiet=not visible, highlight=False, soft_wrap=True, stderr=True)
         self.total = total
+        self._prefix = f"{printable(name)}: " if name else ""
         self._outcomes = Counter(record.outcome for record in before)
         self._bar: Progress | None = None
         if self.console.is_terminal and self.console.file.isatty() and visible:
@@ -49,7 +56,7 @@ class RolloutProgress:
                 TimeRemainingColumn(),
             )
             self._bar = Progress(*columns, console=self.console)
-            self._task = self._bar.add_task(self.summary, total=total, completed=self.done)
+            self._task = self._bar.add_task(self._description, total=total, completed=self.done)
 
     def __enter__(self) -> Self:
         if self._bar is not None:
@@ -77,13 +84,20 @@ class RolloutProgress:
             text += f" · {errors} errors"
         return text
 
+    @property
+    def _description(self) -> str:
+        return escape(self._prefix) + self.summary
+
     def episode(self, record: EpisodeRecord, again: bool = False) -> None:
         """One episode ended; `again` if it will be tried once more, and does not count yet."""
         if not again:
             self._outcomes[record.outcome] += 1
         seconds = record.seconds
+        episode = f"{record.task} {record.episode}"
+        if record.difficulty:
+            episode += f" ({record.difficulty})"
         line = (
-            f"{record.task} {record.episode} ({record.difficulty}): {record.outcome},"
+            f"{self._prefix}{episode}: {record.outcome},"
             f" {record.steps} steps in {seconds.total:.0f} s (simulation {seconds.sim:.0f},"
             f" rendering {seconds.render:.0f}, policy {seconds.policy:.0f})"
         )
@@ -92,14 +106,14 @@ class RolloutProgress:
         if again:
             line += " · tried again"
         if self._bar is not None:
-            self._bar.update(self._task, description=self.summary, completed=self.done)
+            self._bar.update(self._task, description=self._description, completed=self.done)
             self._bar.console.print(line, markup=False)
         else:
             self.console.print(f"{line} · {self.done}/{self.total}, {self.summary}", markup=False)
 
     def say(self, text: str) -> None:
         """Print a line that stays."""
-        self.console.print(text, markup=False)
+        self.console.print(f"{self._prefix}{text}", markup=False)
 
 
 def earlier_records(output: Path, named: Path | None) -> list[EpisodeRecord]:

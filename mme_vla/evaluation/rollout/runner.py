@@ -19,7 +19,7 @@ from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import Command
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.events import read_events
@@ -94,6 +94,24 @@ class RunFacts:
     composition: str | None = None
     training: TrainingIdentity | None = None
     event: str | None = None
+
+    @property
+    def run(self) -> RunKey:
+        """The run that its records are of."""
+        checkpoint = self.checkpoint
+        if str(checkpoint).isdecimal():
+            checkpoint = int(checkpoint)
+        return RunKey(
+            self.model,
+            self.subgoal,
+            self.memory_budget,
+            checkpoint,
+            self.model_seed,
+            self.split,
+            self.composition,
+            self.training,
+            self.event,
+        )
 
 
 @dataclass

@@ -1,5 +1,5 @@
-"""An episode as a video: all cameras side by side, the conditioning part in a red border, the
-subgoal below.
+"""An episode as a video: all cameras side by side, the conditioning part in a red border, below
+them the goal, the run, the step, the subgoal and at the end the outcome.
 """
 
 import re
@@ -25,28 +25,39 @@ class EpisodeVideo:
     file beside it.
 
     path: of the video, from outcome and goal. kept: which outcomes are kept: `all`, `success` or
-    `failure`.
+    `failure`. run: name of the run, in every frame.
     """
 
-    def __init__(self, path: Callable[[str, str], Path], save_on: str = "all") -> None:
+    def __init__(
+        self, path: Callable[[str, str], Path], save_on: str = "all", run: str = ""
+    ) -> None:
         self._path = path
         self._save_on = save_on
+        self._run = run
         self._video: VideoWriter | None = None
         self._draft = Path()
         self._thread: ThreadPoolExecutor | None = None
         self._waiting: deque[Future[None]] = deque()
 
     def add(
-        self, views: Sequence[np.ndarray], caption: str | None = None, demo: bool = False
+        self,
+        views: Sequence[np.ndarray],
+        goal: str | None = None,
+        caption: str = "",
+        demo: bool = False,
     ) -> None:
-        """Append the images [H, W, 3] uint8 that all cameras took at one step."""
+        """Append the images [H, W, 3] uint8 that all cameras took at one step.
+
+        goal, caption: the two lines below them; the run's name begins the second. demo: whether
+        they are of the conditioning video.
+        """
+        line = " · ".join(part for part in (self._run, caption) if part)
+        text = f"{goal or ''}\n{line}"
         if self._video is None:
             self._video = self._open()
             self._thread = ThreadPoolExecutor(1, "video")
         assert self._thread is not None
-        self._waiting.append(
-            self._thread.submit(self._video.add, video_frame(views, caption, demo))
-        )
+        self._waiting.append(self._thread.submit(self._video.add, video_frame(views, text, demo)))
         while len(self._waiting) > BEHIND:
             self._waiting.popleft().result()
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, counted
 from mme_vla.extras.play.game import ChoiceSession
 from mme_vla.extras.play.run import PlayRun
 
@@ -201,11 +201,11 @@ class Desk:
         self.run.save(session, participant=self.participant)
         which = session.episode
         log.info(
-            "%s, episode %d: %s after %d choices",
+            "%s, episode %d: %s after %s",
             which.task,
             which.episode,
             session.status,
-            len(session.decisions),
+            counted(len(session.decisions), "choice"),
         )
         return self._enter("ended")
 

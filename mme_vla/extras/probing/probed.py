@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.data.recording import SUBGOAL, stored_frames
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.metadata import SESSIONS, read_variant
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.arms import UNPROBED, Arm, options_of, read_arm
 from mme_vla.extras.probing.channels import Channel, MemorySnapshot, Remembered, channel_of
 from mme_vla.extras.probing.interventions import Moment
-from mme_vla.extras.probing.recordings import SUBGOAL, Recording, all_recordings, stored_frames
+from mme_vla.extras.probing.recordings import Recording, all_recordings
 from mme_vla.extras.probing.streams import Shown
 from mme_vla.policy.base import Policy, PolicyInfo
 from mme_vla.policy.episode import Episode, Failure

@@ -137,7 +137,7 @@ def run_probe(
             probed = ProbedPolicy(policy, arm, plan.lend, donors).eval()
             output = folder / ONLINE / slug(arm.name)
             named_facts = replace(facts, model=named(facts.model, arm))
-            arm_options = replace(options, notes={"arm": arm.name})
+            arm_options = replace(options, notes={"arm": arm.name}, show_forecast=False)
             evaluate(probed, plan.jobs, output, named_facts, settings, arm_options)
 
     # The page on all that the folder holds.

@@ -280,7 +280,7 @@ def test_inspect_names_its_parts(
     policy = loaded(model)
     parts = {policy.finetune_spec.component_of(name) for name, _ in policy.named_parameters()}
     console = Console(record=True, width=200, file=io.StringIO())
-    show_checkpoint(trained(model), console)
+    show_checkpoint(trained(model), console, everything=True)
     output = console.export_text()
     assert "action" in parts and all(
         word in output for word in ("parameters", "normalisation", model, *parts)

@@ -19,6 +19,7 @@ from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.processing.normalise import NormStats
 from mme_vla.testing.small import unit_stats
+from mme_vla.training.open_loop import open_loop
 
 JOINED: list[dict[str, Any]] = [{"name": "framesamp", "budget": 64}, {"name": "ttt", "budget": 64}]
 
@@ -232,3 +233,15 @@ def test_a_subgoal_of_another_episode_reaches_the_prompt() -> None:
     assert episode.inner.subgoal[-1] in "12" and episode.inner.subgoal.startswith(
         "pick it up for the first time"
     )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_policy_is_checked_open_loop(kind: str) -> None:
+    policy = KINDS[kind]()
+    recording = made_up(robot=policy.embodiment)[0]
+    first = open_loop(policy, recording, "an episode", most=3, seed=1)
+    again = open_loop(policy, recording, "an episode", most=3, seed=1)
+    assert first.predicted.shape[::2] == (3, policy.embodiment.action.width)
+    assert first.recorded.shape == first.predicted.shape
+    np.testing.assert_array_equal(first.predicted, again.predicted)
+    assert "baseline" in first.verdict()

@@ -1,0 +1,164 @@
+"""A recorded episode that a policy observes as it would a running one."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.errors import UserError
+from mme_vla.memory.base import union_frames
+from mme_vla.policy.base import Policy
+
+SUBGOAL = "simple_subgoal"  # The column whose changes separate sub-tasks
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode of a dataset.
+
+    action_offset: actions between a frame and the first one that is decided there
+    (`data.action_offset`).
+    """
+
+    source: EpisodeSource
+    episode: int
+    action_offset: int = 0
+
+    @property
+    def length(self) -> int:
+        return int(self.source.lengths[self.episode])
+
+    @property
+    def exec_start(self) -> int:
+        """The first execution frame."""
+        return int(self.source.exec_starts[self.episode])
+
+    @property
+    def task(self) -> str:
+        return self.source.task(self.episode)
+
+    @property
+    def goal(self) -> str:
+        return self.source.goal(self.episode)
+
+    @property
+    def name(self) -> str:
+        return f"{self.source.name}/{self.episode}"
+
+    @property
+    def described(self) -> str:
+        """Which episode of which dataset, and its goal."""
+        goals = " → ".join(self.source.goals(self.episode))
+        return f"episode {self.episode} of {self.source.name}: “{goals}”"
+
+    @property
+    def tells_subtasks(self) -> bool:
+        return SUBGOAL in self.source.subgoal_names
+
+    def subgoal(self, step: int, column: str = SUBGOAL) -> str | None:
+        """The subgoal at a step; None where the dataset has no such column."""
+        return self.source.subgoals(self.episode, step).get(column)
+
+    def frame(self, number: int) -> np.ndarray:
+        """An image [H, W, 3] uint8 of the camera that feeds memory."""
+        return self.source.frames(self.episode, [number])[0]
+
+    def boundaries(self) -> list[int]:
+        """Frames at which a sub-task begins, the execution's first among them."""
+        if not self.tells_subtasks:
+            return [self.exec_start]
+        subgoals = [self.subgoal(step) for step in range(self.length)]
+        changes = [step for step in range(1, self.length) if subgoals[step] != subgoals[step - 1]]
+        return sorted({0, self.exec_start, *changes})
+
+    def decisions(self, stride: int, most: int | None) -> list[int]:
+        """Steps at which chunks are chosen: every `stride`-th at which the robot decides, `most` of
+        them at most.
+        """
+        every = 1 if self.source.robot.action.frames is None else stride
+        steps = np.asarray(self.source.decisions(self.episode))[::every]
+        if most is not None and len(steps) > most:
+            steps = steps[np.linspace(0, len(steps) - 1, most).round().astype(int)]
+        return [int(step) for step in steps]
+
+    def views(
+        self, start: int, stop: int, required: np.ndarray | None
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray] | None]:
+        """Images of frames start … stop − 1 and where they stand, as `Episode.observe` takes them.
+
+        required: frames that the memory camera shows beside the last, which all cameras do; None
+        for every frame.
+
+        Raises:
+            UserError: the robot reads depth, which a dataset has no columns for.
+        """
+        robot = self.source.robot
+        if robot.readings:
+            raise UserError(
+                f"The robot {robot.name!r} reads {', '.join(robot.readings)}, and {self.name} holds"
+                " images alone: a recorded episode cannot be shown to it."
+            )
+        views, rendered = {}, {}
+        for name in robot.camera_names:
+            frames: np.ndarray = np.arange(start, stop)
+            if required is not None:
+                frames = np.array([stop - 1])
+                if name == robot.memory_camera:
+                    inside = (required >= start) & (required < stop)
+                    frames = np.union1d(required[inside], frames)
+            views[name] = self.source.frames(self.episode, frames, name)
+            rendered[name] = frames - start
+        return views, None if required is None else rendered
+
+    def show(
+        self,
+        running: Any,
+        start: int,
+        stop: int,
+        required: np.ndarray | None = None,
+        video: bool = False,
+    ) -> None:
+        """Observe frames start … stop − 1 in a running episode, which then offers the options that
+        were recorded.
+
+        required: as for `views`. video: all of it as if it were a conditioning video of that
+        episode.
+        """
+        if stop <= start:
+            return
+        if not video:
+            running.options = self.source.options(self.episode)
+        views, rendered = self.views(start, stop, required)
+        frames = np.arange(start, stop)
+        executed = frames[frames >= self.exec_start]
+        if video:
+            actions = None
+        elif self.source.robot.action.frames is None:
+            n_observed = len(self.source.past_actions(self.episode, start - 1, self.length))
+            actions = self.source.past_actions(self.episode, stop - 1, self.length)[n_observed:]
+        else:
+            before = np.maximum(executed - 1 + self.action_offset, 0)
+            actions = self.source.actions(self.episode)[before]
+        demo = np.ones(len(frames), bool) if video else frames < self.exec_start
+        states = self.source.states(self.episode, start, stop)
+        if rendered is None:
+            running.observe(views, states, demo, actions)
+        else:
+            running.observe(views, states, demo, actions, rendered=rendered)
+
+
+def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
+    """Frames of an episode that a memory may have stored or scored, whatever it chooses; None for
+    all.
+    """
+    memory = policy.memory
+    if memory is None or memory.past_view_spec is not None:
+        return None
+    if policy.frames_read(np.zeros(1, np.int64), 0) is None:
+        return None
+    frames = [memory.storage.stored_frames(length)]
+    scorer = memory.make_scorer()
+    if scorer is not None:
+        frames.append(scorer.frames_scored(length))
+    return union_frames(frames)
