@@ -47,6 +47,14 @@ class Perturbation:
     shows_video: ClassVar[bool] = True
     renews: ClassVar[bool] = False
 
+    @property
+    def meaning(self) -> str:
+        """What it does in a few plain words, as reports and progress show it: by default the first
+        sentence of its class.
+        """
+        words = " ".join((type(self).__doc__ or "").split())
+        return words.partition(". ")[0].rstrip(".")
+
     # What is shown
 
     @property
@@ -176,6 +184,10 @@ class Pause(Perturbation):
     dial: ClassVar = "frames"
 
     @property
+    def meaning(self) -> str:
+        return f"time stands still for {self.frames} frames"
+
+    @property
     def hold(self) -> int:
         return self.frames
 
@@ -209,6 +221,10 @@ class Gap(Perturbation):
     dial: ClassVar = "frames"
 
     @property
+    def meaning(self) -> str:
+        return f"{self.frames} frames pass that the policy does not see"
+
+    @property
     def hold(self) -> int:
         return self.frames + 1 if self.frames else 0
 
@@ -229,6 +245,10 @@ class Speed(Perturbation):
     neutral: ClassVar = 1
     drops: ClassVar = True
 
+    @property
+    def meaning(self) -> str:
+        return f"the past runs {self.factor:g} times as fast"
+
     def repeats(
         self, length: int, exec_start: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
@@ -245,6 +265,10 @@ class DropFrames(Perturbation):
     share: Share = 0.25
     dial: ClassVar = "share"
     drops: ClassVar = True
+
+    @property
+    def meaning(self) -> str:
+        return f"{100 * self.share:g} % of the frames are lost"
 
     def repeats(
         self, length: int, exec_start: int, rng: np.random.Generator | None = None
@@ -265,6 +289,10 @@ class Noise(Perturbation):
     std: NonNegative = 0.1
     dial: ClassVar = "std"
 
+    @property
+    def meaning(self) -> str:
+        return f"noise of {self.std:g} standard deviations on what is remembered"
+
     def perturb(self, rows: "Tensor", rng: np.random.Generator | None = None) -> "Tensor":
         import torch  # results read the names of perturbations without it
 
@@ -282,6 +310,10 @@ class Restart(Perturbation):
     """The frame index restarts at 0: what is remembered keeps its content and its times, the clock
     begins anew.
     """
+
+    @property
+    def meaning(self) -> str:
+        return "the frame number begins at 0 again"
 
     def act(self, episode: Any) -> None:
         episode.restart_clock()

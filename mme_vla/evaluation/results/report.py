@@ -26,8 +26,8 @@ class Section:
     """A box of a page.
 
     figure: SVG from `plots.svg`. headed: whether tables stand under their titles. folded: tables
-    behind a summary. images: name and WEBP in base64. half: whether it takes half the width, beside
-    another.
+    behind a summary. images: name and WEBP in base64. terms: words that its tables and figure use,
+    and what each means. half: whether it takes half the width, beside another.
     """
 
     title: str
@@ -38,6 +38,7 @@ class Section:
     paragraphs: Sequence[str] = ()
     folded: Sequence[tuple[str, Table]] = ()
     images: Sequence[tuple[str, str]] = ()
+    terms: Sequence[tuple[str, str]] = ()
     half: bool = False
 
 
@@ -48,9 +49,10 @@ def html_page(
     notes: Sequence[str] = (),
     sortable: bool = False,
     lead: str = "",
+    footnotes: Sequence[str] = (),
 ) -> str:
-    """One self-contained page of these sections. sortable: whether a click on a heading sorts its
-    table. lead: what was found, in a sentence.
+    """One self-contained page of these sections. notes: warnings. sortable: whether a click on a
+    heading sorts its table. lead: what was found, in a sentence. footnotes: small print.
     """
     return render(
         "page.html",
@@ -60,6 +62,7 @@ def html_page(
         sections=sections,
         sortable=sortable,
         lead=lead,
+        footnotes=footnotes,
     )
 
 

@@ -126,6 +126,7 @@ class RunOptions:
     times_from: earlier records, of any policy: the longest episodes begin first, and say how long
     all will take; by default those in the run's folder and in the folders beside it.
     show_forecast: whether that is printed: of several arms on the same episodes by the first.
+    name: what progress calls the run; None for its label.
     """
 
     subgoals: SubgoalPredictor | None = None
@@ -136,6 +137,7 @@ class RunOptions:
     times_from: Path | None = None
     show_progress: bool = True
     show_forecast: bool = True
+    name: str | None = None
 
 
 def evaluate_events(
@@ -160,7 +162,9 @@ def evaluate_events(
     matched = evaluate(policy, jobs, output, facts, settings, options)
     if not events:
         return matched
-    options = replace(options, times_from=options.times_from or output, show_forecast=False)
+    options = replace(
+        options, times_from=options.times_from or output, show_forecast=False, name=None
+    )
     records: list[EpisodeRecord] = []
     for event in events:
         folder = output / ("event-" + re.sub(r"[^\w.+-]", "-", event))
@@ -211,9 +215,8 @@ def evaluate(
         workers = min(workers, policy.info.max_running or workers)
 
         completed = [record for record in done if record.outcome != "error"]
-        with RolloutProgress(
-            len(jobs), completed, options.show_progress, facts.run.label
-        ) as progress:
+        name = options.name or facts.run.label
+        with RolloutProgress(len(jobs), completed, options.show_progress, name) as progress:
             if completed:
                 progress.say(
                     f"{output} holds {len(completed)} of {len(jobs)} episodes: continuing with the"

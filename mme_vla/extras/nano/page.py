@@ -67,15 +67,22 @@ def write_page(
         without=without,
         success=success_table(records, ends, results),
         comparison=to_markdown(comparison_table(comparisons)) if comparisons else "",
-        verdicts=[comparison.verdict for comparison in comparisons],
+        lead=[comparison.verdict for comparison in comparisons] or [solved(records)],
         notes=results.notes,
-        minutes=minutes,
+        minutes={stage: spent for stage, spent in minutes.items() if round(spent, 1) > 0},
         curves=CURVES,
         videos=[(video.stem, video.relative_to(folder)) for video in videos],
     )
     with write_atomically(folder / PAGE) as draft:
         draft.write_text(text, encoding="utf-8")
     return folder / PAGE
+
+
+def solved(records: Mapping[str, Sequence[EpisodeRecord]]) -> str:
+    """What the first model solved, where there is no other to compare it with."""
+    first = next(iter(records.values()))
+    won = sum(record.success for record in first)
+    return f"{first[0].model} {won} of {len(first)} episodes"
 
 
 def compared(

@@ -1,6 +1,7 @@
 """Arms of a probe: perturbations alone or together (`drop:2`, `nodemo+shuffle`)."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -49,6 +50,13 @@ class Arm:
 
     name: str
     parts: tuple[Perturbation, ...] = ()
+
+    @property
+    def meaning(self) -> str:
+        """What it does in plain words."""
+        if not self.parts:
+            return "the policy as it is, which the other arms are compared with"
+        return " and ".join(part.meaning for part in self.parts)
 
     @property
     def feed(self) -> Feed:
@@ -217,19 +225,39 @@ def choose_arms(
     n_goals: int = 0,
 ) -> tuple[list[Arm], list[str]]:
     """The arms of `specs`; by default those of `DEFAULT_ARMS` that policy and data allow, and why
-    not the others.
+    not the others: a sentence for each reason.
+
+    Of a policy that reads no subgoals, arms of subgoals are none that a reader misses.
     """
-    arms, left_out = [], []
+    arms = []
+    names_of_reasons: dict[str, list[str]] = {}
     for arm in read_arms(DEFAULT_ARMS if specs is None else specs):
         why = lacking(arm, policy, channel, recordings, boundaries=boundaries, n_goals=n_goals)
         if why is None:
             arms.append(arm)
-        elif specs is None:
-            left_out.append(f"{arm.name} was left out: it needs {why}.")
-        else:
+        elif specs is not None:
             name = PolicySections.of(policy.config).name or "this policy"
             raise UserError(f"with={arm.name} needs {why}; {name} has none here.")
+        elif why != NEEDS["subgoal"]:
+            names_of_reasons.setdefault(why, []).append(arm.name)
+    left_out = []
+    for why, names in names_of_reasons.items():
+        if len(names) == 1:
+            left_out.append(f"{names[0]} was left out: it needs {why}.")
+        else:
+            left_out.append(f"{', '.join(names)} were left out: they need {why}.")
     return arms, left_out
+
+
+def meanings_of(names: Iterable[str]) -> dict[str, str]:
+    """What arms of these names do, in plain words; without those that are more than words, or of a
+    plugin that is not loaded.
+    """
+    meanings = {UNPROBED.name: UNPROBED.meaning}
+    for name in names:
+        with suppress(UserError):
+            meanings.setdefault(name, read_arm(name).meaning)
+    return meanings
 
 
 def options_of(arm: Arm) -> list[dict[str, Any]]:

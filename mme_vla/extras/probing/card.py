@@ -13,9 +13,9 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.pairing import pair
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, display_name
 from mme_vla.evaluation.results.report import Section, html_page
-from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.scopes import Protocol, counted
 from mme_vla.evaluation.results.statistics import (
     paired_interval,
     percentiles,
@@ -28,16 +28,17 @@ from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.extras.probing import lines
-from mme_vla.extras.probing.arms import UNPROBED, lacking, read_arm, slug
+from mme_vla.extras.probing.arms import UNPROBED, lacking, meanings_of, read_arm, slug
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.evidence import record_evidence
+from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.lines import MomentLine
-from mme_vla.extras.probing.report import Findings
 from mme_vla.extras.probing.run import OFFLINE, ONLINE, ProbePlan, run_probe
 from mme_vla.extras.probing.writing import required_frames, score_writing
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.utils import require_earlier, to_json, write_atomically, write_json
+from mme_vla.utils.pages import escape_markdown
 
 TIME, CONTENT, WRONG_SCENE = "time-shifted", "content-swapped", "wrong scene first"
 ARMS = {
@@ -483,22 +484,60 @@ def tables_of(card: Card) -> list[Table]:
         "lost : gained",
         "beyond noise",
     )
-    return [Table("In short", ("", ""), rows), Table("Histories in closed loop", columns, arms)]
+    return [
+        Table("In short", ("figure", "value"), rows),
+        Table("Histories in closed loop", columns, arms),
+    ]
+
+
+def conclude_card(card: Card) -> str:
+    """What the card shows, in a sentence, or that it is too little to tell."""
+    scenes = counted(card.scenes, "scene")
+    score = card.memory_or_clock
+    losses = []
+    for label in (TIME, CONTENT):
+        if label in card.arms:
+            losses.append(f"{label} entries cost {100 * card.arms[label].loss:.0f} points")
+    text = f"This policy solves {_percent(card.matched)} of {scenes}"
+    if losses:
+        text += f", {' and '.join(losses)}"
+    if score.score is None or score.low is None or score.high is None:
+        return f"{text}: too little to tell whether its memory is a clock ({score.undefined})."
+    if score.low > 0.5:
+        kind = "its memory serves mostly as a clock"
+    elif score.high < 0.5:
+        kind = "its memory serves mostly by its content"
+    else:
+        kind = "it reads times and contents, or the scenes are too few to tell which more"
+    return f"{text}: {kind} (memory-or-clock score {_score(score)})."
 
 
 def write_card(card: Card, folder: Path) -> None:
     """Write the page and the JSON."""
     write_json(folder / FIGURES, to_json(asdict(card)))
-    sections = [Section(table.title, tables=[table]) for table in tables_of(card)]
-    sections.append(Section("How the numbers are made", paragraphs=_HOW))
-    title, subtitle = f"{MARK} {card.model}", f"checkpoint {card.checkpoint}, {card.scenes} scenes"
+    meanings = meanings_of(ARMS.values())
+    short, histories = tables_of(card)
+    terms = [(label, meanings[ARMS[label]]) for label in card.arms]
+    sections = [
+        Section(short.title, tables=[short]),
+        Section(histories.title, tables=[histories], terms=[("matched", UNPROBED.meaning), *terms]),
+        Section("How the numbers are made", paragraphs=_HOW),
+    ]
+    page = html_page(
+        f"{MARK} {display_name(card.model, card.checkpoint)}",
+        sections,
+        f"checkpoint {card.checkpoint} · {counted(card.scenes, 'scene')} in closed loop",
+        lead=conclude_card(card),
+        footnotes=card.notes,
+    )
     with write_atomically(folder / PAGE) as draft:
-        draft.write_text(html_page(title, sections, subtitle, card.notes), encoding="utf-8")
+        draft.write_text(page, encoding="utf-8")
 
 
 def card_text(card: Card) -> str:
     """The card in Markdown."""
-    return "\n".join([*map(to_markdown, tables_of(card)), *card.notes])
+    lead = f"**{escape_markdown(conclude_card(card))}**\n"
+    return "\n".join([lead, *map(to_markdown, tables_of(card)), *card.notes])
 
 
 def _score(score: ClockScore) -> str:

@@ -73,6 +73,10 @@ class Shuffle(Perturbation):
 
     needs: ClassVar = frozenset({"entries"})
 
+    @property
+    def meaning(self) -> str:
+        return "what is remembered changes places, the times stay"
+
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         slots = store.occupied
         order = moment.rng.permutation(slots)
@@ -92,6 +96,14 @@ class Drop(Perturbation):
     which: Literal["oldest", "newest", "random", "used"] = "random"
     dial: ClassVar = "count"
     needs: ClassVar = frozenset({"entries"})
+
+    @property
+    def meaning(self) -> str:
+        if self.count is None:
+            return "everything remembered is removed"
+        entries = "entry" if self.count == 1 else "entries"
+        kind = "most used" if self.which == "used" else self.which
+        return f"{self.count} {entries} removed: {kind}"
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         slots = store.occupied
@@ -122,6 +134,12 @@ class Swap(Perturbation):
     dial: ClassVar = "count"
     needs: ClassVar = frozenset({"entries", "recordings"})
 
+    @property
+    def meaning(self) -> str:
+        if self.count is None:
+            return "what is remembered is of another episode, the times stay"
+        return f"of what is remembered, {self.count} at random is of another episode"
+
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         occupied = store.occupied
         donor = moment.donor(store.name)
@@ -148,6 +166,11 @@ class Delay(Perturbation):
     dial: ClassVar = "frames"
     needs: ClassVar = frozenset({"entries", "clock"})
 
+    @property
+    def meaning(self) -> str:
+        direction = "earlier" if self.frames < 0 else "later"
+        return f"every entry seems to be {abs(self.frames)} frames {direction} than it was"
+
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         shifted = list(store.entries)
         for slot in store.occupied:
@@ -166,6 +189,10 @@ class Recent(Perturbation):
     dial: ClassVar = "frames"
     needs: ClassVar = frozenset({"entries", "choice"})
 
+    @property
+    def meaning(self) -> str:
+        return f"only the last {self.frames} frames can be remembered"
+
     def only(self, moment: Moment) -> np.ndarray | None:
         inside = moment.stored[moment.stored > moment.now - self.frames]
         return inside if len(inside) else moment.stored[-1:]
@@ -179,6 +206,10 @@ class Oracle(Perturbation):
     """
 
     needs: ClassVar = frozenset({"entries", "choice", "boundaries"})
+
+    @property
+    def meaning(self) -> str:
+        return "only the frames where sub-tasks begin can be remembered"
 
     def only(self, moment: Moment) -> np.ndarray | None:
         past = [frame for frame in moment.boundaries if frame <= moment.now]
@@ -196,6 +227,11 @@ class Distract(Perturbation):
     needs: ClassVar = frozenset({"recordings"})
 
     @property
+    def meaning(self) -> str:
+        others = "another episode" if self.sessions == 1 else f"{self.sessions} other episodes"
+        return f"{others} first, as if part of this one"
+
+    @property
     def n_sessions(self) -> int:
         return self.sessions
 
@@ -206,6 +242,10 @@ class NoDemo(Perturbation):
     """The conditioning video is not shown."""
 
     shows_video: ClassVar = False
+
+    @property
+    def meaning(self) -> str:
+        return "the video before the episode is not shown"
 
 
 class _Perturbed(History):
@@ -274,6 +314,10 @@ class SubgoalSwap(Perturbation):
 
     needs: ClassVar = frozenset({"subgoal", "recordings"})
 
+    @property
+    def meaning(self) -> str:
+        return "the subgoal is that of another episode"
+
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         return subgoal if moment.donor_subgoal is None else moment.donor_subgoal
 
@@ -286,6 +330,10 @@ class SubgoalDelay(Perturbation):
     decisions: PositiveInt = 2
     dial: ClassVar = "decisions"
     needs: ClassVar = frozenset({"subgoal"})
+
+    @property
+    def meaning(self) -> str:
+        return f"the subgoal is the one of {self.decisions} chunks ago"
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         if not moment.subgoals:
@@ -303,6 +351,10 @@ class SubgoalCount(Perturbation):
     by: int = 1
     dial: ClassVar = "by"
     needs: ClassVar = frozenset({"subgoal"})
+
+    @property
+    def meaning(self) -> str:
+        return f"every count in the subgoal is wrong by {self.by}"
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         return None if subgoal is None else _COUNT.sub(self._wrong, subgoal)

@@ -264,7 +264,7 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
     }  # fmt: skip
     folders = {model: [tmp_path / model] for model in runs if model != "planner"}
     page = write_page(
-        tmp_path, config, runs, "pi05", {"videos": 2.0}, [video], folders, 7
+        tmp_path, config, runs, "pi05", {"videos": 2.0, "planner": 0.0}, [video], folders, 7
     ).read_text()
     assert (
         "| framesamp_modul | 4 | 60 % (60/100) | 50 … 69 % | 60/100 |  |  | 2.0 cm | 67 % |" in page
@@ -275,6 +275,11 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
         and "ttt_modul@4 − pi05" in page
         and "videos/a.mp4" in page
     )
-    assert "framesamp_modul@4 is significantly better than pi05 (p < 0.001)" in page
+    lead = (
+        "**framesamp_modul@4 60 of 100 against pi05 5 of 100: framesamp_modul@4 is significantly"
+        " better (p < 0.001).**"
+    )
+    assert page.splitlines()[2] == lead, "what was found comes first"
     assert page.count("Incomplete") == 1 and "7 demonstrations" in page
+    assert "| planner | 0.0 |" not in page, "a stage that did not run has no row"
     assert "| videos | 2.0 |" in page and (tmp_path / "learning.png").is_file()

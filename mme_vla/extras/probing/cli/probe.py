@@ -99,12 +99,12 @@ def probe(cfg: DictConfig) -> None:
     )
     predictor = None if subgoals is None else str(values["subgoal"]["name"])
     facts = facts_of(policy, name, source, settings, predictor)
-    folder = Path(
-        "outputs",
-        "card" if card else "probe",
-        safe_name(name, "the policy's name"),
-        str(facts.checkpoint),
-    )
+    # A shipped policy has a folder of its name; one that an earlier version began continues.
+    kind = "card" if card else "probe"
+    model = safe_name(name, "the policy's name")
+    folder = Path("outputs", kind, model, str(facts.checkpoint))
+    if facts.run.is_shipped and not folder.exists():
+        folder = Path("outputs", kind, str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
     plan = ProbePlan(values["with"], probed, recordings, jobs, offline, events)
