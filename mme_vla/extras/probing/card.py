@@ -498,7 +498,7 @@ def conclude_card(card: Card) -> str:
     for label in (TIME, CONTENT):
         if label in card.arms:
             losses.append(f"{label} entries cost {100 * card.arms[label].loss:.0f} points")
-    text = f"This policy solves {_percent(card.matched)} of {scenes}"
+    text = f"This policy solves {percent(card.matched)} of {scenes}"
     if losses:
         text += f", {' and '.join(losses)}"
     if score.score is None or score.low is None or score.high is None:
