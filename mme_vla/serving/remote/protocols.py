@@ -269,8 +269,8 @@ class HarnessProtocol(ServerProtocol):
         connection.send("episode_start", {"task": {"name": frames.goal}})
 
     def act(self, connection: Connection, frames: NewFrames) -> dict[str, Any]:
-        # Frames between two decisions, of an event that holds the robot, get actions that nobody
-        # executes.
+        # Frames between two decisions, of an event that holds the robot, get actions that are not
+        # executed.
         reply: dict[str, Any] = {}
         for number in range(frames.n_video, len(frames.states)):
             images = {}
