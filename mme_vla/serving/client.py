@@ -115,7 +115,8 @@ class Client:
         """Send one message and return the answer.
 
         Raises:
-            UserError: the server refuses the message, and says why. The connection is closed then.
+            UserError: the server refuses the message, and says why. The episode goes on where
+                nothing was changed; else the next request raises `ConnectionError`.
             ConnectionError: the connection is lost. TimeoutError: no answer within `timeout`; the
                 connection is closed.
         """
@@ -151,7 +152,6 @@ class Client:
                 f"No answer from {self.url} within {timeout:g} s; call reconnect()."
             ) from None
         if isinstance(response, str):
-            self.close()
             raise UserError(f"The server refuses this request: {response}")
         try:
             return decoded_map(response)

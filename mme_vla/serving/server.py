@@ -281,11 +281,7 @@ class PolicyServer:
                 raise HTTPException(503, FULL)
             place.work()
             begun = time.perf_counter()
-            try:
-                message = await self._read(body)
-            except UserError:
-                self.sessions.drop(name)
-                raise
+            message = await self._read(body)
             del body
             reply = await self.sessions.respond(name, message, begun)
             return Response(pack(reply), media_type=MSGPACK)
@@ -388,7 +384,7 @@ class PolicyServer:
                     raise WebSocketDisconnect(coming.result()["code"])
                 reply = await computing  # another request may have come; it waits for its turn
                 await self._send(socket, reply)
-                if isinstance(reply, str):
+                if isinstance(reply, str) and not session.intact:
                     await _close(socket, 1011, reply)
                     return
                 place.wait()
@@ -400,7 +396,11 @@ class PolicyServer:
     async def _reply(
         self, session: Session, event: Mapping[str, Any], place: "Place"
     ) -> dict[str, Any] | str:
-        """The reply to a message, or the reason why there is none; then the connection closes."""
+        """The reply to a message, or the reason why there is none.
+
+        The connection closes after a reason, unless `session.intact`: a request that is refused
+        before it changes anything costs neither the connection nor the episode.
+        """
         try:
             if event.get("bytes") is None:
                 raise UserError("Requests are binary msgpack messages; this one is text.")
@@ -411,6 +411,7 @@ class PolicyServer:
             logger.info("%s: refused: %s", place.name, error)
             return error_text(error)
         except Exception as error:
+            session.intact = False
             self.stats.count("failed")
             logger.exception("%s: failed", place.name)
             return error_text(error)

@@ -6,7 +6,7 @@ connection does not identify an episode.
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,7 +29,12 @@ class Session:
 
     Requests of a session must come one after the other; `respond` is not to be called twice at the
     same time.
+
+    intact: whether the episode can go on. It can after a request that was carried out, or refused
+    before it changed anything, and not after one that failed half way.
     """
+
+    intact = True
 
     def __init__(self, engine: Engine, settings: ServeSettings) -> None:
         self._engine = engine
@@ -41,6 +46,7 @@ class Session:
         self.episode = self._engine.policy.start_episode("", seed=self._seed)
         self._exec_start = 0
         self._n_frames_at_action: int | None = None
+        self._sizes: dict[tuple[str, str], tuple[int, ...]] = {}  # by kind of message and camera
 
     async def respond(self, request: Request, begun: float) -> dict[str, Any]:
         """Do what a request asks and return the reply as the protocol has it, not yet packed.
@@ -48,6 +54,9 @@ class Session:
         Args:
             begun: when the message was there whole (`time.perf_counter()`); the reply says how
                 long it took.
+
+        Raises:
+            UserError: the request is refused. `intact` says whether the episode can go on.
         """
         reply: dict[str, Any] = {}
         if isinstance(request, Reset):
@@ -65,6 +74,7 @@ class Session:
             space = self._engine.policy.embodiment.action
             if space.choice:
                 reply["choices"] = [benchmark_action(space, row) for row in reply["actions"]]
+        self.intact = True
         seconds = time.perf_counter() - begun
         self._engine.stats.took(kind, seconds)
         reply[f"{kind}_time_ms"] = seconds * 1e3
@@ -73,6 +83,9 @@ class Session:
     async def _add_buffer(self, request: AddBuffer) -> None:
         count = len(request.frames)
         self._check_capacity(count)
+        robot = self._engine.policy.embodiment
+        self._check_sizes("add_buffer", {robot.memory_camera: request.frames})
+        self.intact = False
         if request.exec_start > 0:
             self._exec_start = request.exec_start
 
@@ -91,6 +104,9 @@ class Session:
         self._check_course(request)
         if request.stored:
             self._check_capacity(count)
+        cameras = self._engine.policy.embodiment.camera_names
+        self._check_sizes("observation", {name: request.views[name] for name in cameras})
+        self.intact = False
 
         episode = self.episode
         episode.goal = request.goal
@@ -193,6 +209,21 @@ class Session:
                 " (limits.frames). Reset between episodes."
             )
 
+    def _check_sizes(self, kind: str, views: Mapping[str, Sequence[np.ndarray]]) -> None:
+        """Make sure that a camera's images have the size that they had when the episode began.
+
+        kind: of the message. Clients may scale the images of one kind and not those of the other.
+        """
+        sizes = {(kind, name): view[0].shape[:2] for name, view in views.items()}
+        for key, size in sizes.items():
+            before = self._sizes.get(key, size)
+            if size != before:
+                raise UserError(
+                    f"The images of camera {key[1]!r} have {list(size)} pixels (height, width), and"
+                    f" had {list(before)} before in this episode: send one size."
+                )
+        self._sizes |= sizes
+
     def _subgoal(self, request: Infer) -> str | None:
         """The subgoal this policy was trained to read, of those the request brings."""
         kind = subgoal_kind(self._engine.policy)
@@ -252,8 +283,9 @@ class HttpSessions:
                 if self.entries.get(name) is not entry and not _begins(request):
                     raise NoEpisodeError(LOST)  # a request before this one failed
                 return await entry.session.respond(request, begun)
-        except Exception:
-            self.drop(name, entry)
+        except Exception as error:
+            if not isinstance(error, UserError) or not entry.session.intact:
+                self.drop(name, entry)
             raise
         finally:
             entry.requests -= 1

@@ -79,7 +79,7 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     average = overview(results)
     whiskers = f"Whiskers: {100 * protocol.confidence:g} % intervals."
     if any(method.paper for method in results.methods):
-        whiskers += " Black lines: the paper."
+        whiskers += " Lines across: the paper."
     pale = ""
     if any(
         figure.is_pale for method in results.methods for figure in method.figures["task"].values()

@@ -90,3 +90,13 @@ class RolloutKeywords(TypedDict, total=False):
     draw: Literal["needed", "all"]
     video: Literal["none", "all", "success", "failure"]
     subgoal_log: bool
+
+
+def check_config(config: Mapping[str, Any]) -> None:
+    """Check what a command's configuration says of rollouts and of the tasks, without PyTorch.
+
+    Args:
+        config: plain and resolved, of a command that has the keys of configs/evaluate.yaml.
+    """
+    # Each event is a run of its own, which the command checks.
+    RolloutSettings.from_config({**config, "event": None})

@@ -27,12 +27,15 @@ def conclude(findings: Findings, comparisons: Sequence[Comparison]) -> str:
 def _on_recordings(findings: Findings) -> str:
     arms = findings.arms()
     if not findings.changed:
-        tried = "The intervention does not change"
-        if len(arms) > 1:
-            tried = f"None of the {len(arms)} interventions changes"
-        reads = "this policy does not read its memory"
+        tried = f"None of the {len(arms)} interventions changes"
+        if len(arms) == 1:
+            tried = f"{next(iter(arms))} does not change"
         if not any(line.entries for line in findings.moments):
             reads = "this policy acts on what it sees now alone"
+        elif EVERYTHING in arms:
+            reads = "this policy does not read its memory"
+        else:
+            reads = f"with=[{EVERYTHING}] tells whether this policy reads its memory at all"
         return f"{tried} the actions: {reads} ({findings.size})."
 
     if all(effect_of.change < UNCHANGED for effect_of in arms.values()):

@@ -11,7 +11,6 @@ import numpy as np
 
 from mme_vla.errors import require
 from mme_vla.evaluation.results.compare import Comparison, show_p
-from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.scopes import counted
 from mme_vla.evaluation.results.tables import Table, to_markdown
@@ -23,6 +22,7 @@ from mme_vla.extras.probing.recordings import Recording
 from mme_vla.utils import require_earlier, write_atomically
 from mme_vla.utils.media import Tile, contact_sheet
 from mme_vla.utils.pages import render
+from mme_vla.utils.style import COLOURS, FAINT, INK, figure, legend, rgb, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -349,7 +349,7 @@ def _plot_dial(
 
 
 PAGE, TABLE, IMAGES = "page.html", "table.md", "remembered"
-VIDEO, EXECUTION, NOW = (122, 162, 205), (233, 148, 62), (200, 40, 40)
+VIDEO, EXECUTION, NOW = rgb("video"), rgb("series-1"), rgb("border")
 UNITS = (
     "Change: distance of two chunks of actions that start from the same noise, in normalised"
     " actions (one is half of what the training data span). In brackets: how many times the"

@@ -309,10 +309,9 @@ def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Co
 
     model: the unprobed one's name.
     """
-    tasks = tuple(dict.fromkeys(record.task for record in records))
-    if not tasks:
+    if not records:
         return []
-    protocol = Protocol(tasks, episodes=1 + max(record.episode for record in records))
+    protocol = Protocol.of_records(records)
     methods = aggregate(records, protocol, split).methods
     unprobed = [method for method in methods if method.model == model and method.event is None]
     for method in methods:

@@ -20,7 +20,7 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.extras.nano import demonstrations, tokens
 from mme_vla.extras.nano.demonstrations import Demonstration, Scene
 from mme_vla.extras.nano.learning import Decisions, position_error, statistics
-from mme_vla.extras.nano.page import write_page
+from mme_vla.extras.nano.page import ends_of, outcome_lines, plot_curves, write_page
 from mme_vla.extras.nano.rows import TRAINED
 from mme_vla.extras.nano.runs import Group, demonstrate
 from mme_vla.extras.nano.settings import NanoRun
@@ -283,3 +283,13 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
     assert page.count("Incomplete") == 1 and "7 demonstrations" in page
     assert "| planner | 0.0 |" not in page, "a stage that did not run has no row"
     assert "| videos | 2.0 |" in page and (tmp_path / "learning.png").is_file()
+    lines = outcome_lines(runs, ends_of(folders))
+    assert lines[0] == (
+        "framesamp_modul: off by 2.0 cm on held-out decisions, 60 of 100 episodes solved"
+    )
+    assert lines[-1] == "planner: 100 of 100 episodes solved"
+
+
+def test_a_run_without_held_out_losses_has_no_learning_curve(tmp_path):
+    assert not plot_curves({"pi05": [{"step": 10, "loss": 0.5}]}, tmp_path / "learning.png")
+    assert not (tmp_path / "learning.png").exists()

@@ -74,7 +74,7 @@ def compared(arm: str, wins: int, losses: int, episodes: int, arms: int = 1) -> 
         ),
         (
             moments([0.0], "nodemo", entries=0),
-            "The intervention does not change the actions: this policy acts on what it sees now"
+            "nodemo does not change the actions: this policy acts on what it sees now"
             " alone (1 decision of 1 recorded episode).",
         ),
         (

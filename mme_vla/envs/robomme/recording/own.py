@@ -119,5 +119,11 @@ def _create(row: dict[str, Any], root: Path, fps: int) -> Any:
             names = [f"{name.rpartition('.')[2]} {i}" for i in range(len(value))]
             features[name] = {"dtype": "float32", "shape": value.shape, "names": names}
     return LeRobotDataset.create(
-        f"local/{root.name}", fps=fps, features=features, root=root, use_videos=False
+        f"local/{root.name}",
+        fps=fps,
+        features=features,
+        root=root,
+        use_videos=False,
+        # LeRobot would try torchcodec, and print why it does not load where FFmpeg is missing.
+        video_backend="pyav",
     )
