@@ -15,7 +15,14 @@ from mme_vla.evaluation.results.aggregate import Figure, Method, Results, Run
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.curves import CAPTION, process_tables
 from mme_vla.evaluation.results.paper import chunk_flops
-from mme_vla.evaluation.results.tables import Table, comparison_table, detail, overview, runs_table
+from mme_vla.evaluation.results.tables import (
+    Table,
+    comparison_table,
+    detail,
+    grouping_tables,
+    overview,
+    runs_table,
+)
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 from mme_vla.evaluation.store import RUN_FILE, read_run
 from mme_vla.utils.pages import render
@@ -114,6 +121,8 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     else:
         text = f"Success rate in percent.{pale.replace('n:', 'in brackets')}"
         sections.append(Section("Tasks", plots.heat_map(results), caption=text))
+    if groupings := grouping_tables(results):
+        sections.append(Section("Groups of tasks", tables=groupings, headed=True))
 
     # Averages beside the paper's: of the whole benchmark alone
     points: dict[str, list[tuple[int, Figure]]] = {}

@@ -266,7 +266,7 @@ def _environments(
     make = partial(
         make_rollout_env,
         base=base,
-        max_steps=settings.max_steps,
+        max_steps=settings.limit_of,
         videos=videos,
         run=facts.run.label,
         robot=robot,

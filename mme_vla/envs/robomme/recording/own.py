@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.console import progress, quiet_libraries
-from mme_vla.envs.base import Environment, EpisodeEnv
+from mme_vla.envs.base import Environment
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import UserError
 from mme_vla.utils import write_atomically
@@ -82,7 +82,7 @@ def record_own(
 
 def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.ndarray] | None:
     """The columns of an episode [frames, …] and its `task`; None where it did not succeed."""
-    env = EpisodeEnv(environment, environment.make(spec), spec, environment.step_limit(spec.split))
+    env = environment.open(spec.task, spec.split, spec.episode)
     try:
         rows: list[dict[str, np.ndarray]] = []
         for observation, action, visible in env.demonstration():
