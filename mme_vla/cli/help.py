@@ -23,7 +23,8 @@ from mme_vla.errors import UserError, did_you_mean
 
 def configured_commands() -> dict[str, str]:
     """File of the tree's top level → how the command that it configures is typed."""
-    usages = {"policy": "build_policy(…)"}
+    # Files that commands include.
+    usages = {"policy": "build_policy(…)", "server": "RemotePolicy(…)"}
     for name, command in commands().items():
         if command.config:
             usages[command.config] = command.usage or f"mme-vla {name}"

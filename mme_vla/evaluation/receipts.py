@@ -191,12 +191,15 @@ def receipt(
     path = receipt_file(records)
     here = _conditions(policy.device.type == "cuda", renders, _extras_of(policy))
     here["checkpoint"] = _checkpoint(source)
+    here |= policy.conditions()
     conditions: list[dict[str, Any]] = []
     if path.exists():
         conditions = read_receipt(path)["conditions"]
     if to_json(here) not in conditions:
         conditions.append(here)
     trained = identity_of(policy.config)
+    if policy.info.identity is not None:
+        trained = policy.info.identity.training
     facts = {
         "settings": run["settings"],
         "training": None if trained is None else asdict(trained),
@@ -212,6 +215,7 @@ def receipt(
     try:
         yield
     finally:
+        here |= policy.conditions()  # a server's times are known now
         write()
 
 

@@ -5,8 +5,8 @@ hooks that it can serve:
 
 - `data.history_transforms`: training, on recorded episodes (`repeats`, `perturb`);
 - `event`: a rollout, in the simulation (`hold`, `act`, and `repeats` of the conditioning video);
-- `with`: a probe, on what a policy observes, remembers and is told (`repeats`, `perturb`,
-  `n_sessions`, `shows_video`, `only`, `edit`, `say`).
+- `with`: a probe, on what a policy observes, remembers and is told (`repeats`, `show`, `renews`,
+  `n_sessions`, `shows_video`, `perturb`, `only`, `edit`, `say`, `instruct`).
 
 One of your own is a class registered with `register("perturbation", name)` in a module that
 `plugins` names.
@@ -35,7 +35,9 @@ class Perturbation:
 
     dial: the option that `name:value` sets. neutral: its value without effect, at which a curve has
     the plain run. drops: whether `repeats` may leave frames out. needs: what else a probe must have
-    for it, such as `recordings`. shows_video: whether the conditioning video is shown.
+    for it, such as `recordings`. shows_video: whether the conditioning video is shown. renews:
+    whether the policy begins an episode anew at each decision, with what is shown of the frames so
+    far. lag: frames before the shown ones that `show` needs too.
     """
 
     dial: ClassVar[str | None] = None
@@ -43,6 +45,7 @@ class Perturbation:
     drops: ClassVar[bool] = False
     needs: ClassVar[frozenset[str]] = frozenset()
     shows_video: ClassVar[bool] = True
+    renews: ClassVar[bool] = False
 
     @property
     def meaning(self) -> str:
@@ -53,6 +56,20 @@ class Perturbation:
         return words.partition(". ")[0].rstrip(".")
 
     # What is shown
+
+    @property
+    def lag(self) -> int:
+        return 0
+
+    def show(self, frames: Any, moment: Any) -> Any:
+        """Change the frames since the last decision as the policy observes them; with `renews`, all
+        frames so far.
+
+        Args:
+            frames: what a probe collected, the current frame last. moment: what it knows of the
+                current step.
+        """
+        return frames
 
     def repeats(
         self, length: int, exec_start: int, rng: np.random.Generator | None = None
@@ -115,12 +132,27 @@ class Perturbation:
         """The subgoal that the policy reads instead."""
         return subgoal
 
+    def instruct(self, goal: str, moment: Any) -> str:
+        """The goal that the policy reads instead."""
+        return goal
+
 
 TRAINING, ROLLOUT, PROBE = "data.history_transforms", "event", "with"  # options that take some
 _HOOKS = {
     TRAINING: ("repeats", "perturb"),
     ROLLOUT: ("hold", "act", "repeats"),
-    PROBE: ("repeats", "perturb", "n_sessions", "shows_video", "only", "edit", "say"),
+    PROBE: (
+        "repeats",
+        "show",
+        "renews",
+        "n_sessions",
+        "shows_video",
+        "perturb",
+        "only",
+        "edit",
+        "say",
+        "instruct",
+    ),
 }
 
 

@@ -11,12 +11,13 @@ import logging
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any
 
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.policy.base import Policy
+from mme_vla.policy.identity import identify_policy
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.serving.codec import pack, unpack
 from mme_vla.serving.engine import Engine, ServerStats
@@ -24,6 +25,7 @@ from mme_vla.serving.requests import Request as PolicyRequest
 from mme_vla.serving.requests import RequestReader
 from mme_vla.serving.session import BusyError, HttpSessions, NoEpisodeError, Session
 from mme_vla.serving.settings import Limits, ServeSettings, listen
+from mme_vla.utils import to_json
 
 try:
     import uvicorn
@@ -73,11 +75,18 @@ class PolicyServer:
     Args:
         policy: with normalisation statistics, in eval mode, on its device.
         settings: how to serve.
-        name: what metadata call the policy. trained: False says that its weights are fresh.
+        name: what metadata call the policy. trained: False says that its weights are fresh. source:
+            where they are from.
     """
 
     def __init__(
-        self, policy: Policy, settings: ServeSettings, *, name: str = "", trained: bool = True
+        self,
+        policy: Policy,
+        settings: ServeSettings,
+        *,
+        name: str = "",
+        trained: bool = True,
+        source: str | None = None,
     ) -> None:
         policy.require_processor().require_stats()
         settings.check_robot(policy.embodiment, policy.require_processor().prompt_spec.past_actions)
@@ -88,6 +97,8 @@ class PolicyServer:
         self.sessions = HttpSessions(self.engine, settings)
         self.places = Places(settings.limits, self.stats)
         self.metadata = _metadata(policy, settings, name, trained)
+        identity = identify_policy(policy, name or None, source)
+        self.metadata["identity"] = to_json(asdict(identity))
         self.port = settings.port
         self._background: list[asyncio.Task[None]] = []
         self._uvicorn: uvicorn.Server | None = None
@@ -568,5 +579,9 @@ def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool)
         "remembers_frames": policy.memory is not None,
         "subgoal": subgoal_kind(policy),
         "schemas": ["mme_vla", "robomme_challenge"],
+        "robot": to_json(robot.to_dict()),
+        "max_actions": policy.info.max_actions,
+        "sample_steps": settings.flow_steps or policy.info.sample_steps,
+        "max_clients": limits.connections,
         "limits": {"message_bytes": limits.message_bytes, "frames": limits.frames},
     }

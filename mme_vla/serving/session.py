@@ -39,10 +39,11 @@ class Session:
     def __init__(self, engine: Engine, settings: ServeSettings) -> None:
         self._engine = engine
         self._settings = settings
+        self._seed = settings.seed
         self._begin()
 
     def _begin(self) -> None:
-        self.episode = self._engine.policy.start_episode("", seed=self._settings.seed)
+        self.episode = self._engine.policy.start_episode("", seed=self._seed)
         self._exec_start = 0
         self._n_frames_at_action: int | None = None
         self._sizes: dict[tuple[str, str], tuple[int, ...]] = {}  # by kind of message and camera
@@ -60,6 +61,7 @@ class Session:
         reply: dict[str, Any] = {}
         if isinstance(request, Reset):
             kind = "reset"
+            self._seed = self._settings.seed if request.seed is None else request.seed
             self._begin()
             reply["reset_finished"] = True
         elif isinstance(request, AddBuffer):
@@ -98,7 +100,7 @@ class Session:
         # A client that repeats its first request means the same episode, not a longer one.
         if request.first:
             self._begin()
-            self._exec_start = count - 1
+            self._exec_start = count - 1 if request.exec_start is None else request.exec_start
         self._check_course(request)
         if request.stored:
             self._check_capacity(count)
@@ -151,10 +153,22 @@ class Session:
 
     def _observe(self, request: Infer) -> Iterator[None]:
         if request.stored:
+            # Frames before `first_led` were led to by no action that the client names.
+            executed = request.executed
+            count = len(request.states)
+            first_led = count if executed is None else count - len(executed)
 
             def take(part: slice, is_demo: np.ndarray) -> None:
-                views = {name: np.stack(view[part]) for name, view in request.views.items()}
-                self.episode.observe(views, request.states[part], is_demo)
+                middle = min(max(part.start, first_led), part.stop)
+                for piece in (slice(part.start, middle), slice(middle, part.stop)):
+                    if piece.start == piece.stop:
+                        continue
+                    views = {name: np.stack(view[piece]) for name, view in request.views.items()}
+                    actions = None
+                    if executed is not None and piece.start >= first_led:
+                        actions = executed[piece.start - first_led : piece.stop - first_led]
+                    demo = is_demo[piece.start - part.start : piece.stop - part.start]
+                    self.episode.observe(views, request.states[piece], demo, actions)
 
             yield from self._in_pieces(len(request.states), take)
         else:

@@ -29,6 +29,7 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy
+from mme_vla.policy.episode import Failure
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.subgoal import SubgoalPredictor
@@ -64,7 +65,7 @@ class Waiting:
         self._again.append(job)
 
 
-GIVE_UP_AFTER = 8  # episodes in a row whose environments did not even begin
+GIVE_UP_AFTER = 8  # episodes in a row that did not even begin
 SAME_ERRORS = 2  # equal errors of an environment's code, in a row, that stop a run
 
 
@@ -185,6 +186,7 @@ class Rollout:
         self._running: dict[int, RunningEpisode] = {}  # by worker
         self._tries: Counter[Job] = Counter()
         self._stillborn = 0  # episodes in a row whose environments did not begin
+        self._inactive = 0  # episodes in a row in which the policy chose no chunk
         self._last_error = ""  # of an environment's code
         self._same_errors = 0  # episodes in a row that it ended
         self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(
@@ -374,6 +376,10 @@ class Rollout:
         execute = self.settings.execute or self.policy.embodiment.action.execute
         for running, chunk in zip(batch, chunks, strict=True):
             running.add_policy_seconds(share)
+            if (failure := running.episode.failure) is not None:
+                self._give_up(running, failure)
+                continue
+            self._inactive = 0
             actions = chunk[:execute]
             if not np.isfinite(actions).all():
                 self._finish(
@@ -385,6 +391,21 @@ class Rollout:
             command = Command(actions, subgoal=running.episode.subgoal, draw=draw)
             self.envs.send(running.worker, command)
             self._scheduler.later[running] = None
+
+    def _give_up(self, running: RunningEpisode, failure: Failure) -> None:
+        """End an episode in which the policy cannot act any more.
+
+        Raises:
+            UserError: it chose no chunk in many episodes in a row.
+        """
+        if not running.chunks:
+            self._inactive += 1
+        if self._inactive >= GIVE_UP_AFTER:
+            raise UserError(
+                f"The policy chose no chunk in {self._inactive} episodes in a row, so the run"
+                f" stops; the last one: {failure.reason}"
+            )
+        self._finish(running, "error", failure.reason, retry=failure.again)
 
     def _finish(
         self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True
@@ -398,6 +419,7 @@ class Rollout:
         if status not in ("success", "fail", "timeout"):
             outcome = "error"
             error = error or f"the environment ended the episode with the status {status!r}"
+        running.episode.close()
         again = outcome == "error" and retry and self._tries[running.job] <= self.settings.retries
         self.on_end(running, Ending(outcome, error, again))
         if again:

@@ -14,6 +14,7 @@ from torch import Tensor
 from mme_vla.config.sections import NonNegativeInt, PositiveInt
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.channels import Remembered, same_progress
+from mme_vla.extras.probing.recordings import Recording
 from mme_vla.memory.history import History
 from mme_vla.memory.perturbation import Perturbation
 from mme_vla.registry import PERTURBATIONS
@@ -25,6 +26,8 @@ NEEDS = {
     "pauses": "a memory that sees frames at which nothing is decided",
     "subgoal": "a policy that reads subgoals",
     "recordings": "recorded episodes to take from: name them with recordings=…",
+    "stream": "a robot with one action a frame, and without depth",
+    "goals": "recorded episodes with several goals",
     "boundaries": (
         "sub-tasks whose beginnings are told: by recordings with subgoals, in closed loop by"
         " env=mme_vla"
@@ -45,7 +48,9 @@ class Moment:
     observed. stored: stored frames up to now, ascending. boundaries: frames at which a sub-task
     began. subgoals: earlier ones, the current one last. donor: the store of a name of another
     episode that is as far along. donor_subgoal: the subgoal there. weigh: for each slot of a store,
-    by how much the chunk changes without it.
+    by how much the chunk changes without it. exec_start: the first execution frame; of a video that
+    is not over, the frame after it. donor_recording: another recorded episode. donor_goal: the goal
+    of one that has another goal.
     """
 
     rng: np.random.Generator
@@ -56,6 +61,9 @@ class Moment:
     donor: Callable[[str], Remembered] = _nothing
     donor_subgoal: str | None = None
     weigh: Callable[[Remembered], np.ndarray] | None = None
+    exec_start: int = 0
+    donor_recording: Recording | None = None
+    donor_goal: str | None = None
 
 
 @PERTURBATIONS.register("shuffle")

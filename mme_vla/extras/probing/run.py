@@ -103,14 +103,33 @@ def run_probe(
         n_donors = len(donor_names)
         if any(recording.name in donor_names for recording in plan.recordings):
             n_donors -= 1  # never the probed one
+        n_goals = len({recording.goal for recording in plan.lend})
         arms, left_out = choose_arms(
-            plan.arms, policy, channel, n_donors, boundaries=has_boundaries
+            plan.arms, policy, channel, n_donors, boundaries=has_boundaries, n_goals=n_goals
         )
+        require(
+            policy.info.resamples,
+            "A served policy is probed in closed loop alone, because a server chooses a chunk once:"
+            " set offline=false online=true. Recordings are what contents are taken from.",
+        )
+        in_loop = [arm.name for arm in arms if arm.in_closed_loop]
+        if in_loop:
+            require(plan.jobs, f"with={in_loop[0]} acts in closed loop: set online=true.")
+            left_out.append(
+                f"On recordings {', '.join(in_loop)} were left out: they act in episodes."
+            )
+        arms = [arm for arm in arms if not arm.in_closed_loop]
         _on_recordings(policy, arms, plan, folder / OFFLINE, facts, options)
     if plan.jobs:
         has_boundaries = options.base is make_env and settings.env == "mme_vla"
+        n_goals = len({recording.goal for recording in plan.lend})
         arms, not_in_loop = choose_arms(
-            plan.arms, policy, channel, len(plan.lend), boundaries=has_boundaries
+            plan.arms,
+            policy,
+            channel,
+            len(plan.lend),
+            boundaries=has_boundaries,
+            n_goals=n_goals,
         )
         left_out += [f"In closed loop {note}" for note in not_in_loop if note not in left_out]
         _in_closed_loop(policy, arms, plan, folder / ONLINE, facts, settings, options)

@@ -62,6 +62,13 @@ def probe(cfg: DictConfig) -> None:
         raise UserError(
             "offline=false online=false leaves nothing to probe: set one of them to true."
         )
+    if values["server"] is not None:
+        # A server chooses a chunk once: recordings are what contents are taken from.
+        values["offline"] = False
+        require(
+            values["online"] or card,
+            "server=…: a served policy is probed in closed loop alone: add online=true.",
+        )
     if values["offline"] and values["recordings"] is None and not card:
         raise UserError(NO_DATA)
     events = event_arms(values["event"])
@@ -112,6 +119,7 @@ def probe(cfg: DictConfig) -> None:
             page = run_probe(policy.eval(), plan, folder, facts, settings, options).page
             text = (folder / "table.md").read_text(encoding="utf-8")
     finally:
+        policy.close()
         if subgoals is not None:
             report_usage(subgoals.usage)
             subgoals.close()
