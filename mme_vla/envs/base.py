@@ -17,6 +17,7 @@ import numpy as np
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option
+from mme_vla.envs.facts import Fact
 from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
 from mme_vla.errors import check_known, listed, require
@@ -90,6 +91,12 @@ class Environment(ABC):
         Empty: nothing.
         """
         return {}
+
+    def facts(self, env: Any) -> Sequence[Fact]:
+        """What the episode of `env` has shown so far that is needed later, from the simulator's
+        state: for the score of writing and the table beside a recording. By default nothing.
+        """
+        return ()
 
     def scene_values(self, env: Any) -> Mapping[str, Any] | None:
         """What makes the scene of `env`, right after its reset: plain values, the same on every
@@ -311,6 +318,11 @@ class EpisodeEnv:
     def close(self) -> None:
         """Free the environment."""
         self.env.close()
+
+    @property
+    def facts(self) -> Sequence[Fact]:
+        """What the frames since the reset showed, the video's first."""
+        return self.environment.facts(self.env)
 
     @property
     def hold_action(self) -> Any:
