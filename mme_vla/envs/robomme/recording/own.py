@@ -61,7 +61,7 @@ def record_own(
                     with write_atomically(path) as temporary, temporary.open("wb") as file:
                         np.savez_compressed(file, **columns)  # type: ignore[arg-type]
             advance(1)
-        tables = []
+        tables: list[tuple[int, str, list[Fact]]] = []
         for path in filter(Path.is_file, episodes):
             with np.load(path) as loaded:
                 columns = dict(loaded)
