@@ -9,7 +9,8 @@
 In the video a square of one of four colours passes over the scene; when execution begins it is
 gone, and the right action depends on its colour alone. The current view, the goal and the state say
 nothing, so a policy without memory can only guess: `pi05` is always trained beside what is named.
-Prints the open-loop error of each policy on episodes it has not seen, and draws it.
+Prints the open-loop error of each policy on 32 episodes it has not seen, and draws it with its
+interval over these episodes.
 
 The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; all but FrameSamp
 read every 4th frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At
@@ -37,12 +38,15 @@ import torch
 from mme_vla import build_policy
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.config.composition import compose
+from mme_vla.evaluation.results.statistics import bootstrap
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.images import past_views, stack_past
 from mme_vla.testing.small import ALL_BEYOND, NEURAL, cached_history
 from mme_vla.types import Batch, PastViews
+from mme_vla.utils.style import COLOURS as SERIES
+from mme_vla.utils.style import FAINT, INK, figure, legend, svg
 
 COLOURS = np.array([[220, 40, 40], [40, 200, 60], [50, 70, 230], [230, 210, 40]], np.uint8)
 ANSWERS = np.array(
@@ -57,6 +61,7 @@ ANSWERS = np.array(
 SIZE, SQUARE = 64, 40  # pixels
 VIDEO, LENGTH = 8, 12  # frames of conditioning video, and of the whole episode
 MEMORYLESS = "pi05"
+INTEGRATIONS = {"modul": SERIES[0], "context": SERIES[1], "expert": SERIES[2]}
 MEMORY = {"budget": 64, "grid": 4}
 OF_KIND: dict[str, dict[str, Any]] = {
     "framesamp": {},
@@ -138,12 +143,10 @@ def make_streams(policy: MMEPolicy, count: int, seed: int) -> list[Stream]:
     return streams
 
 
-def make_batch(
-    policy: MMEPolicy, streams: list[Stream], rng: np.random.Generator, size: int
-) -> Batch:
-    """Random execution steps of random episodes, with the action of their colour."""
+def make_batch(policy: MMEPolicy, selected: list[Stream], rng: np.random.Generator) -> Batch:
+    """A random execution step of each episode, with the action of its colour."""
     processor, config = policy.require_processor(), policy.backbone.config
-    selected = [streams[i] for i in rng.integers(len(streams), size=size)]
+    size = len(selected)
     steps = rng.integers(VIDEO, LENGTH, size=size)
     views = np.stack([stream.frames[t] for stream, t in zip(selected, steps, strict=True)])
     prompt, prompt_mask = processor.prompt("do what the video showed")
@@ -183,15 +186,15 @@ def past_of(policy: MMEPolicy, selected: Sequence[Stream], steps: np.ndarray) ->
     return replace(past, images=past.images[:, :, :1])
 
 
-def open_loop_error(policy: MMEPolicy, streams: list[Stream], chunks: int = 48) -> float:
-    """Mean absolute error of sampled chunks on unseen episodes; guessing a colour
-    gives about 0.75.
+def open_loop_errors(policy: MMEPolicy, streams: list[Stream]) -> list[float]:
+    """Mean absolute error of a sampled chunk of each episode; guessing a colour gives about 0.75
+    on average.
     """
     policy.eval()
-    batch = make_batch(policy, streams, np.random.default_rng(7), chunks)
+    batch = make_batch(policy, streams, np.random.default_rng(7))
     sampled = policy.sample_actions(batch, generator=torch.Generator().manual_seed(0))
     assert batch.actions is not None
-    return float((sampled - batch.actions)[..., :8].abs().mean())
+    return (sampled - batch.actions)[..., :8].abs().mean((1, 2)).tolist()
 
 
 def learn(
@@ -207,7 +210,7 @@ def learn(
     every: int = 100,
     enough: float = 0.08,
 ) -> dict[str, Any]:
-    """Train one policy until it fits the episodes it trains on; its error on others, and what it
+    """Train one policy until it fits the episodes it trains on; its errors on others, and what it
     took.
 
     Args:
@@ -237,14 +240,15 @@ def learn(
         policy.train()
         for group in optimizer.param_groups:
             group["lr"] = lr * min(1.0, (done + 1) / 30)
-        loss, _ = policy(make_batch(policy, train_streams, rng, batch_size))
+        selected = [train_streams[i] for i in rng.integers(episodes, size=batch_size)]
+        loss, _ = policy(make_batch(policy, selected, rng))
         loss.backward()
         torch.nn.utils.clip_grad_norm_(trained, 1.0)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         done += 1
         if done % every == 0 and policy.memory is not None:
-            error = open_loop_error(policy, train_streams, 24)
+            error = np.mean(open_loop_errors(policy, train_streams[:32]))
             print(
                 f"  {model}: {error:.2f} on the episodes it learns from after {done} steps",
                 flush=True,
@@ -252,9 +256,11 @@ def learn(
             if error < enough:
                 break
     cpu, wall = time.process_time() - start, time.perf_counter() - wall
+    errors = open_loop_errors(policy, unseen)
     return {
         "model": model,
-        "error": open_loop_error(policy, unseen),
+        "error": float(np.mean(errors)),
+        "errors": [round(error, 4) for error in errors],
         "steps": done,
         "cpu": cpu,
         "wall": wall,
@@ -262,26 +268,35 @@ def learn(
 
 
 def plot(results: list[dict], path: Path) -> None:
-    """Draw one bar a policy."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(7, 0.4 * len(results) + 1.4), layout="constrained")
-    names = [r["model"] for r in results]
-    bars = axes.barh(
-        names,
-        [r["error"] for r in results],
-        color=["#9a9a9a" if n == MEMORYLESS else "#2b6cb0" for n in names],
-    )
-    axes.bar_label(bars, fmt="%.2f", padding=3)
-    axes.axvline(0.75, color="#c05621", linestyle="--", linewidth=1, label="guessing a colour")
-    axes.invert_yaxis()
-    axes.set_xlabel("open-loop error on unseen episodes (mean absolute, actions are ±1)")
-    axes.legend(frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=130)
+    """Draw the error of each policy with its interval over episodes, a row a memory."""
+    rows: dict[str, list[dict]] = {}
+    for result in results:
+        rows.setdefault(result["model"].rpartition("_")[0] or result["model"], []).append(result)
+    with figure((7.2, 0.42 * len(rows) + 1.4)) as (canvas, (axes,)):
+        for row, policies in enumerate(rows.values()):
+            for place, result in enumerate(policies):
+                # Policies of a memory lie beside each other in its row.
+                y = row + 0.22 * (place - (len(policies) - 1) / 2)
+                kind = result["model"].rpartition("_")[2]
+                colour = INTEGRATIONS.get(kind, FAINT)
+                low, high = bootstrap({"": [np.array(result["errors"])[:, None]]})
+                axes.plot([low, high], [y, y], color=colour, lw=1.6)
+                axes.plot(result["error"], y, "o", color=colour, ms=5)
+        for kind, colour in INTEGRATIONS.items():
+            axes.plot([], [], "-o", color=colour, ms=5, label=kind)
+        axes.axvline(0.75, color=INK, ls="--", lw=1, label="guessing a colour")
+        axes.set_yticks(range(len(rows)), list(rows))
+        axes.set_ylim(len(rows) - 0.5, -0.5)
+        axes.set_xlim(0, 0.9)
+        axes.grid(True, axis="x")
+        axes.grid(False, axis="y")
+        n = len(results[0]["errors"])
+        axes.set_xlabel(f"error of sampled chunks (actions are ±1), 95 % over {n} unseen episodes")
+        legend(canvas, axes, 4)
+        if path.suffix == ".svg":
+            path.write_text(svg(canvas))
+        else:
+            canvas.savefig(path)
 
 
 def one_of_several(job: tuple[str, float, Path | None]) -> dict[str, Any]:

@@ -4,9 +4,10 @@ name.
 
 import sys
 
+import mme_vla
 from mme_vla.cli import commands, run
 from mme_vla.cli.errors import print_user_errors
-from mme_vla.errors import did_you_mean
+from mme_vla.errors import UserError, did_you_mean
 
 
 def main() -> None:
@@ -14,6 +15,9 @@ def main() -> None:
     commands.
     """
     name, *words = sys.argv[1:] or ["--help"]
+    if name in ("-V", "--version"):
+        print(f"mme-vla {mme_vla.__version__}")
+        return
     if name in ("-h", "--help"):
         width = max(map(len, commands()))
         lines = "\n".join(
@@ -21,15 +25,13 @@ def main() -> None:
         )
         with print_user_errors():
             print(
-                f"usage: mme-vla COMMAND …\n\n{lines}\n\nmme-vla COMMAND --help says more of one."
+                f"usage: mme-vla COMMAND …\n\n{lines}\n\nmme-vla COMMAND --help says more"
+                " of one; mme-vla --version names the version."
             )
         return
     if name not in commands():
-        print(
-            f"mme-vla: there is no command {name!r}. {did_you_mean(name, commands())}",
-            file=sys.stderr,
-        )
-        raise SystemExit(2)
+        with print_user_errors():
+            raise UserError(f"There is no command {name!r}. {did_you_mean(name, commands())}")
     sys.argv = [f"mme-vla {name}", *words]
     run(name)
 

@@ -24,6 +24,22 @@ class SceneError(RuntimeError):
     """A scene that cannot be laid out from its seed: an object found no place."""
 
 
+def place_of(error: BaseException | None) -> str | None:
+    """Kind, file and line of an error in a plugin's code, which worker processes note; None of
+    others.
+    """
+    notes = getattr(error, "__notes__", ())
+    return notes[0] if notes else None
+
+
+def text_of(error: BaseException) -> str:
+    """The message of an error, with its place if it is a plugin's."""
+    place = place_of(error)
+    if place is None:
+        return str(error)
+    return f"{error} ({place})"
+
+
 def require(holds: object, message: str, error: type[Exception] = UserError) -> None:
     """Raise an error with this message unless something holds.
 

@@ -29,7 +29,9 @@ class Command:
     top level that configures it; empty for commands with options. usage: how it is typed; by
     default `mme-vla NAME`. processes: what it does where a launcher starts several: `one` is
     refused, `shared` divides the work, `any` only reads. reads_words: its `main` reads the command
-    line itself, and takes no configuration.
+    line itself, and takes no configuration. check: `module:function` that reads the configuration,
+    plain and resolved, before PyTorch is imported, and raises a `UserError` on values that cannot
+    work.
     """
 
     module: str
@@ -38,6 +40,7 @@ class Command:
     usage: str = ""
     processes: Literal["one", "shared", "any"] = "one"
     reads_words: bool = False
+    check: str = ""
 
 
 @dataclass(frozen=True)

@@ -11,20 +11,20 @@ selections read no tokens.
 """
 
 import argparse
+import base64
 import csv
+import re
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
 import numpy as np
 import torch
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from PIL import Image
 
 from mme_vla.backbone.base import BackboneConfig, ExpertConfig, VisionConfig
 from mme_vla.data.episodes import EpisodeSource
@@ -38,12 +38,13 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.rmt import RMT
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.memory.ttt import TTT
+from mme_vla.utils.style import COLOURS, EXECUTION, FAINT, INK, LINE, VIDEO, look, rgb, svg
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "concepts" / "figures"
 PUBLISHED = ROOT / "mme_vla" / "assets" / "paper"
-VIDEO, EXECUTION, FAINT = "#7aa2cd", "#e9943e", "#8d99ae"
-TILES = 7  # images a memory
+WIDTH_IN = 7.6  # inches: the column of the site, so that letters keep their size
+TILES = 6  # images a memory
 REPLAN = 16  # steps of a chunk that are executed
 EPISODE, WIDTH = 0, 8
 """The sample's episode, and a token width: selections do not depend on it."""
@@ -67,13 +68,13 @@ def replay(memory: MemoryModule, source: EpisodeSource) -> OnlineHistory:
 
 
 def highlighted(frame: np.ndarray, patches: np.ndarray, grid: int) -> np.ndarray:
-    """The frame [H, W, 3], in colour in the selected patches and pale elsewhere."""
+    """The frame [H, W, 4], in colour in the selected patches, grey and faint elsewhere."""
     mask = np.isin(np.arange(grid**2), patches).reshape(grid, grid)
-    large = np.kron(mask, np.ones((frame.shape[0] // grid, frame.shape[1] // grid), bool))[
-        ..., None
-    ]
-    pale = 255 - (255 - frame.mean(2, keepdims=True)) * 0.35
-    return np.where(large, frame, np.broadcast_to(pale, frame.shape)).astype(np.uint8)
+    large = np.kron(mask, np.ones((frame.shape[0] // grid, frame.shape[1] // grid), bool))
+    grey = np.broadcast_to(frame.mean(2, keepdims=True), frame.shape)
+    image = np.where(large[..., None], frame, grey)
+    alpha = np.where(large, 255, 90)[..., None]
+    return np.concatenate([image, alpha], 2).astype(np.uint8)
 
 
 def phases(axes: Axes, start: int, length: int) -> None:
@@ -81,6 +82,7 @@ def phases(axes: Axes, start: int, length: int) -> None:
     axes.axvspan(-0.5, start - 0.5, color=VIDEO, alpha=0.15, lw=0)
     axes.axvspan(start - 0.5, length - 0.5, color=EXECUTION, alpha=0.15, lw=0)
     axes.set_xlim(-1, length)
+    axes.grid(False)
 
 
 def memory(source: EpisodeSource) -> Figure:
@@ -88,7 +90,7 @@ def memory(source: EpisodeSource) -> Figure:
     patches.
     """
     start, length = int(source.exec_starts[EPISODE]), int(source.lengths[EPISODE])
-    figure = plt.figure(figsize=(11, 10.5))
+    figure = Figure((WIDTH_IN, 10.4))
     parts = figure.subfigures(len(MEMORIES), 1)
     for part, (name, (kind, options, reads)) in zip(parts, MEMORIES.items(), strict=True):
         built = kind(WIDTH, WIDTH, **options)
@@ -96,8 +98,8 @@ def memory(source: EpisodeSource) -> Figure:
         selected = built.select(history, length - 1)
         counts = np.bincount(selected[:, 0], minlength=length)
         frames = np.flatnonzero(counts)
-        place = {"left": 0.02, "right": 0.98, "bottom": 0.02, "top": 0.86, "hspace": 0.55}
-        grid = part.add_gridspec(2, TILES, height_ratios=[0.35, 1], **place)
+        place = {"left": 0.01, "right": 0.99, "bottom": 0.01, "top": 0.87, "hspace": 0.75}
+        grid = part.add_gridspec(2, TILES, height_ratios=[0.3, 1], wspace=0.06, **place)
         line = part.add_subplot(grid[0, :])
         line.bar(
             frames,
@@ -108,11 +110,15 @@ def memory(source: EpisodeSource) -> Figure:
         phases(line, start, length)
         line.set_yticks([])
         line.set_xticks(
-            [0, start, length - 1], ["0", f"{start}: execution", str(length - 1)], fontsize=8
+            [0, start, length - 1], ["0", f"{start}: execution begins", str(length - 1)], fontsize=9
         )
+        line.spines["left"].set_visible(False)
+        line.get_xticklabels()[-1].set_ha("right")
         part.suptitle(
             f"{name} at step {length - 1} reads {len(selected)} tokens in {len(frames)} frames:"
             f" {reads}",
+            x=0.01,
+            ha="left",
             fontsize=11,
         )
         steps = frames[np.linspace(0, len(frames) - 1, min(TILES, len(frames))).round().astype(int)]
@@ -122,7 +128,7 @@ def memory(source: EpisodeSource) -> Figure:
             axes.imshow(
                 highlighted(image, selected[selected[:, 0] == frame, 1], built.storage.grid)
             )
-            axes.set_title(f"frame {frame}, {counts[frame]} tokens", fontsize=8)
+            axes.set_title(f"frame {frame}\n{counts[frame]} tokens", fontsize=9)
             axes.set_axis_off()
     return figure
 
@@ -130,9 +136,8 @@ def memory(source: EpisodeSource) -> Figure:
 def history(source: EpisodeSource) -> Figure:
     """Above, the frames that each step reads. Below, what is stored so far."""
     start, length = int(source.exec_starts[EPISODE]), int(source.lengths[EPISODE])
-    figure, grid = plt.subplots(
-        2, len(MEMORIES), figsize=(11, 5), height_ratios=[1.6, 1], layout="constrained"
-    )
+    figure = Figure((WIDTH_IN, 4.6), layout="constrained")
+    grid = figure.subplots(2, len(MEMORIES), height_ratios=[1.6, 1], sharex=True, sharey="row")
     for column, (name, (kind, options, _)) in enumerate(MEMORIES.items()):
         built, (raster, stored) = kind(WIDTH, WIDTH, **options), grid[:, column]
         past = replay(built, source)
@@ -140,15 +145,12 @@ def history(source: EpisodeSource) -> Figure:
             [np.bincount(built.select(past, t)[:, 0], minlength=length) for t in range(length)]
         )
         share = read / built.storage.grid**2
-        raster.imshow(
-            share.T**0.5,
-            origin="lower",
-            cmap="Blues",
-            vmin=0,
-            vmax=1,
-            aspect="auto",
-            interpolation="nearest",
-        )
+        # One colour, as strong as the share of the frame: the ground is the page's own.
+        image = np.zeros((length, length, 4), np.uint8)
+        image[..., :3] = rgb("raster")
+        image[..., 3] = 255 * share.T**0.5
+        raster.imshow(image, origin="lower", aspect="auto", interpolation="nearest")
+        raster.grid(False)
         raster.axhline(start, color=EXECUTION, lw=0.8)
         raster.axvline(start, color=EXECUTION, lw=0.8)
         raster.set(title=name, ylabel="frame that is read" if column == 0 else "")
@@ -158,11 +160,13 @@ def history(source: EpisodeSource) -> Figure:
         needed = np.array([len(built.frames_read(steps, start)) for steps in replans]) * tokens
         stored.plot(kept * BYTES / 2**20, color=FAINT, label="every stored frame")
         stored.plot(
-            needed * BYTES / 2**20, color="#1f6f8b", label=f"read by replans every {REPLAN} steps"
+            needed * BYTES / 2**20, color=COLOURS[0], label=f"read by replans every {REPLAN} steps"
         )
         phases(stored, start, length)
         stored.set(xlabel="step", ylabel="MiB at full width" if column == 0 else "", ylim=(0, 46))
-    grid[1, 0].legend(fontsize=7, frameon=False, loc="upper left")
+        stored.set_xticks([0, start, length - 1])
+    labels = grid[1, 0].get_legend_handles_labels()
+    figure.legend(*labels, loc="outside lower center", ncols=2)
     return figure
 
 
@@ -174,18 +178,17 @@ def budget(source: EpisodeSource) -> Figure:
     with (PUBLISHED / "memory_budget.csv").open() as file:
         rows = list(csv.DictReader(file))
     budgets = [int(row["memory_tokens"]) for row in rows]
-    figure, (left, right) = plt.subplots(
-        1, 2, figsize=(11, 3.4), width_ratios=[1.6, 1], layout="constrained"
-    )
+    figure = Figure((WIDTH_IN, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
     for place, tokens in enumerate(budgets):
         built = FrameSamp(WIDTH, WIDTH, budget=tokens)
         frames = built.selected_frames(length - 1)
-        left.plot(frames, np.full(len(frames), place), "|", ms=16, mew=1.6, color="#1f6f8b")
+        left.plot(frames, np.full(len(frames), place), "|", ms=16, mew=1.4, color=COLOURS[0])
     phases(left, start, length)
     left.set_yticks(
         range(len(budgets)),
-        [f"{tokens} tokens,\n{tokens // 16} frames" for tokens in budgets],
-        fontsize=8,
+        [f"{tokens:,} tokens\n{tokens // 16} frames" for tokens in budgets],
+        fontsize=9,
     )
     left.set(
         xlabel="frame",
@@ -196,18 +199,17 @@ def budget(source: EpisodeSource) -> Figure:
         ("framesamp_modul_success", "FrameSamp"),
         ("tokendrop_modul_success", "TokenDrop"),
     ):
-        right.plot(
-            budgets, [float(row[column]) for row in rows], "o-", label=f"{label} + modulator"
-        )
+        right.plot(budgets, [float(row[column]) for row in rows], "o-", ms=5, label=label)
     right.set_xscale("log", base=2)
-    right.set_xticks(budgets, [str(tokens) for tokens in budgets])
+    right.set_xticks(budgets, [f"{tokens:,}" for tokens in budgets])
+    right.minorticks_off()
     right.set(
         xlabel="memory tokens",
         ylabel="success (%)",
-        title="published success on 16 tasks",
+        title="published success, modulator",
         ylim=(0, 50),
     )
-    right.legend(frameon=False, fontsize=8)
+    right.legend(loc="lower right")
     return figure
 
 
@@ -225,8 +227,9 @@ def integration(source: EpisodeSource) -> Figure:
         "expert": MemoryExpert(sizes),
         "modulator": Modulator(sizes),
     }
-    figure, panels = plt.subplots(1, len(kinds), figsize=(11, 3.2), layout="constrained")
-    for axes, (name, built) in zip(panels, kinds.items(), strict=True):
+    figure = Figure((WIDTH_IN, 4.6), layout="constrained")
+    panels = figure.subplots(2, 2)
+    for axes, (name, built) in zip(panels.flat, kinds.items(), strict=True):
         experts = {
             "memory": "VLM" if name == "context" else "memory",
             "images": "VLM",
@@ -237,36 +240,29 @@ def integration(source: EpisodeSource) -> Figure:
         ]
         for row, query in enumerate(blocks):
             for column, key in enumerate(blocks):
-                visible = key in built.visibility[query]
-                colour = ("#1f6f8b" if key == "memory" else VIDEO) if visible else "#f1f3f6"
+                colour = LINE
+                if key in built.visibility[query]:
+                    colour = COLOURS[1] if key == "memory" else COLOURS[0]
                 axes.add_patch(Rectangle((column, row), 0.94, 0.94, color=colour, lw=0))
         axes.set(
-            xlim=(-0.1, 4.1),
-            ylim=(len(blocks) + 0.1, -0.1),
-            aspect="equal",
-            anchor="NW",
-            title=name,
-        )
-        places = np.arange(len(blocks)) + 0.5
-        axes.set_xticks(places, blocks, rotation=40, fontsize=8)
+            xlim=(-0.1, 4.1), ylim=(len(blocks) + 0.1, -0.1), aspect="equal", anchor="NW",
+        )  # fmt: skip
+        axes.set_title(name, loc="left")
+        axes.grid(False)
+        places = np.arange(len(blocks)) + 0.47
+        axes.set_xticks(places, blocks, rotation=35, ha="right", rotation_mode="anchor")
         axes.set_yticks(
-            places,
-            [f"{block}\n({experts.get(block, 'action')} expert)" for block in blocks],
-            fontsize=7,
+            places, [f"{block} ({experts.get(block, 'action')} expert)" for block in blocks]
         )
-        axes.tick_params(length=0)
+        axes.tick_params(length=0, labelsize=9)
         for side in axes.spines.values():
             side.set_visible(False)
-    panels[0].set_ylabel("this block attends to …")
-    panels[-1].text(
-        1.5,
-        5.0,
-        "every layer of the action expert:\ncross-attention to memory,\nthen scale and shift",
-        ha="center",
-        va="center",
-        fontsize=8,
-        color="#1f6f8b",
+    for axes in panels[:, 0]:
+        axes.set_ylabel("this block attends to …", fontsize=9)
+    note = (
+        "and every layer\nof the action expert:\ncross-attention to\nmemory, then scale\nand shift"
     )
+    panels[1, 1].text(3.15, 1.5, note, va="center", fontsize=9, color=COLOURS[1])
     return figure
 
 
@@ -276,18 +272,40 @@ def probe(folder: Path) -> Figure:
     """
     effects = probed_folder(folder).arms()
     names = sorted(effects, key=lambda arm: effects[arm].change)
-    figure, axes = plt.subplots(figsize=(7, 0.4 * len(names) + 1.2), layout="constrained")
-    bars = axes.barh(names, [effects[name].change for name in names], color="#1f6f8b")
-    axes.bar_label(bars, fmt="%.2f", padding=3)
-    axes.axvline(
-        np.mean([each.spread for each in effects.values()]),
-        color=EXECUTION,
-        ls="--",
-        label="own spread: noise alone",
-    )
+    changes = [effects[name].change for name in names]
+    spread = np.mean([each.spread for each in effects.values()])
+    figure = Figure((WIDTH_IN, 0.36 * len(names) + 1.2), layout="constrained")
+    axes = figure.subplots()
+    bars = axes.barh(names, changes, color=COLOURS[0])
+    axes.axvline(spread, color=EXECUTION, ls="--", label="own spread: noise alone")
+    # Beside the line where it would cross a number.
+    for bar, change in zip(bars, changes, strict=True):
+        axes.annotate(
+            f"{change:.2f}",
+            (max(change, spread), bar.get_y() + bar.get_height() / 2),
+            (4, 0),
+            textcoords="offset points",
+            va="center",
+            color=INK,
+        )
+    axes.set_xlim(0, 1.12 * max(changes))
     axes.set_xlabel("change of the chunk, normalised actions")
-    axes.legend(frameon=False)
+    axes.grid(True, axis="x")
+    axes.grid(False, axis="y")
+    axes.legend(loc="lower right")
     return figure
+
+
+def with_webp(text: str) -> str:
+    """The SVG with its photographs as WebP, a tenth of the bytes."""
+
+    def smaller(match: re.Match[str]) -> str:
+        out = BytesIO()
+        image = Image.open(BytesIO(base64.b64decode(match[1])))
+        image.save(out, "WEBP", quality=80, method=6)
+        return f"data:image/webp;base64,{base64.b64encode(out.getvalue()).decode()}"
+
+    return re.sub(r"data:image/png;base64,\s*([^\"]+)", smaller, text)
 
 
 FIGURES: dict[str, Callable[[EpisodeSource], Figure]] = {
@@ -311,10 +329,13 @@ def main() -> None:
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     for name in options.figures or FIGURES:
-        figure = probe(options.probe) if name == "probe" else FIGURES[name](EpisodeSource("sample"))
-        path = options.output / f"{name}.webp"
-        figure.savefig(path, dpi=110, pil_kwargs={"quality": 82, "method": 6})
-        plt.close(figure)
+        path = options.output / f"{name}.svg"
+        with look():
+            if name == "probe":
+                figure = probe(options.probe)
+            else:
+                figure = FIGURES[name](EpisodeSource("sample"))
+            path.write_text(with_webp(svg(figure)), encoding="utf-8")
         print(f"{path}: {path.stat().st_size:,} bytes")
 
 

@@ -168,8 +168,7 @@ def main() -> None:
     for path, text in pages(made).items():
         path.write_text(text)
     if made:
-        svg = board_page.success_figure(made[0])
-        FIGURE.write_text(svg.replace("<svg ", '<svg style="background: white" ', 1))
+        FIGURE.write_text(board_page.success_figure(made[0]))
 
 
 if __name__ == "__main__":

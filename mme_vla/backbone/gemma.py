@@ -36,22 +36,24 @@ KeyValue = tuple[Tensor, Tensor]
 
 
 class StaticKV(NamedTuple):
-    """Keys and values of one layer [b, past + n, K, h]: those of the past, and space for a pass of
-    n tokens.
+    """Space for the keys and values of one layer [b, tokens, K, h], of which the first `start`
+    tokens are the past's.
     """
 
     k: Tensor
     v: Tensor
+    start: int
 
     def filled(self, k: Tensor, v: Tensor) -> KeyValue:
-        """All keys and values, this pass's [b, n, K, h] written into the space."""
+        """The past's keys and values, and this pass's [b, n, K, h] written behind them."""
+        stop = self.start + k.shape[1]
         for buffer, new in ((self.k, k), (self.v, v)):
-            buffer[:, -new.shape[1] :].copy_(new)
-        return self.k, self.v
+            buffer[:, self.start : stop].copy_(new)
+        return self.k[:, :stop], self.v[:, :stop]
 
-    def past(self, n: int) -> KeyValue:
-        """What is there without the last n."""
-        return self.k[:, :-n], self.v[:, :-n]
+    def past(self) -> KeyValue:
+        """The past's keys and values."""
+        return self.k[:, : self.start], self.v[:, : self.start]
 
 
 class LayerModulation(NamedTuple):
@@ -62,10 +64,22 @@ class LayerModulation(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Neighbouring blocks of one expert, run as one matrix."""
+    """Neighbouring blocks of one expert, run as one matrix.
+
+    update, gate: of the sublayer before, where the sum is left to the layer that reads it: it is
+    then one kernel with that layer's norm. Such a layer leaves its own last sum to the next one.
+    """
 
     expert: str
     tokens: Tensor
+    update: Tensor | None = None
+    gate: Tensor | None = None
+
+    def summed(self) -> Tensor:
+        """The tokens with the update [b, n, d]."""
+        if self.update is None:
+            return self.tokens
+        return _residual(self.tokens, self.update, self.gate)
 
 
 class GatedMLP(nn.Module):
@@ -78,7 +92,8 @@ class GatedMLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         gate, up = self.gate_up(x).chunk(2, dim=-1)
-        if torch.is_grad_enabled():
+        # Compiled code has one kernel that writes the product alone. In place it would need two.
+        if torch.is_grad_enabled() or torch.compiler.is_compiling():
             return self.down(nn.functional.gelu(gate, approximate="tanh") * up)
         # in place: a chunk's largest tensors
         return self.down(torch.ops.aten.gelu_(gate, approximate="tanh").mul_(up))
@@ -131,7 +146,14 @@ class ExpertLayer(nn.Module):
         x, gate = self.attention_norm(x, condition)
         heads = (self.kv if self.keys_only else self.qkv)(x).unflatten(-1, (-1, self.head_dim))
         v = heads[..., -self.kv_heads :, :]
-        qk = rotate(heads[..., : -self.kv_heads, :], rope)  # in one go: queries first, keys last
+        queries_and_keys = heads[..., : -self.kv_heads, :]
+        if torch.compiler.is_compiling() and not torch.is_grad_enabled():
+            # Each by itself: compiled code then rotates keys straight into the cache.
+            q = None
+            if not self.keys_only:
+                q = rotate(queries_and_keys[..., : self.heads, :], rope)
+            return q, rotate(queries_and_keys[..., -self.kv_heads :, :], rope), v, gate
+        qk = rotate(queries_and_keys, rope)  # in one go: queries first, keys last
         k = qk[..., -self.kv_heads :, :]
         return None if self.keys_only else qk[..., : self.heads, :], k, v, gate
 
@@ -142,15 +164,19 @@ class ExpertLayer(nn.Module):
         gate: Tensor | None,
         condition: Tensor | Modulation | None,
         hook: Callable[[Tensor], Tensor] | None,
-    ) -> Tensor:
-        """Add the attention's output, then the MLP's; the hook changes only what the MLP reads."""
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Add the attention's output; the hook changes only what the MLP reads.
+
+        Returns:
+            The sum [b, n, d], and the MLP's output and gate, which are to be added to it.
+        """
         x = _residual(x, self.out(attended), gate)
         normed, gate = self.mlp_norm(x if hook is None else hook(x), condition)
-        return _residual(x, self.mlp(normed), gate)
+        return x, self.mlp(normed), gate
 
 
 def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
-    return x + update if gate is None else torch.addcmul(x, update, gate)
+    return x + update if gate is None else torch.addcmul(x, update, gate.to(x.dtype))
 
 
 class JointBlock(nn.Module):
@@ -214,30 +240,33 @@ class JointBlock(nn.Module):
             adaptive = segment.expert == self.action_expert
             rows = slice(row, row + segment.tokens.shape[1])
             of_norm = of_attention if adaptive else None
-            q, k, v, gate = layer.project(segment.tokens, rope.rows(rows), of_norm)
+            x = segment.summed()
+            q, k, v, gate = layer.project(x, rope.rows(rows), of_norm)
             keys.append(k)
             values.append(v)
             if q is not None:
                 last = (of_mlp, hook) if adaptive else (None, None)
-                querying.append((segment, layer, gate, *last, rows))
+                querying.append((segment, x, layer, gate, *last, rows))
                 queries.append(q)
             row = rows.stop
 
         # All queries read all keys, those of earlier passes first.
         k, v = _join(keys), _join(values)
+        all_k, all_v = _after(past, k, v)  # a cache is filled even where nothing reads it yet
         if not querying:
             return [], (k, v)
-        all_k, all_v = _after(past, k, v)
         if len(querying) < len(segments):
             mask = select_rows(mask, [rows for *_, rows in querying], k.dtype)
         attended = attend(_join(queries), all_k, all_v, mask)
 
         # Every expert finishes its own.
         pieces = attended.split([rows.stop - rows.start for *_, rows in querying], dim=1)
-        updated = [
-            Segment(segment.expert, layer.finish(segment.tokens, piece, gate, of, change))
-            for (segment, layer, gate, of, change, _), piece in zip(querying, pieces, strict=True)
-        ]
+        updated = []
+        for (segment, x, layer, gate, of, change, _), piece in zip(querying, pieces, strict=True):
+            following = Segment(segment.expert, *layer.finish(x, piece, gate, of, change))
+            if segment.update is None:
+                following = Segment(segment.expert, following.summed())
+            updated.append(following)
         return updated, (k, v)
 
 
@@ -250,21 +279,6 @@ class KVCache:
     layers: Sequence[KeyValue | StaticKV]
     spans: list[Span]
     mask: Tensor  # [b, past] bool
-
-    def preallocate(self, tokens: int) -> "KVCache":
-        """The same with space behind it, in which every one of many passes of so many tokens writes
-        its own.
-
-        It is theirs alone: no pass can be kept (`JointTransformer.forward`), and each overwrites
-        the last.
-        """
-        space = (0, 0, 0, 0, 0, tokens)
-        static = []
-        for layer in self.layers:
-            keys = nn.functional.pad(layer[0], space)
-            values = nn.functional.pad(layer[1], space)
-            static.append(StaticKV(keys, values))
-        return KVCache(static, self.spans, self.mask)
 
 
 class Layout(NamedTuple):
@@ -313,10 +327,12 @@ class JointTransformer(nn.Module):
     ) -> None:
         super().__init__()
         self.head_dim = config.head_dim
+        self.kv_heads = config.num_kv_heads
         self.action_expert = action_expert
         self.experts = experts
         self.gradient_checkpointing: Recompute = False
         self.attention = "auto"
+        self.read_out: Callable[..., Tensor] = read_out
         self.layers = nn.ModuleList(
             JointBlock(config, experts, action_expert, last=i == config.depth - 1)
             for i in range(config.depth)
@@ -343,6 +359,22 @@ class JointTransformer(nn.Module):
     @property
     def _compiled(self) -> bool:
         return self.layers[0]._compiled_call_impl is not None
+
+    def cache_space(self, blocks: Sequence[Block], following: int) -> KVCache:
+        """An empty cache with space for a pass over `blocks`, and behind them for every one of many
+        passes of `following` tokens.
+
+        The space behind them is for one pass at a time: no such pass can be kept (`forward`), and
+        each overwrites the last.
+        """
+        tokens = sum(len(block) for block in blocks) + following
+        first = blocks[0].tokens
+        size = (len(first), tokens, self.kv_heads, self.head_dim)
+        layers = []
+        for _ in self.layers:
+            keys = first.new_empty(size, dtype=compute_dtype(first))
+            layers.append(StaticKV(keys, torch.empty_like(keys), 0))
+        return KVCache(layers, [], blocks[0].mask[:, :0])
 
     def layout(
         self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None
@@ -388,7 +420,10 @@ class JointTransformer(nn.Module):
             `blocks`) and the cache (None unless kept).
         """
         segments = _segments(blocks, layout.dtype, self._compiled)
-        cached: list[KeyValue] = []
+        is_compiled = self._compiled and not torch.is_grad_enabled()
+        if is_compiled and not isinstance(condition, Tensor):  # while sampling
+            segments = [self._with_update(segment, condition) for segment in segments]
+        cached: list[KeyValue | StaticKV] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
             past_kv = None if past is None else past.layers[i]
@@ -402,17 +437,34 @@ class JointTransformer(nn.Module):
                 past_kv,
                 how=self.gradient_checkpointing,
             )
-            if keep:
+            if keep and isinstance(past_kv, StaticKV):
+                cached.append(past_kv._replace(start=past_kv.start + k.shape[1]))
+            elif keep:
                 # Copies where they are views: a view would keep all queries of its layer alive.
                 k, v = _after(past_kv, k, v)
                 cached.append((k.contiguous(), v.contiguous()))
         output = None
         if segments:
             final = condition.final if isinstance(condition, Conditioning) else condition
-            output, _ = self.final_norm(segments[-1].tokens, final)
+            output = self.read_out(self.final_norm, segments[-1], final)
         if not keep:
             return output, None
         return output, KVCache(cached, layout.spans, layout.valid)
+
+    def _with_update(self, segment: Segment, condition: Conditioning | None) -> Segment:
+        """A segment with an update of zeros: the first layer then shares the compiled code of the
+        others.
+        """
+        gate = None
+        if segment.expert == self.action_expert and condition is not None:
+            gate = condition.final.gate  # of any value; this one is no other input of the layer
+        return segment._replace(update=torch.zeros_like(segment.tokens), gate=gate)
+
+
+def read_out(norm: AdaRMSNorm, segment: Segment, condition: Tensor | Modulation) -> Tensor:
+    """The output [b, n, d] of the last layer behind the final norm."""
+    output, _ = norm(segment.summed(), condition)
+    return output
 
 
 def _after(past: KeyValue | StaticKV | None, k: Tensor, v: Tensor) -> KeyValue:

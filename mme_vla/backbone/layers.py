@@ -135,11 +135,12 @@ class AdaRMSNorm(nn.Module):
         return Modulation(*float32_linear(self.dense, condition).unsqueeze(1).chunk(3, dim=-1))
 
     def forward(self, x: Tensor, condition: Tensor | Modulation) -> tuple[Tensor, Tensor]:
-        """Normalise [b, n, d]. `condition` is the raw [b, c] or, when sampling, a modulation made
-        beforehand.
+        """Normalise [b, n, d]; the second value is the gate, in the condition's float32.
+
+        `condition` is the raw [b, c] or, when sampling, a modulation made beforehand.
         """
         m = condition if isinstance(condition, Modulation) else self.modulation(condition)
-        return torch.addcmul(m.shift, rms_normalise(x), 1 + m.scale).to(x.dtype), m.gate.to(x.dtype)
+        return torch.addcmul(m.shift, rms_normalise(x), 1 + m.scale).to(x.dtype), m.gate
 
 
 @dataclass

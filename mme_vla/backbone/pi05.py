@@ -17,11 +17,17 @@ from mme_vla.backbone.base import (
     Injection,
 )
 from mme_vla.backbone.flow import HasFlowHead, Predict, build_head, time_embedding
-from mme_vla.backbone.gemma import Conditioning, JointTransformer
+from mme_vla.backbone.gemma import Conditioning, JointTransformer, read_out
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, check_backend, float32_linear
 from mme_vla.backbone.siglip import VisionTower
 from mme_vla.registry import BACKBONES
-from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes
+from mme_vla.speed import (
+    SAMPLING_OPTIONS,
+    CapturableSampling,
+    HasAttentionBackends,
+    Recompute,
+    Recomputes,
+)
 from mme_vla.types import Batch, Noise, PastViews
 
 
@@ -85,6 +91,7 @@ class Pi05Backbone(
         self.embedding.shard_alone = True  # type: ignore[assignment]  # see `backbone_groups`
         experts = {**(extra_experts or {}), "vlm": config.vlm, "action": config.action}
         self.transformer = JointTransformer(config, experts)
+        self._float32_linear: Callable[[nn.Linear, Tensor], Tensor] = float32_linear
         self.keep_times = False
         self._cached: dict[int, Conditioning] = {}
         self._cached_stamp: tuple[object, ...] = ()
@@ -140,7 +147,7 @@ class Pi05Backbone(
     def action_block(self, x_t: Tensor) -> Block:
         """The noisy chunk [b, h, a] as the block of the action expert."""
         mask = torch.ones(x_t.shape[:2], dtype=torch.bool, device=x_t.device)
-        return Block("action", float32_linear(self.action_in, x_t), mask, "action")
+        return Block("action", self._float32_linear(self.action_in, x_t), mask, "action")
 
     def time_condition(self, time: Tensor) -> Tensor:
         """Condition [b, d_action] of the adaptive norms for flow times [b], in float32."""
@@ -153,7 +160,7 @@ class Pi05Backbone(
         """The velocity [b, h, a] in float32 from the output [b, n, d], whose last h tokens are the
         actions.
         """
-        return float32_linear(self.action_out, hidden[:, -self.horizon :])
+        return self._float32_linear(self.action_out, hidden[:, -self.horizon :])
 
     # Training
 
@@ -206,15 +213,15 @@ class Pi05Backbone(
         x = self.head.start(noise, steps, batch.overlap)
         times = self.head.times(steps, x.device)
 
-        # Prefill: one pass over images, prompt and memory leaves their keys and values.
-        layout = self.transformer.layout(injection.blocks, injection.visibility)
-        _, prefix = self.transformer(injection.blocks, layout, keep=True)
-
-        # What all steps share: mask and angles, a cache with space for a step's own keys, and the
-        # time modulations of every layer.
+        # Prefill: one pass over images, prompt and memory leaves their keys and values in a cache
+        # with space for a step's own.
         blocks = [*injection.beside, self.action_block(x)]
+        space = self.transformer.cache_space(injection.blocks, sum(len(block) for block in blocks))
+        layout = self.transformer.layout(injection.blocks, injection.visibility)
+        _, prefix = self.transformer(injection.blocks, layout, past=space, keep=True)
+
+        # What all steps share: mask and angles, and the time modulations of every layer.
         layout = self.transformer.layout(blocks, injection.visibility, prefix)
-        past = prefix.preallocate(sum(len(block) for block in blocks))
         if injection.condition is None:
             rows = 1
             conditions = self.conditions(len(times))
@@ -228,7 +235,7 @@ class Pi05Backbone(
         def output(x_t: Tensor, index: int) -> Tensor:
             blocks = [*injection.beside, self.action_block(x_t)]
             condition = conditions.at(index, rows)
-            hidden, _ = self.transformer(blocks, layout, condition, injection.hook, past)
+            hidden, _ = self.transformer(blocks, layout, condition, injection.hook, prefix)
             return self.read_velocity(hidden)
 
         velocity = self.head.velocity(output, times, noise)
@@ -288,9 +295,18 @@ class Pi05Backbone(
         """Recompute layers in the backward pass (activation checkpointing)."""
         self.transformer.gradient_checkpointing = mode
 
-    def compile_sampling(self) -> Callable[[], object]:
-        """Keep the time modulations between chunks."""
+    def compile_sampling(self, layers: bool = False) -> Callable[[], object]:
+        """Keep the time modulations between chunks.
+
+        Args:
+            layers: compile tower and layers, and what is around the layers in an Euler step.
+        """
         self.keep_times = True
+        if layers:
+            self.compile(**SAMPLING_OPTIONS)
+            compiled = partial(torch.compile, fullgraph=True, **SAMPLING_OPTIONS)
+            self._float32_linear = compiled(float32_linear)
+            self.transformer.read_out = compiled(read_out)
         return self.sampling_stamp
 
     def sampling_stamp(self) -> tuple[object, ...]:

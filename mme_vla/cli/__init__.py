@@ -2,6 +2,7 @@
 `python -m mme_vla NAME` run them; `table.py` lists them.
 """
 
+import atexit
 import os
 import sys
 from collections.abc import Callable
@@ -29,6 +30,7 @@ def run(name: str) -> None:
     # Threads that wait for each other asleep leave their cores to data workers and environments:
     # busy waiting slows a step tenfold. It counts only when set before PyTorch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    atexit.register(_end_quietly)
     with print_user_errors():
         command = commands()[name]
         if _PRINTING.isdisjoint(sys.argv[1:]):
@@ -42,7 +44,18 @@ def run(name: str) -> None:
             return load_main(command)(cfg)
 
         main.__module__ = command.module
-        run_configured(command.config, main)
+        run_configured(command.config, main, check=command.check)
+
+
+def _end_quietly() -> None:
+    """Close standard error last of all, where the planner's package was loaded.
+
+    OMPL's extension module lists, at the interpreter's end, what it did not free: tens of lines
+    after a command's result.
+    """
+    if "ompl" in sys.modules and sys.stderr is not None:
+        sys.stderr.flush()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 def load_main(command: Command) -> Callable[..., object]:

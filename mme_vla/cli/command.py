@@ -1,21 +1,26 @@
 """Run a function as a command with a Hydra configuration."""
 
+import argparse
 import functools
 import logging
 import os
+import pkgutil
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import ClassVar, NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.cli.errors import print_user_errors
+from mme_vla.cli.errors import MISTAKE, print_user_errors
 from mme_vla.cli.help import help_page
 from mme_vla.config import plugins
 from mme_vla.config.composition import (
@@ -25,15 +30,21 @@ from mme_vla.config.composition import (
     join_plugins,
     local_hydra,
     parse,
+    resolved,
 )
 from mme_vla.config.naming import join_memories, several_memories
-from mme_vla.config.override_errors import paths, unknown_option
+from mme_vla.config.override_errors import Names, badly_spaced, bare_word, paths, unknown_option
+from mme_vla.config.plugins import TRUST_FLAG
 from mme_vla.config.trees import config_dir, library_trees
 from mme_vla.errors import UserError, printable, require
+from mme_vla.policy.run_folders import check_output, shipped_checkpoints
 
 
 def run_configured(
-    config_name: str, main: Callable[[DictConfig], object], directory: Path | None = None
+    config_name: str,
+    main: Callable[[DictConfig], object],
+    directory: Path | None = None,
+    check: str = "",
 ) -> None:
     """Run a command under Hydra: run folder, `--multirun`, `--help`, `--cfg job`, `--config-dir`.
 
@@ -44,6 +55,7 @@ def run_configured(
         config_name: a YAML of the tree's top level, without its suffix.
         main: takes the composed configuration.
         directory: the tree; the library's own by default.
+        check: `module:function` that is given the plain configuration before `main` is called.
     """
     tree = directory or config_dir()
     sys.argv[1:] = options_first(several_memories(plugins.trust_as_override(sys.argv[1:])))
@@ -60,10 +72,12 @@ def run_configured(
             name = str(hydra_cfg.job.config_name)
             join_plugins(cfg, name, command_trees(), hydra_cfg.overrides.task)
             plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
+            if check:
+                pkgutil.resolve_name(check)(resolved(cfg))
             return main(cfg)
 
     with print_user_errors():
-        _check_command_line(config_name, tree)
+        _check_command_line(config_name, tree, check)
         start = hydra.main(
             version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name
         )
@@ -74,6 +88,27 @@ def run_configured(
             start(job)()
         except HydraException as error:
             raise UserError(str(error)) from error
+        except SystemExit as ended:
+            if ended.code == MISTAKE:
+                for folder in NewFolders.made:
+                    with suppress(OSError):
+                        folder.rmdir()  # it stays if it holds anything
+            raise
+
+
+class NewFolders(Callback):
+    """Notes which folders Hydra makes for a run, so that a command that is refused leaves none.
+
+    `hydra.callbacks` of a command's file names it.
+    """
+
+    made: ClassVar[list[Path]] = []
+    """The run's folder and those above it that were not there, from the inside."""
+
+    def on_run_start(self, config: DictConfig, **_: object) -> None:
+        """Called by Hydra before it makes the folder."""
+        folder = Path(str(config.hydra.run.dir)).absolute()
+        NewFolders.made = [path for path in (folder, *folder.parents) if not path.exists()]
 
 
 def options_first(words: Sequence[str]) -> list[str]:
@@ -81,7 +116,10 @@ def options_first(words: Sequence[str]) -> list[str]:
 
     A command line with an unknown option stays as it is.
     """
-    args, unknown = get_args_parser().parse_known_intermixed_args(words)
+    try:
+        args, unknown = _parser().parse_known_intermixed_args(words)
+    except _ParserError:
+        return list(words)  # `_check_command_line` says what is wrong
     if unknown:
         return list(words)
     options = list(words)
@@ -91,12 +129,14 @@ def options_first(words: Sequence[str]) -> list[str]:
     return [*reversed(options), *args.overrides]
 
 
-def _check_command_line(config_name: str, tree: Path) -> None:
-    args, unknown = get_args_parser().parse_known_intermixed_args()
+def _check_command_line(config_name: str, tree: Path, check: str) -> None:
+    try:
+        args, unknown = _parser().parse_known_intermixed_args()
+    except _ParserError as error:
+        # an option with too few words, or the beginning of several
+        raise _explained(error, _names(config_name, tree, [])) from None
     if unknown:
-        with local_hydra(tree, []):
-            known = list(paths(OmegaConf.to_container(hydra.compose(config_name))))
-        raise unknown_option(unknown[0], sys.argv[1:], known)
+        raise unknown_option(unknown[0], sys.argv[1:], _names(config_name, tree, []))
     modes = []
     for mode in ("run", "multirun", "cfg", "info", "shell_completion"):
         if getattr(args, mode):
@@ -112,9 +152,69 @@ def _check_command_line(config_name: str, tree: Path) -> None:
         raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
-    check_overrides(
+    _check_bare_words(args.overrides, args.config_name or config_name, tree, extra)
+    for word in args.overrides:
+        key, _, value = word.partition("=")
+        if key == "output":
+            check_output(Path(value))
+    composed = check_overrides(
         args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra
     )
+    for cfg in composed:
+        # What a plugin registers is known only once it is imported, which `job` does.
+        if check and not args.cfg and not cfg.get("plugins") and not OmegaConf.missing_keys(cfg):
+            pkgutil.resolve_name(check)(resolved(cfg))
+
+
+class _ParserError(Exception):
+    """What Hydra's parser of options says of a command line."""
+
+
+def _parser() -> argparse.ArgumentParser:
+    """Hydra's parser of options, which raises instead of printing its usage."""
+
+    def refuse(message: str) -> NoReturn:
+        raise _ParserError(message)
+
+    parser = get_args_parser()
+    parser.error = refuse  # type: ignore[method-assign]
+    return parser
+
+
+def _explained(error: _ParserError, names: Names) -> UserError:
+    for word in sys.argv[1:]:
+        option = word.partition("=")[0]
+        if option.startswith("--") and option not in names.options:
+            return unknown_option(word, sys.argv[1:], names)
+    # such as "argument --config-dir/-cd: expected one argument"
+    return UserError(f"{str(error).capitalize()}. --help lists the options.")
+
+
+def _names(config_name: str, tree: Path, extra_dirs: Sequence[Path]) -> Names:
+    """What the words of a command line may name."""
+    options = [TRUST_FLAG]
+    for action in get_args_parser()._actions:
+        options += [option for option in action.option_strings if option.startswith("--")]
+    with local_hydra(tree, extra_dirs) as engine:
+        loader = engine.config_loader
+        keys = list(paths(OmegaConf.to_container(hydra.compose(config_name))))
+        groups = {group: loader.get_group_options(group) for group in loader.list_groups("")}
+    groups.pop("hydra", None)
+    return Names(keys, groups, options, list(shipped_checkpoints()))
+
+
+def _check_bare_words(
+    words: Sequence[str], config_name: str, tree: Path, extra_dirs: Sequence[Path]
+) -> None:
+    """Refuse words without `=`, with what they may mean."""
+    for number, word in enumerate(words):
+        mistake = badly_spaced(words, number)
+        if "=" in word or word.startswith("~"):
+            # It may only be cut where a word follows that cannot stand alone.
+            following = words[number + 1 : number + 2]
+            if mistake is None or not following or "=" in following[0]:
+                continue
+        raise UserError(mistake or bare_word(words, number, _names(config_name, tree, extra_dirs)))
 
 
 def check_overrides(
@@ -123,18 +223,20 @@ def check_overrides(
     *,
     directory: Path | None = None,
     extra_dirs: Sequence[Path] = (),
-) -> None:
+) -> list[DictConfig]:
     """Compose once to see that the overrides fit, every choice of a sweep
-    (`model=a,b`) included.
+    (`model=a,b`) included. Returns the configurations.
     """
     columns = [_choices(override) for override in parse(overrides)]
     columns = [column for column in columns if column]
     n_rows = max((len(column) for column in columns), default=1)
+    composed = []
     for row in range(n_rows):
         # A column shorter than the longest stays at its first choice: every choice is seen once,
         # not their product.
         words = [column[row] if row < len(column) else column[0] for column in columns]
-        compose(config_name, words, directory=directory, extra_dirs=extra_dirs)
+        composed.append(compose(config_name, words, directory=directory, extra_dirs=extra_dirs))
+    return composed
 
 
 def _choices(override: Override) -> list[str]:

@@ -2,7 +2,6 @@
 network.
 """
 
-import argparse
 import logging
 import shutil
 import tempfile
@@ -10,6 +9,7 @@ import time
 import webbrowser
 from pathlib import Path
 
+from mme_vla.cli.help import argument_parser
 from mme_vla.errors import UserError, listed, missing_extra, require
 from mme_vla.utils import file_sum, read_json, write_json
 
@@ -115,8 +115,8 @@ def _replace(draft: Path, target: Path) -> None:
 def main() -> None:
     """Run `mme-vla docs`."""
     purpose = str(__doc__).partition(": ")[2]
-    parser = argparse.ArgumentParser(
-        prog="mme-vla docs", description=purpose[0].upper() + purpose[1:]
+    parser = argument_parser(
+        "mme-vla docs", purpose[0].upper() + purpose[1:], ("", "--build --output outputs/site")
     )
     parser.add_argument(
         "--output",

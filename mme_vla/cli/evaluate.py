@@ -164,7 +164,10 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
             events,
             options,
         )
+        if server := policy.conditions().get("server"):
+            logger.info("server: %s", server.get("times"))
     finally:
+        policy.close()
         if subgoals is not None:
             report_usage(subgoals.usage)
             subgoals.close()

@@ -5,15 +5,17 @@ files of a group, `--help model=framesamp_modul` one of them. Nothing here impor
 """
 
 import argparse
+import re
 import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 
+from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.table import commands
 from mme_vla.config.trees import yaml_files
 from mme_vla.errors import UserError, did_you_mean
@@ -21,7 +23,8 @@ from mme_vla.errors import UserError, did_you_mean
 
 def configured_commands() -> dict[str, str]:
     """File of the tree's top level → how the command that it configures is typed."""
-    usages = {"policy": "build_policy(…)"}
+    # Files that commands include.
+    usages = {"policy": "build_policy(…)", "server": "RemotePolicy(…)"}
     for name, command in commands().items():
         if command.config:
             usages[command.config] = command.usage or f"mme-vla {name}"
@@ -165,16 +168,98 @@ def _body(file: Path) -> str:
     return "\n".join(lines).strip()
 
 
-def argument_parser(
-    command: str, text: str | None, examples: Sequence[str]
-) -> argparse.ArgumentParser:
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose replies to mistakes are those of the commands with a configuration.
+
+    A mistake ends the process with code 2 and one sentence that names the word, what is known and
+    where more is said.
+    """
+
+    def error(self, message: str) -> NoReturn:
+        """End with a mistake of a command line."""
+        with print_user_errors():
+            sentence = self._plain(message).rstrip(".")
+            raise UserError(f"{sentence}. `{self.prog} --help` says more.")
+        raise AssertionError("a user error ends the process")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is None or value in action.choices:
+            return
+        name = "/".join(action.option_strings) or str(action.metavar or action.dest)
+        choices = [str(choice) for choice in action.choices]
+        if not action.option_strings and "=" in str(value):
+            example = f"{self.prog} {choices[0]} {_as_option(str(value))}"
+            self.error(
+                f"{value!r} comes too early: {name} is first, one of {', '.join(choices)}. Settings"
+                f" are options here. Such as: {example}"
+            )
+        self.error(f"{name} {value!r} is not known. {did_you_mean(str(value), choices)}")
+
+    def _plain(self, message: str) -> str:
+        """A message of argparse in the words of the other commands."""
+        kind, _, rest = message.partition(": ")
+        if kind == "unrecognized arguments":
+            return self._unknown_word(rest.split()[0])
+        if kind == "the following arguments are required":
+            names = []
+            for action in self._actions:
+                word = str(action.metavar or action.dest)
+                if word in rest.split(", ") and action.nargs != "*":
+                    names.append(word)
+            names = names or rest.split(", ")
+            return f"A value is needed for {' and '.join(names)}{self._help_of(names[0])}."
+        name = kind.removeprefix("argument ")
+        if rest.startswith("expected "):
+            return f"{name} needs {rest.removeprefix('expected ').replace('argument', 'value')}."
+        invalid = re.fullmatch(r"invalid (\w+) value: (.+)", rest, re.DOTALL)
+        if invalid:
+            wanted = _WANTED.get(invalid[1], f"of type {invalid[1]}")
+            return f"{name} {invalid[2]} does not fit: it is {wanted}."
+        return f"{message[:1].upper()}{message[1:]}."
+
+    def _unknown_word(self, word: str) -> str:
+        parsers: list[argparse.ArgumentParser] = [self]
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                parsers += action.choices.values()
+        options = []
+        for parser in parsers:
+            options += [name for name in parser._option_string_actions if name.startswith("--")]
+        typed = word.partition("=")[0]
+        if not word.startswith("-") and f"--{typed}" in options:
+            return f"{word!r} is written as an option here: {_as_option(word)}."
+        what = "There is no option" if word.startswith("-") else "There is no place for the word"
+        return f"{what} {typed!r}. {did_you_mean(typed, set(options))}"
+
+    def _help_of(self, name: str) -> str:
+        """What help says of a positional argument."""
+        for action in self._actions:
+            if name != str(action.metavar or action.dest):
+                continue
+            if action.choices:
+                return f", one of {', '.join(map(str, action.choices))}"
+            if action.help:
+                return f" ({name}: {action.help})"
+        return ""
+
+
+_WANTED = {"int": "a whole number", "float": "a number"}
+
+
+def _as_option(word: str) -> str:
+    """A `key=value` word as an option."""
+    key, _, value = word.partition("=")
+    return f"--{key} {value or '…'}"
+
+
+def argument_parser(command: str, text: str | None, examples: Sequence[str]) -> CommandParser:
     """A parser for commands that read options instead of a configuration, with the same kind of
     `--help`.
 
     command: as it is typed. text: what it does. examples: what is typed after it.
     """
     listed = "\n".join(f"  {command} {example}".rstrip() for example in examples)
-    return argparse.ArgumentParser(
+    return CommandParser(
         command,
         description=text,
         epilog=f"Examples\n{listed}",

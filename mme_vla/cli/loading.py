@@ -14,12 +14,15 @@ from omegaconf import OmegaConf
 
 from mme_vla.config.devices import find_device
 from mme_vla.config.sections import PathText, read_section
+from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.run_folders import locate_checkpoint
 from mme_vla.policy.sections import SECTIONS, PolicySections
 from mme_vla.processing.normalise import NormStats
+from mme_vla.serving.remote.settings import ServerChoice
+from mme_vla.speed.compiler import keep_compiled_code, missing_compiler
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,7 @@ class PolicyChoice:
     """The keys of a command that say which policy it is about.
 
     config: all of the command's configuration, plain. Without a checkpoint its model is built.
+    server: a server that has the policy, in place of a checkpoint.
     """
 
     name: PathText
@@ -36,11 +40,13 @@ class PolicyChoice:
     dtype: str
     trust_plugins: bool
     config: Mapping[str, Any]
+    server: ServerChoice | None = None
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read a composed configuration, plain and resolved."""
-        return replace(read_section(cls, config, others=True, config={}), config=config)
+        choice = read_section(cls, config, others=True, config={}, server=None)
+        return replace(choice, config=config, server=ServerChoice.from_config(config))
 
 
 class LoadedPolicy(NamedTuple):
@@ -67,6 +73,8 @@ def load_policy(
         logger: takes a line on what was loaded.
         device: instead of the configured one.
     """
+    if choice.server is not None:
+        return _connect(choice, choice.server, logger)
     device = find_device(choice.device) if device is None else device
     # What a checkpoint brings along, so that it cannot be set beside one.
     named = words_of("model", *set(SECTIONS) - {"plugins"})
@@ -102,6 +110,36 @@ def load_policy(
     return LoadedPolicy(policy, choice.name, None)
 
 
+def _connect(choice: PolicyChoice, server: ServerChoice, logger: logging.Logger) -> LoadedPolicy:
+    """The policy that a server has."""
+    from mme_vla.serving.remote.policy import RemotePolicy  # the extra `serve`
+
+    require(
+        choice.checkpoint is None,
+        f"server={server.server} and checkpoint={choice.checkpoint} are two policies: leave out"
+        " one.",
+    )
+    named = words_of("model", *set(SECTIONS) - {"plugins", "embodiment"})
+    if named:
+        raise UserError(f"A server brings its own model: leave out {' '.join(named)}.")
+    require(
+        choice.config.get("flow_steps") is None,
+        f"flow_steps={choice.config.get('flow_steps')}: a server chooses its own; leave it out, or"
+        " set it where the server is started.",
+    )
+    robot = Embodiment.from_dict(choice.config.get("embodiment"))
+    policy = RemotePolicy(server, robot, choice.config.get("execute"))
+    assert policy.info.identity is not None
+    name = policy.info.identity.model
+    spoken = policy.protocol.name
+    if policy.detected is not None:
+        spoken += f" ({policy.detected})"
+    logger.info("%s at %s, which speaks %s", name, server.server, spoken)
+    if policy.info.max_running is not None:
+        logger.info("episodes at the same time: at most %d", policy.info.max_running)
+    return LoadedPolicy(policy, name, None)
+
+
 SAMPLING = ("auto", "eager", "graph", "compiled")
 """How a command computes chunks: `sampling` of configs/evaluate.yaml and configs/serve.yaml."""
 
@@ -120,7 +158,20 @@ def prepare_sampling(policy: Policy, sampling: str, logger: logging.Logger) -> N
     if sampling == "eager" or (sampling == "auto" and not on_gpu):
         return
     begun = time.perf_counter()
-    if not policy.compile_sampling(layers=sampling == "compiled"):
+    layers = sampling == "compiled"
+    if layers:
+        folder = keep_compiled_code()
+        missing = missing_compiler(policy.device)
+        if missing is None:
+            logger.info("compiling layers: a minute or more at first, later starts read %s", folder)
+        else:
+            layers = False
+            logger.warning(
+                "sampling=compiled: layers stay eager, since %s is missing. Install it, or set"
+                " sampling=auto.",
+                missing,
+            )
+    if not policy.compile_sampling(layers, logger.info if layers else lambda text: None):
         require(
             sampling == "auto",
             f"sampling={sampling}: {type(policy).__name__} has no sampler that can be compiled. Set"

@@ -15,7 +15,8 @@ from mme_vla.config.composition import resolved
 from mme_vla.config.sections import PathText, PositiveInt, read_section
 from mme_vla.data.console import progress
 from mme_vla.data.convert import ConvertOptions, write_previews
-from mme_vla.envs.base import environment
+from mme_vla.embodiment import Embodiment
+from mme_vla.envs.base import Environment, environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import ROBOMME, make_task, require_simulator
 from mme_vla.envs.robomme.recording.coverage import compare, goal_of, goals_recorded, in_words
@@ -55,7 +56,7 @@ class RecordRun:
     memory: Mapping[str, Any] | None
     names: str
     images: str
-    fps: PositiveInt
+    fps: PositiveInt | None
     video: Mapping[str, Any]
 
     @classmethod
@@ -64,6 +65,7 @@ class RecordRun:
         return read_section(cls, config, others=True, tasks=named_tasks(config))
 
 
+_FPS = 20  # of RoboMME's cameras and control
 FAILED = "the demonstration did not end in success"
 
 
@@ -232,8 +234,9 @@ def main(cfg: DictConfig) -> None:
     )
     if not run.lerobot and run.hdf5 is None:
         raise UserError("lerobot=false leaves nothing to write: name a folder with hdf5=<folder>.")
+    rate = run.fps or _FPS
     options = read_section(
-        ConvertOptions, run.video, "video", images=run.images, fps=run.fps, names=run.names
+        ConvertOptions, run.video, "video", images=run.images, fps=rate, names=run.names
     )
     jobs = plan(run)
     recording_plan = RecordingPlan(
@@ -293,6 +296,7 @@ def record_environment(run: RecordRun) -> None:
     source = environment(run.env)
     source.check_installed()
     specs = choose_episodes(run.tasks, run.episodes, run.split, run.env)
+    rate = _rate(source, run)
     output = Path(run.output)
     work = _work_folder(run.output)
     require(
@@ -300,13 +304,37 @@ def record_environment(run: RecordRun) -> None:
         f"{output} exists already; choose another output, or remove it yourself.",
     )
     with FolderLock(work, "recording"):
-        _claim(work, [{"env": run.env, "fps": run.fps}, *map(vars, specs)])
-        frames, failures = record_own(source, specs, output, work, run.fps)
+        _claim(work, [{"env": run.env, "fps": rate}, *map(vars, specs)])
+        frames, failures = record_own(source, specs, output, work, rate)
         drop_plan(work, DRAFT, *(glob.escape(episode_file(spec)) for spec in specs))
     print(
         f"{run.output}: {counted(len(specs) - len(failures), 'episode')},"
         f" {counted(frames, 'step')}; {len(failures)} did not succeed."
     )
+
+
+def _rate(source: Environment, run: RecordRun) -> int:
+    """Frames per second of the dataset: the robot's, and where it names none as many as RoboMME's.
+
+    Raises:
+        UserError: `fps` contradicts the robot.
+    """
+    rate = None
+    if source.embodiment is not None:
+        rate = Embodiment.from_dict(source.embodiment).fps
+    if rate is None:
+        return run.fps or _FPS
+    require(
+        run.fps in (None, rate),
+        f"fps={run.fps} contradicts the robot of env={run.env}, which has {rate:g} frames per"
+        " second: leave out fps.",
+    )
+    require(
+        rate == int(rate),
+        f"The robot of env={run.env} has {rate:g} frames per second; a dataset takes whole"
+        " numbers.",
+    )
+    return int(rate)
 
 
 def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:

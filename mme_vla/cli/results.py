@@ -45,6 +45,7 @@ from mme_vla.evaluation.results.tables import (
     Table,
     comparison_table,
     detail,
+    grouping_tables,
     leaderboard,
     overview,
     print_table,
@@ -329,7 +330,13 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
         texts[args.latex] = "\n".join(to_latex(table) for table in _tables(results, comparisons))
     if args.markdown:
         boards = [table for method in results.methods for table in leaderboard(method, results)]
-        tables = [overview(results), *boards, *process_tables(results), *subgoal_tables(results)]
+        tables = [
+            overview(results),
+            *grouping_tables(results),
+            *boards,
+            *process_tables(results),
+            *subgoal_tables(results),
+        ]
         texts[args.markdown] = render(
             "results.md",
             tables=map(to_markdown, tables),
@@ -346,7 +353,7 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
 
 
 def _tables(results: Results, comparisons: list[Comparison], detailed: bool = True) -> list[Table]:
-    tables = [overview(results)]
+    tables = [overview(results), *grouping_tables(results)]
     if detailed:
         details = []
         for method in results.methods:

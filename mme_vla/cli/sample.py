@@ -6,10 +6,10 @@ under 6 MB. It exists so that the first command of the README needs nothing else
 this.
 """
 
-import argparse
 import shutil
 from pathlib import Path
 
+from mme_vla.cli.help import argument_parser
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import EpisodeRef
 from mme_vla.data.lerobot_files import SAMPLE
@@ -53,7 +53,9 @@ def make_sample(full: Path, thinned: Path, output: Path = SAMPLE) -> int:
 
 def main() -> None:
     """Run `mme-vla sample`."""
-    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
+    parser = argument_parser(
+        "mme-vla sample", str(__doc__).partition("\n")[0], ("full_files thinned_files",)
+    )
     parser.add_argument(
         "full", type=Path, help="folder with the VideoUnmask file that has an image for every step"
     )

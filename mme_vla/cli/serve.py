@@ -22,9 +22,10 @@ def main(cfg: DictConfig) -> None:
     settings = ServeSettings.from_dict(config)
     choice = PolicyChoice.from_config(config)
     log_to_terminal(logger, clock=True)
-    policy, name, _ = load_policy(choice, "serve", logger)
+    policy, name, source = load_policy(choice, "serve", logger)
     prepare_sampling(policy, str(cfg.sampling), logger)
-    server = PolicyServer(policy, settings, name=name, trained=choice.checkpoint is not None)
+    trained = choice.checkpoint is not None
+    server = PolicyServer(policy, settings, name=name, trained=trained, source=source)
     if not is_local(settings.host) and settings.api_key is None:
         logger.warning(
             "host=%s without api_key: every client that reaches this port can use it", settings.host

@@ -9,6 +9,7 @@ COMMANDS = {
         config="train",
         usage="python -m mme_vla.train",
         processes="shared",
+        check="mme_vla.training.settings:TrainRun.from_config",
     ),
     "evaluate": Command(
         "mme_vla.cli.evaluate",
@@ -16,6 +17,7 @@ COMMANDS = {
         config="evaluate",
         usage="python -m mme_vla.evaluate",
         processes="shared",
+        check="mme_vla.evaluation.rollout.settings:check_config",
     ),
     "results": Command(
         "mme_vla.cli.results",
@@ -35,6 +37,7 @@ COMMANDS = {
         "put a policy behind a port",
         config="serve",
         usage="python -m mme_vla.serve",
+        check="mme_vla.serving.settings:ServeSettings.from_dict",
     ),
     "harness": Command("mme_vla.cli.harness", "put a policy behind AI2's vla-evaluation-harness"),
     "convert": Command(

@@ -7,13 +7,13 @@ behaviour: the same special ids, single digits, bytes for unknown characters, an
 stands (no prefix, no case folding, spaces and newlines kept). Training is deterministic.
 """
 
-import argparse
 import io
 import string
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
 
+from mme_vla.cli.help import argument_parser
 from mme_vla.errors import UserError, require
 
 VOCAB_SIZE = 1024
@@ -62,8 +62,8 @@ def read_corpus() -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train on the shipped corpus and write `tokenizer.model` into a folder."""
-    parser = argparse.ArgumentParser(
-        prog="mme-vla train-tokenizer", description=str(__doc__).partition("\n")[0]
+    parser = argument_parser(
+        "mme-vla train-tokenizer", str(__doc__).partition("\n")[0], ("", "outputs/tokenizer")
     )
     parser.add_argument(
         "folder",

@@ -28,7 +28,12 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mme_vla.config import plugins
 from mme_vla.config.naming import join_memories, several_memories
-from mme_vla.config.override_errors import COMPOSITION_ERRORS, ConfigTree
+from mme_vla.config.override_errors import (
+    COMPOSITION_ERRORS,
+    FORMS,
+    ConfigTree,
+    badly_spaced,
+)
 from mme_vla.config.trees import config_dir, library_trees
 from mme_vla.errors import UserError, require
 
@@ -95,11 +100,16 @@ def parse(overrides: Sequence[str]) -> list[Override]:
             if not override.key_or_group:
                 raise OverrideParseException(str(override.input_line), "the key is missing")
     except OverrideParseException as error:
-        raise UserError(
-            f"Cannot read the override {error.override!r}: {error.message.splitlines()[0]}. Write"
-            " key=value, +key=value to add a key, ~key to remove one; quote values with special"
-            " characters."
-        ) from error
+        words = list(overrides)
+        reason = None
+        if error.override in words:
+            reason = badly_spaced(words, words.index(error.override))
+        if reason is None:
+            detail = error.message.splitlines()[0]
+            if detail.startswith("Error parsing"):  # says no more than the word itself
+                detail = "it is no setting"
+            reason = f"Cannot read the override {error.override!r}: {detail}. {FORMS}"
+        raise UserError(reason) from error
     return parsed
 
 

@@ -4,8 +4,10 @@ kind.
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -55,7 +57,16 @@ class ConfigTree:
             if group == "hydra/launcher":
                 return str(missing_extra(f"launcher={name}", "sweep"))
             options = error.options or self.loader.get_group_options(group)
-            return f"Unknown {group or 'config'} {name!r}. {did_you_mean(name, options)}"
+            text = f"Unknown {group or 'config'} {name!r}."
+            known = did_you_mean(name, options)
+            own = own_file(group, name) if group else None
+            if own is not None:
+                folder = own.parents[len(Path(group).parts)]
+                return f"{text} ./{own} exists: add --config-dir {folder}. {known}"
+            return (
+                f"{text} {known} A file of your own, DIR/{group}/{name}.yaml, is found with"
+                " --config-dir DIR."
+            )
         for choice in self.choices:
             if not isinstance(choice.value(), str | list | None):
                 options = self.loader.get_group_options(choice.key_or_group)
@@ -106,6 +117,18 @@ class ConfigTree:
                     f"{override.input_line!r} does not fit: {override.key_or_group!r} is"
                     f" {expected}."
                 )
+
+
+def own_file(group: str, name: str) -> Path | None:
+    """A file of the user's in or near the current folder, which the command line does not lead
+    to.
+    """
+    path = f"{group}/{name}.yaml"
+    for pattern in (f"configs/{path}", path, f"*/{path}", f"*/configs/{path}"):
+        files = sorted(Path().glob(pattern))
+        if files:
+            return files[0]
+    return None
 
 
 def _keys_of_a_list(word: str, members: Sequence[Any]) -> str:
@@ -185,29 +208,141 @@ def _keys_with_word(word: str, keys: Iterable[str]) -> list[str]:
     return equal + [k for k, name in last.items() if name != word and word in name.split("_")]
 
 
-def unknown_option(option: str, words: Sequence[str], keys: Sequence[str]) -> UserError:
+FORMS = (
+    "Write key=value, +key=value to add a key, ~key to remove one; quote values with special"
+    " characters."
+)
+
+
+@dataclass(frozen=True)
+class Names:
+    """What words of a command line may name.
+
+    keys: dotted ones of the configuration. groups: group → the names of its files. options: with
+    their dashes. checkpoints: names of those that ship with the library.
+    """
+
+    keys: Sequence[str]
+    groups: Mapping[str, Sequence[str]]
+    options: Sequence[str] = ()
+    checkpoints: Sequence[str] = ()
+
+    def settings_of(self, word: str) -> list[str]:
+        """The settings that a word without a key may mean, the likeliest first."""
+        settings = []
+        is_checkpoint = word in self.checkpoints or Path(word).expanduser().exists()
+        if "checkpoint" in self.keys and is_checkpoint:
+            settings.append(f"checkpoint={word}")
+        elif word in self.groups or word in self.keys:
+            return [f"{word}=…"]
+        # A model is meant more often than the part of one that has the same name.
+        groups = sorted(self.groups, key=lambda group: group != "model")
+        settings += [f"{group}={word}" for group in groups if word in self.groups[group]]
+        return settings
+
+
+def unknown_option(option: str, words: Sequence[str], names: Names) -> UserError:
     """What to type instead of an option that there is not: settings are `key=value` words here.
 
-    option: as it was typed, `--steps` or `--steps=10`. words: the command line. keys: dotted ones
-    of the configuration.
+    option: as it was typed, `--steps` or `--steps=10`. words: the command line. names: what the
+    command knows.
     """
-    name, _, value = option.lstrip("-").partition("=")
+    typed, _, value = option.partition("=")
+    near_options = [known for known in names.options if known.startswith(typed)]
+    if len(typed) > 3 and near_options:
+        # `--config` for `--config-dir`. The folder is what is meant nearly always.
+        if "--config-dir" in near_options:
+            near_options = ["--config-dir"]
+        meant = " or ".join(map(repr, near_options))
+        return UserError(
+            f"There is no option {typed!r}. Did you mean {meant}? `--config-dir DIR` searches a"
+            " folder of YAML files of your own. --help lists all options."
+        )
+    name = typed.lstrip("-")
     following = words[words.index(option) + 1 :] if option in words else []
     if not value and following and "=" not in following[0] and not following[0].startswith("-"):
         value = following[0]
     word = name.replace("-", "_").rpartition(".")[2]
-    near = _keys_with_word(word, keys)
+    near = _keys_with_word(word, names.keys)
+    if name in names.groups:
+        near = [name]
     if not near:
-        last_parts = list(dict.fromkeys(key.rpartition(".")[2] for key in keys))
+        last_parts = list(dict.fromkeys(key.rpartition(".")[2] for key in names.keys))
         for part in get_close_matches(word, last_parts):  # the nearest first
-            near += [key for key in keys if key.rpartition(".")[2] == part]
+            near += [key for key in names.keys if key.rpartition(".")[2] == part]
+    similar = get_close_matches(typed, names.options, cutoff=0.8)
     hint = "--help lists them."
     if near:
         hint = f"write {' or '.join(f'{key}={value or "…"}' for key in near[:3])}."
+    elif similar:
+        hint = f"--help lists them. Or did you mean the option {similar[0]!r}?"
     return UserError(
         f"There is no option {option!r}. Settings are words of the form key=value, without dashes:"
         f" {hint}"
     )
+
+
+def badly_spaced(words: Sequence[str], number: int) -> str | None:
+    """What is wrong with a word of a command line that a space cut in two, and how it is typed.
+
+    number: of the word that cannot be read. None where no space is the reason.
+    """
+    word = words[number]
+    following = [*words[number + 1 :], "", ""]
+    joined = ""
+    if "=" not in word and following[0] == "=":
+        joined = f"{word}={following[1]}"
+    elif "=" not in word and following[0].startswith("="):
+        joined = f"{word}{following[0]}"
+    elif "=" not in word and number and words[number - 1].endswith("="):
+        joined = f"{words[number - 1]}{word}"
+    if joined:
+        return f"Cannot read {word!r}: write {joined}, without spaces around =."
+    missing = _open_brackets(word)
+    if not missing:
+        return None
+    for end in range(number + 2, len(words) + 1):
+        parts = words[number:end]
+        if not _open_brackets(" ".join(parts)):
+            return (
+                f"Cannot read {word!r}: a space ended the word. Write {''.join(parts)}, or quote"
+                f" it: '{' '.join(parts)}'."
+            )
+    return f"Cannot read the override {word!r}: {missing!r} is not closed. {FORMS}"
+
+
+def _open_brackets(text: str) -> str:
+    """The brackets of a text that nothing closes."""
+    closes = {")": "(", "]": "[", "}": "{"}
+    unclosed: list[str] = []
+    for letter in text:
+        if letter in closes.values():
+            unclosed.append(letter)
+        elif unclosed and closes.get(letter) == unclosed[-1]:
+            unclosed.pop()
+    return "".join(unclosed)
+
+
+def bare_word(words: Sequence[str], number: int, names: Names) -> str:
+    """What to type instead of a word that has no `=`.
+
+    number: of that word in the command line.
+    """
+    word = words[number]
+    following = words[number + 1] if number + 1 < len(words) else "="
+    if word in names.groups and "=" not in following:
+        return f"Cannot read {word!r}: write {word}={following}."
+    settings = names.settings_of(word)
+    if not settings:
+        near = get_close_matches(word, [*names.groups, *names.checkpoints])
+        settings = [setting for name in near for setting in names.settings_of(name)]
+    if not settings:
+        return f"Cannot read {word!r}: settings are words of the form key=value. {FORMS}"
+    text = f"Cannot read {word!r}: settings are words of the form key=value. Did you mean"
+    text += f" {' or '.join(settings[:3])}?"
+    if word in names.groups:
+        text += f" `--help {word}` lists its names."
+    return text
 
 
 def paths(tree: Any, prefix: str = "") -> Iterator[str]:

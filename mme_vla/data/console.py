@@ -13,8 +13,7 @@ from functools import partialmethod
 def quiet_libraries() -> Iterator[None]:
     """Surround work whose progress this library shows itself.
 
-    Log records below warnings are dropped. Bars of tqdm appear on terminals alone, those of
-    `datasets` never.
+    Log records below warnings are dropped, and no bars but this library's appear.
     """
     import av.logging
     import tqdm
@@ -23,7 +22,7 @@ def quiet_libraries() -> Iterator[None]:
     root = logging.getLogger()  # LeRobot reports by it
     level, begin = root.level, tqdm.tqdm.__init__
     root.setLevel(max(level, logging.WARNING))
-    tqdm.tqdm.__init__ = partialmethod(begin, disable=None)
+    tqdm.tqdm.__init__ = partialmethod(begin, disable=True)
     # x264 sums up every video that it closes. LeRobot asks for warnings only, but not until then.
     av.logging.set_libav_level(av.logging.ERROR)
     try:

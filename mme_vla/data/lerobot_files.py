@@ -9,9 +9,11 @@ take several seconds to import.
 
 import re
 import string
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from difflib import get_close_matches
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
@@ -130,6 +132,20 @@ class Columns:
     tables: tuple[str, ...]
 
 
+def _near_column(name: str, features: Iterable[str]) -> str | None:
+    """The column that a name is most like: with the same end, or spelt almost alike."""
+    known = list(features)
+    end = name.rpartition(".")[2]
+    for column in known:
+        if column.rpartition(".")[2] == end:
+            return column
+    ends = {column.rpartition(".")[2]: column for column in known}
+    near = get_close_matches(name, known, 1, 0.8) or get_close_matches(end, list(ends), 1, 0.8)
+    if not near:
+        return None
+    return ends.get(near[0], near[0])
+
+
 def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment) -> Columns:
     """Match a robot with a dataset.
 
@@ -160,23 +176,30 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
             missing.append(candidates[0])
         else:
             columns[name] = column
-    plural = "" if len(missing) == 1 else "s"
-    remedy = (
-        f" `mme-vla inspect dataset={root}` drafts that file, and docs/extend/your-robot.md"
-        " explains it."
-    )
-    if robot.action.space is not None and all(name in columns for name in robot.camera_names):
-        remedy = (
-            " (RoboMME's poses and waypoints are columns of datasets that this library converts or"
-            " records.)"
+    if missing:
+        plural = "" if len(missing) == 1 else "s"
+        message = (
+            f"{root} lacks the feature{plural} {', '.join(missing)}; it has"
+            f" {listed(features)}. These are the names of the robot {robot.name!r}: choose"
+            " embodiment=<the robot this dataset is of>, or name its columns in a"
+            " configs/embodiment file of your own."
         )
-    require(
-        not missing,
-        f"{root} lacks the feature{plural} {', '.join(missing)}; it has"
-        f" {listed(features)}. These are the names of the robot {robot.name!r}: choose"
-        " embodiment=<the robot this dataset is of>, or name its columns in a configs/embodiment"
-        f" file of your own.{remedy}",
-    )
+        for name in missing:
+            near = _near_column(name, features)
+            if near is not None:
+                message += f" Did you mean `key: {near}` for {name}?"
+        # A robot without the cameras is another one.
+        if robot.action.space is not None and all(name in columns for name in robot.camera_names):
+            message += (
+                " (RoboMME's poses and waypoints are columns of datasets that this library converts"
+                " or records.)"
+            )
+        else:
+            message += (
+                f" `mme-vla inspect dataset={root}` drafts that file, and"
+                " docs/extend/your-robot.md explains it."
+            )
+        raise UserError(message)
 
     cameras = {name: columns[name] for name in robot.camera_names}
     for name, column in cameras.items():
@@ -614,7 +637,7 @@ def open_table(root: Path, columns: Sequence[str], features: Mapping[str, Featur
     folder = user_cache("tables") / _tables_key(root, files, large)
     with (
         decoding(root / "data", "tables of frames", REMEDY),
-        nullcontext() if large else SuppressProgressBars(),
+        nullcontext() if large and sys.stderr.isatty() else SuppressProgressBars(),
     ):
         table = Dataset.from_parquet(
             [str(file) for file in files],

@@ -6,11 +6,12 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from mme_vla.utils.media import FAINT, GAP, INK, LABEL, TILE, Tile, contact_sheet, font, thumbnail
+from mme_vla.utils.style import rgb
 
 COLUMNS = 8  # tiles a row
 MOST = 47  # remembered frames that are shown
 TIMELINE = 90  # pixels
-VIDEO, EXECUTION, NOW = (122, 162, 205), (233, 148, 62), (200, 40, 40)
+VIDEO, EXECUTION, NOW = rgb("video"), rgb("series-1"), rgb("border")
 
 
 def memory_sheet(

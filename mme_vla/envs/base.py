@@ -3,15 +3,17 @@ every command.
 
 RoboMME is one entry of the registry (`mme_vla/envs/benchmark.py`). An environment of your own is a
 class beside a `gymnasium.Env`, whose observations are a dict: a uint8 image [H, W, 3] for each
-camera of the embodiment, and `state`, float32 [s]. Its info dict may hold `goal` (text, needed on
-reset), `video` (on reset: earlier observations, which become the conditioning video), `success`
-(bool) and `subgoal` (text).
+camera of the embodiment, and `state`, float32 [s]. An image may be a function that renders it now.
+Its info dict may hold `goal` (text, needed on reset), `video` (on reset: earlier observations,
+which become the conditioning video), `frozen` (on reset: steps in which no action has an effect),
+`success` (bool) and `subgoal` (text).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs.facts import Fact
 from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
 from mme_vla.errors import check_known, listed, require
 from mme_vla.registry import ENVS
@@ -29,6 +32,7 @@ CHOICES = "multi_choice"
 _FIRST_SEED = {"train": 0, "test": 500_000, "val": 1_000_000}
 _OTHER_SPLITS = 2_000_000  # first seed of splits with other names
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
+_KEPT = 4  # scenes that a process keeps for further episodes
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,16 @@ class Environment(ABC):
         tasks: names, in the order of tables.
         splits: name → episodes of each task.
         suites: name → tasks; `results` makes a figure of each. A task belongs to at most one.
+        groupings: further ways to group tasks: title → name → tasks, as `suites`; `results` makes
+            a table of each.
+        steps: steps after which an episode is a timeout; of every task, or task → steps.
+        success: `end`: an episode is a success if its last step is one. `once`: the first step that
+            is one ends it.
+        cue: what becomes of the steps in which no action has an effect (`info["frozen"]`). `steps`:
+            the policy acts in them as in others. `video`: the library performs them with `hold`,
+            and their frames are the conditioning video.
+        reuse: whether an environment that `make` returned serves the next episode of its task in
+            the same process: `reset(seed=…)` alone makes the scene.
         embodiment: as in a file of `configs/embodiment`: the robot of models that are built with
             `env=NAME`. None where users select one.
     """
@@ -54,6 +68,11 @@ class Environment(ABC):
     tasks: ClassVar[Sequence[str]]
     splits: ClassVar[Mapping[str, int]] = {"train": 100, "val": 50, "test": 50}
     suites: ClassVar[Mapping[str, Sequence[str]]] = {}
+    groupings: ClassVar[Mapping[str, Mapping[str, Sequence[str]]]] = {}
+    steps: ClassVar[int | Mapping[str, int]] = DEFAULT_STEPS
+    success: ClassVar[Literal["end", "once"]] = "end"
+    cue: ClassVar[Literal["steps", "video"]] = "steps"
+    reuse: ClassVar[bool] = False
     embodiment: ClassVar[Mapping[str, Any] | None] = None
 
     @abstractmethod
@@ -182,16 +201,26 @@ class Environment(ABC):
             env.close()
         return digest
 
-    def step_limit(self, split: str) -> int:
-        """Steps after which an episode of a split is a timeout."""
-        return DEFAULT_STEPS
+    def step_limit(self, split: str, task: str | None = None) -> int:
+        """Steps after which an episode of a task is a timeout; without a task the most of any."""
+        if isinstance(self.steps, int):
+            return self.steps
+        if task is None:
+            return max(self.steps.values())
+        return self.steps[task]
 
     def suite_of(self, task: str) -> str | None:
         """The suite of a task."""
-        for suite, tasks in self.suites.items():
-            if task in tasks:
-                return suite
-        return None
+        return _group_of(task, self.suites)
+
+    def groups_of(self, task: str) -> dict[str, str]:
+        """The group of a task in each further grouping: title → name."""
+        groups = {}
+        for title, grouping in self.groupings.items():
+            group = _group_of(task, grouping)
+            if group is not None:
+                groups[title] = group
+        return groups
 
     def open(
         self,
@@ -205,8 +234,22 @@ class Environment(ABC):
     ) -> Any:
         """One episode with the interface of `make_env`: lists of frames, status, goal."""
         spec = self.episode(task, split, episode)
-        limit = max_steps or self.step_limit(split)
-        return EpisodeEnv(self, self.make(spec, render), spec, limit, action_space == CHOICES)
+        limit = max_steps or self.step_limit(split, task)
+        env = _kept.pop((type(self), task, render), None)
+        if env is None:
+            env = self.make(spec, render)
+        return EpisodeEnv(self, env, spec, limit, action_space == CHOICES, render)
+
+
+def _group_of(task: str, grouping: Mapping[str, Sequence[str]]) -> str | None:
+    for name, tasks in grouping.items():
+        if task in tasks:
+            return name
+    return None
+
+
+_kept: OrderedDict[tuple[type[Environment], str, bool], Any] = OrderedDict()
+"""Environments between two episodes, by environment, task and whether they render."""
 
 
 def environment(name: str) -> Environment:
@@ -240,9 +283,12 @@ class EpisodeEnv:
         max_steps: steps until the status becomes `timeout`.
         by_choice: actions are `{"choice": letter}` among `environment.choices`, and all frames of
             one are returned.
+        render: as `env` was made.
 
     Attributes:
         scene_digest: of the values of the scene, from the reset on.
+        render_request: the images that are rendered of those that the environment gives as
+            functions; None: all. The others are None.
     """
 
     def __init__(
@@ -252,12 +298,16 @@ class EpisodeEnv:
         spec: EpisodeSpec,
         max_steps: int,
         by_choice: bool = False,
+        render: bool = True,
     ) -> None:
         self.environment = environment
         self.env = env
         self.spec = spec
         self.max_steps = max_steps
+        self.render_request: RenderRequest | None = None
         self.goal = ""
+        self._key = (type(environment), spec.task, render)
+        self._whole = True  # no call has failed
         self._by_choice = by_choice
         self._steps = 0
         self._limit = max_steps
@@ -268,18 +318,14 @@ class EpisodeEnv:
 
     def reset(self) -> tuple[dict[str, list[Any]], dict[str, Any]]:
         """The conditioning video, if there is one, and the current frame."""
-        observation, info = self.env.reset(seed=self.spec.seed)
-        require(
-            isinstance(info.get("goal"), str),
-            f"{self.spec.task}: reset() must return the goal in info['goal'].",
-        )
-        self.goal = info["goal"]
-        self._frames = 0
-        self._steps = 0
-        self._limit = self.max_steps
+        observation, info = self._begin()
         values = self.environment.scene_values(self.env)
         self.scene_digest = NO_VALUES if values is None else scene_digest(values)
-        return self._lists([*info.get("video", ()), observation]), self._info(info, False, False)
+        frames = []
+        for visible in self._video(observation, info):
+            frames.append(self._taken(visible, newest=False))
+        frames.append(self._taken(self._newest, newest=True))
+        return self._lists(frames), self._info(info, False, False)
 
     def step(self, action: Any) -> tuple[dict[str, list[Any]], float, bool, bool, dict[str, Any]]:
         """Perform one action, all actions of a choice, or a `Hold`."""
@@ -291,16 +337,21 @@ class EpisodeEnv:
             parts = self._choices[action["choice"].lower()]
         frames = []
         total = 0.0
-        for part in parts:
-            observation, reward, terminated, truncated, info = self.env.step(part)
-            frames.append(observation)
+        for number, part in enumerate(parts, 1):
+            observation, reward, terminated, truncated, info = self._perform(part)
             total += float(reward)
             self._steps += 1
             truncated = bool(truncated) or self._steps >= self._limit
-            if terminated or truncated:
+            over = terminated or truncated
+            frames.append(self._taken(observation, newest=bool(over) or number == len(parts)))
+            if over:
                 break
         report = self._info(info, bool(terminated), truncated)
         return self._lists(frames), total, bool(terminated), truncated, report
+
+    def render_image(self, image: Callable[[], np.ndarray]) -> np.ndarray:
+        """The image [H, W, 3] that a function of the environment renders."""
+        return image()
 
     def render(self) -> Any:
         """What the environment renders."""
@@ -316,8 +367,20 @@ class EpisodeEnv:
         return choice
 
     def close(self) -> None:
-        """Free the environment."""
-        self.env.close()
+        """Free the environment, or keep it for the next episode of its task."""
+        env = self.env
+        self.env = None
+        if env is None:
+            return
+        if not (self.environment.reuse and self._whole):
+            env.close()
+            return
+        replaced = _kept.pop(self._key, None)
+        _kept[self._key] = env
+        if replaced is None and len(_kept) > _KEPT:
+            _, replaced = _kept.popitem(last=False)
+        if replaced is not None:
+            replaced.close()
 
     @property
     def facts(self) -> Sequence[Fact]:
@@ -333,18 +396,19 @@ class EpisodeEnv:
         """Observation, action and whether the frame is of the conditioning video, until the
         demonstrator is done.
         """
-        observation, info = self.env.reset(seed=self.spec.seed)
-        self.goal = str(info["goal"])
+        observation, info = self._begin()
         self.success = False
+        video = [self._taken(visible) for visible in self._video(observation, info)]
+        frame = self._taken(self._newest)
         actions = self.environment.demonstrate(self.env)
-        first = next(actions, None)
-        require(first is not None, f"{self.spec.task}: the demonstrator gives no action.")
-        for visible in info.get("video", ()):
-            yield visible, np.zeros_like(first), True
-        action: Any = first
+        action: Any = next(actions, None)
+        require(action is not None, f"{self.spec.task}: the demonstrator gives no action.")
+        for visible in video:
+            yield visible, np.zeros_like(action), True
         for _ in range(self.max_steps):
-            yield observation, action, False
-            observation, _, terminated, truncated, info = self.env.step(action)
+            yield frame, action, False
+            observation, _, terminated, truncated, info = self._perform(action)
+            frame = self._taken(observation)
             self.success = bool(info.get("success", False))
             if terminated or truncated:
                 return
@@ -352,24 +416,85 @@ class EpisodeEnv:
             if action is None:
                 return
 
-    def _lists(self, frames: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-        """The values of frames by their names; every frame of an episode must have all of them, or
-        images would be of other frames than states.
+    def _begin(self) -> tuple[Mapping[str, Any], dict[str, Any]]:
+        """Reset the environment to the scene of the episode."""
+        self._whole = False
+        observation, info = self.env.reset(seed=self.spec.seed)
+        self._whole = True
+        require(
+            isinstance(info.get("goal"), str),
+            f"{self.spec.task}: reset() must return the goal in info['goal'].",
+        )
+        self.goal = info["goal"]
+        self._frames = 0
+        self._names = set()
+        self._steps = 0
+        self._limit = self.max_steps
+        return observation, info
+
+    def _perform(self, action: Any) -> tuple[Mapping[str, Any], float, bool, bool, dict[str, Any]]:
+        """Perform one action; with `success="once"` the first success ends the episode."""
+        self._whole = False
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._whole = True
+        if self.environment.success == "once" and info.get("success", False):
+            terminated = True
+        return observation, reward, terminated, truncated, info
+
+    def _video(
+        self, observation: Mapping[str, Any], info: Mapping[str, Any]
+    ) -> Iterator[Mapping[str, Any]]:
+        """The observations of the conditioning video, each to be read before the next one; the
+        current one is in `_newest` afterwards.
         """
+        self._newest = observation
+        yield from info.get("video", ())
+        if self.environment.cue == "video":
+            for _ in range(int(info.get("frozen", 0))):
+                yield self._newest
+                self._newest, _, terminated, truncated, _ = self._perform(self.hold_action)
+                require(
+                    not (terminated or truncated),
+                    f"{self.spec.task}: the episode ended within the {info['frozen']} steps of"
+                    " info['frozen'], before a policy could act.",
+                )
+
+    def _taken(self, observation: Mapping[str, Any], newest: bool = False) -> dict[str, Any]:
+        """An observation with its images: those that are functions are rendered now, or left
+        out if nobody requested them.
+        """
+        frame = dict(observation)
+        requested = self.render_request
+        for name, value in observation.items():
+            if not callable(value):
+                continue
+            if requested is None or name in requested.cameras(self._frames, newest):
+                frame[name] = self.render_image(value)
+            else:
+                frame[name] = None
+        self._check_frame(frame)
+        self._frames += 1
+        return frame
+
+    def _lists(self, frames: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+        """The values of frames by their names."""
         lists: dict[str, list[Any]] = {"state_list": []}
         for frame in frames:
-            self._check_frame(frame)
             for name, value in frame.items():
                 if name == "state":
                     lists["state_list"].append(np.asarray(value, np.float32))
-                else:
-                    lists.setdefault(f"{name}_rgb_list", []).append(np.asarray(value))
+                    continue
+                image = None if value is None else np.asarray(value)
+                lists.setdefault(f"{name}_rgb_list", []).append(image)
         if self._by_choice and len(lists) > 1:
             first_camera = next(images for name, images in lists.items() if name != "state_list")
             lists.setdefault("front_rgb_list", first_camera)  # what `play` shows
         return lists
 
     def _check_frame(self, frame: Mapping[str, Any]) -> None:
+        """Every frame of an episode has the names of the first, or images would be of other frames
+        than states.
+        """
         if self._frames == 0:
             require("state" in frame, f"{self.spec.task}: observations have no 'state'.")
             self._names = set(frame)
@@ -379,7 +504,6 @@ class EpisodeEnv:
         require(not missing, f"{place} lacks {listed(missing)}, which frame 0 has. {remedy}")
         added = sorted(set(frame) - self._names)
         require(not added, f"{place} has {listed(added)}, which frame 0 lacks. {remedy}")
-        self._frames += 1
 
     def _info(self, info: Mapping[str, Any], terminated: bool, truncated: bool) -> dict[str, Any]:
         report: dict[str, Any] = {

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, NamedTuple, Self, TypedDict
 
 from mme_vla.config.sections import Range, read_section
+from mme_vla.envs.make import ROBOMME
 from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, check_choice, require
@@ -143,7 +144,8 @@ class EpisodeRecord:
     What follows is of rollouts, and is not written where it is None or empty. env: the
     environment's name. goal: the instruction. chunks: how often the policy acted. video_frames:
     observed frames of the conditioning video. actions_sha256: digest of the executed actions.
-    suite: the task's, where its environment has suites. refused: what the environment says of an
+    suite: the task's, where its environment has suites. groups: the task's in its environment's
+    further groupings, title → name. refused: what the environment says of an
     episode that failed. video: name of the file. process: where the chain of sub-tasks broke
     (`ProcessScore`). events: what happened, and at which control step. subgoals: their score
     (`SubgoalScore`). made_up: whether the record is synthetic.
@@ -178,6 +180,7 @@ class EpisodeRecord:
     video_frames: Integer | None = None
     actions_sha256: str | None = None
     suite: str | None = None
+    groups: Mapping[str, str] | None = None
     refused: str | None = None
     video: str | None = None
     process: Mapping[str, Any] | None = None
@@ -325,12 +328,17 @@ def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]
     for record in records:
         runs.setdefault(record.run, []).append(record)
     for run, members in runs.items():
-        for name in ("max_steps", "action_space"):
-            values = sorted({getattr(member, name) for member in members})
+        of_one: dict[tuple[str, str], set[Any]] = {}
+        for member in members:
+            of_one.setdefault(("action_space", ""), set()).add(member.action_space)
+            # Tasks of other environments may have limits of their own.
+            scope = "" if member.env in (None, ROBOMME) else member.task
+            of_one.setdefault(("max_steps", scope), set()).add(member.max_steps)
+        for (name, _), values in of_one.items():
             if len(values) > 1:
                 raise UserError(
-                    f"{run} mixes {name} {' and '.join(map(str, values))}: evaluate it with one of"
-                    " them."
+                    f"{run} mixes {name} {' and '.join(map(str, sorted(values)))}: evaluate it"
+                    " with one of them."
                 )
     return runs
 

@@ -2,7 +2,9 @@
 from memory (paper, section 4.3).
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +13,7 @@ from mme_vla.backbone.base import BackboneConfig, Hook, LayerHooks
 from mme_vla.backbone.layers import (
     EPS,
     RMSNorm,
+    Rotation,
     additive_mask,
     attend,
     compute_dtype,
@@ -20,6 +23,7 @@ from mme_vla.backbone.layers import (
 )
 from mme_vla.integration.base import Integration, ages_of, checked_position, required
 from mme_vla.registry import INTEGRATIONS
+from mme_vla.speed import CompilesParts
 from mme_vla.types import MemoryTokens
 
 
@@ -41,18 +45,13 @@ class ModulatorLayer(nn.Module):
         nn.init.normal_(self.modulation.weight, std=0.0 if exact_identity else 0.002)
         nn.init.zeros_(self.modulation.bias)
 
-    def keys_values(self, memory: Tensor, positions: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Memory [b, m, d] → rotated keys and values [b, m, K, h]: once per chunk, whatever the
-        number of steps.
-
-        Queries have positions after all memory slots, padding included; `positions` [b, m] count
-        from the same origin. None numbers the slots.
+    def keys_values(self, memory: Tensor, rope: Rotation) -> tuple[Tensor, Tensor]:
+        """Memory [b, m, d] → keys, rotated by `rope`, and values [b, m, K, h]: once per chunk,
+        whatever the number of steps.
         """
-        if positions is None:
-            positions = _positions(0, memory)
         kv = self.kv(self.norm(memory)[0]).unflatten(-1, (-1, self.head_dim))
         k, v = kv.chunk(2, dim=-2)
-        return rotate(k, rotation(positions, self.head_dim)), v
+        return rotate(k, rope), v
 
     def read_memory(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
         """r: what actions [b, h, d] read from memory; their positions come after all memory slots,
@@ -74,7 +73,7 @@ class ModulatorLayer(nn.Module):
 
 
 @INTEGRATIONS.register("modulator")
-class Modulator(Integration):
+class Modulator(Integration, CompilesParts):
     """Fills the action expert's hook in every layer; the prefix never sees memory."""
 
     def __init__(
@@ -105,18 +104,29 @@ class Modulator(Integration):
             ModulatorLayer(self.memory_width, num_heads, num_kv_heads, head_dim, exact_identity)
             for _ in range(backbone.depth)
         )
+        self.head_dim = head_dim
+        self._keys_values: Callable[..., tuple[Tensor, Tensor]] = ModulatorLayer.keys_values
+
+    def compile(self, **options: Any) -> None:
+        """Compile the keys and values of memory; what actions read is in their layers' code."""
+        self._keys_values = torch.compile(
+            ModulatorLayer.keys_values, **{"fullgraph": True, "dynamic": True, **options}
+        )
 
     def hook(self, memory: MemoryTokens | None) -> Hook:
         memory = required(memory)
         tokens = memory.tokens.to(compute_dtype(memory.tokens))
-        positions = None
+        # Queries have positions after all memory slots, padding included; those of memory count
+        # from the same origin.
+        positions = _positions(0, tokens)
         if self.memory_position == "time":
             positions = tokens.shape[1] - 1 - ages_of(memory)
+        rope = rotation(positions, self.head_dim)
         # Every action sees the same keys: b 1 1 m.
         mask = additive_mask(memory.mask[:, None], tokens.dtype)
         hooks = []
         for layer in self.layers:
-            k, v = layer.keys_values(tokens, positions)  # type: ignore[operator]
+            k, v = self._keys_values(layer, tokens, rope)
             hooks.append(partial(layer, k=k, v=v, mask=mask))
         return LayerHooks(hooks)
 

@@ -5,8 +5,8 @@ hooks that it can serve:
 
 - `data.history_transforms`: training, on recorded episodes (`repeats`, `perturb`);
 - `event`: a rollout, in the simulation (`hold`, `act`, and `repeats` of the conditioning video);
-- `with`: a probe, on what a policy observes, remembers and is told (`repeats`, `perturb`,
-  `n_sessions`, `shows_video`, `only`, `edit`, `say`).
+- `with`: a probe, on what a policy observes, remembers and is told (`repeats`, `show`, `renews`,
+  `n_sessions`, `shows_video`, `perturb`, `only`, `edit`, `say`, `instruct`).
 
 One of your own is a class registered with `register("perturbation", name)` in a module that
 `plugins` names.
@@ -35,7 +35,9 @@ class Perturbation:
 
     dial: the option that `name:value` sets. neutral: its value without effect, at which a curve has
     the plain run. drops: whether `repeats` may leave frames out. needs: what else a probe must have
-    for it, such as `recordings`. shows_video: whether the conditioning video is shown.
+    for it, such as `recordings`. shows_video: whether the conditioning video is shown. renews:
+    whether the policy begins an episode anew at each decision, with what is shown of the frames so
+    far. lag: frames before the shown ones that `show` needs too.
     """
 
     dial: ClassVar[str | None] = None
@@ -43,8 +45,31 @@ class Perturbation:
     drops: ClassVar[bool] = False
     needs: ClassVar[frozenset[str]] = frozenset()
     shows_video: ClassVar[bool] = True
+    renews: ClassVar[bool] = False
+
+    @property
+    def meaning(self) -> str:
+        """What it does in a few plain words, as reports and progress show it: by default the first
+        sentence of its class.
+        """
+        words = " ".join((type(self).__doc__ or "").split())
+        return words.partition(". ")[0].rstrip(".")
 
     # What is shown
+
+    @property
+    def lag(self) -> int:
+        return 0
+
+    def show(self, frames: Any, moment: Any) -> Any:
+        """Change the frames since the last decision as the policy observes them; with `renews`, all
+        frames so far.
+
+        Args:
+            frames: what a probe collected, the current frame last. moment: what it knows of the
+                current step.
+        """
+        return frames
 
     def repeats(
         self, length: int, exec_start: int, rng: np.random.Generator | None = None
@@ -107,12 +132,27 @@ class Perturbation:
         """The subgoal that the policy reads instead."""
         return subgoal
 
+    def instruct(self, goal: str, moment: Any) -> str:
+        """The goal that the policy reads instead."""
+        return goal
+
 
 TRAINING, ROLLOUT, PROBE = "data.history_transforms", "event", "with"  # options that take some
 _HOOKS = {
     TRAINING: ("repeats", "perturb"),
     ROLLOUT: ("hold", "act", "repeats"),
-    PROBE: ("repeats", "perturb", "n_sessions", "shows_video", "only", "edit", "say"),
+    PROBE: (
+        "repeats",
+        "show",
+        "renews",
+        "n_sessions",
+        "shows_video",
+        "perturb",
+        "only",
+        "edit",
+        "say",
+        "instruct",
+    ),
 }
 
 
@@ -142,6 +182,10 @@ class Pause(Perturbation):
     at: NonNegativeInt | None = None
     p: Share = 1.0
     dial: ClassVar = "frames"
+
+    @property
+    def meaning(self) -> str:
+        return f"time stands still for {self.frames} frames"
 
     @property
     def hold(self) -> int:
@@ -177,6 +221,10 @@ class Gap(Perturbation):
     dial: ClassVar = "frames"
 
     @property
+    def meaning(self) -> str:
+        return f"{self.frames} frames pass that the policy does not see"
+
+    @property
     def hold(self) -> int:
         return self.frames + 1 if self.frames else 0
 
@@ -197,6 +245,10 @@ class Speed(Perturbation):
     neutral: ClassVar = 1
     drops: ClassVar = True
 
+    @property
+    def meaning(self) -> str:
+        return f"the past runs {self.factor:g} times as fast"
+
     def repeats(
         self, length: int, exec_start: int, rng: np.random.Generator | None = None
     ) -> np.ndarray:
@@ -213,6 +265,10 @@ class DropFrames(Perturbation):
     share: Share = 0.25
     dial: ClassVar = "share"
     drops: ClassVar = True
+
+    @property
+    def meaning(self) -> str:
+        return f"{100 * self.share:g} % of the frames are lost"
 
     def repeats(
         self, length: int, exec_start: int, rng: np.random.Generator | None = None
@@ -233,6 +289,10 @@ class Noise(Perturbation):
     std: NonNegative = 0.1
     dial: ClassVar = "std"
 
+    @property
+    def meaning(self) -> str:
+        return f"noise of {self.std:g} standard deviations on what is remembered"
+
     def perturb(self, rows: "Tensor", rng: np.random.Generator | None = None) -> "Tensor":
         import torch  # results read the names of perturbations without it
 
@@ -250,6 +310,10 @@ class Restart(Perturbation):
     """The frame index restarts at 0: what is remembered keeps its content and its times, the clock
     begins anew.
     """
+
+    @property
+    def meaning(self) -> str:
+        return "the frame number begins at 0 again"
 
     def act(self, episode: Any) -> None:
         episode.restart_clock()

@@ -28,6 +28,7 @@ from mme_vla.memory.base import (
     union_frames,
 )
 from mme_vla.memory.history import History, StorageSpec
+from mme_vla.speed import CompilesParts
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 
@@ -246,7 +247,7 @@ class RecurrentLayer(nn.Module):
         return {}
 
 
-class RecurrentMemory(MemoryModule):
+class RecurrentMemory(MemoryModule, CompilesParts):
     """Encoder → recurrent layer → output projection. Subclasses supply the layer.
 
     Besides its own arguments it takes those of `FrameSchedule` and `FeatureEncoder`.

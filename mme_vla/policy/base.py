@@ -16,6 +16,7 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.episode import Episode
+from mme_vla.policy.identity import PolicyIdentity
 from mme_vla.policy.saving import load_policy, push_folder, save_policy
 from mme_vla.policy.sections import PolicySections
 from mme_vla.types import Noise, stack_noise
@@ -33,6 +34,10 @@ class PolicyInfo:
     max_actions: actions after which its rollouts end, beside their limit of frames.
     n_distractor_episodes: unrelated episodes that it is shown before each of its own, as a stress
         split requires.
+    resamples: whether a chunk can be sampled any number of times at one step of an episode.
+    max_running: most episodes that it can act in at the same time; None for any number.
+    identity: what records call a policy that does not compute here; None for what its configuration
+    says.
     history_dtype: of stored vision tokens (`Policy.encode_frames`).
     processor_sizes: sizes of the network that its processor must have too, by the name of the
         processor's attribute, such as `image_size` or `embodiment.action.horizon`. A checkpoint in
@@ -43,6 +48,9 @@ class PolicyInfo:
     supports_rtc: bool = False
     max_actions: int | None = None
     n_distractor_episodes: int = 0
+    resamples: bool = True
+    max_running: int | None = None
+    identity: PolicyIdentity | None = None
     history_dtype: torch.dtype = torch.bfloat16
     processor_sizes: Mapping[str, object] = field(default_factory=dict)
 
@@ -184,11 +192,14 @@ class Policy(nn.Module):
         """
         raise NotImplementedError
 
-    def compile_sampling(self, layers: bool = False) -> bool:
+    def compile_sampling(
+        self, layers: bool = False, report: Callable[[str], object] = lambda text: None
+    ) -> bool:
         """Compile the sampler of a policy whose weights are final.
 
         Args:
             layers: compile the network's layers too.
+            report: gets a line on each part that is ready.
 
         Returns:
             Whether the policy has a sampler that can be compiled.
@@ -230,6 +241,15 @@ class Policy(nn.Module):
             Whether more remains. A recurrent memory reads its next list of frames so.
         """
         return False
+
+    def conditions(self) -> dict[str, Any]:
+        """What a receipt names of this policy beside code and files; a server's metadata, if it
+        computes there.
+        """
+        return {}
+
+    def close(self) -> None:
+        """Free what the policy holds outside of this process."""
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         """The current observations of episodes, as a batch of the processor's kind on the policy's

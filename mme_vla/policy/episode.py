@@ -33,6 +33,17 @@ class ActionPrefix:
     delay: int
 
 
+@dataclass(frozen=True)
+class Failure:
+    """Why a policy cannot act in an episode any more.
+
+    again: whether it may be able to when the episode is run again from its beginning.
+    """
+
+    reason: str
+    again: bool
+
+
 class Host(Protocol):
     """What an episode needs of its policy."""
 
@@ -335,6 +346,14 @@ class Episode:
         """Note the frames at which sub-tasks began, if the environment reports them; only probes
         use it.
         """
+
+    @property
+    def failure(self) -> Failure | None:
+        """Why the policy could not act at the last decision; None where it could."""
+        return None
+
+    def close(self) -> None:
+        """End the episode: free what it holds outside of this process."""
 
     def acted(self, chunk: np.ndarray) -> None:
         """Take the chunk [h, w] of the policy; the frames that follow show how much of it was

@@ -1,6 +1,7 @@
 """`MMEPolicy`: the network `MMEModel` with a processor, episodes and checkpoints."""
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -34,7 +35,14 @@ from mme_vla.policy.saving import policy_options
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
-from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes
+from mme_vla.speed import (
+    SAMPLING_OPTIONS,
+    CapturableSampling,
+    CompilesParts,
+    HasAttentionBackends,
+    Recompute,
+    Recomputes,
+)
 from mme_vla.speed.graphs import CapturedSampling
 from mme_vla.speed.sharding import ShardGroup, backbone_groups
 from mme_vla.types import Batch, MemoryTokens, Noise, map_noise, named_noise, send, stack_noise
@@ -269,12 +277,12 @@ class MMEPolicy(NetworkPolicy):
         self.backbone.recompute(mode)
 
     def compile(self, **options: Any) -> None:
-        """Compile the backbone's tower and layers in place, each by itself, and the recurrence of a
-        memory.
+        """Compile the backbone's tower and layers in place, each by itself, and what memory and
+        integration name (`CompilesParts`).
         """
         self.backbone.compile(**options)
         for module in self.modules():
-            if isinstance(module, RecurrentMemory):
+            if isinstance(module, CompilesParts):
                 module.compile(**options)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
@@ -325,35 +333,44 @@ class MMEPolicy(NetworkPolicy):
             memory = self.model.memory_tokens(batch)
         return self._sampler(batch, values, steps or self.info.sample_steps, memory)
 
-    def compile_sampling(self, layers: bool = False) -> bool:
+    def compile_sampling(
+        self, layers: bool = False, report: Callable[[str], object] = lambda text: None
+    ) -> bool:
         """Speed up sampling with fixed weights; chunks are equal up to the rounding of other
         kernels.
 
         What depends on the flow time alone is computed once and kept. On a GPU a chunk becomes one
         CUDA graph for each batch size, captured when it first occurs; here for one episode and
-        every length of prompt.
+        every length of prompt. Layers are compiled for the same lengths.
 
         Args:
             layers: compile the tower and the layers too, which takes a minute or more at full size.
+            report: gets a line for each length that is ready.
 
         Returns:
             Whether this backbone has a sampler that can be captured.
         """
         if not isinstance(self.backbone, CapturableSampling):
             return False
-        stamp = self.backbone.compile_sampling()
-        if layers:
-            self.backbone.compile(dynamic=False)
-        if self.device.type != "cuda":
-            return True
-        self._sampler = CapturedSampling(self.model.sample, stamp)
-        if self.processor is None:
+        stamp = self.backbone.compile_sampling(layers)
+        if layers and isinstance(self.integration, CompilesParts):
+            self.integration.compile(**SAMPLING_OPTIONS)
+        on_gpu = self.device.type == "cuda"
+        if on_gpu:
+            self._sampler = CapturedSampling(self.model.sample, stamp)
+        if self.processor is None or not (on_gpu or layers):
             return True
         full = self.full_batch(self.device)
-        for length in range(16, self._prompt_length() + 16, 16):
+        lengths = range(16, self._prompt_length() + 16, 16)
+        for index, length in enumerate(lengths):
+            begun = time.perf_counter()
             prompt = full.prompt[:, :length]
             prompt_mask = full.prompt_mask[:, :length]
             self.sample_actions(replace(full, prompt=prompt, prompt_mask=prompt_mask))
+            took = time.perf_counter() - begun
+            report(
+                f"prompts of {length} tokens are ready: {index + 1} of {len(lengths)}, {took:.1f} s"
+            )
         return True
 
     # Episodes

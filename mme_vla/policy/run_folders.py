@@ -66,9 +66,18 @@ def newest_write(run: Path) -> int:
 
 
 LATEST = "latest"
-"""`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder
-is called so.
+"""`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last. Where a
+folder is a run itself, its `latest` is that run. No folder is called so.
 """
+
+
+def check_output(folder: Path) -> None:
+    """Make sure that a new folder has no name that means another one."""
+    require(
+        folder.name != LATEST,
+        f"output={folder}: {LATEST!r} is reserved, {folder} means the newest run in"
+        f" {folder.parent}. Choose another name.",
+    )
 
 
 def shipped_checkpoints() -> dict[str, Path]:
@@ -93,6 +102,8 @@ def find_run(path: Path) -> Path:
     if path.name != LATEST:
         return path
     runs = [run for run in path.parent.glob("*") if newest_write(run)]
+    if not runs and newest_write(path.parent):
+        return path.parent  # it is a run itself
     require(
         runs,
         f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name"

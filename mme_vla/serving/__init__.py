@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mme_vla.serving.client import Client
     from mme_vla.serving.codec import pack, unpack
+    from mme_vla.serving.remote.policy import RemotePolicy
+    from mme_vla.serving.remote.settings import ServerChoice
     from mme_vla.serving.server import PolicyServer
     from mme_vla.serving.settings import Limits, ServeSettings
 
@@ -19,11 +21,22 @@ _HOME = {
     "pack": "codec",
     "unpack": "codec",
     "PolicyServer": "server",
+    "RemotePolicy": "remote.policy",
+    "ServerChoice": "remote.settings",
     "Limits": "settings",
     "ServeSettings": "settings",
 }
 
-__all__ = ["Client", "Limits", "PolicyServer", "ServeSettings", "pack", "unpack"]
+__all__ = [
+    "Client",
+    "Limits",
+    "PolicyServer",
+    "RemotePolicy",
+    "ServeSettings",
+    "ServerChoice",
+    "pack",
+    "unpack",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -6,14 +6,23 @@ from typing import Any, Self
 
 import numpy as np
 
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, brief, missing_extra
 from mme_vla.serving.codec import pack, unpack
 
 try:
-    from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
+    from websockets.exceptions import (
+        ConnectionClosed,
+        InvalidHandshake,
+        InvalidStatus,
+        InvalidURI,
+    )
     from websockets.sync.client import connect
 except ImportError as error:
     raise missing_extra("The client", "serve") from error
+
+
+class FullError(UserError, ConnectionError):
+    """The server has no place for another client now."""
 
 
 class Client:
@@ -63,29 +72,8 @@ class Client:
         begun.
         """
         self.close()
-        try:
-            opening = connect(
-                self.url,
-                additional_headers=self._headers,
-                compression=None,
-                max_size=None,
-                open_timeout=self.open_timeout,
-                ping_timeout=self.timeout,
-                proxy=None,
-            )
-            self._socket = self._ends.enter_context(opening)
-        except InvalidURI as error:
-            raise UserError(
-                f"{self.url!r} is not an address such as ws://127.0.0.1:8001: {error}"
-            ) from None
-        except InvalidHandshake as error:
-            reply = getattr(getattr(error, "response", None), "body", b"") or b""
-            message = bytes(reply).decode(errors="replace").strip()
-            raise UserError(
-                f"The server at {self.url} refuses the connection: {message or error}"
-            ) from None
-        except (OSError, TimeoutError, EOFError) as error:
-            raise ConnectionError(f"No policy server responds at {self.url}: {error}") from error
+        opening = open_socket(self.url, self._headers, self.open_timeout, self.timeout)
+        self._socket = self._ends.enter_context(opening)
         self.metadata = self._receive(self.open_timeout)
 
     def reset(self) -> dict[str, Any]:
@@ -127,7 +115,8 @@ class Client:
         """Send one message and return the answer.
 
         Raises:
-            UserError: the server refuses the message, and says why. The connection is closed then.
+            UserError: the server refuses the message, and says why. The episode goes on where
+                nothing was changed; else the next request raises `ConnectionError`.
             ConnectionError: the connection is lost. TimeoutError: no answer within `timeout`; the
                 connection is closed.
         """
@@ -163,10 +152,63 @@ class Client:
                 f"No answer from {self.url} within {timeout:g} s; call reconnect()."
             ) from None
         if isinstance(response, str):
-            self.close()
             raise UserError(f"The server refuses this request: {response}")
-        fields: dict[str, Any] = unpack(response)
-        for key, value in fields.items():
-            if isinstance(value, np.ndarray):
-                fields[key] = value.copy()  # unpacked arrays cannot be written to
-        return fields
+        try:
+            return decoded_map(response)
+        except UserError:
+            self.close()
+            raise
+
+
+def open_socket(
+    url: str, headers: Mapping[str, str], open_timeout: float, pong_timeout: float
+) -> Any:
+    """Open a websocket without compression or a limit on messages.
+
+    Args:
+        open_timeout: seconds to wait for the handshake. pong_timeout: for the reply to a ping.
+
+    Raises:
+        UserError: not an address, or the server refuses this client.
+        ConnectionError: there is no server, or (`FullError`) no place for this client now.
+    """
+    try:
+        return connect(
+            url,
+            additional_headers=dict(headers),
+            compression=None,
+            max_size=None,
+            open_timeout=open_timeout,
+            ping_timeout=pong_timeout,
+            proxy=None,
+        )
+    except InvalidURI as error:
+        raise UserError(f"{url!r} is not an address such as ws://127.0.0.1:8001: {error}") from None
+    except InvalidHandshake as error:
+        reply = getattr(getattr(error, "response", None), "body", b"") or b""
+        message = bytes(reply).decode(errors="replace").strip()
+        text = f"The server at {url} refuses the connection: {message or error}"
+        is_full = isinstance(error, InvalidStatus) and error.response.status_code == 503
+        if is_full:
+            raise FullError(text) from None
+        raise UserError(text) from None
+    except (OSError, TimeoutError, EOFError) as error:
+        raise ConnectionError(f"No policy server responds at {url}: {error}") from error
+
+
+def decoded_map(data: bytes) -> dict[str, Any]:
+    """A server's message, with arrays that can be written to.
+
+    Raises:
+        UserError: it is no map.
+    """
+    try:
+        fields = unpack(data)
+    except UserError as error:
+        raise UserError(f"The server's reply is malformed: {error}") from error
+    if not isinstance(fields, dict):
+        raise UserError(f"The server's reply is malformed: {brief(fields)} is no map.")
+    for key, value in fields.items():
+        if isinstance(value, np.ndarray):
+            fields[key] = value.copy()
+    return fields

@@ -130,7 +130,7 @@ def _encode(value: Any) -> dict[bytes, Any]:
 
 def _decode(fields: dict[Any, Any]) -> Any:
     if b"__ndarray__" in fields:
-        return _array(fields)
+        return read_array(fields)
     if b"__npgeneric__" in fields:
         dtype = _dtype(fields)
         value = fields.get(b"data")
@@ -145,7 +145,8 @@ def _decode(fields: dict[Any, Any]) -> Any:
     return fields
 
 
-def _array(fields: dict[Any, Any]) -> np.ndarray:
+def read_array(fields: dict[Any, Any]) -> np.ndarray:
+    """The array of a map with bytes keys; a view on its data."""
     dtype = _dtype(fields)
     shape: Any = fields.get(b"shape")
     data: Any = fields.get(b"data")

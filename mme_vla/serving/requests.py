@@ -36,7 +36,12 @@ from mme_vla.utils.validation import described, validated
 
 @dataclass(frozen=True)
 class Reset:
-    """Forget the episode and begin another."""
+    """Forget the episode and begin another.
+
+    seed: of its noise; None for the server's.
+    """
+
+    seed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,10 @@ class Infer:
     states: [t, s] float32.
     stored: whether the frames go into memory; False where they came by `AddBuffer`, and t is 1.
     first: whether the message begins an episode; None in the MME-VLA schema, which does not say.
+    exec_start: index of the episode's first execution frame, in the message that begins it; None
+        where the last frame of that message is the first.
+    executed: actions [k, w] that led to the last k frames, where the client says so; None for
+        those of the last chunk.
     subgoals: by kind; kinds that the message lacks are left out.
     options: what can be chosen, for a policy that chooses; empty where the options stay as they
         were.
@@ -73,6 +82,8 @@ class Infer:
     states: np.ndarray
     stored: bool
     first: bool | None = None
+    exec_start: int | None = None
+    executed: np.ndarray | None = None
     subgoals: Mapping[str, str] = field(default_factory=dict)
     options: tuple[Option, ...] = ()
 
@@ -225,15 +236,24 @@ IMAGE_KEYS = {"front": "observation/image", "wrist": "observation/wrist_image"}
 KNOWN = ("reset", "add_buffer", "observation/image", "front_rgb_list")
 
 
+Index = Annotated[StrictInt, BeforeValidator(_integer), Field(ge=0)]
+
+
 class Flags(BaseModel):
     reset: Flag = False
     add_buffer: Flag = False
 
 
+class ResetMessage(BaseModel):
+    """`{"reset": True}`, with the seed of the episode's noise if the client chooses it."""
+
+    seed: Annotated[Index, Field(lt=2**63)] | None = None
+
+
 class BufferMessage(BaseModel):
     """`{"add_buffer": True, …}` of the MME-VLA schema. Its reader adds `images` and `state`."""
 
-    exec_start_idx: Annotated[StrictInt, BeforeValidator(_integer), Field(ge=0)] = 0
+    exec_start_idx: Index = 0
 
 
 class InferMessage(BaseModel):
@@ -255,11 +275,20 @@ class ObservationMessage(InferMessage):
     prompt: Goal
 
 
-class ChallengeMessage(InferMessage):
-    """All frames since the last request, in the challenge's schema."""
+class ListMessage(InferMessage):
+    """All frames since the last request. Its reader adds what the robot sees.
+
+    exec_start_idx, executed_action_list: extensions of the challenge's schema, see `Infer`.
+    """
 
     task_goal: Goal
     is_first_step: Truth
+    exec_start_idx: Index | None = None
+
+
+class ChallengeMessage(ListMessage):
+    """The same as the challenge has it: with the benchmark's two lists of states."""
+
     joint_state_list: _shaped(None, ARM_JOINTS)  # type: ignore[valid-type]
     gripper_state_list: _shaped(None, 2)  # type: ignore[valid-type]
 
@@ -302,7 +331,10 @@ class RequestReader:
                 observed[f"see_{pose_name}"] = (_shaped(3, 4), one)
                 listed[f"see_{pose_name}"] = (_shaped(None, 3, 4), many)
         self._observation = create_model("Observation", __base__=ObservationMessage, **observed)
+        listed["executed_action_list"] = (_shaped(None, robot.action.width) | None, None)
         self._challenge = create_model("Challenge", __base__=ChallengeMessage, **listed)
+        listed["state_list"] = (_shaped(None, width), ...)
+        self._list = create_model("Frames", __base__=ListMessage, **listed)
         self._buffer = create_model(
             "Buffer",
             __base__=BufferMessage,
@@ -326,7 +358,8 @@ class RequestReader:
             )
         flags = validated(Flags, message, "The request")
         if flags.reset:
-            return Reset()
+            reset: Any = validated(ResetMessage, message, "The request")
+            return Reset(reset.seed)
         if flags.add_buffer:
             return self._add_buffer(message)
         require(
@@ -367,31 +400,55 @@ class RequestReader:
         )
 
     def _listed_frames(self, message: dict[Any, Any]) -> Infer:
+        # The benchmark's robots have their states in two lists, others in one.
+        is_challenge = "state_list" not in message
         require(
-            self._robot.action.space is not None,
-            f"The robot {self._robot.name!r} is not the benchmark's: send observation/… messages.",
+            not is_challenge or self._robot.action.space is not None,
+            f"The robot {self._robot.name!r} is not the benchmark's: send its states as state_list,"
+            " or observation/… messages.",
         )
-        challenge: Any = validated(self._challenge, message, "The request")
-        joints = challenge.joint_state_list
-        grippers = challenge.gripper_state_list
-        views = self._views(challenge)
+        frames: Any = validated(
+            self._challenge if is_challenge else self._list, message, "The request"
+        )
+        views = self._views(frames)
         lengths = {}
         for name, view in views.items():
             suffix = "_rgb_list" if name in self._robot.camera_names else "_list"
             lengths[name + suffix] = len(view)
-        lengths["joint_state_list"] = len(joints)
-        lengths["gripper_state_list"] = len(grippers)
-        _check_lengths(lengths)
+        if is_challenge:
+            joints = frames.joint_state_list
+            grippers = frames.gripper_state_list
+            lengths["joint_state_list"] = len(joints)
+            lengths["gripper_state_list"] = len(grippers)
+            _check_lengths(lengths)
+            states = np.stack([benchmark_state(*row) for row in zip(joints, grippers, strict=True)])
+        else:
+            states = frames.state_list
+            lengths["state_list"] = len(states)
+            _check_lengths(lengths)
         self._check_depth(views, "{}_list")
-        states = [benchmark_state(*row) for row in zip(joints, grippers, strict=True)]
+        executed = frames.executed_action_list
+        exec_start = frames.exec_start_idx
+        if executed is not None and len(executed) > len(states):
+            raise UserError(
+                f"executed_action_list has {len(executed)} actions for {len(states)} frames: send"
+                " one for each of the last frames."
+            )
+        if exec_start is not None and not (frames.is_first_step and exec_start < len(states)):
+            raise UserError(
+                f"exec_start_idx={exec_start}: it is one of the {len(states)} frames, in the"
+                " request with is_first_step."
+            )
         return Infer(
-            goal=challenge.task_goal,
+            goal=frames.task_goal,
             views=views,
-            states=np.stack(states),
+            states=states,
             stored=True,
-            first=challenge.is_first_step,
-            subgoals=challenge.subgoals,
-            options=self._options(challenge),
+            first=frames.is_first_step,
+            exec_start=exec_start,
+            executed=executed,
+            subgoals=frames.subgoals,
+            options=self._options(frames),
         )
 
     def _views(self, message: InferMessage) -> dict[str, Any]:

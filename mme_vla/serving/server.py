@@ -11,12 +11,13 @@ import logging
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any
 
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.policy.base import Policy
+from mme_vla.policy.identity import identify_policy
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.serving.codec import pack, unpack
 from mme_vla.serving.engine import Engine, ServerStats
@@ -24,6 +25,7 @@ from mme_vla.serving.requests import Request as PolicyRequest
 from mme_vla.serving.requests import RequestReader
 from mme_vla.serving.session import BusyError, HttpSessions, NoEpisodeError, Session
 from mme_vla.serving.settings import Limits, ServeSettings, listen
+from mme_vla.utils import to_json
 
 try:
     import uvicorn
@@ -73,11 +75,18 @@ class PolicyServer:
     Args:
         policy: with normalisation statistics, in eval mode, on its device.
         settings: how to serve.
-        name: what metadata call the policy. trained: False says that its weights are fresh.
+        name: what metadata call the policy. trained: False says that its weights are fresh. source:
+            where they are from.
     """
 
     def __init__(
-        self, policy: Policy, settings: ServeSettings, *, name: str = "", trained: bool = True
+        self,
+        policy: Policy,
+        settings: ServeSettings,
+        *,
+        name: str = "",
+        trained: bool = True,
+        source: str | None = None,
     ) -> None:
         policy.require_processor().require_stats()
         settings.check_robot(policy.embodiment, policy.require_processor().prompt_spec.past_actions)
@@ -88,6 +97,8 @@ class PolicyServer:
         self.sessions = HttpSessions(self.engine, settings)
         self.places = Places(settings.limits, self.stats)
         self.metadata = _metadata(policy, settings, name, trained)
+        identity = identify_policy(policy, name or None, source)
+        self.metadata["identity"] = to_json(asdict(identity))
         self.port = settings.port
         self._background: list[asyncio.Task[None]] = []
         self._uvicorn: uvicorn.Server | None = None
@@ -270,11 +281,7 @@ class PolicyServer:
                 raise HTTPException(503, FULL)
             place.work()
             begun = time.perf_counter()
-            try:
-                message = await self._read(body)
-            except UserError:
-                self.sessions.drop(name)
-                raise
+            message = await self._read(body)
             del body
             reply = await self.sessions.respond(name, message, begun)
             return Response(pack(reply), media_type=MSGPACK)
@@ -377,7 +384,7 @@ class PolicyServer:
                     raise WebSocketDisconnect(coming.result()["code"])
                 reply = await computing  # another request may have come; it waits for its turn
                 await self._send(socket, reply)
-                if isinstance(reply, str):
+                if isinstance(reply, str) and not session.intact:
                     await _close(socket, 1011, reply)
                     return
                 place.wait()
@@ -389,7 +396,11 @@ class PolicyServer:
     async def _reply(
         self, session: Session, event: Mapping[str, Any], place: "Place"
     ) -> dict[str, Any] | str:
-        """The reply to a message, or the reason why there is none; then the connection closes."""
+        """The reply to a message, or the reason why there is none.
+
+        The connection closes after a reason, unless `session.intact`: a request that is refused
+        before it changes anything costs neither the connection nor the episode.
+        """
         try:
             if event.get("bytes") is None:
                 raise UserError("Requests are binary msgpack messages; this one is text.")
@@ -400,6 +411,7 @@ class PolicyServer:
             logger.info("%s: refused: %s", place.name, error)
             return error_text(error)
         except Exception as error:
+            session.intact = False
             self.stats.count("failed")
             logger.exception("%s: failed", place.name)
             return error_text(error)
@@ -567,5 +579,9 @@ def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool)
         "remembers_frames": policy.memory is not None,
         "subgoal": subgoal_kind(policy),
         "schemas": ["mme_vla", "robomme_challenge"],
+        "robot": to_json(robot.to_dict()),
+        "max_actions": policy.info.max_actions,
+        "sample_steps": settings.flow_steps or policy.info.sample_steps,
+        "max_clients": limits.connections,
         "limits": {"message_bytes": limits.message_bytes, "frames": limits.frames},
     }

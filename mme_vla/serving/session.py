@@ -6,7 +6,7 @@ connection does not identify an episode.
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,17 +29,24 @@ class Session:
 
     Requests of a session must come one after the other; `respond` is not to be called twice at the
     same time.
+
+    intact: whether the episode can go on. It can after a request that was carried out, or refused
+    before it changed anything, and not after one that failed half way.
     """
+
+    intact = True
 
     def __init__(self, engine: Engine, settings: ServeSettings) -> None:
         self._engine = engine
         self._settings = settings
+        self._seed = settings.seed
         self._begin()
 
     def _begin(self) -> None:
-        self.episode = self._engine.policy.start_episode("", seed=self._settings.seed)
+        self.episode = self._engine.policy.start_episode("", seed=self._seed)
         self._exec_start = 0
         self._n_frames_at_action: int | None = None
+        self._sizes: dict[tuple[str, str], tuple[int, ...]] = {}  # by kind of message and camera
 
     async def respond(self, request: Request, begun: float) -> dict[str, Any]:
         """Do what a request asks and return the reply as the protocol has it, not yet packed.
@@ -47,10 +54,14 @@ class Session:
         Args:
             begun: when the message was there whole (`time.perf_counter()`); the reply says how
                 long it took.
+
+        Raises:
+            UserError: the request is refused. `intact` says whether the episode can go on.
         """
         reply: dict[str, Any] = {}
         if isinstance(request, Reset):
             kind = "reset"
+            self._seed = self._settings.seed if request.seed is None else request.seed
             self._begin()
             reply["reset_finished"] = True
         elif isinstance(request, AddBuffer):
@@ -63,6 +74,7 @@ class Session:
             space = self._engine.policy.embodiment.action
             if space.choice:
                 reply["choices"] = [benchmark_action(space, row) for row in reply["actions"]]
+        self.intact = True
         seconds = time.perf_counter() - begun
         self._engine.stats.took(kind, seconds)
         reply[f"{kind}_time_ms"] = seconds * 1e3
@@ -71,6 +83,9 @@ class Session:
     async def _add_buffer(self, request: AddBuffer) -> None:
         count = len(request.frames)
         self._check_capacity(count)
+        robot = self._engine.policy.embodiment
+        self._check_sizes("add_buffer", {robot.memory_camera: request.frames})
+        self.intact = False
         if request.exec_start > 0:
             self._exec_start = request.exec_start
 
@@ -85,10 +100,13 @@ class Session:
         # A client that repeats its first request means the same episode, not a longer one.
         if request.first:
             self._begin()
-            self._exec_start = count - 1
+            self._exec_start = count - 1 if request.exec_start is None else request.exec_start
         self._check_course(request)
         if request.stored:
             self._check_capacity(count)
+        cameras = self._engine.policy.embodiment.camera_names
+        self._check_sizes("observation", {name: request.views[name] for name in cameras})
+        self.intact = False
 
         episode = self.episode
         episode.goal = request.goal
@@ -135,10 +153,22 @@ class Session:
 
     def _observe(self, request: Infer) -> Iterator[None]:
         if request.stored:
+            # Frames before `first_led` were led to by no action that the client names.
+            executed = request.executed
+            count = len(request.states)
+            first_led = count if executed is None else count - len(executed)
 
             def take(part: slice, is_demo: np.ndarray) -> None:
-                views = {name: np.stack(view[part]) for name, view in request.views.items()}
-                self.episode.observe(views, request.states[part], is_demo)
+                middle = min(max(part.start, first_led), part.stop)
+                for piece in (slice(part.start, middle), slice(middle, part.stop)):
+                    if piece.start == piece.stop:
+                        continue
+                    views = {name: np.stack(view[piece]) for name, view in request.views.items()}
+                    actions = None
+                    if executed is not None and piece.start >= first_led:
+                        actions = executed[piece.start - first_led : piece.stop - first_led]
+                    demo = is_demo[piece.start - part.start : piece.stop - part.start]
+                    self.episode.observe(views, request.states[piece], demo, actions)
 
             yield from self._in_pieces(len(request.states), take)
         else:
@@ -178,6 +208,21 @@ class Session:
                 f"An episode of {total} frames: this server remembers at most {most}"
                 " (limits.frames). Reset between episodes."
             )
+
+    def _check_sizes(self, kind: str, views: Mapping[str, Sequence[np.ndarray]]) -> None:
+        """Make sure that a camera's images have the size that they had when the episode began.
+
+        kind: of the message. Clients may scale the images of one kind and not those of the other.
+        """
+        sizes = {(kind, name): view[0].shape[:2] for name, view in views.items()}
+        for key, size in sizes.items():
+            before = self._sizes.get(key, size)
+            if size != before:
+                raise UserError(
+                    f"The images of camera {key[1]!r} have {list(size)} pixels (height, width), and"
+                    f" had {list(before)} before in this episode: send one size."
+                )
+        self._sizes |= sizes
 
     def _subgoal(self, request: Infer) -> str | None:
         """The subgoal this policy was trained to read, of those the request brings."""
@@ -238,8 +283,9 @@ class HttpSessions:
                 if self.entries.get(name) is not entry and not _begins(request):
                     raise NoEpisodeError(LOST)  # a request before this one failed
                 return await entry.session.respond(request, begun)
-        except Exception:
-            self.drop(name, entry)
+        except Exception as error:
+            if not isinstance(error, UserError) or not entry.session.intact:
+                self.drop(name, entry)
             raise
         finally:
             entry.requests -= 1

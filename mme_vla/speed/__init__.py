@@ -64,6 +64,21 @@ def fused_kernels(x: torch.Tensor) -> AbstractContextManager[object]:
     )
 
 
+SAMPLING_OPTIONS: dict[str, Any] = {"dynamic": False, "options": {"combo_kernels": True}}
+"""How `torch.compile` compiles for sampling: for each length by itself, since a graph is captured
+for each; and independent small kernels as one, such as the rotation of queries and the writing of
+keys and values.
+"""
+
+
+class CompilesParts:
+    """Capability of a memory or an integration: it has code that is compiled with the layers."""
+
+    def compile(self, **options: Any) -> None:
+        """Compile it in place; `options` are `torch.compile`'s."""
+        raise NotImplementedError
+
+
 class HasAttentionBackends:
     """Capability of a backbone: it can compute attention with each backend
     (`mme_vla.backbone.layers.BACKENDS`).
@@ -87,8 +102,11 @@ class CapturableSampling:
     CUDA graph.
     """
 
-    def compile_sampling(self) -> Callable[[], object]:
+    def compile_sampling(self, layers: bool = False) -> Callable[[], object]:
         """Keep what depends on weights alone between chunks.
+
+        Args:
+            layers: compile the network too (`SAMPLING_OPTIONS`).
 
         Returns:
             What identifies the weights that the kept values were computed from: graphs are captured

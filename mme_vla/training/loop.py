@@ -18,6 +18,7 @@ from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
 from mme_vla.speed import Recomputes
+from mme_vla.speed.compiler import keep_compiled_code, missing_compiler
 from mme_vla.training.checkpoint import (
     checkpoint_name,
     restore,
@@ -139,6 +140,12 @@ class Trainer:
                 )
             policy.recompute(settings.recomputation)
         if settings.compile:
+            missing = missing_compiler(accelerator.device)
+            if missing is not None:
+                raise UserError(
+                    f"train.compile=true needs {missing}: install it, or set train.compile=false."
+                )
+            keep_compiled_code()
             policy.compile()
         if self.sharded:
             mesh = settings.parallel.mesh(accelerator.device.type)

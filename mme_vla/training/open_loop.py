@@ -15,6 +15,7 @@ from mme_vla.errors import require
 from mme_vla.policy.base import Policy
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.training.order import seed_of
+from mme_vla.utils.style import COLOURS, EXECUTION, FAINT, look
 
 STILL = "holding still"
 LAST = "last action"
@@ -240,6 +241,7 @@ def _baselines(policy: Policy, recording: Recording, step: int) -> dict[str, np.
     return {LAST: last, MEAN: expected}
 
 
+@look()
 def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
     """Draw the recorded actions as a line, and each predicted chunk and the best baseline on top,
     one panel a number. What of a chunk is not executed is pale.
@@ -262,21 +264,21 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
     labels: dict[str, Any] = {}
     for d, panel in enumerate(panels[:width]):
         line = _unbroken(time, result.recorded[..., d], result.valid)
-        (labels["recorded"],) = panel.plot(*line, color="0.25", lw=2.2)
+        (labels["recorded"],) = panel.plot(*line, color=FAINT, lw=2.2)
         for i, valid in enumerate(result.valid):
             known = int(valid.sum())
             executed = min(result.execute, known)
             chunk = result.predicted[i, :known, d]
             # The rest begins at the last executed action, so that the line is not broken.
             rest = slice(max(executed - 1, 0), known)
-            panel.plot(time[i, rest], chunk[rest], color="tab:orange", lw=1.2, alpha=0.35)
+            panel.plot(time[i, rest], chunk[rest], color=EXECUTION, lw=1.2, alpha=0.35)
             (labels[f"predicted, {result.execute} actions executed"],) = panel.plot(
-                time[i, :executed], chunk[:executed], color="tab:orange", lw=1.6
+                time[i, :executed], chunk[:executed], color=EXECUTION, lw=1.6
             )
-            panel.plot(time[i, :1], chunk[:1], "o", color="tab:orange", ms=4)
+            panel.plot(time[i, :1], chunk[:1], "o", color=EXECUTION, ms=4)
             held = np.full(executed, result.baselines[best][i, d])
             (labels[f"best baseline: {best}"],) = panel.plot(
-                time[i, :executed], held, color="tab:blue", lw=1.8, ls=":", zorder=4
+                time[i, :executed], held, color=COLOURS[0], lw=1.8, ls=":", zorder=4
             )
         panel.set_title(
             f"{result.names[d]}: normalised error {scaled[d]:.2f}, {best} {scaled_best[d]:.2f}",
@@ -284,7 +286,6 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
             loc="left",
         )
         panel.set_ylabel(result.units[d], fontsize=9)
-        panel.grid(alpha=0.25)
         panel.margins(x=0.01)
     for panel in panels[width:]:
         panel.set_axis_off()

@@ -6,11 +6,9 @@ weights (`NetworkPolicy.shard_groups`) right before it is needed. All of it is P
 `fully_shard`. Launchers stay `torchrun` and `accelerate launch`.
 """
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, distributed, nn
@@ -19,12 +17,10 @@ from torch.distributed.checkpoint.state_dict import (
     get_model_state_dict,
     set_model_state_dict,
 )
-from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
+from torch.distributed.device_mesh import DeviceMesh
 from torch.distributed.fsdp import FSDPModule, MixedPrecisionPolicy, fully_shard
 from torch.distributed.tensor import DTensor
 
-from mme_vla.config.sections import PositiveInt
-from mme_vla.errors import require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.network import NetworkPolicy
 from mme_vla.policy.saving import recompute_buffers
@@ -32,46 +28,6 @@ from mme_vla.speed.sharding import ShardGroup, float32_modules, stacked_layers
 
 FULL_STATE = StateDictOptions(full_state_dict=True, cpu_offload=True)
 FROM_FIRST = StateDictOptions(full_state_dict=True, broadcast_from_rank0=True)
-
-
-@dataclass(frozen=True)
-class ParallelSettings:
-    """The keys of `train.parallel`, where each is explained."""
-
-    strategy: Literal["auto", "ddp", "fsdp"] = "auto"
-    replicate: PositiveInt | None = None
-
-    def shards(self, device: torch.device) -> bool:
-        """Whether this run shards its weights: where that is asked for, and of itself on several
-        GPUs.
-        """
-        started = distributed.is_available() and distributed.is_initialized()
-        require(
-            self.strategy != "fsdp" or started,
-            "train.parallel.strategy=fsdp shares the weights among processes, and this one was"
-            " started alone: start it with torchrun --nproc-per-node <GPUs> -m mme_vla.train …, or"
-            " leave the strategy at auto.",
-        )
-        if self.strategy == "auto":
-            return started and distributed.get_world_size() > 1 and device.type == "cuda"
-        return self.strategy == "fsdp"
-
-    def mesh(self, device_type: str) -> DeviceMesh:
-        """The processes: weights are shared along the last axis; with copies (HSDP) the first axis
-        counts those.
-        """
-        world = distributed.get_world_size()
-        nodes = max(world // int(os.environ.get("LOCAL_WORLD_SIZE", world)), 1)
-        copies = nodes if self.replicate is None else self.replicate
-        require(
-            world % copies == 0,
-            f"train.parallel.replicate={copies} must divide the number of processes, {world}.",
-        )
-        if copies == 1:
-            return init_device_mesh(device_type, (world,), mesh_dim_names=("shard",))
-        return init_device_mesh(
-            device_type, (copies, world // copies), mesh_dim_names=("replicate", "shard")
-        )
 
 
 def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool = False) -> None:

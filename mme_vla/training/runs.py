@@ -13,6 +13,7 @@ from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import (
     CHECKPOINTS,
+    check_output,
     checkpoints_in,
     newest_checkpoint,
     newest_write,
@@ -85,6 +86,7 @@ def claim_run(
             another run that began in the same second: then this run takes the next name,
             `<folder>-2`.
     """
+    check_output(folder)
     for number in range(1, 1000):
         place = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
         try:

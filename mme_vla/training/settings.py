@@ -1,10 +1,11 @@
 """What a training run may be told (`configs/train.yaml` and its groups), checked before anything
-starts.
+starts, and before PyTorch is imported.
 """
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from mme_vla.config.sections import (
     NonNegative,
@@ -16,8 +17,57 @@ from mme_vla.config.sections import (
     read_section,
 )
 from mme_vla.errors import require
-from mme_vla.speed import SELECTIVE, Recompute
-from mme_vla.training.parallel import ParallelSettings
+
+if TYPE_CHECKING:
+    import torch
+    from torch.distributed.device_mesh import DeviceMesh
+
+    from mme_vla.speed import Recompute
+
+
+@dataclass(frozen=True)
+class ParallelSettings:
+    """The keys of `train.parallel`, where each is explained."""
+
+    strategy: Literal["auto", "ddp", "fsdp"] = "auto"
+    replicate: PositiveInt | None = None
+
+    def shards(self, device: "torch.device") -> bool:
+        """Whether this run shards its weights: where that is asked for, and of itself on several
+        GPUs.
+        """
+        from torch import distributed
+
+        started = distributed.is_available() and distributed.is_initialized()
+        require(
+            self.strategy != "fsdp" or started,
+            "train.parallel.strategy=fsdp shares the weights among processes, and this one was"
+            " started alone: start it with torchrun --nproc-per-node <GPUs> -m mme_vla.train …, or"
+            " leave the strategy at auto.",
+        )
+        if self.strategy == "auto":
+            return started and distributed.get_world_size() > 1 and device.type == "cuda"
+        return self.strategy == "fsdp"
+
+    def mesh(self, device_type: str) -> "DeviceMesh":
+        """The processes: weights are shared along the last axis; with copies (HSDP) the first axis
+        counts those.
+        """
+        from torch import distributed
+        from torch.distributed.device_mesh import init_device_mesh
+
+        world = distributed.get_world_size()
+        nodes = max(world // int(os.environ.get("LOCAL_WORLD_SIZE", world)), 1)
+        copies = nodes if self.replicate is None else self.replicate
+        require(
+            world % copies == 0,
+            f"train.parallel.replicate={copies} must divide the number of processes, {world}.",
+        )
+        if copies == 1:
+            return init_device_mesh(device_type, (world,), mesh_dim_names=("shard",))
+        return init_device_mesh(
+            device_type, (copies, world // copies), mesh_dim_names=("replicate", "shard")
+        )
 
 
 @dataclass(frozen=True)
@@ -102,8 +152,10 @@ class TrainSettings:
         )
 
     @property
-    def recomputation(self) -> Recompute:
+    def recomputation(self) -> "Recompute":
         """What the backward pass computes again."""
+        from mme_vla.speed import SELECTIVE
+
         if not self.gradient_checkpointing:
             return False
         return SELECTIVE if self.recompute == SELECTIVE else True

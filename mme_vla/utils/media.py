@@ -12,16 +12,17 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self
 import numpy as np
 
 from mme_vla.utils import write_atomically
+from mme_vla.utils.style import rgb
 
 if TYPE_CHECKING:
     from PIL.Image import Image
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
 FPS = 30  # of videos; the simulator's steps simply play faster
-RED = (255, 0, 0)  # the border of a conditioning video's images
+RED = (255, 0, 0)  # the border of a conditioning video's images, as in the benchmark's own
 BORDER = 10  # pixels
 CAPTION = 20  # pixels of a line of text below a video's images
-INK, FAINT = (40, 40, 40), (150, 150, 150)
+INK, FAINT = rgb("ink"), rgb("faint")
 TILE, GAP, MARGIN, LABEL = 160, 12, 20, 20  # pixels of a contact sheet
 
 

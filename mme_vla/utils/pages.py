@@ -7,6 +7,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mme_vla.utils import style
+
 if TYPE_CHECKING:
     from jinja2 import Environment
 
@@ -38,4 +40,5 @@ def _environment() -> "Environment":
         keep_trailing_newline=True,
     )
     environment.filters["markdown"] = escape_markdown
+    environment.globals["palette"] = style.css()
     return environment

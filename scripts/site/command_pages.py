@@ -18,6 +18,7 @@ GUIDES = {
     "evaluate": "evaluate/evaluation.md",
     "results": "evaluate/results.md",
     "analyse": "probe/analyses.md",
+    "audit": "evaluate/servers.md",
     "probe": "probe/probe.md",
     "inspect": "start/getting-started.md",
     "serve": "serve/serving.md",

@@ -138,12 +138,14 @@ def overview() -> str:
     files = {group: " · ".join(f"`{name}`" for name in library_files(group)) for group in groups()}
     rows = [f"| [`{name}`](configuration/{name}.md) | {stems} |" for name, stems in files.items()]
     policy = section(library_files("")["policy"], "## `build_policy`", "reference")
+    server = section(library_files("")["server"], "## `server`", "reference")
     return "\n\n".join(
         [
             INTRODUCTION.strip(),
             "## Groups",
             "\n".join(["| group | files |", "|---|---|", *rows]),
             policy,
+            server,
         ]
     )
 

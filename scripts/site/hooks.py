@@ -23,6 +23,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 from mme_vla.utils.pages import TEMPLATES
+from mme_vla.utils.style import css
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
@@ -49,6 +50,7 @@ BOOST = {
 }
 """Folder or page → weight in the search, 1 for the others."""
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)(#[^)\s]*)?\)")
+DRAWING = re.compile(r'<img alt="([^"]*)" src="([^"]*\.svg)" />')
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", ".toml": "toml"}
 
 
@@ -99,6 +101,7 @@ def on_files(files: Files, config: "MkDocsConfig") -> Files:
     files.append(
         File.generated(config, "javascripts/sort.js", content=(TEMPLATES / "sort.js").read_text())
     )
+    files.append(File.generated(config, "stylesheets/colours.css", content=css()))
     texts = {**pages, **{file.src_uri: file.content_string for file in files.documentation_pages()}}
     for target in sorted(
         {target for path, text in texts.items() for target in outside(path, text)}
@@ -119,6 +122,23 @@ def on_page_markdown(markdown: str, page: "Page", **_: object) -> str:
     if path == GALLERY:
         page.meta["hide"] = ["toc"]  # four clips beside each other
     return unbroken(relink(path, markdown))
+
+
+def on_page_content(html: str, page: "Page", **_: object) -> str:
+    """Put drawings into the page itself, where they follow its light and dark."""
+
+    def inline(match: re.Match[str]) -> str:
+        target = target_of(page.file.src_uri, match[2])
+        return match[0] if target is None else drawing(ROOT / target, match[1])
+
+    return DRAWING.sub(inline, html)
+
+
+def drawing(path: Path, description: str) -> str:
+    """An SVG file as an element of a page."""
+    text = path.read_text(encoding="utf-8")
+    element = text[text.index("<svg") :]
+    return f'<span class="drawing" role="img" aria-label="{description}">{element}</span>'
 
 
 def on_page_context(context: dict[str, Any], page: "Page", **_: object) -> dict[str, Any]:

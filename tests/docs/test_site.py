@@ -16,6 +16,7 @@ from mme_vla import cli
 from mme_vla.cli import docs
 from mme_vla.config.trees import library_files
 from mme_vla.errors import UserError
+from mme_vla.utils.style import css
 
 pytestmark = pytest.mark.slow
 
@@ -139,6 +140,14 @@ def test_the_theme_has_the_projects_name_version_and_mark(site: Path) -> None:
     assert f"MME-VLA {version}" in page and "images/mark.svg" in page
     assert "Made with" not in page
     assert page.count("VideoUnmask") == 1, "the first table of the README"
+
+
+def test_drawings_and_pages_share_one_palette(site: Path) -> None:
+    assert (site / "stylesheets/colours.css").read_text() == css()
+    for page in ("extend/architecture.html", "concepts/budget.html", "train/nano.html"):
+        text = (site / page).read_text()
+        assert "colours.css" in text
+        assert re.search(r'<span class="drawing" role="img" aria-label="[^"]+"><svg', text), page
 
 
 def test_help_begins_with_a_capital_letter(

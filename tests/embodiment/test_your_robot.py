@@ -209,6 +209,13 @@ def test_columns_are_detected_in_both_spellings_joined_or_by_name(place: Path) -
         UserError, match=r"lacks the features image, wrist_image.*choose embodiment="
     ):
         EpisodeSource("demonstrations")
+    shortened = {"cameras": {"eye": {"key": "images.left_wrst"}}, "memory_camera": "eye"}
+    with pytest.raises(
+        UserError, match=r"Did you mean `key: (.*)left_wrist` for images\.left_wrst"
+    ):
+        EpisodeSource(
+            "demonstrations", robot=Embodiment.from_dict({**robot.to_dict(), **shortened})
+        )
     hand = EpisodeSource(
         "demonstrations",
         robot=Embodiment.from_dict({**robot.to_dict(), "memory_camera": "left_wrist"}),

@@ -105,7 +105,7 @@ def test_the_figures_come_from_the_sample(tmp_path: Path) -> None:
     ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert {path.stem for path in tmp_path.glob("*.webp")} == {
+    assert {path.stem for path in tmp_path.glob("*.svg")} == {
         "memory",
         "history",
         "budget",

@@ -21,10 +21,11 @@ from mme_vla.cli.results import main
 from mme_vla.envs.base import environment
 from mme_vla.evaluation import receipts
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import checkpoint_label, facts_of, run_settings
+from mme_vla.evaluation.rollout.evaluation import facts_of, run_settings
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RecordLog, claim_run, fingerprint, read_records
 from mme_vla.policy.base import Policy
+from mme_vla.policy.identity import checkpoint_label
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import to_json, with_checksum
 

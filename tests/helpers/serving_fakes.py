@@ -46,9 +46,10 @@ class Served:
     server runs.
     """
 
-    def __init__(self, policy: MMEPolicy, **settings: Any) -> None:
+    def __init__(self, policy: MMEPolicy, source: str | None = None, **settings: Any) -> None:
         self.server: PolicyServer
         self._policy = policy
+        self._source = source
         self._settings = ServeSettings(
             **{"port": 0, "flow_steps": 2, "encode_chunk": 16, "max_batch": 8, **settings}
         )
@@ -61,7 +62,10 @@ class Served:
         return self
 
     async def _start(self) -> None:
-        self.server = PolicyServer(self._policy, self._settings, name="test", trained=False)
+        name = "test" if self._source is None else ""
+        self.server = PolicyServer(
+            self._policy, self._settings, name=name, trained=False, source=self._source
+        )
         await self.server.start()
 
     def __exit__(self, *_: object) -> None:

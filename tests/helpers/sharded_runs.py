@@ -33,9 +33,9 @@ from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.optim import clip_gradients, make_optimizer
 from mme_vla.training.order import Validation
-from mme_vla.training.parallel import ParallelSettings, full_value, gathered, shard
+from mme_vla.training.parallel import full_value, gathered, shard
 from mme_vla.training.runs import Run
-from mme_vla.training.settings import TrainSettings
+from mme_vla.training.settings import ParallelSettings, TrainSettings
 from mme_vla.training.shards import shard_files
 
 RUNS = [(2, "train,stop,policies,die"), (1, "go_on"), (3, "resume"), (1, "whole")]

@@ -266,20 +266,6 @@ KEY = re.compile(
 )
 PLACE = re.compile(r"[\w.-]+/[\w./-]*\w|\w+\.(?:json|jsonl|safetensors|yaml|txt)\b")
 USAGE = re.compile(r"^usage:.*?(?=^\S*[^\n]*error:|\Z)", re.DOTALL | re.MULTILINE)
-CRITICISED = {
-    "train --model tokendrop_expert": "suggests another key's value",
-    "train --config configs": "Hydra's usage, and the options that it has",
-    "train model=mine": "no word of --config-dir",
-    "train model": "the parser's own text",
-    "train pi05": "the parser's own text",
-    "train model = pi05": "the parser's own text",
-    "train model=pi05 tasks=[VideoUnmask, StopCube]": "the parser's own text",
-    "evaluate nano": "the parser's own text",
-    "evaluate checkpoint = nano": "the parser's own text",
-    "analyse checkpoint=nano": "argparse's own text",
-    "docs --biuld": "argparse's own text",
-}
-"""Command line → what is wrong with its reply. A later reply need only name what was typed."""
 
 
 def typed(line: str) -> set[str]:
@@ -305,9 +291,8 @@ def essential(line: str, text: str) -> list[str]:
         for word in typed(line)
         if len(word) > 2 and re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text)
     }
-    if line not in CRITICISED:
-        found |= {next(filter(None, match)) for match in QUOTED.findall(text)}
-        found |= {*KEY.findall(text), *PLACE.findall(text)}
+    found |= {next(filter(None, match)) for match in QUOTED.findall(text)}
+    found |= {*KEY.findall(text), *PLACE.findall(text)}
     found = {word.partition("<")[0].strip() for word in found}  # what follows is a placeholder
     return sorted(found - {""})
 

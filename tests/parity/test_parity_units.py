@@ -280,7 +280,8 @@ def test_modulator(unit):
         "out.weight": [Piece("mem_attn/out_einsum_mem/w", "n h d -> d (n h)", heads)],
     } | prefixed("modulation", linear("mem_rms_norm_ffn/Dense_0"))
     layer.load_state_dict(read(table, params(tensors)))
-    k, v = layer.keys_values(tensors["in/memory"])
+    positions = torch.arange(tensors["in/memory"].shape[1])[None]
+    k, v = layer.keys_values(tensors["in/memory"], rotation(positions, layer.head_dim))
     mask = additive_mask(tensors["in/memory_mask"][:, None], torch.float32)
     assert error(layer.read_memory(tensors["in/x"], k, v, mask), tensors["out/r"]) <= TOLERANCE
     assert error(layer(tensors["in/x"], k, v, mask), tensors["out/x_hat"]) <= TOLERANCE

@@ -3,6 +3,7 @@ them do.
 """
 
 import gc
+import re
 import socket
 import threading
 import time
@@ -11,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from helpers.serving_fakes import (
@@ -193,16 +193,15 @@ def test_a_client_that_goes_while_its_video_is_encoded_stops_the_work(policy):
         (pack(challenge(*course()[0], first=False)), "is_first_step"),
     ],
 )
-def test_a_bad_message_is_answered_with_the_reason_and_1011(policy, message, said):
+def test_a_bad_message_is_answered_with_the_reason_and_the_connection_stays(policy, message, said):
     with Served(policy, limits=Limits(frames=50)) as served:
         with connect(f"ws://127.0.0.1:{served.server.port}", compression=None) as raw:
             raw.recv(10)
             raw.send(message)
             reply = raw.recv(10)
             assert isinstance(reply, str) and said in reply and "Traceback" not in reply
-            with pytest.raises(ConnectionClosed) as closed:
-                raw.recv(10)
-            assert closed.value.rcvd.code == 1011
+            raw.send(pack({"reset": True}))
+            assert b"reset_finished" in raw.recv(10)
         with served.client() as client:
             by_challenge(client, course()[:1])  # and others are served as before
         assert (
@@ -216,10 +215,39 @@ def test_an_episode_cannot_outgrow_the_limit(policy):
         client.add_buffer(part[0], part[2])
         with pytest.raises(UserError, match="32 frames"):
             client.add_buffer(part[0], part[2])
-        with pytest.raises(ConnectionError, match="reconnect"):
-            client.reset()
-        client.reconnect()
+        client.reset()
         client.add_buffer(part[0], part[2])
+
+
+def test_a_refused_request_leaves_the_episode_as_it_was(policy):
+    """The actions are those of an episode in which the refused requests never came."""
+    parts = course()[:2]
+    with Served(policy) as served:
+        with served.client() as client:
+            expected = by_challenge(client, parts)
+        with served.client() as client:
+            first = by_challenge(client, parts[:1])
+            small = tuple(images[:, :32] for images in parts[1][:2])
+            for message, said in (
+                ({"front_rgb_list": 3}, "task_goal"),
+                (challenge(*small, *parts[1][2:], first=False), "had [64, 64] before"),
+            ):
+                with pytest.raises(UserError, match=re.escape(said)):
+                    client.request(message)
+            second = client.request(challenge(*parts[1], first=False))["actions"]
+        np.testing.assert_array_equal(np.concatenate([*first, second]), np.concatenate(expected))
+
+
+def test_a_request_that_failed_half_way_ends_its_connection(policy):
+    with Served(policy) as served, served.client() as client:
+        policy.act = lambda *_: 1 / 0
+        try:
+            with pytest.raises(UserError, match="ZeroDivisionError"):
+                by_challenge(client, course()[:1])
+        finally:
+            del policy.act
+        with pytest.raises(ConnectionError, match="closed the connection"):
+            client.reset()
 
 
 def test_an_oversized_message_closes_its_connection_alone(policy):

@@ -147,7 +147,8 @@ def test_a_lost_http_episode_is_not_gone_on_with(policy):
             assert status == 409 and b"Reset and begin the episode again" in reply
         assert ask(served, "POST", "/infer", later, X_Session="c")[0] == 200
         assert ask(served, "POST", "/infer", b"garbage", X_Session="c")[0] == 400
-        assert ask(served, "POST", "/infer", later, X_Session="c")[0] == 409
+        later_again = ask(served, "POST", "/infer", later, X_Session="c")[0]
+        assert later_again == 200, "a refused request changed nothing"
         assert ask(served, "POST", "/infer", first, X_Session="c")[0] == 200
 
 

@@ -16,7 +16,7 @@ from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint
 from mme_vla.testing.small import small_policy
 from mme_vla.training.checkpoint import read_state
 from mme_vla.training.logging import read_metrics
-from mme_vla.training.parallel import ParallelSettings
+from mme_vla.training.settings import ParallelSettings
 from mme_vla.training.shards import shard_files
 
 CLOSE = 2e-6

@@ -31,7 +31,7 @@ from mme_vla.envs.observations import Include, RenderRequest
 from mme_vla.envs.rows import SceneOptions
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import listed, require
+from mme_vla.errors import listed, require, text_of
 from mme_vla.utils.processes import signals_deferred
 
 
@@ -92,7 +92,7 @@ class Reply:
         """Of a command that came to nothing; the message names the episode."""
         info = {
             "status": "error",
-            "error_message": f"{job}: {error}",
+            "error_message": f"{job}: {text_of(error)}",
             "exception_type": type(error).__name__,
         }
         return cls(worker, job, None, None if resetting else 0.0, True, False, info, error)

@@ -9,13 +9,18 @@ import multiprocessing
 import os
 import pickle
 import sys
+import sysconfig
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
 
 from mme_vla import errors
+from mme_vla.config.plugins import imported_plugins
 from mme_vla.envs.rendering import renderer_works
 from mme_vla.utils.processes import end_with_parent
 
@@ -50,6 +55,12 @@ def begin(variables: Mapping[str, str], work: Callable[..., Any], *arguments: An
     return work(*arguments)
 
 
+_EXTRAS = "mme_vla.extras."
+_INSTALLED = (
+    str(Path(errors.__file__).parent),
+    *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+)
+"""Folders of code that is no plugin's, but for packages that are plugins."""
 LARGE = 4096
 """Arrays of at least this many bytes go through shared memory; everything else is pickled."""
 FRAMES_PER_BLOCK = 8
@@ -150,14 +161,42 @@ def serve(connection: Any, block: Any, factory: Callable[..., Any]) -> None:
 
 
 def _portable(error: Exception) -> Exception:
-    """The error, or a RuntimeError of its text if the reader would have to import its class."""
+    """The error, or a RuntimeError of its text if the reader would have to import its class; its
+    place in a plugin's code is noted.
+    """
+    place = _plugin_line(error)
+    portable: Exception = RuntimeError(f"{type(error).__name__}: {error}")
     if type(error).__module__ in ("builtins", errors.__name__):
         try:
             pickle.loads(pickle.dumps(error))
-            return error
+            portable = error
         except Exception:
             pass  # its arguments do not survive the way
-    return RuntimeError(f"{type(error).__name__}: {error}")
+    if place is not None and not isinstance(error, errors.UserError | errors.SceneError):
+        portable.add_note(f"{type(error).__name__}, {place}")
+    return portable
+
+
+def _plugin_line(error: Exception) -> str | None:
+    """File and line of the innermost code of a plugin that an error passed; None where it passed
+    the code of the library and of its packages alone.
+    """
+    place = None
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        if _is_of_plugin(frame):
+            place = f"{frame.f_code.co_filename}, line {line}"
+    return place
+
+
+def _is_of_plugin(frame: FrameType) -> bool:
+    name = str(frame.f_globals.get("__name__", ""))
+    if name.startswith(_EXTRAS):
+        return True
+    packages = {module.partition(".")[0] for module in imported_plugins()}
+    if name.partition(".")[0] in packages:
+        return True
+    file = frame.f_code.co_filename
+    return not file.startswith(("<", *_INSTALLED))
 
 
 def _hand_over(connection: Any, block: Any, outcome: Any) -> None:

@@ -33,6 +33,7 @@ from mme_vla.evaluation.results.scopes import (
     TASK_FACTS,
     Protocol,
     Scope,
+    groupings_of,
     scopes,
     suites_of,
     tasks_of,
@@ -248,6 +249,7 @@ def aggregate(
     records = list(records)
     protocol = protocol or Protocol(tasks_of(records))
     protocol = replace(protocol, task_suites={**suites_of(records), **protocol.task_suites})
+    protocol = replace(protocol, groupings={**groupings_of(records), **protocol.groupings})
     merged = merge(records, conflicts)
     known = {*PAPER_ORDER, *(record.task for record in merged)}
     for task in protocol.tasks:

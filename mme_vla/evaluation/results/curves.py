@@ -16,9 +16,9 @@ from mme_vla.errors import require
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Results, record_table
-from mme_vla.evaluation.results.plots import COLOURS, figure, svg
 from mme_vla.evaluation.results.statistics import Interval, wilson
 from mme_vla.evaluation.results.tables import Table, task_tables
+from mme_vla.utils.style import COLOURS, LINE, figure, svg
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def curve_figure(
         height += 0.2
     with figure((5.6, height)) as (canvas, (axes,)):
         if training is not None:
-            axes.axvspan(*training, color="0.9", label="training range")
+            axes.axvspan(*training, color=LINE, label="training range")
         for i, (name, points) in enumerate(zip(labels, runs.values(), strict=True)):
             amounts = [amount for amount, _, _ in points]
             rates = np.array([rate for _, rate, _ in points])

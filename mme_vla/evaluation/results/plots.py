@@ -1,52 +1,35 @@
 """The report's figures, as SVG text that is in a page by itself."""
 
-import io
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results
+from mme_vla.utils.style import (
+    CARD,
+    COLOURS,
+    FAINT,
+    INK,
+    LINE,
+    ON_DARK,
+    ON_LIGHT,
+    figure,
+    legend,
+    svg,
+)
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Canvas
-
-COLOURS = ("#1f6f8b", "#e07a2f", "#5a9367", "#8d5a97", "#c44536", "#7a8b99", "#b8972f", "#3d5a80")
 FAMILIES = {
-    "none": "#7a8b99",
-    "symbolic": "#b8972f",
-    "perceptual": "#1f6f8b",
-    "recurrent": "#8d5a97",
-    "prior": "#b5523b",
+    "none": COLOURS[5],
+    "symbolic": COLOURS[6],
+    "perceptual": COLOURS[0],
+    "recurrent": COLOURS[3],
+    "prior": COLOURS[4],
 }
-INK = "#2b2d42"
-FAINT = "#8d99ae"
 PALE = 0.35  # opacity of what lacks episodes
 MOST_BARS = 8
 MOST_TASK_BARS = 6  # tasks that have bars; more are in the heat map
 SWEPT = ("framesamp_modul", "tokendrop_modul")  # Models whose memory budget the paper varies
-_STYLE = {
-    "svg.fonttype": "none",
-    "font.family": "sans-serif",
-    "font.size": 10,
-    "axes.edgecolor": FAINT,
-    "axes.labelcolor": INK,
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.grid.axis": "y",
-    "grid.color": "#e3e6ec",
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-    "svg.hashsalt": "mme_vla",
-    "text.parse_math": False,  # a name may hold dollar signs
-}
 
 
 def bars(results: Results, kind: str, wide: bool = False) -> str:
@@ -98,7 +81,7 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
         if lines:
             at, means = np.array(lines).T
             half = 0.46 * width
-            axes.hlines(means, at - half, at + half, color="black", lw=2, label="paper")
+            axes.hlines(means, at - half, at + half, color=INK, lw=2, label="paper")
         # A name of several words is two lines.
         axes.set_xticks(range(len(names)), [name.replace(" ", "\n", 1) for name in names])
         axes.set_ylabel("success (%)")
@@ -132,14 +115,14 @@ def heat_map(results: Results) -> str:
         axes.imshow(values, cmap="GnBu", vmin=0, vmax=100, aspect="auto", alpha=opacity)
         for i, j in np.ndindex(values.shape):
             text = f"{values[i, j]:.0f}"
-            colour = INK
+            colour = ON_LIGHT
             if np.isnan(values[i, j]):
                 text = "–"
                 colour = FAINT
             elif (i, j) in pale:
                 text += f" ({pale[i, j]})"
             elif values[i, j] > 62:
-                colour = "white"
+                colour = ON_DARK
             axes.text(j, i, text, ha="center", va="center", color=colour, fontsize=8.5)
         axes.set_xticks(range(len(tasks)), tasks, rotation=40, ha="right", rotation_mode="anchor")
         axes.set_yticks(range(len(rows)), [name for name, _ in rows])
@@ -151,7 +134,7 @@ def heat_map(results: Results) -> str:
             spine.set_visible(False)
         for edge in range(1, len(rows)):
             if rows[edge][0] != "paper":
-                axes.axhline(edge - 0.5, color="white", lw=3)
+                axes.axhline(edge - 0.5, color=CARD, lw=3)
         # Between the suites, where the tasks are in their order
         in_order: list[str] = []
         boundaries: list[int] = []
@@ -161,7 +144,7 @@ def heat_map(results: Results) -> str:
         if in_order == list(tasks):
             for boundary in boundaries:
                 if 0 < boundary < len(tasks):
-                    axes.axvline(boundary - 0.5, color="white", lw=3)
+                    axes.axvline(boundary - 0.5, color=CARD, lw=3)
         return svg(canvas)
 
 
@@ -213,7 +196,7 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
         axes.set_ylabel("average success (%)")
         axes.set_ylim(bottom=0)
         axes.margins(x=0.08)
-        axes.grid(True, axis="both", color="#e3e6ec")
+        axes.grid(True, axis="both", color=LINE)
         legend(canvas, axes, 2)
         return svg(canvas)
 
@@ -245,7 +228,7 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
                 values,
                 f"--{marker}",
                 color=colour,
-                mfc="white",
+                mfc=CARD,
                 ms=5,
                 lw=1.1,
                 label=f"{model} (paper)",
@@ -292,40 +275,6 @@ def budget_points(methods: Sequence[Method], default: int) -> dict[str, list[tup
         if len(budgets) > 1 or model in SWEPT:
             sweeps[model] = sorted(model_points, key=lambda point: point[0])
     return sweeps
-
-
-@contextmanager
-def figure(size: tuple[float, float], panels: int = 1) -> "Iterator[tuple[Canvas, list[Axes]]]":
-    """A figure of panels under each other, in the report's style for as long as it is entered."""
-    import matplotlib
-    from matplotlib.figure import Figure as Canvas
-
-    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]
-        canvas = Canvas(size, layout="constrained")
-        yield canvas, list(canvas.subplots(panels, squeeze=False, sharex=True)[:, 0])
-
-
-def svg(canvas: "Canvas") -> str:
-    """The figure as an element that is in a page."""
-    out = io.StringIO()
-    canvas.savefig(out, format="svg", transparent=True, metadata={"Date": None})
-    text = out.getvalue()
-    return text[text.index("<svg") :]
-
-
-def legend(canvas: "Canvas", axes: "Axes", columns: int) -> None:
-    """A legend above the panel, clear of its content, in so many columns at most."""
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        # last, in the bars
-        order = sorted(range(len(labels)), key=lambda i: labels[i].endswith("paper"))
-        canvas.legend(
-            [handles[i] for i in order],
-            [labels[i] for i in order],
-            loc="outside upper center",
-            ncols=min(len(labels), columns),
-            fontsize=9,
-        )
 
 
 def _colour(i: int) -> str:

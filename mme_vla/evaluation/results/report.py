@@ -15,7 +15,14 @@ from mme_vla.evaluation.results.aggregate import Figure, Method, Results, Run
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.curves import CAPTION, process_tables
 from mme_vla.evaluation.results.paper import chunk_flops
-from mme_vla.evaluation.results.tables import Table, comparison_table, detail, overview, runs_table
+from mme_vla.evaluation.results.tables import (
+    Table,
+    comparison_table,
+    detail,
+    grouping_tables,
+    overview,
+    runs_table,
+)
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 from mme_vla.evaluation.store import RUN_FILE, read_run
 from mme_vla.utils.pages import render
@@ -26,8 +33,8 @@ class Section:
     """A box of a page.
 
     figure: SVG from `plots.svg`. headed: whether tables stand under their titles. folded: tables
-    behind a summary. images: name and WEBP in base64. half: whether it takes half the width, beside
-    another.
+    behind a summary. images: name and WEBP in base64. terms: words that its tables and figure use,
+    and what each means. half: whether it takes half the width, beside another.
     """
 
     title: str
@@ -38,6 +45,7 @@ class Section:
     paragraphs: Sequence[str] = ()
     folded: Sequence[tuple[str, Table]] = ()
     images: Sequence[tuple[str, str]] = ()
+    terms: Sequence[tuple[str, str]] = ()
     half: bool = False
 
 
@@ -48,9 +56,10 @@ def html_page(
     notes: Sequence[str] = (),
     sortable: bool = False,
     lead: str = "",
+    footnotes: Sequence[str] = (),
 ) -> str:
-    """One self-contained page of these sections. sortable: whether a click on a heading sorts its
-    table. lead: what was found, in a sentence.
+    """One self-contained page of these sections. notes: warnings. sortable: whether a click on a
+    heading sorts its table. lead: what was found, in a sentence. footnotes: small print.
     """
     return render(
         "page.html",
@@ -60,6 +69,7 @@ def html_page(
         sections=sections,
         sortable=sortable,
         lead=lead,
+        footnotes=footnotes,
     )
 
 
@@ -76,7 +86,7 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     average = overview(results)
     whiskers = f"Whiskers: {100 * protocol.confidence:g} % intervals."
     if any(method.paper for method in results.methods):
-        whiskers += " Black lines: the paper."
+        whiskers += " Lines across: the paper."
     pale = ""
     if any(
         figure.is_pale for method in results.methods for figure in method.figures["task"].values()
@@ -111,6 +121,8 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     else:
         text = f"Success rate in percent.{pale.replace('n:', 'in brackets')}"
         sections.append(Section("Tasks", plots.heat_map(results), caption=text))
+    if groupings := grouping_tables(results):
+        sections.append(Section("Groups of tasks", tables=groupings, headed=True))
 
     # Averages beside the paper's: of the whole benchmark alone
     points: dict[str, list[tuple[int, Figure]]] = {}

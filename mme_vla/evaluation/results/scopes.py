@@ -85,6 +85,8 @@ class Protocol:
         these: tasks of one's own have figures of their own, beside the average.
     numbers: task → the numbers of its episodes that count, where these are not all `episodes`.
     task_suites: task → suite, of environments that are not RoboMME (`suites_of`).
+    groupings: title → task → group, of environments that group their tasks in further ways
+    (`groupings_of`).
     errors: whether an episode that ended in an error is a `failure`, as in the official evaluation,
     or `missing`. confidence, samples, seed: of the intervals; samples and seed are the bootstrap's.
     """
@@ -97,6 +99,7 @@ class Protocol:
     seed: int = 0
     task_suites: Mapping[str, str] = field(default_factory=dict)
     numbers: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    groupings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @classmethod
     def of_records(
@@ -207,6 +210,15 @@ def suites_of(records: Iterable[EpisodeRecord]) -> dict[str, str]:
     return {r.task: r.suite for r in records if r.suite and r.task not in TASK_FACTS}
 
 
+def groupings_of(records: Iterable[EpisodeRecord]) -> dict[str, dict[str, str]]:
+    """Title → task → group, as the records name them."""
+    groupings: dict[str, dict[str, str]] = {}
+    for record in records:
+        for title, group in (record.groups or {}).items():
+            groupings.setdefault(title, {})[record.task] = group
+    return groupings
+
+
 def tasks_of(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
     """The tasks that a run consists of by default: the benchmark's, if a record is of one, and the
     user's own.
@@ -218,8 +230,13 @@ def tasks_of(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
     )
 
 
+GROUPING = "grouping: "
+
+
 class Scope(NamedTuple):
-    """What a figure is about: `kind` is task, suite, group, difficulty or average."""
+    """What a figure is about: `kind` is task, suite, group, difficulty, average, or `GROUPING` and
+    the title of a grouping.
+    """
 
     kind: str
     name: str
@@ -243,5 +260,9 @@ def scopes(protocol: Protocol) -> list[Scope]:
         Scope("suite", suite, tuple(protocol.choose("suite", suite))) for suite in protocol.suites
     ]
     result += [Scope("group", group, tuple(protocol.choose("group", group))) for group in GROUPS]
+    for title, grouping in protocol.groupings.items():
+        for group in dict.fromkeys(grouping.values()):
+            members = [task for task in protocol.tasks if grouping.get(task) == group]
+            result.append(Scope(GROUPING + title, group, tuple(members)))
     result += [Scope("average", "average", protocol.averaged)]
     return [scope for scope in result if scope.tasks]

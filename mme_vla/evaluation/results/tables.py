@@ -11,7 +11,7 @@ from mme_vla.errors import counted, printable
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results, by_training
 from mme_vla.evaluation.results.compare import Comparison, show_p
-from mme_vla.evaluation.results.scopes import PAPER_SEEDS, scopes
+from mme_vla.evaluation.results.scopes import GROUPING, PAPER_SEEDS, scopes
 from mme_vla.evaluation.results.statistics import Interval
 from mme_vla.utils.pages import escape_markdown
 
@@ -128,6 +128,22 @@ def overview(results: Results) -> Table:
     if any(len(method.runs) > 1 for method in results.methods):
         title += f", mean ± sample standard deviation over {over}"
     return Table(title, columns, rows)
+
+
+def grouping_tables(results: Results) -> list[Table]:
+    """Methods × groups, a table for each further grouping that an environment has."""
+    tables = []
+    for title, grouping in results.protocol.groupings.items():
+        groups = list(dict.fromkeys(grouping.values()))
+        rows = []
+        for method in results.methods:
+            figures = method.figures.get(GROUPING + title, {})
+            row = [method.label]
+            for group in groups:
+                row.append(show(figures[group]) if group in figures else "")
+            rows.append(row)
+        tables.append(Table(f"Success rate (%) by {title}", ["method", *groups], rows))
+    return tables
 
 
 def detail(method: Method, results: Results) -> Table:

@@ -18,7 +18,7 @@ import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state, choice_row
-from mme_vla.envs.base import Hold, environment, open_episode
+from mme_vla.envs.base import EpisodeEnv, Hold, environment, open_episode
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
 from mme_vla.envs.metadata import BASE, DEFAULT_STEPS, STICK_TASKS
 from mme_vla.envs.observations import Include, RenderRequest
@@ -106,6 +106,9 @@ class RenderClock:
         """Time the images of this environment; those of the official package are part of its
         simulation.
         """
+        if isinstance(env, EpisodeEnv):
+            env.render_image = self._timed(env.render_image)  # type: ignore[method-assign]
+            return
         scene = getattr(getattr(env, "task", None), "scene", None)
         if scene is None:
             return
@@ -475,7 +478,7 @@ def make_rollout_env(
     episode: int,
     *,
     base: Callable[..., Any] = make_env,
-    max_steps: int = DEFAULT_STEPS,
+    max_steps: int | Callable[[str], int] = DEFAULT_STEPS,
     videos: tuple[str, str] | None = None,
     run: str = "",
     robot: Embodiment = ROBOMME_JOINT,
@@ -486,10 +489,11 @@ def make_rollout_env(
     """What every worker builds for an episode.
 
     base: makes the environment itself from `task`, `split`, `episode` and `max_steps`
-    (`base_env`). sessions: unrelated episodes that the caller shows the policy before, as
-    `split=stress:sessions=<n>` requires; the scenes of such a split are those of the test split.
-    videos: folder, and which outcomes are kept: `all`, `success` or `failure`. run: its name, in
-    the videos. robot, max_actions: the policy's. oracle: see `ChunkEnv`.
+    (`base_env`). max_steps: see `ChunkEnv`, or a function that gives it for a task. sessions:
+    unrelated episodes that the caller shows the policy before, as `split=stress:sessions=<n>`
+    requires; the scenes of such a split are those of the test split. videos: folder, and which
+    outcomes are kept: `all`, `success` or `failure`. run: its name, in the videos. robot,
+    max_actions: the policy's. oracle: see `ChunkEnv`.
     """
     if sessions:
         check_sessions(split, sessions)
@@ -502,13 +506,14 @@ def make_rollout_env(
             save_on,
             run,
         )
+    limit = max_steps if isinstance(max_steps, int) else max_steps(task)
     stick = task in STICK_TASKS
     if task in TASKS:  # once its module is imported
         stick = stick or bool(getattr(TASKS[task], "stick", False))
     return ChunkEnv(
-        lambda: base(task=task, split=split, episode=episode, max_steps=max_steps),
+        lambda: base(task=task, split=split, episode=episode, max_steps=limit),
         stick=stick,
-        max_steps=max_steps,
+        max_steps=limit,
         video=video,
         robot=robot,
         max_actions=max_actions,

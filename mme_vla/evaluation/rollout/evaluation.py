@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mme_vla.config.naming import DEFAULT_BUDGET
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
@@ -34,9 +33,8 @@ from mme_vla.evaluation.store import (
     read_records,
 )
 from mme_vla.policy.base import Policy
-from mme_vla.policy.saving import composition_digest
+from mme_vla.policy.identity import identify_policy
 from mme_vla.policy.sections import PolicySections
-from mme_vla.policy.training_identity import identity_of
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
 from mme_vla.subgoal.background import BackgroundPredictor
@@ -128,6 +126,7 @@ class RunOptions:
     times_from: earlier records, of any policy: the longest episodes begin first, and say how long
     all will take; by default those in the run's folder and in the folders beside it.
     show_forecast: whether that is printed: of several arms on the same episodes by the first.
+    name: what progress calls the run; None for its label.
     """
 
     subgoals: SubgoalPredictor | None = None
@@ -138,6 +137,7 @@ class RunOptions:
     times_from: Path | None = None
     show_progress: bool = True
     show_forecast: bool = True
+    name: str | None = None
 
 
 def evaluate_events(
@@ -162,7 +162,9 @@ def evaluate_events(
     matched = evaluate(policy, jobs, output, facts, settings, options)
     if not events:
         return matched
-    options = replace(options, times_from=options.times_from or output, show_forecast=False)
+    options = replace(
+        options, times_from=options.times_from or output, show_forecast=False, name=None
+    )
     records: list[EpisodeRecord] = []
     for event in events:
         folder = output / ("event-" + re.sub(r"[^\w.+-]", "-", event))
@@ -210,11 +212,11 @@ def evaluate(
         durations = Durations(earlier_records(output, options.times_from))
         missing = durations.longest_first(missing)
         workers = settings.worker_count(-(-len(missing) // shard.count))
+        workers = min(workers, policy.info.max_running or workers)
 
         completed = [record for record in done if record.outcome != "error"]
-        with RolloutProgress(
-            len(jobs), completed, options.show_progress, facts.run.label
-        ) as progress:
+        name = options.name or facts.run.label
+        with RolloutProgress(len(jobs), completed, options.show_progress, name) as progress:
             if completed:
                 progress.say(
                     f"{output} holds {len(completed)} of {len(jobs)} episodes: continuing with the"
@@ -264,7 +266,7 @@ def _environments(
     make = partial(
         make_rollout_env,
         base=base,
-        max_steps=settings.max_steps,
+        max_steps=settings.limit_of,
         videos=videos,
         run=facts.run.label,
         robot=robot,
@@ -360,15 +362,6 @@ def predictor_of(policy: Policy, subgoal: str | SubgoalPredictor | None) -> Subg
     return subgoal
 
 
-def checkpoint_label(source: str | None) -> int | str:
-    """What records call a checkpoint: its step where its name ends in one, else its name."""
-    if source is None:
-        return "untrained"
-    name = Path(source).name
-    step = re.search(r"(?:^|[_-])(\d+)$", name)
-    return int(step[1]) if step else name
-
-
 def facts_of(
     policy: Policy,
     name: str | None,
@@ -381,25 +374,19 @@ def facts_of(
     name: of the model; None for the policy's own. source: the checkpoint. subgoal: name of the
     predictor.
     """
+    identity = policy.info.identity or identify_policy(policy, name, source)
     return RunFacts(
-        name or str(PolicySections.of(policy.config).name or "policy"),
-        checkpoint_label(source),
+        name or identity.model,
+        identity.checkpoint,
         settings.seed,
         settings.split,
         settings.max_steps,
         subgoal,
-        memory_budget(policy),
-        composition_digest(policy.config),
-        identity_of(policy.config),
+        identity.memory_budget,
+        identity.composition,
+        identity.training,
         settings.event,
     )
-
-
-def memory_budget(policy: Policy) -> int | None:
-    """Memory tokens; None where they are `DEFAULT_BUDGET`."""
-    if policy.memory is None or policy.memory.budget == DEFAULT_BUDGET:
-        return None
-    return policy.memory.budget
 
 
 def default_output(facts: RunFacts) -> Path:

@@ -18,7 +18,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.errors import SceneError, UserError
+from mme_vla.errors import SceneError, UserError, place_of, text_of
 from mme_vla.evaluation.records import EpisodeRecord, RunKey
 from mme_vla.evaluation.rollout.environment import Command
 from mme_vla.evaluation.rollout.episode import RunningEpisode
@@ -29,6 +29,7 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy
+from mme_vla.policy.episode import Failure
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.subgoal import SubgoalPredictor
@@ -64,7 +65,8 @@ class Waiting:
         self._again.append(job)
 
 
-GIVE_UP_AFTER = 8  # episodes in a row whose environments did not even begin
+GIVE_UP_AFTER = 8  # episodes in a row that did not even begin
+SAME_ERRORS = 2  # equal errors of an environment's code, in a row, that stop a run
 
 
 class Environments(Protocol):
@@ -184,6 +186,9 @@ class Rollout:
         self._running: dict[int, RunningEpisode] = {}  # by worker
         self._tries: Counter[Job] = Counter()
         self._stillborn = 0  # episodes in a row whose environments did not begin
+        self._inactive = 0  # episodes in a row in which the policy chose no chunk
+        self._last_error = ""  # of an environment's code
+        self._same_errors = 0  # episodes in a row that it ended
         self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(
             settings.max_batch
         )
@@ -278,7 +283,7 @@ class Rollout:
             message = running.report.error
         else:
             status = "error"
-            message = f"{reply.job}: {reply.error}"
+            message = f"{reply.job}: {text_of(reply.error)}"
         if isinstance(reply.error, UserError):
             raise UserError(str(message))
         # A scene in which an object finds no place finds none again, and says nothing of the
@@ -286,12 +291,35 @@ class Rollout:
         is_unbuildable = isinstance(reply.error, SceneError)
         if not running.chunks and not is_unbuildable:
             self._stillborn += 1
+        self._check_same_error(running, reply)
         if self._stillborn >= GIVE_UP_AFTER:
             raise UserError(
                 f"{self._stillborn} environments in a row could not be started, so the run stops;"
                 f" the last one: {message}"
             )
         self._finish(running, status, message, retry=not is_unbuildable)
+
+    def _check_same_error(self, running: RunningEpisode, reply: Reply) -> None:
+        """Stop if the environment's own code failed twice in the same way: it will again.
+
+        Episodes that are tried again do not count, as all that failed for rare reasons meet there.
+        """
+        if reply.error is None:
+            self._same_errors = 0
+            return
+        if place_of(reply.error) is None or self._tries[running.job] > 1:
+            return
+        text = text_of(reply.error)
+        if text != self._last_error:
+            self._last_error = text
+            self._same_errors = 0
+        self._same_errors += 1
+        if self._same_errors >= SAME_ERRORS:
+            raise UserError(
+                f"{self._same_errors} episodes in a row ended in the same error of the"
+                f" environment's code, so the run stops: {text} Mend it, and repeat the command:"
+                " finished episodes are kept."
+            )
 
     def _restarts(self, running: RunningEpisode, reply: Reply) -> bool:
         """Restart the episode if required video frames were not rendered."""
@@ -348,6 +376,10 @@ class Rollout:
         execute = self.settings.execute or self.policy.embodiment.action.execute
         for running, chunk in zip(batch, chunks, strict=True):
             running.add_policy_seconds(share)
+            if (failure := running.episode.failure) is not None:
+                self._give_up(running, failure)
+                continue
+            self._inactive = 0
             actions = chunk[:execute]
             if not np.isfinite(actions).all():
                 self._finish(
@@ -359,6 +391,21 @@ class Rollout:
             command = Command(actions, subgoal=running.episode.subgoal, draw=draw)
             self.envs.send(running.worker, command)
             self._scheduler.later[running] = None
+
+    def _give_up(self, running: RunningEpisode, failure: Failure) -> None:
+        """End an episode in which the policy cannot act any more.
+
+        Raises:
+            UserError: it chose no chunk in many episodes in a row.
+        """
+        if not running.chunks:
+            self._inactive += 1
+        if self._inactive >= GIVE_UP_AFTER:
+            raise UserError(
+                f"The policy chose no chunk in {self._inactive} episodes in a row, so the run"
+                f" stops; the last one: {failure.reason}"
+            )
+        self._finish(running, "error", failure.reason, retry=failure.again)
 
     def _finish(
         self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True
@@ -372,6 +419,7 @@ class Rollout:
         if status not in ("success", "fail", "timeout"):
             outcome = "error"
             error = error or f"the environment ended the episode with the status {status!r}"
+        running.episode.close()
         again = outcome == "error" and retry and self._tries[running.job] <= self.settings.retries
         self.on_end(running, Ending(outcome, error, again))
         if again:
@@ -385,8 +433,9 @@ class Rollout:
         source = environment(self.settings.env)
         spec = source.episode(job.task, job.split, job.episode)
         failed = ending.outcome == "error"
+        facts = {**vars(self.facts), "max_steps": self.settings.limit_of(job.task)}
         return EpisodeRecord(
-            **vars(self.facts),
+            **facts,
             action_space=robot.action.answers or robot.name,
             task=job.task,
             episode=job.episode,
@@ -403,6 +452,7 @@ class Rollout:
             video_frames=running.video_frames,
             actions_sha256=running.actions_sha256,
             suite=source.suite_of(job.task),
+            groups=source.groups_of(job.task) or None,
             refused=None if failed else ending.error,
             video=running.video,
             process=running.process,

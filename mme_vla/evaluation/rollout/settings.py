@@ -15,7 +15,8 @@ class RolloutSettings:
     """The protocol, and how it is run. The defaults are the paper's.
 
     seed: of the policy's noise; it does not reach the environments.
-    max_steps: actions until the outcome is `timeout`; by default as many as the split allows.
+    max_steps: actions until the outcome is `timeout`; by default as many as the split allows, of
+    environments whose tasks differ the most of any (`limit_of`).
     max_actions: actions, whatever frames they take, until the outcome is `timeout`; None: the
     policy's own limit. only_possible: by choices, offer no option whose every object is out of
     reach. execute: actions of a chunk that are executed before the policy acts again; None: the
@@ -65,6 +66,15 @@ class RolloutSettings:
         }
         return read_section(cls, provided, others=True)
 
+    def limit_of(self, task: str) -> int:
+        """Actions until the outcome of a task is `timeout`: its own number unless another was
+        set.
+        """
+        source = environment(self.env)
+        if self.max_steps != source.step_limit(self.split):
+            return self.max_steps
+        return source.step_limit(self.split, task)
+
     def worker_count(self, episodes: int) -> int:
         """How many workers run that many episodes."""
         requested = min(len(os.sched_getaffinity(0)), 16) if self.workers is None else self.workers
@@ -90,3 +100,13 @@ class RolloutKeywords(TypedDict, total=False):
     draw: Literal["needed", "all"]
     video: Literal["none", "all", "success", "failure"]
     subgoal_log: bool
+
+
+def check_config(config: Mapping[str, Any]) -> None:
+    """Check what a command's configuration says of rollouts and of the tasks, without PyTorch.
+
+    Args:
+        config: plain and resolved, of a command that has the keys of configs/evaluate.yaml.
+    """
+    # Each event is a run of its own, which the command checks.
+    RolloutSettings.from_config({**config, "event": None})

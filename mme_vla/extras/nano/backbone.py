@@ -138,20 +138,20 @@ class Reader(nn.Module):
         """
         normed, gate = self.norm(x, condition)
         q, new_k, new_v = self.qkv(normed).unflatten(-1, (-1, self.head_dim)).chunk(3, dim=-2)
-        x = x + (1 + gate) * self.out(attend(q, new_k, new_v, None))
+        x = x + (1 + gate.to(x.dtype)) * self.out(attend(q, new_k, new_v, None))
         normed, gate = self.read_norm(x, condition)
         q = self.read_q(normed).unflatten(-1, (-1, self.head_dim))
         # The versions of a sample read the same context: they are side by side as its queries.
         together = q.unflatten(0, (-1, versions)).flatten(1, 2)
         read = attend(together, k, v, mask).unflatten(1, (versions, -1)).flatten(0, 1)
         # The goal gates what is read: products are learned sooner here than behind the MLP.
-        x = x + (1 + gate) * self.read_out(read * self.read_gate(condition)[:, None])
+        x = x + (1 + gate.to(x.dtype)) * self.read_out(read * self.read_gate(condition)[:, None])
         if hook is not None:
             rows = x.unflatten(0, (-1, versions)).unbind(1)
             x = torch.stack([hook(row) for row in rows], 1).flatten(0, 1)
         normed, gate = self.mlp_norm(x, condition)
         inner, opening = self.up(normed).chunk(2, dim=-1)
-        return x + (1 + gate) * self.down(nn.functional.gelu(inner) * opening)
+        return x + (1 + gate.to(x.dtype)) * self.down(nn.functional.gelu(inner) * opening)
 
 
 class GoalReader(nn.Module):

@@ -9,11 +9,11 @@ import numpy as np
 
 from mme_vla.errors import listed
 from mme_vla.evaluation.results.compare import show_p
-from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, comparison_table, show, span
 from mme_vla.extras.nano.board import Board, Row, Separation, published_success
 from mme_vla.extras.nano.rows import CHOICES
+from mme_vla.utils.style import COLOURS, FAINT, INK, LINE, figure, legend, svg
 
 PAINT = {"policy": COLOURS[0], "floor": FAINT, "ceiling": COLOURS[2]}
 LOCAL = COLOURS[1]
@@ -264,7 +264,7 @@ def success_figure(board: Board) -> str:
         axes.set_yticks(range(len(rows)), [row.name for row in rows])
         axes.set_xlim(0, 100)
         axes.set_xlabel("success over all tasks (%); strokes: trainings")
-        axes.grid(True, axis="x", color="#e3e6ec")
+        axes.grid(True, axis="x", color=LINE)
         return svg(canvas)
 
 
@@ -313,7 +313,7 @@ def published_figure(board: Board) -> str:
             axes.annotate(row.name, (x, y), (4, 3), textcoords="offset points", fontsize=7)
         axes.set_xlabel("published success (%)")
         axes.set_ylabel("success here (%)")
-        axes.grid(True, axis="both", color="#e3e6ec")
+        axes.grid(True, axis="both", color=LINE)
         return svg(canvas)
 
 

@@ -28,8 +28,10 @@ from mme_vla.extras.nano.rows import TRAINED
 from mme_vla.extras.nano.settings import NanoRun
 from mme_vla.utils import read_json, write_atomically
 from mme_vla.utils.pages import render
+from mme_vla.utils.style import figure, legend
 
 PAGE, CURVES = "page.md", "learning.png"
+FEW_POINTS = 12  # of a curve, below which each has a marker
 
 
 def write_page(
@@ -50,14 +52,13 @@ def write_page(
     folders of its trainings. demonstrations: how many they learned from.
     """
     results, comparisons = compared(records, nano.task, nano.split, without)
-    ends: dict[str, list[Any]] = {}
+    ends = ends_of(runs)
     curves: dict[str, list[dict[str, float]]] = {}
     for model, folders in runs.items():
-        ends[model] = [read_json(run / TRAINED, "a training's end") for run in folders]
         for run in folders:
             label = model if len(folders) == 1 else f"{model}, {run.name}"
             curves[label] = learning_curve(run)
-    plot_curves(curves, folder / CURVES)
+    is_drawn = plot_curves(curves, folder / CURVES)
     text = render(
         "nano.md",
         config=nano.config,
@@ -67,15 +68,47 @@ def write_page(
         without=without,
         success=success_table(records, ends, results),
         comparison=to_markdown(comparison_table(comparisons)) if comparisons else "",
-        verdicts=[comparison.verdict for comparison in comparisons],
+        lead=[comparison.verdict for comparison in comparisons] or [solved(records)],
         notes=results.notes,
-        minutes=minutes,
-        curves=CURVES,
+        minutes={stage: spent for stage, spent in minutes.items() if round(spent, 1) > 0},
+        curves=CURVES if is_drawn else None,
         videos=[(video.stem, video.relative_to(folder)) for video in videos],
     )
     with write_atomically(folder / PAGE) as draft:
         draft.write_text(text, encoding="utf-8")
     return folder / PAGE
+
+
+def ends_of(runs: Mapping[str, Sequence[Path]]) -> dict[str, list[Any]]:
+    """Of each model, what each of its trainings wrote at its end. runs: the trainings' folders."""
+    ends: dict[str, list[Any]] = {}
+    for model, folders in runs.items():
+        ends[model] = [read_json(run / TRAINED, "a training's end") for run in folders]
+    return ends
+
+
+def outcome_lines(
+    records: Mapping[str, Sequence[EpisodeRecord]], ends: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> list[str]:
+    """What came out, a line a model: how far off its held-out decisions were, and its episodes."""
+    lines = []
+    for model, model_records in records.items():
+        parts = []
+        measured = [end["off_by_m"] for end in ends.get(model, ()) if end.get("off_by_m")]
+        if measured:
+            centimetres = 100 * np.median(np.concatenate(measured))
+            parts.append(f"off by {centimetres:.1f} cm on held-out decisions")
+        won = sum(record.success for record in model_records)
+        parts.append(f"{won} of {len(model_records)} episodes solved")
+        lines.append(f"{model}: {', '.join(parts)}")
+    return lines
+
+
+def solved(records: Mapping[str, Sequence[EpisodeRecord]]) -> str:
+    """What the first model solved, where there is no other to compare it with."""
+    first = next(iter(records.values()))
+    won = sum(record.success for record in first)
+    return f"{first[0].model} {won} of {len(first)} episodes"
 
 
 def compared(
@@ -169,20 +202,42 @@ def success_table(
     return "\n".join(lines)
 
 
-def plot_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> None:
-    """The loss on held-out demonstrations against updates, a line a model."""
-    import matplotlib
+def plot_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> bool:
+    """Draw the loss on held-out demonstrations over updates, a line a training.
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    Returns:
+        Whether there was a loss to draw.
+    """
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-    figure, axes = pyplot.subplots(figsize=(6, 3.2), dpi=120)
+    measured: dict[str, list[tuple[float, float]]] = {}
     for model, curve in curves.items():
         points = [(line["step"], line["val/loss"]) for line in curve if "val/loss" in line]
         if points:
-            axes.plot(*zip(*points, strict=True), label=model)
-    axes.set(xlabel="updates", ylabel="loss on held-out demonstrations", yscale="log")
-    axes.legend(frameon=False)
-    figure.tight_layout()
-    figure.savefig(path)
-    pyplot.close(figure)
+            measured[model] = points
+    if not measured:
+        return False
+    losses = [loss for points in measured.values() for _, loss in points]
+    with figure((6.4, 3.4)) as (canvas, (axes,)):
+        for model, points in measured.items():
+            # A line of few points shows which of it was measured.
+            marker = "o" if len(points) <= FEW_POINTS else None
+            axes.plot(*zip(*points, strict=True), marker=marker, ms=4, label=model)
+        if min(losses) > 0 and max(losses) > 10 * min(losses):
+            axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.yaxis.set_minor_formatter(NullFormatter())
+        else:
+            axes.set_ylim(bottom=0)
+        axes.yaxis.set_major_formatter("{x:g}")
+        steps = sorted({step for points in measured.values() for step, _ in points})
+        if len(steps) <= FEW_POINTS // 2:
+            axes.set_xticks(steps)
+        else:
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.xaxis.set_major_formatter("{x:,.0f}")
+        axes.set_xlabel("updates")
+        axes.set_ylabel("loss, held out")
+        legend(canvas, axes, 2)
+        canvas.savefig(path)
+    return True

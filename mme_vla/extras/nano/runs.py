@@ -38,7 +38,7 @@ from mme_vla.extras.nano.evaluating import (
 )
 from mme_vla.extras.nano.fitting import Training, compose_policy, train_in_process
 from mme_vla.extras.nano.learning import check_reflection
-from mme_vla.extras.nano.page import write_page
+from mme_vla.extras.nano.page import ends_of, outcome_lines, write_page
 from mme_vla.extras.nano.settings import STAGES, NanoRun
 from mme_vla.extras.nano.tokens import TokenStore
 from mme_vla.utils import read_json, write_json
@@ -56,8 +56,8 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
     """
     until = STAGES.index(nano.stage)
     folder = Path(nano.output)
-    folder.mkdir(parents=True, exist_ok=True)
     rows = compose_rows(nano, extra_dirs)
+    folder.mkdir(parents=True, exist_ok=True)
     minutes = Minutes(folder / "clock.json")
     with minutes.of("demonstrations"):
         files = record_all(nano, folder / "demonstrations", rows.choices, rows.robot)
@@ -90,17 +90,11 @@ def run(nano: NanoRun, extra_dirs: Sequence[Path] = ()) -> Path:
             row, (first, *others) = next(iter(jobs.items()))
             of_first = records[row][: len(records[row]) // (1 + len(others))]
             videos = record_videos(first.checkpoint, folder / "videos", of_first, rules_of(nano))
-    page = write_page(
-        folder,
-        nano,
-        records,
-        rows.blind,
-        minutes.spent,
-        videos,
-        {row: [job.folder for job in of_row] for row, of_row in jobs.items()},
-        len(files),
-    )
+    trained = {row: [job.folder for job in of_row] for row, of_row in jobs.items()}
+    page = write_page(folder, nano, records, rows.blind, minutes.spent, videos, trained, len(files))
     print(page)
+    for line in outcome_lines(records, ends_of(trained)):
+        print(line)
     return page
 
 

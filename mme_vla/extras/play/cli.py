@@ -68,6 +68,9 @@ def main(cfg: DictConfig) -> None:
     source = environment(command.env)
     specs = choose_episodes(named_tasks(config), command.episodes, command.split, command.env)
     max_steps = command.max_steps or source.step_limit(command.split)
+    limits = {}
+    if command.max_steps is None:
+        limits = {spec.task: source.step_limit(spec.split, spec.task) for spec in specs}
     settings = read_section(PlaySettings, {**config, "max_steps": max_steps}, others=True)
     by_hand = command.player["name"] == HUMAN
     built = None if by_hand else build_player(command.player)
@@ -92,11 +95,12 @@ def main(cfg: DictConfig) -> None:
             **asdict(settings),
             "player": {k: v for k, v in command.player.items() if k not in INDIFFERENT},
         },
+        limits,
     )
     make = partial(
         make_session,
         env=command.env,
-        max_steps=max_steps,
+        max_steps=command.max_steps,
         max_choices=settings.max_choices,
         images=needs_images,
     )

@@ -3,7 +3,7 @@ compare.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,11 +17,12 @@ from mme_vla.extras.play.game import ChoiceSession
 
 
 def make_session(
-    episode: EpisodeSpec, env: str, max_steps: int, max_choices: int, images: bool = True
+    episode: EpisodeSpec, env: str, max_steps: int | None, max_choices: int, images: bool = True
 ) -> ChoiceSession:
     """The simulator for one episode.
 
-    episode: which one. env: name of the environment. max_steps, max_choices: when it has timed out.
+    episode: which one. env: name of the environment. max_steps, max_choices: when it has timed out;
+    None: after the task's own number of steps.
     images: whether the player reads them.
     """
     from mme_vla.envs.base import CHOICES, open_episode
@@ -37,13 +38,20 @@ def make_session(
 
 @dataclass(frozen=True)
 class Identity:
-    """Under which name a run's records are kept. settings: all that decides its outcomes."""
+    """Under which name a run's records are kept. settings: all that decides its outcomes. limits:
+    task → steps, where it is not `max_steps`.
+    """
 
     model: str
     checkpoint: int | str
     model_seed: int
     max_steps: int
     settings: Mapping[str, Any]
+    limits: Mapping[str, int] = field(default_factory=dict)
+
+    def limit_of(self, task: str) -> int:
+        """Steps after which an episode of a task is a timeout."""
+        return self.limits.get(task, self.max_steps)
 
 
 class PlayRun:
@@ -90,7 +98,7 @@ class PlayRun:
                 identity.model,
                 identity.checkpoint,
                 identity.model_seed,
-                identity.max_steps,
+                identity.limit_of(session.episode.task),
                 **extra,
             ),
         )
@@ -112,7 +120,7 @@ class PlayRun:
             model=identity.model,
             checkpoint=identity.checkpoint,
             model_seed=identity.model_seed,
-            max_steps=identity.max_steps,
+            max_steps=identity.limit_of(which.task),
             action_space="multi_choice",
             task=which.task,
             episode=which.episode,

@@ -12,6 +12,7 @@ from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.extras.play.desk import Desk, StaleError
 from mme_vla.serving.settings import is_local, listen
 from mme_vla.utils import parse_json
+from mme_vla.utils.style import css
 
 log = logging.getLogger("mme_vla.play")
 PAGE = {"": "index.html"} | {
@@ -58,6 +59,8 @@ def make_app(desk: Desk, local: bool = True) -> Any:
         if name is None:
             return refuse(404, "There is nothing here.")
         content = files("mme_vla.extras.play").joinpath("page", name).read_bytes()
+        if name == "play.css":
+            content = css().encode() + content
         return Response(content, media_type=KINDS[name.rpartition(".")[2]])
 
     async def state(_: Request) -> Response:

@@ -1,6 +1,7 @@
 """Arms of a probe: perturbations alone or together (`drop:2`, `nodemo+shuffle`)."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -51,6 +52,13 @@ class Arm:
     parts: tuple[Perturbation, ...] = ()
 
     @property
+    def meaning(self) -> str:
+        """What it does in plain words."""
+        if not self.parts:
+            return "the policy as it is, which the other arms are compared with"
+        return " and ".join(part.meaning for part in self.parts)
+
+    @property
     def feed(self) -> Feed:
         """What the policy observes."""
         return Feed.of(self.parts)
@@ -66,6 +74,26 @@ class Arm:
             elif overrides(type(part), "repeats"):
                 needs.add("pauses")
         return frozenset(needs)
+
+    @property
+    def shows(self) -> bool:
+        """Whether frames are changed that were collected since the last decision."""
+        return any(overrides(type(part), "show") or part.renews for part in self.parts)
+
+    @property
+    def in_closed_loop(self) -> bool:
+        """Whether it acts where a policy runs an episode, and not at single recorded steps."""
+        return self.shows or any(overrides(type(part), "instruct") for part in self.parts)
+
+    @property
+    def renews(self) -> bool:
+        """Whether the policy begins an episode anew at each decision."""
+        return any(part.renews for part in self.parts)
+
+    @property
+    def lag(self) -> int:
+        """Frames before those since the last decision that are needed too."""
+        return max((part.lag for part in self.parts), default=0)
 
     @property
     def edits(self) -> bool:
@@ -94,6 +122,14 @@ class Arm:
             if overrides(type(part), "perturb"):
                 store = perturb_store(store, part, moment.rng)
         return store
+
+    def show(self, frames: Any, moment: Moment) -> Any:
+        """The frames as the policy observes them."""
+        return reduce(lambda shown, part: part.show(shown, moment), self.parts, frames)
+
+    def instruct(self, goal: str, moment: Moment) -> str:
+        """The goal that the policy reads instead."""
+        return reduce(lambda text, part: part.instruct(text, moment), self.parts, goal)
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         """The subgoal that the policy reads instead."""
@@ -145,11 +181,18 @@ def read_arms(specs: Any) -> list[Arm]:
 
 
 def lacking(
-    arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool
+    arm: Arm,
+    policy: Policy,
+    channel: Channel,
+    recordings: int,
+    *,
+    boundaries: bool,
+    n_goals: int = 0,
 ) -> str | None:
     """What an arm needs and lacks, for a message; None where it can be probed.
 
-    recordings: recorded episodes to take from. boundaries: whether sub-tasks are recorded.
+    recordings: recorded episodes to take from. boundaries: whether sub-tasks are recorded. n_goals:
+    how many goals the recorded episodes have.
     """
     robot = policy.embodiment
     there = {
@@ -160,6 +203,8 @@ def lacking(
         "subgoal": policy.require_processor().prompt_spec.reads_subgoal,
         "recordings": recordings > 0 and not robot.readings,
         "boundaries": boundaries,
+        "stream": robot.action.frames is not None and not robot.readings,
+        "goals": n_goals > 1,
     }
     for need in sorted(arm.needs):
         if not there.get(need, False):
@@ -171,22 +216,48 @@ def lacking(
 
 
 def choose_arms(
-    specs: Any, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool
+    specs: Any,
+    policy: Policy,
+    channel: Channel,
+    recordings: int,
+    *,
+    boundaries: bool,
+    n_goals: int = 0,
 ) -> tuple[list[Arm], list[str]]:
     """The arms of `specs`; by default those of `DEFAULT_ARMS` that policy and data allow, and why
-    not the others.
+    not the others: a sentence for each reason.
+
+    Of a policy that reads no subgoals, arms of subgoals are none that a reader misses.
     """
-    arms, left_out = [], []
+    arms = []
+    names_of_reasons: dict[str, list[str]] = {}
     for arm in read_arms(DEFAULT_ARMS if specs is None else specs):
-        why = lacking(arm, policy, channel, recordings, boundaries=boundaries)
+        why = lacking(arm, policy, channel, recordings, boundaries=boundaries, n_goals=n_goals)
         if why is None:
             arms.append(arm)
-        elif specs is None:
-            left_out.append(f"{arm.name} was left out: it needs {why}.")
-        else:
+        elif specs is not None:
             name = PolicySections.of(policy.config).name or "this policy"
             raise UserError(f"with={arm.name} needs {why}; {name} has none here.")
+        elif why != NEEDS["subgoal"]:
+            names_of_reasons.setdefault(why, []).append(arm.name)
+    left_out = []
+    for why, names in names_of_reasons.items():
+        if len(names) == 1:
+            left_out.append(f"{names[0]} was left out: it needs {why}.")
+        else:
+            left_out.append(f"{', '.join(names)} were left out: they need {why}.")
     return arms, left_out
+
+
+def meanings_of(names: Iterable[str]) -> dict[str, str]:
+    """What arms of these names do, in plain words; without those that are more than words, or of a
+    plugin that is not loaded.
+    """
+    meanings = {UNPROBED.name: UNPROBED.meaning}
+    for name in names:
+        with suppress(UserError):
+            meanings.setdefault(name, read_arm(name).meaning)
+    return meanings
 
 
 def options_of(arm: Arm) -> list[dict[str, Any]]:

@@ -13,9 +13,9 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.pairing import pair
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, display_name
 from mme_vla.evaluation.results.report import Section, html_page
-from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.scopes import Protocol, counted
 from mme_vla.evaluation.results.statistics import (
     paired_interval,
     percentiles,
@@ -28,16 +28,17 @@ from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.extras.probing import lines
-from mme_vla.extras.probing.arms import UNPROBED, lacking, read_arm, slug
+from mme_vla.extras.probing.arms import UNPROBED, lacking, meanings_of, read_arm, slug
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.evidence import record_evidence
+from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.lines import MomentLine
-from mme_vla.extras.probing.report import Findings
 from mme_vla.extras.probing.run import OFFLINE, ONLINE, ProbePlan, run_probe
 from mme_vla.extras.probing.writing import required_frames, score_writing
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.utils import require_earlier, to_json, write_atomically, write_json
+from mme_vla.utils.pages import escape_markdown
 
 TIME, CONTENT, WRONG_SCENE = "time-shifted", "content-swapped", "wrong scene first"
 ARMS = {
@@ -124,9 +125,9 @@ class Card:
     """Everything a card shows. noise: share of scenes that end otherwise in an equal run with other
     noise.
 
-    suites: the memory-or-clock score of each suite's scenes, where they are of several. writing:
-    score of writing (writing.py). references: success of other runs on the same
-    scenes.
+    interventions: label → the intervention that did it. suites: the memory-or-clock score of each
+    suite's scenes, where they are of several. writing: score of writing (writing.py). references:
+    success of other runs on the same scenes.
     """
 
     model: str
@@ -136,6 +137,7 @@ class Card:
     noise: float
     arms: dict[str, Loss]
     memory_or_clock: ClockScore
+    interventions: Mapping[str, str] = field(default_factory=dict)
     suites: Mapping[str, ClockScore] = field(default_factory=dict)
     recovery: Recovery | None = None
     writing: dict[str, Any] | None = None
@@ -158,27 +160,49 @@ def run_card(
 ) -> Card:
     """Run what the folder lacks of a card, and write `card.html` and `card.json`.
 
-    Args:
-        plan: its jobs are the scenes, its recordings those that recovery is measured on, `lend`
-            those to take contents from. references: name → folder of records, floors and ceilings
-            such as `{"demonstrator": "outputs/…"}`.
+    Args: as for `measure_card`.
     """
     for name, mark in ((PAGE, MARK), (FIGURES, "memory_or_clock")):
         require_earlier(folder / name, mark)
+    card = measure_card(policy, plan, folder, facts, settings, options, references)
+    write_card(card, folder)
+    return card
+
+
+def measure_card(
+    policy: Policy,
+    plan: ProbePlan,
+    folder: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    options: RunOptions,
+    references: Mapping[str, str] | None = None,
+    interventions: Mapping[str, str] = ARMS,
+) -> Card:
+    """Run what the folder lacks of a card.
+
+    Args:
+        plan: its jobs are the scenes, its recordings those that recovery is measured on, `lend`
+            those to take contents from. references: name → folder of records, floors and ceilings
+            such as `{"demonstrator": "outputs/…"}`. interventions: label → intervention.
+    """
     channel = channel_of(policy)
     in_simulation = options.base is make_env and settings.env == "mme_vla"
-    arms = {label: read_arm(word) for label, word in ARMS.items()}
+    arms = {label: read_arm(word) for label, word in interventions.items()}
     possible, notes = [], []
     for label, arm in arms.items():
-        why = lacking(arm, policy, channel, len(plan.lend), boundaries=in_simulation)
+        n_goals = len({recording.goal for recording in plan.lend})
+        why = lacking(
+            arm, policy, channel, len(plan.lend), boundaries=in_simulation, n_goals=n_goals
+        )
         if why is None:
             possible.append(label)
         else:
-            notes.append(f"{label} ({ARMS[label]}) was left out: it needs {why}.")
+            notes.append(f"{label} ({interventions[label]}) was left out: it needs {why}.")
     others = {name: _reference(name, place, plan) for name, place in (references or {}).items()}
 
     # In closed loop: every arm, then the matched run again with other noise.
-    plan = replace(plan, arms=[ARMS[label] for label in possible], events=())
+    plan = replace(plan, arms=[interventions[label] for label in possible], events=())
     run_probe(policy, replace(plan, recordings=()), folder, facts, settings, options)
     again = replace(settings, seed=settings.seed + 1)
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
@@ -186,9 +210,10 @@ def run_card(
 
     # On recorded episodes: how long a wrong scene has an effect.
     recovered = None
-    if plan.recordings and len(plan.lend) > 1 and WRONG_SCENE in possible:
+    can_recover = policy.info.resamples and WRONG_SCENE in possible
+    if plan.recordings and len(plan.lend) > 1 and can_recover:
         offline = replace(plan.offline, moments=None, scan=False)
-        wrong = replace(plan, arms=[ARMS[WRONG_SCENE]], jobs=(), offline=offline)
+        wrong = replace(plan, arms=[interventions[WRONG_SCENE]], jobs=(), offline=offline)
         run_probe(policy, wrong, folder, facts, settings, options)
         recovered = recovery(Findings.of(lines.read_all(folder / OFFLINE)).moments)
     writing = None
@@ -218,13 +243,13 @@ def run_card(
         grade(matched, outcomes, repeated),
         model=facts.model,
         checkpoint=facts.checkpoint,
+        interventions={label: interventions[label] for label in possible},
         suites=clock_scores(matched, outcomes, repeated, suites),
         recovery=recovered,
         references=shown,
         notes=notes,
         writing=writing if isinstance(writing, dict) else None,
     )
-    write_card(card, folder)
     return card
 
 
@@ -428,7 +453,7 @@ def tables_of(card: Card) -> list[Table]:
     rows += [
         [f"memory-or-clock score, {suite}", _score(score)] for suite, score in card.suites.items()
     ]
-    rows.append(["noise: scenes that end otherwise in an equal run", _percent(card.noise)])
+    rows.append(["noise: scenes that end otherwise in an equal run", percent(card.noise)])
     if after is not None:
         median = "no" if after.median is None else f"{after.median:g} decisions"
         text = (
@@ -439,15 +464,16 @@ def tables_of(card: Card) -> list[Table]:
     if card.writing is not None:
         mean = card.writing["mean"]
         rows.append(["score of writing", f"{mean['score']:.2f} (chance {mean['chance']:.2f})"])
-    arms = [["matched", "", _percent(card.matched), "", "", "", ""]]
+    words = {**ARMS, **card.interventions}
+    arms = [["matched", "", percent(card.matched), "", "", "", ""]]
     for label, loss in card.arms.items():
         arms.append([
-            label, ARMS[label], _percent(loss.success), _percent(loss.loss),
+            label, words.get(label, ""), percent(loss.success), percent(loss.loss),
             f"[{100 * loss.low:.0f}, {100 * loss.high:.0f}]", f"{loss.lost} : {loss.gained}",
             "yes" if loss.beyond_noise else "no",
         ])  # fmt: skip
     arms += [
-        [name, "", _percent(rate), "", "", "", ""] for name, rate in (card.references or {}).items()
+        [name, "", percent(rate), "", "", "", ""] for name, rate in (card.references or {}).items()
     ]
     columns = (
         "history",
@@ -458,22 +484,60 @@ def tables_of(card: Card) -> list[Table]:
         "lost : gained",
         "beyond noise",
     )
-    return [Table("In short", ("", ""), rows), Table("Histories in closed loop", columns, arms)]
+    return [
+        Table("In short", ("figure", "value"), rows),
+        Table("Histories in closed loop", columns, arms),
+    ]
+
+
+def conclude_card(card: Card) -> str:
+    """What the card shows, in a sentence, or that it is too little to tell."""
+    scenes = counted(card.scenes, "scene")
+    score = card.memory_or_clock
+    losses = []
+    for label in (TIME, CONTENT):
+        if label in card.arms:
+            losses.append(f"{label} entries cost {100 * card.arms[label].loss:.0f} points")
+    text = f"This policy solves {percent(card.matched)} of {scenes}"
+    if losses:
+        text += f", {' and '.join(losses)}"
+    if score.score is None or score.low is None or score.high is None:
+        return f"{text}: too little to tell whether its memory is a clock ({score.undefined})."
+    if score.low > 0.5:
+        kind = "its memory serves mostly as a clock"
+    elif score.high < 0.5:
+        kind = "its memory serves mostly by its content"
+    else:
+        kind = "it reads times and contents, or the scenes are too few to tell which more"
+    return f"{text}: {kind} (memory-or-clock score {_score(score)})."
 
 
 def write_card(card: Card, folder: Path) -> None:
     """Write the page and the JSON."""
     write_json(folder / FIGURES, to_json(asdict(card)))
-    sections = [Section(table.title, tables=[table]) for table in tables_of(card)]
-    sections.append(Section("How the numbers are made", paragraphs=_HOW))
-    title, subtitle = f"{MARK} {card.model}", f"checkpoint {card.checkpoint}, {card.scenes} scenes"
+    meanings = meanings_of(ARMS.values())
+    short, histories = tables_of(card)
+    terms = [(label, meanings[ARMS[label]]) for label in card.arms]
+    sections = [
+        Section(short.title, tables=[short]),
+        Section(histories.title, tables=[histories], terms=[("matched", UNPROBED.meaning), *terms]),
+        Section("How the numbers are made", paragraphs=_HOW),
+    ]
+    page = html_page(
+        f"{MARK} {display_name(card.model, card.checkpoint)}",
+        sections,
+        f"checkpoint {card.checkpoint} · {counted(card.scenes, 'scene')} in closed loop",
+        lead=conclude_card(card),
+        footnotes=card.notes,
+    )
     with write_atomically(folder / PAGE) as draft:
-        draft.write_text(html_page(title, sections, subtitle, card.notes), encoding="utf-8")
+        draft.write_text(page, encoding="utf-8")
 
 
 def card_text(card: Card) -> str:
     """The card in Markdown."""
-    return "\n".join([*map(to_markdown, tables_of(card)), *card.notes])
+    lead = f"**{escape_markdown(conclude_card(card))}**\n"
+    return "\n".join([lead, *map(to_markdown, tables_of(card)), *card.notes])
 
 
 def _score(score: ClockScore) -> str:
@@ -482,5 +546,5 @@ def _score(score: ClockScore) -> str:
     return f"{score.score:.2f} [{score.low:.2f}, {score.high:.2f}]"
 
 
-def _percent(share: float) -> str:
+def percent(share: float) -> str:
     return f"{100 * share:.0f} %"

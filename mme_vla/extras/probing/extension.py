@@ -4,25 +4,39 @@ from pathlib import Path
 
 from mme_vla.registry import Command, Extension
 
+MEMORY = (
+    "shuffle",
+    "drop",
+    "swap",
+    "delay",
+    "recent",
+    "oracle",
+    "distract",
+    "nodemo",
+    "subgoal_swap",
+    "subgoal_delay",
+    "subgoal_count",
+)
+"""Interventions on what is remembered and said, and on which episodes and videos are shown."""
+STREAM = (
+    "forget",
+    "replay",
+    "shuffle_frames",
+    "swap_frames",
+    "linger",
+    "late",
+    "freeze_state",
+    "goal_swap",
+)
+"""Interventions on what a policy is sent."""
+
 EXTENSION = Extension(
     parts={
         "split_policy": {"sessions": "mme_vla.extras.probing.probed"},
-        "perturbation": dict.fromkeys(
-            (
-                "shuffle",
-                "drop",
-                "swap",
-                "delay",
-                "recent",
-                "oracle",
-                "distract",
-                "nodemo",
-                "subgoal_swap",
-                "subgoal_delay",
-                "subgoal_count",
-            ),
-            "mme_vla.extras.probing.interventions",
-        ),
+        "perturbation": {
+            **dict.fromkeys(STREAM, "mme_vla.extras.probing.streams"),
+            **dict.fromkeys(MEMORY, "mme_vla.extras.probing.interventions"),
+        },
     },
     commands={
         "analyse": Command(

@@ -14,6 +14,7 @@ from torch import Tensor
 from mme_vla.config.sections import NonNegativeInt, PositiveInt
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.channels import Remembered, same_progress
+from mme_vla.extras.probing.recordings import Recording
 from mme_vla.memory.history import History
 from mme_vla.memory.perturbation import Perturbation
 from mme_vla.registry import PERTURBATIONS
@@ -25,6 +26,8 @@ NEEDS = {
     "pauses": "a memory that sees frames at which nothing is decided",
     "subgoal": "a policy that reads subgoals",
     "recordings": "recorded episodes to take from: name them with recordings=…",
+    "stream": "a robot with one action a frame, and without depth",
+    "goals": "recorded episodes with several goals",
     "boundaries": (
         "sub-tasks whose beginnings are told: by recordings with subgoals, in closed loop by"
         " env=mme_vla"
@@ -45,7 +48,9 @@ class Moment:
     observed. stored: stored frames up to now, ascending. boundaries: frames at which a sub-task
     began. subgoals: earlier ones, the current one last. donor: the store of a name of another
     episode that is as far along. donor_subgoal: the subgoal there. weigh: for each slot of a store,
-    by how much the chunk changes without it.
+    by how much the chunk changes without it. exec_start: the first execution frame; of a video that
+    is not over, the frame after it. donor_recording: another recorded episode. donor_goal: the goal
+    of one that has another goal.
     """
 
     rng: np.random.Generator
@@ -56,6 +61,9 @@ class Moment:
     donor: Callable[[str], Remembered] = _nothing
     donor_subgoal: str | None = None
     weigh: Callable[[Remembered], np.ndarray] | None = None
+    exec_start: int = 0
+    donor_recording: Recording | None = None
+    donor_goal: str | None = None
 
 
 @PERTURBATIONS.register("shuffle")
@@ -64,6 +72,10 @@ class Shuffle(Perturbation):
     """The contents of all entries change places; their times and slots stay where they are."""
 
     needs: ClassVar = frozenset({"entries"})
+
+    @property
+    def meaning(self) -> str:
+        return "what is remembered changes places, the times stay"
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         slots = store.occupied
@@ -84,6 +96,14 @@ class Drop(Perturbation):
     which: Literal["oldest", "newest", "random", "used"] = "random"
     dial: ClassVar = "count"
     needs: ClassVar = frozenset({"entries"})
+
+    @property
+    def meaning(self) -> str:
+        if self.count is None:
+            return "everything remembered is removed"
+        entries = "entry" if self.count == 1 else "entries"
+        kind = "most used" if self.which == "used" else self.which
+        return f"{self.count} {entries} removed: {kind}"
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         slots = store.occupied
@@ -114,6 +134,12 @@ class Swap(Perturbation):
     dial: ClassVar = "count"
     needs: ClassVar = frozenset({"entries", "recordings"})
 
+    @property
+    def meaning(self) -> str:
+        if self.count is None:
+            return "what is remembered is of another episode, the times stay"
+        return f"of what is remembered, {self.count} at random is of another episode"
+
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         occupied = store.occupied
         donor = moment.donor(store.name)
@@ -140,6 +166,11 @@ class Delay(Perturbation):
     dial: ClassVar = "frames"
     needs: ClassVar = frozenset({"entries", "clock"})
 
+    @property
+    def meaning(self) -> str:
+        direction = "earlier" if self.frames < 0 else "later"
+        return f"every entry seems to be {abs(self.frames)} frames {direction} than it was"
+
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         shifted = list(store.entries)
         for slot in store.occupied:
@@ -158,6 +189,10 @@ class Recent(Perturbation):
     dial: ClassVar = "frames"
     needs: ClassVar = frozenset({"entries", "choice"})
 
+    @property
+    def meaning(self) -> str:
+        return f"only the last {self.frames} frames can be remembered"
+
     def only(self, moment: Moment) -> np.ndarray | None:
         inside = moment.stored[moment.stored > moment.now - self.frames]
         return inside if len(inside) else moment.stored[-1:]
@@ -171,6 +206,10 @@ class Oracle(Perturbation):
     """
 
     needs: ClassVar = frozenset({"entries", "choice", "boundaries"})
+
+    @property
+    def meaning(self) -> str:
+        return "only the frames where sub-tasks begin can be remembered"
 
     def only(self, moment: Moment) -> np.ndarray | None:
         past = [frame for frame in moment.boundaries if frame <= moment.now]
@@ -188,6 +227,11 @@ class Distract(Perturbation):
     needs: ClassVar = frozenset({"recordings"})
 
     @property
+    def meaning(self) -> str:
+        others = "another episode" if self.sessions == 1 else f"{self.sessions} other episodes"
+        return f"{others} first, as if part of this one"
+
+    @property
     def n_sessions(self) -> int:
         return self.sessions
 
@@ -198,6 +242,10 @@ class NoDemo(Perturbation):
     """The conditioning video is not shown."""
 
     shows_video: ClassVar = False
+
+    @property
+    def meaning(self) -> str:
+        return "the video before the episode is not shown"
 
 
 class _Perturbed(History):
@@ -266,6 +314,10 @@ class SubgoalSwap(Perturbation):
 
     needs: ClassVar = frozenset({"subgoal", "recordings"})
 
+    @property
+    def meaning(self) -> str:
+        return "the subgoal is that of another episode"
+
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         return subgoal if moment.donor_subgoal is None else moment.donor_subgoal
 
@@ -278,6 +330,10 @@ class SubgoalDelay(Perturbation):
     decisions: PositiveInt = 2
     dial: ClassVar = "decisions"
     needs: ClassVar = frozenset({"subgoal"})
+
+    @property
+    def meaning(self) -> str:
+        return f"the subgoal is the one of {self.decisions} chunks ago"
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         if not moment.subgoals:
@@ -295,6 +351,10 @@ class SubgoalCount(Perturbation):
     by: int = 1
     dial: ClassVar = "by"
     needs: ClassVar = frozenset({"subgoal"})
+
+    @property
+    def meaning(self) -> str:
+        return f"every count in the subgoal is wrong by {self.by}"
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         return None if subgoal is None else _COUNT.sub(self._wrong, subgoal)

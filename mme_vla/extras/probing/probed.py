@@ -20,8 +20,9 @@ from mme_vla.extras.probing.arms import UNPROBED, Arm, options_of, read_arm
 from mme_vla.extras.probing.channels import Channel, MemorySnapshot, Remembered, channel_of
 from mme_vla.extras.probing.interventions import Moment
 from mme_vla.extras.probing.recordings import Recording, all_recordings
+from mme_vla.extras.probing.streams import Shown
 from mme_vla.policy.base import Policy, PolicyInfo
-from mme_vla.policy.episode import Episode
+from mme_vla.policy.episode import Episode, Failure
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.types import Noise, stack_noise
@@ -43,6 +44,11 @@ class ProbedEpisode(Episode):
         self.seed = seed
         self.inner = policy.inner.start_episode(goal, seed)
         self.exec_start: int | None = None
+        self._decisions = 0
+        self._collected: Shown | None = None
+        """Frames since the last decision, where the arm changes them; with `renews` all frames."""
+        self._start: np.ndarray | None = None
+        self._before: dict[str, np.ndarray] = {}
         self._counts: np.ndarray = np.zeros(0, np.int64)
         self._starts: np.ndarray = np.zeros(0, np.int64)
         self.boundaries: Sequence[int] = ()
@@ -96,13 +102,70 @@ class ProbedEpisode(Episode):
             views[name] = view
             if (repeats != 1).any():
                 views[name] = view[np.searchsorted(with_images, order[places[name]])]
-        if rendered is None:
+        if self._probed.arm.shows:
+            self._collect(views, states[order], demo[order], numbers[order], actions)
+        elif rendered is None:
             self.inner.observe(views, states[order], demo[order], actions)
         else:
             visible = {name: places[name] for name in rendered}
             self.inner.observe(views, states[order], demo[order], actions, rendered=visible)
         if len(self._starts):
             self.boundaries = self.numbers(self._starts)
+
+    def _collect(
+        self,
+        views: Mapping[str, np.ndarray],
+        states: np.ndarray,
+        demo: np.ndarray,
+        numbers: np.ndarray,
+        actions: np.ndarray | None,
+    ) -> None:
+        """Keep frames until the policy decides."""
+        executed = np.zeros((len(states), self._robot.action.width), np.float32)
+        if actions is not None:
+            executed[~demo] = actions
+        if self._start is None and not demo.all():
+            self._start = np.asarray(states[int(demo.sum())], np.float32)
+        new = Shown(
+            views=views,
+            states=np.asarray(states, np.float32),
+            demo=demo,
+            numbers=numbers,
+            actions=executed,
+            led=~demo if actions is not None else np.zeros(len(demo), bool),
+            before={},
+            start=self._start,
+        )
+        self._collected = new if self._collected is None else self._collected.join(new)
+
+    def show_collected(self) -> None:
+        """Show the policy the frames that were collected, as the arm has them."""
+        arm = self._probed.arm
+        collected = self._collected
+        if not arm.shows or collected is None:
+            return
+        before = self._before or {name: view[:0] for name, view in collected.views.items()}
+        shown = arm.show(replace(collected, before=before), self._probed.moment(self))
+        if arm.renews:
+            # Another seed at each decision: the noise of one is not that of the others.
+            if self._decisions:
+                self.inner.close()
+                self.inner = self._probed.inner.start_episode("", self.seed + self._decisions)
+            self.inner.options = self.options
+        else:
+            self._collected = None
+        self._decisions += 1
+        if arm.lag:
+            for name, view in collected.views.items():
+                self._before[name] = np.concatenate([before[name], view])[-arm.lag :]
+        shown.observe_in(self.inner)
+
+    @property
+    def failure(self) -> Failure | None:
+        return self.inner.failure
+
+    def close(self) -> None:
+        self.inner.close()
 
     def restart_clock(self) -> None:
         self.inner.restart_clock()
@@ -207,6 +270,14 @@ class DonorEpisodes:
             self._donors[donor.name] = DonorEpisode(self._policy, self._channel, donor)
         return self._donors[donor.name]
 
+    def goal_for(self, episode: ProbedEpisode) -> str | None:
+        """A goal that reads like this episode's and differs; None where all are the same."""
+        alike = others(self._recordings, episode.recording, episode.goal)
+        goals = list(dict.fromkeys(one.goal for one in alike if one.goal != episode.goal))[:ALIKE]
+        if not goals:
+            return None
+        return goals[int(np.random.default_rng(episode.seed).integers(len(goals)))]
+
 
 def others(
     recordings: Sequence[Recording], exclude: Recording | None, goal: str
@@ -249,6 +320,8 @@ class ProbedPolicy(Policy):
         self.info = PolicyInfo(
             sample_steps=inner.info.sample_steps,
             max_actions=inner.info.max_actions,
+            max_running=inner.info.max_running,
+            identity=inner.info.identity,
             history_dtype=inner.info.history_dtype,
         )
         if arm.parts:
@@ -256,6 +329,9 @@ class ProbedPolicy(Policy):
 
     def start_episode(self, goal: str, seed: int = 0) -> ProbedEpisode:
         return ProbedEpisode(self, goal, seed)
+
+    def conditions(self) -> dict[str, Any]:
+        return self.inner.conditions()
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
         return self.inner.sampling_noise(generator)
@@ -276,7 +352,7 @@ class ProbedPolicy(Policy):
         leaves some out.
         """
         feed, n_before = self.feed, self.n_before
-        if feed.drops:
+        if feed.drops or self.arm.shows:
             return None
         displayed = feed.displayed(steps, exec_start, n_before)
         reads = self.inner.frames_read(displayed, feed.first_executed(exec_start, n_before))
@@ -293,8 +369,11 @@ class ProbedPolicy(Policy):
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         for episode in map(_probed, episodes):
+            episode.show_collected()
+            moment = self.moment(episode)
+            episode.inner.goal = self.arm.instruct(episode.goal, moment)
             episode.subgoals.append(episode.subgoal)
-            episode.inner.subgoal = self.arm.say(episode.subgoal, self.moment(episode))
+            episode.inner.subgoal = self.arm.say(episode.subgoal, moment)
         return self.inner.observation([_probed(episode).inner for episode in episodes])
 
     def predict_chunk(
@@ -340,10 +419,18 @@ class ProbedPolicy(Policy):
         if self.memory is not None:
             stored = self.memory.storage.stored_frames(now + 1)
         rng = np.random.default_rng([episode.seed, now, zlib.crc32(self.arm.name.encode())])
-        known: dict[str, Any] = {}
+        exec_start = episode.n_observed_frames
+        if episode.exec_start is not None:
+            exec_start = episode.exec_start
+        known: dict[str, Any] = {"exec_start": exec_start}
         if self.donors is not None:
             donor = self.donors.of(episode)
-            known = {"donor": donor.store_of(episode), "donor_subgoal": donor.subgoal_of(episode)}
+            known |= {
+                "donor": donor.store_of(episode),
+                "donor_subgoal": donor.subgoal_of(episode),
+                "donor_recording": donor.recording,
+                "donor_goal": self.donors.goal_for(episode),
+            }
         return Moment(rng, now, stored, episode.boundaries, episode.subgoals, weigh=weigh, **known)
 
     def _weigh(

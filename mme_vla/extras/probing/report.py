@@ -1,7 +1,7 @@
-"""From a probe's lines to the figures of its page."""
+"""The page of a probe: what was found first, then the figures, and what their words mean."""
 
 import base64
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -10,148 +10,46 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mme_vla.errors import require
-from mme_vla.evaluation.results.compare import Comparison
-from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
+from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.results.report import Section, html_page
-from mme_vla.evaluation.results.tables import Table, comparison_table, to_markdown
-from mme_vla.extras.probing.lines import EntryLine, Line, MomentLine
+from mme_vla.evaluation.results.scopes import counted
+from mme_vla.evaluation.results.tables import Table, to_markdown
+from mme_vla.extras.probing.arms import UNPROBED, meanings_of
+from mme_vla.extras.probing.conclusions import conclude
+from mme_vla.extras.probing.findings import Effect, Findings, by_recording, effect, grouped
+from mme_vla.extras.probing.lines import EntryLine, MomentLine
 from mme_vla.extras.probing.recordings import Recording
 from mme_vla.utils import require_earlier, write_atomically
 from mme_vla.utils.media import Tile, contact_sheet
 from mme_vla.utils.pages import render
+from mme_vla.utils.style import COLOURS, FAINT, INK, figure, legend, rgb, svg
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from PIL.Image import Image
 
 
 MEASURES = {
-    "evidence": ("drop:all", "nothing is remembered"),
-    "order": ("shuffle", "contents change places"),
-    "clock": ("delay:64", "everything seems 64 frames later"),
-    "pause": ("pause", "64 still frames"),
-    "interference": ("distract:1", "one unrelated episode first"),
+    "evidence": ("drop:all", "everything remembered is removed: is the memory read at all?"),
+    "order": ("shuffle", "what is remembered changes places: does it matter when it was?"),
+    "clock": ("delay:64", "entries seem to be later: are they found by their time?"),
+    "pause": ("pause", "time stands still for a while: does that disturb?"),
+    "interference": ("distract:1", "another episode is seen first: does it disturb?"),
 }
 """What a probe's table has one column for: the arm that measures it, and what that does."""
-AGES = (0, 16, 32, 64, 128, 256, 512)  # Where the bins of an entry's age begin, in frames
-
-
-@dataclass(frozen=True)
-class Effect:
-    """The effect of an arm, or an entry, over some steps.
-
-    change, spread, distance: means, as in `Change`. beyond: share of steps at which the change
-    exceeds the spread.
-    """
-
-    moments: int
-    change: float
-    spread: float
-    distance: float
-    beyond: float
-
-    @property
-    def times(self) -> float | None:
-        """How often the policy's own spread; None for a policy that has none."""
-        return self.change / self.spread if self.spread > 0 else None
-
-
-def effect(lines: Sequence[MomentLine] | Sequence[EntryLine]) -> Effect:
-    """The effect over some lines, at least one."""
-    changes = np.array([line.change for line in lines])
-    spreads = np.array([line.spread for line in lines])
-    distances = np.array([getattr(line, "distance", 0.0) for line in lines])
-    return Effect(
-        moments=len(lines),
-        change=float(changes.mean()),
-        spread=float(spreads.mean()),
-        distance=float(distances.mean()),
-        beyond=float((changes > spreads).mean()),
-    )
-
-
-@dataclass(frozen=True)
-class Findings:
-    """Everything a probe on recorded episodes found of one checkpoint."""
-
-    moments: list[MomentLine]
-    entries: list[EntryLine]
-
-    @classmethod
-    def of(cls, lines: Iterable[Line]) -> "Findings":
-        """Sort the lines."""
-        every = list(lines)
-        return cls(
-            [x for x in every if isinstance(x, MomentLine)],
-            [x for x in every if isinstance(x, EntryLine)],
-        )
-
-    def arms(self) -> dict[str, Effect]:
-        """The effect of every arm, in the order in which they came."""
-        lines_of_arms = _grouped(self.moments, lambda line: line.arm)
-        return {name: effect(lines) for name, lines in lines_of_arms.items()}
-
-    def families(self) -> dict[str, list[tuple[float, Effect]]]:
-        """Interventions of which several places of the dial were probed: dial and effect,
-        ascending.
-        """
-        turned = [line for line in self.moments if line.dial is not None]
-        families = {}
-        for name, members in _grouped(turned, lambda line: line.arm.partition(":")[0]).items():
-            places = _grouped(members, lambda line: line.dial or 0.0)
-            if len(places) > 1:
-                families[name] = [(dial, effect(places[dial])) for dial in sorted(places)]
-        return families
-
-    def decay(self, video: bool) -> list[tuple[float, Effect]]:
-        """Mean age and effect of the entries of each bin of age, those of the video or of the
-        execution.
-        """
-        entries = [entry for entry in self.entries if entry.video == video]
-        bins = _grouped(entries, lambda entry: int(np.searchsorted(AGES, entry.age, "right")))
-        points = []
-        for _, lines in sorted(bins.items()):
-            mean_age = float(np.mean([line.age for line in lines]))
-            points.append((mean_age, effect(lines)))
-        return points
-
-    def reach(self) -> float | None:
-        """How far back what matters lies: mean age of the entries, weighted by their change; None
-        without entries.
-        """
-        weights = np.array([entry.change for entry in self.entries])
-        if weights.sum() <= 0:
-            return None
-        return float(np.average([entry.age for entry in self.entries], weights=weights))
-
-    def from_video(self) -> float | None:
-        """The share of all entries' changes that those of the conditioning video make; None without
-        entries.
-        """
-        total = sum(entry.change for entry in self.entries)
-        if total <= 0:
-            return None
-        return sum(entry.change for entry in self.entries if entry.video) / total
-
-    def matters_most(self) -> dict[str, list[EntryLine]]:
-        """For each task the step at which a single entry mattered most: all entries of
-        that step.
-        """
-        strongest: dict[str, float] = {}
-        entries: dict[str, list[EntryLine]] = {}
-        moments = _grouped(self.entries, lambda entry: (entry.task, entry.recording, entry.step))
-        for (task, *_), lines in moments.items():
-            change = max(line.change for line in lines)
-            if task not in strongest or change > strongest[task]:
-                strongest[task] = change
-                entries[task] = lines
-        return entries
-
-
-def _grouped[K, L](lines: Iterable[L], key: Callable[[L], K]) -> dict[K, list[L]]:
-    groups: dict[K, list[L]] = {}
-    for line in lines:
-        groups.setdefault(key(line), []).append(line)
-    return groups
+REACH = ("reach", "mean age of the entries, weighted by how much the actions change without them")
+FROM_VIDEO = ("from the video", "share of those changes that entries of the video make")
+COLUMNS = (
+    ("change", "distance of two chunks of actions that start from the same noise, with and without"
+     " the intervention, root mean square (1 is half of what the training data span)"),
+    ("own spread", "distance of two chunks that differ in noise alone: what a change is compared"
+     " with"),
+    ("times", "change / own spread"),
+    ("above", "share of the decisions at which the change exceeds the own spread"),
+    ("age", "mean age in frames of the entries that the intervention changes"),
+    ("energy", "energy distance of the two distributions of chunks, 0 where they are one"),
+)  # fmt: skip
+"""What the columns of the table of arms mean."""
 
 
 def show(effect_of: Effect | None) -> str:
@@ -164,52 +62,78 @@ def show(effect_of: Effect | None) -> str:
     return text
 
 
-def arms_table(findings: Findings) -> Table:
-    """Every arm over all steps."""
+def arms_table(findings: Findings, meanings: Mapping[str, str] | None = None) -> Table:
+    """Every arm over all decisions. meanings: what each does, for a column of its own."""
     rows = []
     for name, effect_of in findings.arms().items():
         lines = [line for line in findings.moments if line.arm == name]
         ages = [age for line in lines for age in line.touched]
-        touched = f"{np.mean(ages):.0f}" if ages else "–"
-        times = "–" if effect_of.times is None else f"{effect_of.times:.1f}×"
-        rows.append(
-            [
-                name,
-                str(effect_of.moments),
-                touched,
-                f"{effect_of.change:.3f}",
-                f"{effect_of.spread:.3f}",
-                times,
-                f"{100 * effect_of.beyond:.0f} %",
-                f"{effect_of.distance:.3f}",
-            ]
-        )
-    columns = (
-        "arm",
-        "moments",
-        "age touched",
-        "change",
-        "own spread",
-        "times that",
-        "beyond it",
-        "energy distance",
-    )
-    return Table("What each intervention does to the chunk", columns, rows)
+        row = [name]
+        if meanings is not None:
+            row.append(meanings.get(name, ""))
+        row += [
+            f"{effect_of.change:.3f}",
+            f"{effect_of.spread:.3f}",
+            "–" if effect_of.times is None else f"{effect_of.times:.1f}×",
+            f"{100 * effect_of.beyond:.0f} %",
+            f"{np.mean(ages):.0f}" if ages else "–",
+            f"{effect_of.distance:.3f}",
+        ]
+        rows.append(row)
+    columns = ["arm", *(name for name, _ in COLUMNS)]
+    if meanings is not None:
+        columns.insert(1, "what it does")
+    return Table("What each intervention does to the actions", columns, rows)
 
 
-def phases_table(findings: Findings) -> Table:
-    """Every arm by task and sub-task."""
-    groups = _grouped(findings.moments, lambda line: (line.arm, line.task, line.phase))
-    phases = sorted({(task, phase) for _, task, phase in groups})
-    named = [f"{task or 'task'} · {phase + 1}" for task, phase in phases]
+def phases_table(findings: Findings) -> Table | None:
+    """Every arm by task and sub-task; None where all decisions are of one."""
+    groups = grouped(findings.moments, lambda line: (line.task, line.phase))
+    if len(groups) < 2:
+        return None
+    arms = list(findings.arms())
     rows = []
-    for name in findings.arms():
+    for (task, phase), lines in sorted(groups.items()):
+        by_arm = grouped(lines, lambda line: line.arm)
         cells = []
-        for task, phase in phases:
-            lines = groups.get((name, task, phase))
-            cells.append(show(effect(lines) if lines else None))
-        rows.append([name, *cells])
-    return Table("By task and sub-task", ("arm", *named), rows)
+        for arm in arms:
+            effect_of = effect(by_arm[arm]) if arm in by_arm else None
+            if effect_of is None:
+                cells.append("–")
+            elif effect_of.times is None:
+                cells.append(f"{effect_of.change:.3f}")
+            else:
+                cells.append(f"{effect_of.times:.1f}×")
+        rows.append([phase_name(task, phase, lines), *cells])
+    return Table("By task and sub-task", ("task and sub-task", *arms), rows)
+
+
+def phase_name(task: str, phase: int, lines: Sequence[MomentLine]) -> str:
+    """The name of a sub-task: its number, and the words that its texts share."""
+    name = f"{phase + 1}"
+    if task:
+        name = f"{task} {name}"
+    texts = sorted({line.subgoal for line in lines if line.subgoal})
+    if not texts:
+        return name
+    words = [text.split() for text in texts]
+    if len({len(of_one) for of_one in words}) > 1:
+        return f"{name}: {texts[0]}" if len(texts) == 1 else f"{name}: {_common_start(words)}"
+    shared: list[str] = []
+    for column in zip(*words, strict=True):
+        word = column[0] if len(set(column)) == 1 else "…"
+        if word != "…" or shared[-1:] != ["…"]:
+            shared.append(word)
+    return f"{name}: {' '.join(shared)}"
+
+
+def _common_start(texts: Sequence[Sequence[str]]) -> str:
+    shared = []
+    for column in zip(*texts, strict=False):
+        if len(set(column)) > 1:
+            break
+        shared.append(column[0])
+    return " ".join([*shared, "…"])
 
 
 def checkpoints_table(findings: dict[str, Findings]) -> Table:
@@ -229,37 +153,128 @@ def checkpoints_table(findings: dict[str, Findings]) -> Table:
     )
 
 
-_ON = {
-    "distract": "episodes before one's own",
-    "delay": "frames that the clock runs ahead",
-    "pause": "still frames",
-    "recent": "frames that may be remembered",
-    "drop": "entries taken away",
+def measures_table(findings: Findings, explained: bool = False) -> Table:
+    """The measures of one checkpoint, a row each, without those that were not probed. explained:
+    with a column that says what each measures.
+    """
+    arms = findings.arms()
+    rows = []
+    for measure, (arm, question) in MEASURES.items():
+        if arm in arms:
+            rows.append([measure, question, arm, show(arms[arm])])
+    reach, video = findings.reach(), findings.from_video()
+    if reach is not None:
+        rows.append([*REACH, "each entry removed", f"{reach:.0f} frames"])
+    if video is not None:
+        rows.append([*FROM_VIDEO, "each entry removed", f"{100 * video:.0f} %"])
+    columns = ["measure", "what is measured", "intervention", "change"]
+    if not explained:
+        del columns[1]
+        rows = [[row[0], *row[2:]] for row in rows]
+    return Table("In short", columns, rows)
+
+
+def loop_table(comparisons: Sequence[Comparison], meanings: Mapping[str, str] | None) -> Table:
+    """Every arm in closed loop beside the unprobed run. meanings: as for `arms_table`."""
+    rows = []
+    for c in comparisons:
+        episodes = c.episodes
+        significant = "no"
+        if c.significant:
+            significant = "yes"
+        elif not c.testable:
+            significant = "too few episodes"
+        row = [c.first]
+        if meanings is not None:
+            row.append(meanings.get(c.first, ""))
+        row += [
+            f"{round(c.first_solved, 1):g} of {episodes}",
+            f"{round(c.second_solved, 1):g} of {episodes}",
+            f"{c.difference:+.0f}",
+            f"[{c.interval.low:+.0f}, {c.interval.high:+.0f}]",
+            c.better_worse,
+            show_p(c.corrected),
+            significant,
+        ]
+        rows.append(row)
+    columns = [name for name, _ in LOOP_COLUMNS]
+    if meanings is not None:
+        columns.insert(1, "what it does")
+    return Table("In closed loop", columns, rows)
+
+
+LOOP_COLUMNS = (
+    ("arm", "the same scenes and the same noise as the unprobed run"),
+    ("solved", "scenes solved under the arm"),
+    (UNPROBED.name, "of these, scenes that the policy solves as it is"),
+    ("difference", "of the success rates, in percentage points"),
+    ("95 %", "interval of the difference"),
+    ("gained : lost", "scenes that only the arm solves, and only the unprobed run"),
+    ("p", "exact sign test on those, corrected by Holm for the number of arms"),
+    ("significant", "whether p is below 0.05"),
+)
+"""What the columns of the table of the closed loop mean."""
+
+
+@dataclass(frozen=True)
+class Dial:
+    """How a curve over an intervention's number is called. neutral: whether 0 changes nothing."""
+
+    title: str
+    axis: str
+    neutral: bool = True
+
+
+_DIALS = {
+    "distract": Dial("More other episodes first", "episodes that are seen first"),
+    "delay": Dial("Entries seem later and later", "frames that entries seem later"),
+    "pause": Dial("Longer pauses", "still frames"),
+    "recent": Dial("A longer or shorter past", "frames that may be remembered", False),
+    "drop": Dial("More entries removed", "entries removed"),
 }
 
 
 def effects(findings: Findings) -> str:
-    """A bar an arm: the mean change of the chunk; the line is the policy's own spread."""
+    """A bar an arm: the mean change of the chunk. A dot: one recorded episode. The line is the
+    policy's own spread.
+    """
     arms = findings.arms()
-    with figure((10.4, 3.4)) as (canvas, (axes,)):
-        axes.bar(
-            range(len(arms)),
-            [arm_effect.change for arm_effect in arms.values()],
-            0.7,
-            color=COLOURS[0],
-        )
-        ends = [(i - 0.42, i + 0.42) for i in range(len(arms))]
-        axes.hlines(
-            [arm_effect.spread for arm_effect in arms.values()],
-            *zip(*ends, strict=True),
+    places = np.arange(len(arms))[::-1]
+    with figure((5.8, 1.3 + 0.3 * len(arms))) as (canvas, (axes,)):
+        axes.barh(places, [arm.change for arm in arms.values()], 0.62, color=COLOURS[0])
+        label = "one recorded episode"
+        for place, (name, arm) in zip(places, arms.items(), strict=True):
+            lines = [line for line in findings.moments if line.arm == name]
+            values = [episode.change for episode in by_recording(lines)]
+            axes.plot(
+                values, [place] * len(values), "o", color=INK, ms=3.5, alpha=0.6, lw=0, label=label
+            )
+            label = ""
+            if arm.times is not None:
+                right = max([arm.change, arm.spread, *values])
+                axes.annotate(
+                    f"{arm.times:.1f}×",
+                    (right, place),
+                    xytext=(7, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=9,
+                )
+        axes.vlines(
+            [arm.spread for arm in arms.values()],
+            places - 0.42,
+            places + 0.42,
             color=COLOURS[1],
             lw=2,
             label="the policy's own spread",
         )
-        axes.set_xticks(
-            range(len(arms)), list(arms), rotation=25, ha="right", rotation_mode="anchor"
-        )
-        axes.set_ylabel("change of the chunk")
+        axes.set_yticks(places, list(arms))
+        axes.tick_params(axis="y", length=0)
+        axes.grid(False, axis="y")
+        axes.grid(True, axis="x")
+        axes.set_xlim(left=0)
+        axes.margins(x=0.12)
+        axes.set_xlabel("change of the actions (normalised)")
         legend(canvas, axes, 3)
         return svg(canvas)
 
@@ -284,38 +299,61 @@ def decay(findings: Findings) -> str:
         stds = [entry.spread for entry in findings.entries]
         if stds:
             axes.axhline(sum(stds) / len(stds), color=FAINT, lw=1, ls="--", label="own spread")
+        axes.set_ylim(bottom=0)
         axes.set_xlabel("age of the entry (frames)")
         axes.set_ylabel("change without it")
         legend(canvas, axes, 3)
         return svg(canvas)
 
 
-def dials(findings: Findings) -> dict[str, str]:
-    """A curve for each intervention of which several places of the dial were probed."""
-    figures = {}
+def dials(findings: Findings) -> list[Section]:
+    """A curve for each intervention of which several places of the dial were probed: the mean, and
+    a dot a recorded episode.
+    """
+    sections = []
     for name, points in findings.families().items():
+        dial = _DIALS.get(name, Dial(f"More of {name}", name, False))
         with figure((5.6, 3.0)) as (canvas, (axes,)):
-            axes.plot(
-                [0, *(x for x, _ in points)],
-                [0, *(f.change for _, f in points)],
-                "-o",
-                color=COLOURS[0],
-                ms=5,
-            )
-            axes.axhline(points[0][1].spread, color=COLOURS[1], lw=1, ls="--")
-            axes.set_xlabel(_ON.get(name, name))
-            axes.set_ylabel("change of the chunk")
-            axes.tick_params(colors=INK)
-            figures[name] = svg(canvas)
-    return figures
+            _plot_dial(axes, findings, name, points, dial)
+            svg_text = svg(canvas)
+        caption = "A dot: one recorded episode. Dashed: the policy's own spread."
+        sections.append(Section(dial.title, svg_text, caption=caption))
+    return sections
+
+
+def _plot_dial(
+    axes: "Axes",
+    findings: Findings,
+    name: str,
+    points: Sequence[tuple[float, Effect]],
+    dial: Dial,
+) -> None:
+    for place, _ in points:
+        lines = [
+            line
+            for line in findings.moments
+            if line.dial == place and line.arm.partition(":")[0] == name
+        ]
+        values = [episode.change for episode in by_recording(lines)]
+        axes.plot([place] * len(values), values, "o", color=INK, ms=3, alpha=0.5, lw=0)
+    places = [place for place, _ in points]
+    means = [effect_of.change for _, effect_of in points]
+    if dial.neutral:
+        places = [0, *places]
+        means = [0, *means]
+    axes.plot(places, means, "-o", color=COLOURS[0], ms=5)
+    axes.axhline(points[0][1].spread, color=COLOURS[1], lw=1, ls="--")
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel(dial.axis)
+    axes.set_ylabel("change of the actions")
 
 
 PAGE, TABLE, IMAGES = "page.html", "table.md", "remembered"
-VIDEO, EXECUTION, NOW = (122, 162, 205), (233, 148, 62), (200, 40, 40)
+VIDEO, EXECUTION, NOW = rgb("video"), rgb("series-1"), rgb("border")
 UNITS = (
-    "Change: root mean square distance of two chunks of the same noise, in normalised actions (1 is"
-    " half of what the training data span). In brackets: how many times what chunks differ by that"
-    " differ in noise alone."
+    "Change: distance of two chunks of actions that start from the same noise, in normalised"
+    " actions (one is half of what the training data span). In brackets: how many times the"
+    " distance of two chunks that differ in noise alone."
 )
 
 
@@ -377,43 +415,77 @@ def write_images(findings: Findings, recordings: Sequence[Recording], folder: Pa
     return paths
 
 
+@dataclass(frozen=True)
+class Notes:
+    """What a reader has to know beside the figures.
+
+    warnings: sentences on what was run. left_out: why some of the default arms are not there.
+    """
+
+    warnings: Sequence[str] = ()
+    left_out: Sequence[str] = ()
+
+
 def write_page(
     folder: Path,
     name: str,
+    checkpoint: int | str,
     findings: Findings,
     comparisons: Sequence[Comparison] = (),
-    notes: Sequence[str] = (),
+    notes: Notes = Notes(),
 ) -> Path:
-    """Write `page.html` and `table.md` into the probe's folder."""
-    sections, tables = [], []
+    """Write `page.html` and `table.md` into the probe's folder.
+
+    comparisons: of each arm, as `first`, with the unprobed run.
+    """
+    lead = conclude(findings, comparisons)
+    meanings = meanings_of([*findings.arms(), *(c.first for c in comparisons)])
+    sections: list[Section] = []
+    tables: list[Table] = []
+    sizes = [f"checkpoint {checkpoint}"]
     if findings.moments:
-        tables = [checkpoints_table({name: findings}), arms_table(findings), phases_table(findings)]
-        sections.append(Section("In short", tables=tables[:1], caption=UNITS))
-        sections.append(Section("Interventions", effects(findings)))
-        curves = []
-        if findings.entries:
-            caption = "Each entry left out by itself."
-            curves.append(Section("Decay with distance", decay(findings), caption=caption))
-        for dial, curve in dials(findings).items():
-            caption = "Dashed: the policy's own spread."
-            curves.append(Section(f"Over the dial: {dial}", curve, caption=caption))
-        in_pairs = len(curves) - len(curves) % 2
-        sections += [replace(curve, half=True) for curve in curves[:in_pairs]]
-        sections += curves[in_pairs:]
-        sections += [Section(table.title, tables=[table]) for table in tables[1:]]
+        sizes.append(findings.size)
+        if findings.changed:
+            sections += _offline_sections(findings, meanings)
+            tables += [measures_table(findings), arms_table(findings)]
+            by_phase = phases_table(findings)
+            tables += [] if by_phase is None else [by_phase]
+        else:
+            # What changes nothing has no figure: its numbers are there for who wants them.
+            table = arms_table(findings, meanings)
+            folded = [(f"The {counted(len(table.rows), 'intervention')} in numbers", table)]
+            sections.append(Section("On recorded episodes", folded=folded, terms=COLUMNS))
     images = [(path.stem, _encoded(path)) for path in sorted((folder / IMAGES).glob("*.png"))]
-    if images:
+    if images and findings.changed:
         caption = "The step of each task at which a single entry mattered most."
         sections.append(Section("What was remembered", images=images, caption=caption))
-    verdicts = [comparison.verdict for comparison in comparisons]
     if comparisons:
-        tables.append(comparison_table(comparisons))
-        sections.append(
-            Section("In closed loop", tables=tables[-1:], caption="; ".join(verdicts) + ".")
-        )
-    page = html_page(f"What {name} {MARK}", sections, notes=notes)
+        episodes = max(comparison.episodes for comparison in comparisons)
+        sizes.append(f"{counted(episodes, 'scene')} in closed loop")
+        table = loop_table(comparisons, meanings)
+        section = Section("In closed loop", tables=[table], terms=LOOP_COLUMNS)
+        if not any(comparison.wins or comparison.losses for comparison in comparisons):
+            folded = [(f"{counted(len(table.rows), 'arm')}, all with equal outcomes", table)]
+            section = Section("In closed loop", folded=folded, terms=LOOP_COLUMNS)
+        else:
+            tables.append(loop_table(comparisons, None))
+        sections.append(section)
+    page = html_page(
+        f"What {name} {MARK}",
+        sections,
+        " · ".join(sizes),
+        notes=notes.warnings,
+        lead=lead,
+        footnotes=notes.left_out,
+    )
     text = render(
-        "probe.md", name=name, tables=map(to_markdown, tables), verdicts=verdicts, notes=notes
+        "probe.md",
+        name=name,
+        sizes=" · ".join(sizes),
+        lead=lead,
+        tables=map(to_markdown, tables),
+        terms=_terms_of(tables, meanings),
+        notes=[*notes.warnings, *notes.left_out],
     )
     for file, content in ((PAGE, page), (TABLE, text)):
         with write_atomically(folder / file) as draft:
@@ -421,9 +493,47 @@ def write_page(
     return folder / PAGE
 
 
+def _terms_of(tables: Sequence[Table], meanings: Mapping[str, str]) -> list[tuple[str, str]]:
+    """The measures and arms that some tables have a row of, and what they mean."""
+    questions = {name: question for name, (_, question) in MEASURES.items()}
+    known = {**questions, **dict([REACH, FROM_VIDEO]), **meanings}
+    names: dict[str, None] = {}
+    for table in tables:
+        if table.columns[0] in ("arm", "measure"):
+            names |= dict.fromkeys(row[0] for row in table.rows)
+    return [(name, known[name]) for name in names if known.get(name)]
+
+
+def _offline_sections(findings: Findings, meanings: Mapping[str, str]) -> list[Section]:
+    """The sections on recorded episodes, the short one first."""
+    measures = measures_table(findings, explained=True)
+    sections = []
+    if measures.rows:
+        sections.append(Section("In short", tables=[measures], caption=UNITS))
+    caption = "A bar is the mean over all decisions, a dot that of one recorded episode."
+    sections.append(Section("What each intervention changes", effects(findings), caption=caption))
+    curves = []
+    if findings.entries:
+        caption = "Each entry left out by itself: dots single entries, lines means."
+        curves.append(Section("At what age an entry matters", decay(findings), caption=caption))
+    curves += dials(findings)
+    in_pairs = len(curves) - len(curves) % 2
+    sections += [replace(curve, half=True) for curve in curves[:in_pairs]]
+    sections += curves[in_pairs:]
+    table = arms_table(findings, meanings)
+    sections.append(Section(table.title, tables=[table], terms=COLUMNS))
+    by_phase = phases_table(findings)
+    if by_phase is not None:
+        caption = "How many times the policy's own spread the actions change by."
+        sections.append(Section(by_phase.title, tables=[by_phase], caption=caption))
+    return sections
+
+
 def table_of(findings: Mapping[str, Findings]) -> str:
-    """Several checkpoints beside each other, in Markdown."""
-    return to_markdown(checkpoints_table(dict(findings)))
+    """Several checkpoints beside each other, in Markdown, and what the columns mean."""
+    measures = ((name, question) for name, (_, question) in MEASURES.items())
+    terms = [f"- {name}: {meaning}" for name, meaning in (*measures, REACH, FROM_VIDEO)]
+    return "\n".join([to_markdown(checkpoints_table(dict(findings))), *terms, "", UNITS])
 
 
 def _encoded(path: Path) -> str:

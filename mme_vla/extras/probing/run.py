@@ -2,6 +2,7 @@
 resumes.
 """
 
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
@@ -14,9 +15,9 @@ from mme_vla.data.sources import open_sources
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, printable, require
 from mme_vla.evaluation.api import load
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.records import ARM, EpisodeRecord, display_name
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.events import idle_events
@@ -36,10 +37,11 @@ from mme_vla.evaluation.store import RUN_FILE, claim_run, find_records, fingerpr
 from mme_vla.extras.probing import lines
 from mme_vla.extras.probing.arms import UNPROBED, Arm, choose_arms, options_of, slug
 from mme_vla.extras.probing.channels import channel_of
+from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.offline import OfflineSettings, probe_offline
 from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.extras.probing.recordings import Recording, all_recordings
-from mme_vla.extras.probing.report import Findings, check_outputs, write_images, write_page
+from mme_vla.extras.probing.report import Notes, check_outputs, write_images, write_page
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
 
@@ -94,32 +96,43 @@ def run_probe(
     """Run the parts of the plan that the folder lacks, and write the page."""
     check_outputs(folder, claimed=(folder / OFFLINE / RUN_FILE).is_file())
     channel = channel_of(policy)
-    notes: list[str] = []
+    left_out: list[str] = []
     if plan.recordings:
         has_boundaries = all(recording.tells_subtasks for recording in plan.recordings)
         donor_names = {recording.name for recording in plan.lend}
         n_donors = len(donor_names)
         if any(recording.name in donor_names for recording in plan.recordings):
             n_donors -= 1  # never the probed one
-        arms, notes = choose_arms(plan.arms, policy, channel, n_donors, boundaries=has_boundaries)
+        n_goals = len({recording.goal for recording in plan.lend})
+        arms, left_out = choose_arms(
+            plan.arms, policy, channel, n_donors, boundaries=has_boundaries, n_goals=n_goals
+        )
+        require(
+            policy.info.resamples,
+            "A served policy is probed in closed loop alone, because a server chooses a chunk once:"
+            " set offline=false online=true. Recordings are what contents are taken from.",
+        )
+        in_loop = [arm.name for arm in arms if arm.in_closed_loop]
+        if in_loop:
+            require(plan.jobs, f"with={in_loop[0]} acts in closed loop: set online=true.")
+            left_out.append(
+                f"On recordings {', '.join(in_loop)} were left out: they act in episodes."
+            )
+        arms = [arm for arm in arms if not arm.in_closed_loop]
         _on_recordings(policy, arms, plan, folder / OFFLINE, facts, options)
     if plan.jobs:
         has_boundaries = options.base is make_env and settings.env == "mme_vla"
-        arms, left_out = choose_arms(
-            plan.arms, policy, channel, len(plan.lend), boundaries=has_boundaries
+        n_goals = len({recording.goal for recording in plan.lend})
+        arms, not_in_loop = choose_arms(
+            plan.arms,
+            policy,
+            channel,
+            len(plan.lend),
+            boundaries=has_boundaries,
+            n_goals=n_goals,
         )
-        notes += [f"In closed loop {note}" for note in left_out if note not in notes]
-        donors = DonorEpisodes(policy, channel, plan.lend) if plan.lend else None
-        # The unprobed run, with its events; then every arm on the same scenes.
-        output = folder / ONLINE / slug(UNPROBED.name)
-        arm_options = replace(options, notes={"arm": UNPROBED.name})
-        evaluate_events(policy, plan.jobs, output, facts, settings, plan.events, arm_options)
-        for arm in arms:
-            probed = ProbedPolicy(policy, arm, plan.lend, donors).eval()
-            output = folder / ONLINE / slug(arm.name)
-            named_facts = replace(facts, model=named(facts.model, arm))
-            arm_options = replace(options, notes={"arm": arm.name}, show_forecast=False)
-            evaluate(probed, plan.jobs, output, named_facts, settings, arm_options)
+        left_out += [f"In closed loop {note}" for note in not_in_loop if note not in left_out]
+        _in_closed_loop(policy, arms, plan, folder / ONLINE, facts, settings, options)
 
     # The page on all that the folder holds.
     findings = Findings.of(lines.read_all(folder / OFFLINE))
@@ -127,12 +140,45 @@ def run_probe(
     if (folder / ONLINE).is_dir():
         records = read_folders(find_records([folder / ONLINE]))
     comparisons = _paired(records, facts.split, facts.model)
-    notes += idle_events(records)
+    warnings = idle_events(records)
     for comparison in comparisons:
-        notes += comparison.gaps
+        warnings += comparison.gaps
     write_images(findings, plan.recordings, folder)
-    page = write_page(folder, facts.model, findings, comparisons, notes)
-    return Probe(findings, comparisons, notes, page)
+    name = display_name(facts.model, facts.checkpoint)
+    notes = Notes(warnings, left_out)
+    page = write_page(folder, name, facts.checkpoint, findings, comparisons, notes)
+    return Probe(findings, comparisons, [*left_out, *warnings], page)
+
+
+def _in_closed_loop(
+    policy: Policy,
+    arms: Sequence[Arm],
+    plan: ProbePlan,
+    folder: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    options: RunOptions,
+) -> None:
+    """Run the unprobed policy, with its events, then every arm on the same scenes."""
+    channel = channel_of(policy)
+    donors = DonorEpisodes(policy, channel, plan.lend) if plan.lend else None
+    for number, arm in enumerate([UNPROBED, *arms], start=1):
+        if options.show_progress:
+            heading = f"arm {number} of {len(arms) + 1} · {arm.name}: {arm.meaning}"
+            print(printable(heading), file=sys.stderr)
+        output = folder / slug(arm.name)
+        arm_options = replace(
+            options,
+            notes={"arm": arm.name},
+            show_forecast=arm is UNPROBED,
+            name=f"{display_name(facts.model, facts.checkpoint)}{ARM}{arm.name}",
+        )
+        if arm is UNPROBED:
+            evaluate_events(policy, plan.jobs, output, facts, settings, plan.events, arm_options)
+        else:
+            probed = ProbedPolicy(policy, arm, plan.lend, donors).eval()
+            arm_facts = replace(facts, model=named(facts.model, arm))
+            evaluate(probed, plan.jobs, output, arm_facts, settings, arm_options)
 
 
 def _on_recordings(
@@ -254,21 +300,27 @@ def probe(
 
 def named(model: str, arm: Arm) -> str:
     """What records call a model under an arm; unprobed it keeps its name."""
-    return model if arm is UNPROBED else f"{model} · {arm.name}"
+    return model if arm is UNPROBED else f"{model}{ARM}{arm.name}"
 
 
 def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Comparison]:
     """Each arm against the unprobed run, over the episodes that both have, corrected for their
-    number.
+    number. They are called by the arm alone.
 
     model: the unprobed one's name.
     """
-    tasks = tuple(dict.fromkeys(record.task for record in records))
-    if not tasks:
+    if not records:
         return []
-    protocol = Protocol(tasks, episodes=1 + max(record.episode for record in records))
+    protocol = Protocol.of_records(records)
     methods = aggregate(records, protocol, split).methods
     unprobed = [method for method in methods if method.model == model and method.event is None]
+    for method in methods:
+        if method in unprobed[:1]:
+            method.label = UNPROBED.name
+        elif method.event is not None:
+            method.label = f"event {method.event}"
+        else:
+            method.label = method.model.removeprefix(f"{model}{ARM}")
     pairs = []
     for baseline in unprobed[:1]:
         for method in methods:

@@ -159,7 +159,7 @@ def rollouts(
     make = partial(
         make_rollout_env,
         base=partial(base, **options),
-        max_steps=run_settings.max_steps,
+        max_steps=run_settings.limit_of,
         robot=policy.embodiment,
         oracle=oracle,
     )

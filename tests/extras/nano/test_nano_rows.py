@@ -20,7 +20,7 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.extras.nano import demonstrations, tokens
 from mme_vla.extras.nano.demonstrations import Demonstration, Scene
 from mme_vla.extras.nano.learning import Decisions, position_error, statistics
-from mme_vla.extras.nano.page import write_page
+from mme_vla.extras.nano.page import ends_of, outcome_lines, plot_curves, write_page
 from mme_vla.extras.nano.rows import TRAINED
 from mme_vla.extras.nano.runs import Group, demonstrate
 from mme_vla.extras.nano.settings import NanoRun
@@ -264,7 +264,7 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
     }  # fmt: skip
     folders = {model: [tmp_path / model] for model in runs if model != "planner"}
     page = write_page(
-        tmp_path, config, runs, "pi05", {"videos": 2.0}, [video], folders, 7
+        tmp_path, config, runs, "pi05", {"videos": 2.0, "planner": 0.0}, [video], folders, 7
     ).read_text()
     assert (
         "| framesamp_modul | 4 | 60 % (60/100) | 50 … 69 % | 60/100 |  |  | 2.0 cm | 67 % |" in page
@@ -275,6 +275,21 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
         and "ttt_modul@4 − pi05" in page
         and "videos/a.mp4" in page
     )
-    assert "framesamp_modul@4 is significantly better than pi05 (p < 0.001)" in page
+    lead = (
+        "**framesamp_modul@4 60 of 100 against pi05 5 of 100: framesamp_modul@4 is significantly"
+        " better (p < 0.001).**"
+    )
+    assert page.splitlines()[2] == lead, "what was found comes first"
     assert page.count("Incomplete") == 1 and "7 demonstrations" in page
+    assert "| planner | 0.0 |" not in page, "a stage that did not run has no row"
     assert "| videos | 2.0 |" in page and (tmp_path / "learning.png").is_file()
+    lines = outcome_lines(runs, ends_of(folders))
+    assert lines[0] == (
+        "framesamp_modul: off by 2.0 cm on held-out decisions, 60 of 100 episodes solved"
+    )
+    assert lines[-1] == "planner: 100 of 100 episodes solved"
+
+
+def test_a_run_without_held_out_losses_has_no_learning_curve(tmp_path):
+    assert not plot_curves({"pi05": [{"step": 10, "loss": 0.5}]}, tmp_path / "learning.png")
+    assert not (tmp_path / "learning.png").exists()

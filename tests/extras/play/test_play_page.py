@@ -252,10 +252,12 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
         assert browser.text("#do").startswith("Do it")
         # the video has played to its end
         browser.wait("document.querySelector('#badge').innerText === 'Present'")
+        assert browser.text("#hint") == "Choose the next action.", "the clip is over"
 
         # Scrub back into the video, and see that a point is only taken in the present image.
         browser.press("ArrowLeft", shift=True)
         browser.wait("document.querySelector('#frame').classList.contains('video')")
+        assert browser.text("#hint") == "Watch the clip, then choose."
         browser.click('.option[data-label="a"]')
         browser.wait("document.querySelector('#badge').innerText === 'Present'")
         assert browser.run("document.querySelector('#do').disabled")

@@ -14,12 +14,12 @@ from helpers.rollout_fakes import quick_policy
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.extras.probing.channels import channel_of
+from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.interventions import NoDemo
 from mme_vla.extras.probing.lines import EntryLine, MomentLine, append, read
 from mme_vla.extras.probing.offline import compare_chunks
 from mme_vla.extras.probing.probed import ProbedPolicy
-from mme_vla.extras.probing.report import Findings
-from mme_vla.memory.perturbation import Pause
+from mme_vla.memory.perturbation import Pause, Perturbation
 
 NEURAL_ARMS = [
     "drop:all",
@@ -94,7 +94,12 @@ def test_interventions_on_entries_are_refused_where_there_are_none() -> None:
         choose_arms(["shuffle"], policy, channel_of(policy), 3, boundaries=True)
     arms, notes = choose_arms(None, policy, channel_of(policy), 3, boundaries=True)
     assert [arm.name for arm in arms] == ["nodemo", "pause", "distract:1", "distract:3"]
-    assert "shuffle was left out: it needs something remembered that the probe can reach." in notes
+    assert notes == [
+        "drop:all, swap, shuffle were left out: they need something remembered that the probe can"
+        " reach.",
+        "recent, oracle were left out: they need a memory that chooses among stored frames.",
+        "delay:16, delay:64, delay:256 were left out: they need entries that have a time.",
+    ], "a reason once, and none for the subgoals that this policy cannot read"
     with pytest.raises(UserError, match="3 recorded episodes to take from, and there are 2"):
         choose_arms(["distract:3"], policy, channel_of(policy), 2, boundaries=True)
     with pytest.raises(UserError, match="recordings="):
@@ -118,6 +123,29 @@ def test_words_that_are_no_arms_are_reported(word: Any, message: str) -> None:
     with pytest.raises(UserError) as caught:
         read_arm(word)
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("word", "meaning"),
+    [
+        ("drop:all", "everything remembered is removed"),
+        ({"name": "drop", "which": "used"}, "1 entry removed: most used"),
+        ("delay:-8", "every entry seems to be 8 frames earlier than it was"),
+        ("nodemo+pause:8", "the video before the episode is not shown and time stands still for 8"),
+        ("distract:3", "3 other episodes first, as if part of this one"),
+    ],
+)
+def test_arms_say_in_plain_words_what_they_do(word: Any, meaning: str) -> None:
+    assert read_arm(word).meaning.startswith(meaning)
+
+
+def test_a_perturbation_without_plain_words_says_the_first_sentence_of_its_class() -> None:
+    class Occlude(Perturbation):
+        """The robot holds its pose,
+        and sees half. More of it.
+        """
+
+    assert Occlude().meaning == "The robot holds its pose, and sees half"
 
 
 def test_arms_compose_in_their_order(tmp_path: Path) -> None:

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.probe_fakes import JOBS, actions, made_up
+from helpers.probe_fakes import JOBS, actions, made_up, reader
 from helpers.rollout_fakes import FACTS, quick_policy, use_inline_envs
 from helpers.scripted_env import make_moving_env
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.evaluation import RunOptions, Shard
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.extras.probing.arms import read_arm
+from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.lines import LINES
 from mme_vla.extras.probing.offline import OfflineSettings
-from mme_vla.extras.probing.report import Findings, table_of
-from mme_vla.extras.probing.run import Probe, ProbePlan, named, probed_folder, run_probe
+from mme_vla.extras.probing.report import table_of
+from mme_vla.extras.probing.run import Probe, ProbePlan, probed_folder, run_probe
 
 SILENT = RunOptions(show_progress=False)
 
@@ -39,7 +39,7 @@ def test_images_on_demand_are_all_that_an_arm_reads(name: str, word: str) -> Non
         assert np.array_equal(few, every)
 
 
-def probe_both(folder: Path) -> Probe:
+def probe_both(folder: Path, show_progress: bool = False) -> Probe:
     policy = quick_policy("framesamp_modul").eval()
     recordings = made_up()
     offline = OfflineSettings(1, 2, 1, True, 2)
@@ -48,7 +48,7 @@ def probe_both(folder: Path) -> Probe:
         ["shuffle", "nodemo"], recordings[:1], recordings, JOBS, offline, events=events
     )
     settings = RolloutSettings(max_steps=24, flow_steps=2, workers=1, max_batch=1)
-    options = RunOptions(base=make_moving_env, show_progress=False)
+    options = RunOptions(base=make_moving_env, show_progress=show_progress)
     return run_probe(policy, request, folder, FACTS, settings, options)
 
 
@@ -57,22 +57,23 @@ def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(
 ) -> None:
     use_inline_envs(monkeypatch)
     findings = probe_both(tmp_path)
-    arms = {named("tiny", read_arm(w)) for w in ("shuffle", "nodemo")}
     assert {c.first for c in findings.comparisons} == {
-        *arms,
-        "tiny · pause:4",
-        "tiny · pause:4@step:99",
+        "shuffle",
+        "nodemo",
+        "event pause:4",
+        "event pause:4@step:99",
     }
-    assert all(c.second == "tiny" and c.episodes == 2 for c in findings.comparisons)
+    assert all(c.second == "unprobed" and c.episodes == 2 for c in findings.comparisons)
     assert findings.notes == [
         "event=pause:4@step:99 did not act in 2 episodes: its place never came."
     ]
     assert set(findings.findings.arms()) == {"shuffle", "nodemo"}
     page = findings.page.read_text()
     for words in (
-        "Decay with distance",
+        "At what age an entry matters",
         "In closed loop",
-        "tiny · shuffle",
+        "what is remembered changes places",
+        "1 decision of 1 recorded episode",
         "data:image/webp;base64,",
     ):
         assert words in page
@@ -85,6 +86,36 @@ def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(
     assert "| tiny |" in table_of({"tiny": probed_folder(tmp_path)}) and isinstance(
         findings.findings, Findings
     )
+
+
+def test_each_arm_has_a_heading_and_its_name_in_every_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    use_inline_envs(monkeypatch)
+    probe_both(tmp_path, show_progress=True)
+    lines = capsys.readouterr().err.splitlines()
+    headings = [line for line in lines if line.startswith("arm ")]
+    assert headings == [
+        "arm 1 of 3 · unprobed: the policy as it is, which the other arms are compared with",
+        "arm 2 of 3 · shuffle: what is remembered changes places, the times stay",
+        "arm 3 of 3 · nodemo: the video before the episode is not shown",
+    ]
+    episodes = [line for line in lines if "VideoUnmask 0" in line]
+    names = ["tiny · unprobed", "tiny · pause:4", "tiny · pause:4@step:99"]
+    names += ["tiny · shuffle", "tiny · nodemo"]
+    assert [line.partition(": ")[0] for line in episodes] == names
+
+
+def test_a_policy_that_ignores_its_memory_gets_one_sentence(tmp_path: Path) -> None:
+    recordings = made_up()
+    plan = ProbePlan(None, recordings, recordings, (), OfflineSettings(1, 2, 2, True, 2))
+    probe = run_probe(reader(None), plan, tmp_path, FACTS, RolloutSettings(), SILENT)
+    text = (tmp_path / "table.md").read_text()
+    assert "None of the 11 interventions changes the actions" in text
+    assert "|" not in text, "no table of zeros"
+    page = probe.page.read_text()
+    assert "<summary>The 11 interventions in numbers</summary>" in page
+    assert "<svg" not in page and "subgoal" not in page
 
 
 def test_shards_of_a_probe_meet_in_one_page(tmp_path: Path) -> None:

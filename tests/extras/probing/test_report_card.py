@@ -29,6 +29,7 @@ from mme_vla.extras.probing.card import (
     Recovery,
     card_text,
     clock_scores,
+    conclude_card,
     grade,
     outcomes_of,
     recovery,
@@ -174,6 +175,25 @@ def test_a_policy_that_reads_time_scores_one_and_one_that_reads_content_zero(
         f"{score:.2f}" in card_text(card)
         and "memory-or-clock" in (tmp_path / "card.html").read_text()
     )
+
+
+def test_a_card_says_first_what_it_shows_or_that_it_is_too_little(tmp_path: Path) -> None:
+    matched = scenes([1] * 12)
+    clock = grade(matched, {TIME: scenes([0] * 12), CONTENT: matched}, matched)
+    assert conclude_card(clock).startswith(
+        "This policy solves 100 % of 12 scenes, time-shifted entries cost 100 points and"
+        " content-swapped entries cost 0 points: its memory serves mostly as a clock"
+    )
+    content = grade(matched, {TIME: matched, CONTENT: scenes([0] * 12)}, matched)
+    assert "its memory serves mostly by its content" in conclude_card(content)
+    failed = scenes([0] * 3)
+    nothing = grade(failed, {TIME: failed, CONTENT: failed}, failed)
+    assert "too little to tell whether its memory is a clock" in conclude_card(nothing)
+    write_card(replace(nothing, model="other · name", checkpoint="nano"), tmp_path)
+    page = (tmp_path / "card.html").read_text()
+    assert "<h1>Report card of nano · name</h1>" in page
+    assert "every entry seems to be 64 frames later than it was" in page
+    assert 'class="note"' not in page, "what was left out is no warning"
 
 
 def scenes(values: list[int]) -> dict[EpisodeKey, float]:

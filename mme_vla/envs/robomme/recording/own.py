@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.console import progress, quiet_libraries
-from mme_vla.envs.base import Environment, EpisodeEnv
+from mme_vla.envs.base import Environment
 from mme_vla.envs.facts import FACTS, Fact, write_facts
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import UserError
@@ -91,7 +91,7 @@ def record_own(
 
 def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.ndarray] | None:
     """The columns of an episode [frames, …] and its `task`; None where it did not succeed."""
-    env = EpisodeEnv(environment, environment.make(spec), spec, environment.step_limit(spec.split))
+    env = environment.open(spec.task, spec.split, spec.episode)
     try:
         rows: list[dict[str, np.ndarray]] = []
         for observation, action, visible in env.demonstration():
@@ -129,5 +129,11 @@ def _create(row: dict[str, Any], root: Path, fps: int) -> Any:
             names = [f"{name.rpartition('.')[2]} {i}" for i in range(len(value))]
             features[name] = {"dtype": "float32", "shape": value.shape, "names": names}
     return LeRobotDataset.create(
-        f"local/{root.name}", fps=fps, features=features, root=root, use_videos=False
+        f"local/{root.name}",
+        fps=fps,
+        features=features,
+        root=root,
+        use_videos=False,
+        # LeRobot would try torchcodec, and print why it does not load where FFmpeg is missing.
+        video_backend="pyav",
     )

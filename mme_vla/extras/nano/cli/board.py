@@ -148,6 +148,8 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
     """Read the rows, print the board, and write it where a file is named. trained: folders beside
     those of `rows=`.
     """
+    from rich.console import Console
+
     from mme_vla.evaluation.results.tables import comparison_table, print_table
     from mme_vla.extras.nano import board_page
     from mme_vla.extras.nano.board import SAMPLES, Board
@@ -163,9 +165,10 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
         print(NO_PUBLISHED_ROWS)
     board = Board(rows, samples=args.samples or SAMPLES)
     pairs = comparison_table(board.neighbours())
+    console = Console()
     for table in (board_page.ranking(board, brief=True), board_page.targets(board), pairs):
         if table.rows:
-            print_table(table, 120)
+            print_table(table, console.width if console.is_terminal else 160)
     for line in [
         *board_page.notes(board),
         *board_page.separating(board),

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import log_to_terminal, run_configured
-from mme_vla.config.composition import command_trees, resolved
-from mme_vla.config.trees import library_files
+from mme_vla.config.composition import command_trees, compose, resolved
+from mme_vla.config.trees import library_files, library_trees, yaml_files
 
 ALL_TASKS = "nano16"
 """The file of configs/nano for a command that names no task."""
@@ -81,14 +81,19 @@ def _as_lists(words: Sequence[str]) -> list[str]:
 
 def command(cfg: DictConfig) -> None:
     """Record, train, evaluate and write the page; what exists is skipped."""
-    from mme_vla.envs.episodes import choose_tasks
-    from mme_vla.envs.make import check_names, require_simulator
-    from mme_vla.extras.nano.runs import run
     from mme_vla.extras.nano.settings import NanoRun
 
     nano = NanoRun.from_config(resolved(cfg))
+    trees = command_trees()[1:]
+    for model in nano.models:
+        if model not in yaml_files([*library_trees(), *trees], "model"):
+            compose("policy", [f"model={model}"], extra_dirs=trees)  # says what is near
     log_to_terminal(logging.getLogger("mme_vla.nano"))
+    from mme_vla.envs.episodes import choose_tasks
+    from mme_vla.envs.make import check_names, require_simulator
+    from mme_vla.extras.nano.runs import run
+
     for task in choose_tasks(nano.task):
         check_names(task, "waypoint", None, None)
     require_simulator()
-    run(nano, command_trees()[1:])
+    run(nano, trees)

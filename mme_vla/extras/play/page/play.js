@@ -130,7 +130,13 @@ function renderOptions() {
   $("do").disabled = !ready() || !chosen || (chosen.needs_point && !point);
   const pointing = ready() && chosen?.needs_point;
   $("frame").classList.toggle("pointing", Boolean(pointing));
-  $("hint").textContent = !ready() ? "" : !chosen ? "Watch the clip, then choose."
+  renderHint();
+}
+
+function renderHint() {
+  const pointing = ready() && chosen?.needs_point;
+  const seen = player.at === player.last;
+  $("hint").textContent = !ready() ? "" : !chosen ? (seen ? "Choose the next action." : "Watch the clip, then choose.")
     : pointing && !point ? "Click the object in the image (or move the point with the arrow keys)."
     : pointing ? `Point: row ${point[0]}, column ${point[1]}.` : "";
 }
@@ -173,6 +179,7 @@ function showFrame() {
   const inVideo = last >= 0 && at < (state.video ?? 0);
   $("frame").classList.toggle("video", inVideo);
   $("badge").textContent = last < 0 ? "" : inVideo ? "Conditioning video" : at === last ? "Present" : "Execution";
+  renderHint();
   const marker = $("marker");
   marker.hidden = !(chosen?.needs_point && point && at === last);
   if (point) {

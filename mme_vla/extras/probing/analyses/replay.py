@@ -13,7 +13,6 @@ from mme_vla.data.episodes import EpisodeSource, check_episode
 from mme_vla.data.memory_image import memory_sheet
 from mme_vla.data.statistics import compute_norm_stats, normalised_states
 from mme_vla.errors import UserError, require
-from mme_vla.evaluation.results.plots import COLOURS, FAINT, figure, svg
 from mme_vla.extras.probing.recordings import Recording
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import OnlineHistory
@@ -22,6 +21,7 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.prompt import SubgoalText
+from mme_vla.utils.style import COLOURS, FAINT, figure, svg
 
 STRIDE = 16  # Steps between two chunks, as an evaluation executes them
 

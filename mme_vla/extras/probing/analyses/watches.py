@@ -139,7 +139,7 @@ class AttentionWatch(Watch[AttentionMass]):
         of_attention = condition.attention if isinstance(condition, LayerModulation) else condition
         past: KeyValue | StaticKV | None = arguments["past"]
         if isinstance(past, StaticKV):
-            past = past.past(sum(segment.tokens.shape[1] for segment in segments))
+            past = past.past()
         keys: list[Tensor] = [] if past is None else [past[0]]
         row, q = 0, None
         for segment in segments:
@@ -147,7 +147,7 @@ class AttentionWatch(Watch[AttentionMass]):
             answers = segment.expert == block.action_expert
             layer: Any = block.experts[segment.expert]
             queries, k, _, _ = layer.project(
-                segment.tokens, arguments["turn"].rows(rows), of_attention if answers else None
+                segment.summed(), arguments["turn"].rows(rows), of_attention if answers else None
             )
             keys.append(k)
             row = rows.stop

@@ -62,6 +62,13 @@ def probe(cfg: DictConfig) -> None:
         raise UserError(
             "offline=false online=false leaves nothing to probe: set one of them to true."
         )
+    if values["server"] is not None:
+        # A server chooses a chunk once: recordings are what contents are taken from.
+        values["offline"] = False
+        require(
+            values["online"] or card,
+            "server=…: a served policy is probed in closed loop alone: add online=true.",
+        )
     if values["offline"] and values["recordings"] is None and not card:
         raise UserError(NO_DATA)
     events = event_arms(values["event"])
@@ -92,12 +99,12 @@ def probe(cfg: DictConfig) -> None:
     )
     predictor = None if subgoals is None else str(values["subgoal"]["name"])
     facts = facts_of(policy, name, source, settings, predictor)
-    folder = Path(
-        "outputs",
-        "card" if card else "probe",
-        safe_name(name, "the policy's name"),
-        str(facts.checkpoint),
-    )
+    # A shipped policy has a folder of its name; one that an earlier version began continues.
+    kind = "card" if card else "probe"
+    model = safe_name(name, "the policy's name")
+    folder = Path("outputs", kind, model, str(facts.checkpoint))
+    if facts.run.is_shipped and not folder.exists():
+        folder = Path("outputs", kind, str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
     plan = ProbePlan(values["with"], probed, recordings, jobs, offline, events)
@@ -112,6 +119,7 @@ def probe(cfg: DictConfig) -> None:
             page = run_probe(policy.eval(), plan, folder, facts, settings, options).page
             text = (folder / "table.md").read_text(encoding="utf-8")
     finally:
+        policy.close()
         if subgoals is not None:
             report_usage(subgoals.usage)
             subgoals.close()

@@ -1,0 +1,87 @@
+"""Kernels that one chunk launches at full size: their number is most of its time.
+
+    python benchmarks/gpu_kernels.py pi05 framesamp_modul
+    python benchmarks/gpu_kernels.py pi05 --ways eager --steps 1
+
+One line of JSON for each model and way: launches and matrix products after the memory tokens. It
+asks for a mock CUDA driver, as docs/evidence/hardware.md has it: the driver counts, and computes
+nothing. Weights hold whatever was in memory.
+"""
+
+import argparse
+import ctypes
+import gc
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from gpu_memory import DEVICE, batch_of, on_meta
+
+from mme_vla import MMEPolicy
+from mme_vla.policy.mme import named_noise
+
+WAYS = ("eager", "compiled")
+COUNTERS = {"launches": "n_launch", "products": "n_gemm", "waits": "n_sync"}
+"""What is counted, and the name of the mock driver's counter."""
+
+
+def counted() -> dict[str, int]:
+    """The counters of the mock driver."""
+    driver = ctypes.CDLL(None)
+    return {what: ctypes.c_long.in_dll(driver, counter).value for what, counter in COUNTERS.items()}
+
+
+def full_size(model: str, way: str, backbone: str = "pi05") -> MMEPolicy:
+    """A policy in bfloat16 whose sampler keeps time modulations; with `compiled` its layers are
+    compiled.
+    """
+    policy = on_meta(model, backbone).to(torch.bfloat16).to_empty(device=DEVICE)
+    policy.eval().requires_grad_(False)
+    policy.processor = None  # without prompts to come, no graph is captured beforehand
+    policy.compile_sampling(layers=way == "compiled")
+    policy._sampler = None
+    return policy
+
+
+@torch.no_grad()
+def kernels_of_chunk(policy: MMEPolicy, steps: int = 10) -> dict[str, int]:
+    """Counts of the second chunk of one episode; the first one compiles, and keeps modulations."""
+    batch = batch_of(policy, 1)
+    noise = named_noise(torch.zeros(1, policy.horizon, policy.action_dim, device=DEVICE))
+    with policy.autocast():
+        memory = policy.encode_memory(batch.history)
+    batch = replace(batch, history=None, actions=None)
+    policy.model.sample(batch, noise, steps, memory)
+    before = counted()
+    policy.model.sample(batch, noise, steps, memory)
+    after = counted()
+    return {what: after[what] - before[what] for what in COUNTERS}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Count and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("models", nargs="+")
+    parser.add_argument("--backbone", default="pi05", help="a file of configs/backbone")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
+    parser.add_argument("--steps", type=int, default=10, help="Euler steps")
+    args = parser.parse_args(arguments)
+    # The mock driver has no cuDNN.
+    torch.backends.cudnn.enabled = False
+    for model in args.models:
+        for way in args.ways:
+            policy = full_size(model, way, args.backbone)
+            numbers = kernels_of_chunk(policy, args.steps)
+            print(json.dumps({"model": model, "way": way, **numbers}), flush=True)
+            del policy
+            gc.collect()
+            torch.compiler.reset()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Audits: what any policy, a served one too, takes from its history, told from outside."""

@@ -1,0 +1,138 @@
+"""What a card from outside says of a policy, in plain words."""
+
+from dataclasses import dataclass
+from functools import cache
+
+from mme_vla.evaluation.records import EpisodeKey
+from mme_vla.extras.probing.card import CONTENT, TIME, WRONG_SCENE, Card, Loss, grade, percent
+
+FORGET = "nothing remembered"
+NO_VIDEO = "no video"
+ORDER = "order-broken"
+OWN = "own chunks lost"
+LAST = "last frames pushed out"
+GOAL = "another goal"
+STATE = "state frozen"
+INTERVENTIONS = {
+    FORGET: "forget",
+    NO_VIDEO: "nodemo",
+    CONTENT: "swap_frames",
+    ORDER: "shuffle_frames",
+    TIME: "pause:64",
+    LAST: "linger:16",
+    OWN: "replay",
+    WRONG_SCENE: "distract:1",
+    GOAL: "goal_swap",
+    STATE: "freeze_state",
+}
+"""What an audit changes of what a policy is sent, and the interventions that do it."""
+OF_HISTORY = (FORGET, NO_VIDEO, CONTENT, TIME, OWN)
+"""Changes of which each alone shows that something before the current frame is read."""
+
+VERDICTS = {
+    "nothing": "It shows no sign of memory: nothing that came before the current frame matters.",
+    "goal": "It shows no sign of memory, and acts on the goal and the current frame.",
+    "clock": (
+        "It reads time, not content: it acts by how many frames have passed, whatever they show."
+    ),
+    "own chunks": (
+        "It reads what it did itself: with all frames but without its own chunks it acts otherwise,"
+        " and what past frames show does not matter."
+    ),
+    "last frames": "It remembers the last frames alone: repeating the current one makes it forget.",
+    "content": "It reads what past frames show.",
+    "history": "It reads its history, and these changes do not tell what of it.",
+    "unsolved": "Nothing can be said: it solves too few scenes.",
+}
+"""Name → sentence of what an audit can find."""
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """What an audit found.
+
+    verdict: of `VERDICTS`. sentences: the verdict and the losses that it follows from. resolution:
+    the smallest share of scenes whose loss can be told from chance; None where no loss can.
+    """
+
+    verdict: str
+    sentences: tuple[str, ...]
+    resolution: float | None
+
+
+@cache
+def resolution(scenes: int) -> float:
+    """The smallest loss, as a share of so many scenes, that a card tells from no loss; infinite
+    where none is.
+
+    It is the loss of scenes that the matched run solves and an arm never gains one.
+    """
+    keys = [EpisodeKey("", number) for number in range(scenes)]
+    solved = dict.fromkeys(keys, 1.0)
+    for lost in range(1, scenes + 1):
+        arm = solved | dict.fromkeys(keys[:lost], 0.0)
+        if grade(solved, {"": arm}, solved).arms[""].beyond_noise:
+            return lost / scenes
+    return float("inf")
+
+
+def scenes_for(loss: float) -> int:
+    """How many scenes it takes to tell such a loss from none."""
+    scenes = 4
+    while resolution(scenes) > loss and scenes < 512:
+        scenes += 1
+    return scenes
+
+
+def conclude(card: Card, wanted: float) -> Conclusion:
+    """The conclusion of a card whose interventions are `INTERVENTIONS`.
+
+    wanted: the loss that was to be resolved.
+    """
+    verdict = _verdict(card)
+    finest = max(resolution(card.scenes), card.noise)
+    sentences = [VERDICTS[verdict]]
+    for label in (FORGET, NO_VIDEO, CONTENT, TIME, OWN, LAST, GOAL):
+        if label in card.arms and card.arms[label].beyond_noise:
+            sentences.append(f"With {label} it solves {_change(card, card.arms[label])}.")
+    if verdict == "content" and _loses(card, TIME):
+        sentences.append("It finds what it needs by time: shifted frames mislead it too.")
+    unresolved = [label for label, loss in card.arms.items() if not loss.beyond_noise]
+    if unresolved:
+        limit = f"one below {percent(finest)} cannot be told here"
+        if finest > 1:
+            limit = "none can be told here"
+        sentences.append(f"No loss beyond noise with {', '.join(unresolved)}: {limit}.")
+    if finest > wanted:
+        sentences.append(
+            f"resolve={wanted:g} was not reached with {card.scenes} scenes and a noise of"
+            f" {percent(card.noise)}: give more scenes (episodes=…, minutes=…)."
+        )
+    return Conclusion(verdict, tuple(sentences), finest if finest <= 1 else None)
+
+
+def _verdict(card: Card) -> str:
+    if card.matched < resolution(card.scenes):
+        return "unsolved"
+    if not any(_loses(card, label) for label in OF_HISTORY):
+        return "goal" if _loses(card, GOAL) else "nothing"
+    if _loses(card, CONTENT):
+        # Memory of the last frames alone goes with the next ones, whatever the clock says.
+        is_short = _loses(card, LAST) and not _loses(card, TIME)
+        return "last frames" if is_short else "content"
+    if _loses(card, TIME):
+        return "clock"
+    if _loses(card, OWN):
+        return "own chunks"
+    return "history"
+
+
+def _loses(card: Card, label: str) -> bool:
+    return label in card.arms and card.arms[label].beyond_noise
+
+
+def _change(card: Card, loss: Loss) -> str:
+    return (
+        f"{percent(loss.success)} instead of {percent(card.matched)} (loss {percent(loss.loss)},"
+        f" 95 % interval {percent(loss.low)} to {percent(loss.high)})"
+    )

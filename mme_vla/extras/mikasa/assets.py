@@ -1,0 +1,67 @@
+"""What scenes of MIKASA-Robo-VLA need beside its package, and where it belongs."""
+
+import os
+from importlib.util import find_spec
+from pathlib import Path
+
+from mme_vla.errors import require
+from mme_vla.extras.mikasa.catalog import BULB, FAMILY_OF, YCB
+
+PACKAGE = "mikasa_robo_suite"
+_BULB = Path("vla", "utils", "objects", "low_poly_light_bulb.glb")
+_YCB = Path("data", "assets", "mani_skill2_ycb", "info_pick_v0.json")
+
+
+def check_package() -> None:
+    """Refuse to continue without the benchmark's package and the simulator."""
+    for package in (PACKAGE, "mani_skill"):
+        require(
+            find_spec(package) is not None,
+            "MIKASA-Robo-VLA needs the extra `mikasa`. In the clone: uv sync --inexact --extra"
+            " mikasa (without uv: pip install -c constraints.txt -e '.[sim]' colorama, then pip"
+            " install --no-deps --ignore-requires-python mikasa-robo-suite==1.0.0).",
+        )
+
+
+def bulb_file() -> Path:
+    """Where the package looks for the model of its lamps, which its wheel lacks."""
+    check_package()
+    spec = find_spec(PACKAGE)
+    assert spec is not None and spec.submodule_search_locations
+    return Path(next(iter(spec.submodule_search_locations))) / _BULB
+
+
+def ycb_file() -> Path:
+    """A file of the YCB models where ManiSkill keeps what it downloads."""
+    root = Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
+    return root.expanduser() / _YCB
+
+
+def is_there(need: str | None) -> bool:
+    """Whether what tasks need is on this machine."""
+    if need == BULB:
+        return find_spec(PACKAGE) is not None and bulb_file().is_file()
+    if need == YCB:
+        return ycb_file().is_file()
+    return True
+
+
+def check_assets(task: str) -> None:
+    """Refuse a task whose models are not on this machine, and say where they come from."""
+    need = FAMILY_OF[task].needs
+    if need == BULB:
+        file = bulb_file()
+        require(
+            file.is_file(),
+            f"{task} needs {file.name}, the model of its lamps, which the package"
+            " mikasa-robo-suite lacks. It is in the repository"
+            " github.com/CognitiveAISystems/MIKASA-Robo, below mikasa_robo_suite/vla/utils/objects"
+            f" (CC BY 4.0). Copy it to {file.parent}.",
+        )
+    if need == YCB:
+        file = ycb_file()
+        require(
+            file.is_file(),
+            f"{task} needs ManiSkill's YCB models, which are not in {file.parent}. Download them:"
+            " python -m mani_skill.utils.download_asset ycb",
+        )

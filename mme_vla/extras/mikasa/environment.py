@@ -1,0 +1,199 @@
+"""MIKASA-Robo-VLA 1.0.0 by its protocol: `env=mikasa`, and `env=mikasa_video`, where the cue is a
+conditioning video.
+
+Its tasks are ManiSkill environments and run on the library's ManiSkill. The package's wrappers are
+not used: what they do (cameras, state, no motion while a cue is shown) is done here, with images on
+demand.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any, ClassVar, Literal
+
+import gymnasium
+import numpy as np
+
+from mme_vla.envs.base import Environment
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.errors import check_known
+from mme_vla.extras.mikasa.assets import check_assets, check_package, is_there
+from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS, by_horizon, by_memory
+from mme_vla.extras.mikasa.demonstrators import demonstrate
+from mme_vla.registry import ENVS
+
+CAMERAS = {"top": "base_camera", "wrist": "hand_camera"}
+FIRST_SEEDS = {"test": 4_242_424_242, "train": 0, "val": 1_000_000}
+"""Of each split, the same for every task: the protocol's for the test split."""
+_SIDE = 128  # of images
+
+
+class MikasaScene(gymnasium.Env[Any, Any]):
+    """A task with observations by the protocol: two images, and position [3], roll, pitch and yaw
+    of the hand and the opening of the gripper. Actions are changes of the hand's pose in [−1, 1]:
+    0.1 m and 0.1 rad at 1, and the gripper (1 opens it).
+
+    Attributes:
+        scene: the task itself.
+        time: steps since the reset.
+        frozen: first steps in which no action has an effect.
+        cue_end: the first step at which the answer can be given.
+    """
+
+    def __init__(self, task: str, render: bool) -> None:
+        check_assets(task)
+        import mani_skill.envs  # noqa: F401
+        import mikasa_robo_suite.vla.memory_envs  # noqa: F401  registers the tasks
+
+        from mme_vla.envs.rendering import render_backend
+
+        self._env = gymnasium.make(
+            f"{task}-VLA-v0",
+            num_envs=1,
+            obs_mode="none",  # images are taken on demand
+            control_mode="pd_ee_delta_pose",
+            reward_mode="normalized_dense",
+            sim_backend="physx_cpu",
+            render_backend=render_backend() if render else "none",
+        )
+        self.scene: Any = self._env.unwrapped
+        self._rendered = render
+        self._freezes = FAMILY_OF[task].frozen and not task.endswith("-Long")
+        self.time = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Build the scene of a seed."""
+        _, info = self._env.reset(seed=seed, options=options)
+        self.time = 0
+        self.cue_end = 0
+        for name in ("cue_steps_per_env", "empty_steps_per_env"):
+            if hasattr(self.scene, name):
+                self.cue_end += int(getattr(self.scene, name)[0])
+        self.frozen = self.cue_end if self._freezes else 0
+        goal = info["language_instruction"]
+        if not isinstance(goal, str):
+            goal = goal[0]
+        return self.observe(), {"goal": goal, "frozen": self.frozen}
+
+    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Perform an action [7]."""
+        action = np.clip(np.asarray(action, np.float32), -1, 1)
+        if self.time < self.frozen:
+            action = np.zeros_like(action)
+        _, reward, terminated, truncated, info = self._env.step(action)
+        self.time += 1
+        success = bool(info["success"])
+        return (
+            self.observe(),
+            float(reward),
+            bool(terminated),
+            bool(truncated),
+            {"success": success},
+        )
+
+    def observe(self) -> dict[str, Any]:
+        """The state [7], and for each camera the function that takes its image [128, 128, 3]."""
+        from transforms3d.euler import quat2euler
+
+        pose = self.scene.agent.tcp.pose.raw_pose[0].cpu().numpy()
+        opening = self.scene.agent.robot.get_qpos()[0, -2:].sum().cpu().numpy()
+        angles = quat2euler(pose[3:].astype(np.float64))
+        state = np.concatenate([pose[:3], angles, [opening]]).astype(np.float32)
+        self._is_current = False  # the renderer's copy of the scene
+        images: dict[str, Callable[[], np.ndarray]] = {}
+        for name, camera in CAMERAS.items():
+            images[name] = partial(self._image, camera)
+        return {**images, "state": state}
+
+    def _image(self, camera: str) -> np.ndarray:
+        """The image of a camera [H, W, 3] now."""
+        if not self._rendered:
+            return np.zeros((_SIDE, _SIDE, 3), np.uint8)
+        if not self._is_current:
+            for hidden in self.scene._hidden_objects:
+                hidden.hide_visual()
+            self.scene.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+            self._is_current = True
+        sensor = self.scene.scene.sensors[camera]
+        sensor.capture()
+        taken = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)
+        image: np.ndarray = taken["rgb"][0].cpu().numpy()
+        return image
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._env.close()
+
+
+@ENVS.register("mikasa")
+class Mikasa(Environment):
+    """The tasks of MIKASA-Robo-VLA 1.0.0 that have all they need on this machine."""
+
+    suites = by_memory()
+    groupings: ClassVar = {"horizon": by_horizon()}
+    steps = STEPS
+    splits: ClassVar = {"train": 250, "val": 50, "test": 50}
+    success: ClassVar[Literal["end", "once"]] = "once"
+    reuse = True
+    embodiment: ClassVar[Mapping[str, Any]] = {
+        "name": "mikasa",
+        "cameras": {"top": {"augment": "none"}, "wrist": {"augment": "none"}},
+        "memory_camera": "top",
+        "state": {"width": 7},
+        "action": {
+            "width": 7,
+            "names": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"],
+            "horizon": 8,
+            "execute": 4,
+        },
+        "fps": 10,
+    }
+
+    @property
+    def tasks(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Those whose models are on this machine."""
+        return tuple(task for task, family in FAMILY_OF.items() if is_there(family.needs))
+
+    def check_installed(self) -> None:
+        check_package()
+
+    def check_task(self, task: str) -> None:
+        """A task of the benchmark, whose models are on this machine."""
+        check_known("task", task, FAMILY_OF)
+        if not is_there(FAMILY_OF[task].needs):
+            check_assets(task)
+
+    def episodes(self, task: str, split: str) -> list[EpisodeSpec]:
+        """The protocol's seeds: the same for every task."""
+        self.check_task(task)
+        self.check_split(split)
+        first = FIRST_SEEDS[split]
+        return [
+            EpisodeSpec(task, split, number, first + number, "")
+            for number in range(self.splits[split])
+        ]
+
+    def make(self, spec: EpisodeSpec, render: bool = True) -> MikasaScene:
+        self.check_installed()
+        return MikasaScene(spec.task, render)
+
+    def hold(self, env: MikasaScene) -> np.ndarray:
+        """No motion; the gripper stays open, as it is in every scene's beginning."""
+        return np.array([0, 0, 0, 0, 0, 0, 1], np.float32)
+
+    def demonstrate(self, env: MikasaScene) -> Iterator[np.ndarray]:
+        """Solve the episode from the simulator's state."""
+        return demonstrate(env)
+
+
+@ENVS.register("mikasa_video")
+class MikasaVideo(Mikasa):
+    """The same, where frozen steps are a conditioning video before the execution."""
+
+    cue: ClassVar[Literal["steps", "video"]] = "video"
+    embodiment: ClassVar[Mapping[str, Any]] = {
+        **Mikasa.embodiment,
+        "name": "mikasa_video",
+        "conditioning_video": True,
+    }

@@ -1,0 +1,230 @@
+"""Connections to servers: by websocket (`Client`), by HTTP, and as the harness talks."""
+
+import http.client
+import ssl
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from mme_vla.errors import UserError, brief
+from mme_vla.serving.client import Client, decoded_map, open_socket
+from mme_vla.serving.codec import MOST_TEXT, check_size, msgpack, pack, read_array
+
+PAUSE_S = 0.5  # between two attempts to open a connection
+STARTUP_S = 2.0  # in which a server that speaks first sends its metadata
+
+
+class Connection(Protocol):
+    """One connection to a server, with one episode at a time.
+
+    Requests raise `UserError` where the server refuses one or its reply cannot be read, and
+    `ConnectionError` or `TimeoutError` where there is no reply.
+    """
+
+    metadata: dict[str, Any]
+
+    def request(self, message: Mapping[str, Any]) -> dict[str, Any]: ...
+    def close(self) -> None: ...
+
+
+def open_patiently[T](connect: Callable[[], T], seconds: float) -> T:
+    """Open a connection; a server that is not there, or is full, is tried for so many seconds.
+
+    Raises:
+        UserError: there is none by then, or the server refuses the connection. TimeoutError: the
+            server says nothing.
+    """
+    until = time.monotonic() + seconds
+    while True:
+        try:
+            return connect()
+        except ConnectionError as error:
+            if time.monotonic() >= until:
+                raise UserError(
+                    f"{error} Start the server, then repeat the command: finished episodes are"
+                    " kept."
+                ) from None
+        time.sleep(PAUSE_S)
+
+
+class HttpConnection:
+    """The challenge's HTTP: `/metadata`, `/reset` and `/infer`, in one session.
+
+    Args:
+        url: `http://host:port`. api_key: of the server, if it has one. timeout: seconds to wait for
+            a reply.
+    """
+
+    def __init__(self, url: str, api_key: str | None = None, timeout: float = 600) -> None:
+        self.url = url
+        address = urlsplit(url)
+        self._headers = {
+            "Content-Type": "application/msgpack",
+            "Accept": "application/msgpack",
+            "X-Session": uuid.uuid4().hex,
+        }
+        if api_key is not None:
+            self._headers["Authorization"] = f"Api-Key {api_key}"
+        host = address.hostname or ""
+        self._http: http.client.HTTPConnection
+        if address.scheme == "https":
+            context = ssl.create_default_context()
+            self._http = http.client.HTTPSConnection(
+                host, address.port, timeout=timeout, context=context
+            )
+        else:
+            self._http = http.client.HTTPConnection(host, address.port, timeout=timeout)
+        self.metadata = self._exchange("GET", "/metadata", None)
+
+    def request(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        path = "/reset" if message.get("reset") else "/infer"
+        return self._exchange("POST", path, pack(message))
+
+    def close(self) -> None:
+        self._http.close()
+
+    def _exchange(self, method: str, path: str, body: bytes | None) -> dict[str, Any]:
+        try:
+            self._http.request(method, path, body, self._headers)
+            response = self._http.getresponse()
+            content = response.read()
+        except TimeoutError:
+            self.close()
+            raise TimeoutError(f"No answer from {self.url}{path} in time.") from None
+        except (OSError, http.client.HTTPException) as error:
+            self.close()
+            raise ConnectionError(f"No policy server responds at {self.url}: {error}") from error
+        if response.status == http.HTTPStatus.OK:
+            return decoded_map(content)
+        reason = brief(content.decode(errors="replace").strip(), 400, quote=False)
+        text = f"{self.url}{path}: {response.status} {reason}"
+        # The episode is lost, or there is no place now: both may be better at the next try.
+        if response.status in (http.HTTPStatus.CONFLICT, http.HTTPStatus.SERVICE_UNAVAILABLE):
+            raise ConnectionError(text)
+        raise UserError(f"The server refuses this request: {text}")
+
+
+class HarnessConnection:
+    """The protocol of vla-evaluation-harness 0.8: typed messages with a number, the client speaks
+    first.
+
+    Args:
+        url: `ws://host:port`. timeout: seconds to wait for a reply. open_timeout: for the
+            connection and the first reply.
+    """
+
+    VERSION = 1  # of its protocol
+
+    def __init__(self, url: str, timeout: float = 600, open_timeout: float = 60) -> None:
+        self.url = url
+        self._timeout = open_timeout
+        self._sequence = 0
+        self._socket = open_socket(url, {}, open_timeout, timeout)
+        hello = {"harness_version": "0.8.0", "protocol_version": self.VERSION}
+        try:
+            self.metadata = self._reply("hello", self.send("hello", hello))
+        except BaseException:
+            self.close()
+            raise
+        self._timeout = timeout
+
+    def send(self, kind: str, payload: Mapping[str, Any]) -> int:
+        """Send a message that needs no reply; return its number."""
+        from websockets.exceptions import ConnectionClosed
+
+        self._sequence += 1
+        message = {
+            "type": kind,
+            "payload": payload,
+            "seq": self._sequence,
+            "timestamp": time.time(),
+        }
+        try:
+            self._socket.send(msgpack.packb(message, default=_encode))
+        except ConnectionClosed as error:
+            raise ConnectionError(f"The server at {self.url} closed the connection: {error}") from (
+                None
+            )
+        return self._sequence
+
+    def request(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        """Send an observation and return the action."""
+        return self._reply("action", self.send("observation", message))
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _reply(self, kind: str, number: int) -> dict[str, Any]:
+        """The payload of the reply to a message.
+
+        An error of an earlier message, such as the beginning of the episode, counts as well.
+        """
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            data = self._socket.recv(self._timeout)
+        except TimeoutError:
+            self.close()
+            raise TimeoutError(f"No answer from {self.url} within {self._timeout:g} s.") from None
+        except ConnectionClosed as error:
+            raise ConnectionError(f"The server at {self.url} closed the connection: {error}") from (
+                None
+            )
+        message = _decoded(data)
+        payload = message.get("payload")
+        if message.get("type") == "error":
+            raise UserError(f"The server refuses this request: {brief(payload, 400)}")
+        if (
+            message.get("type") != kind
+            or message.get("seq") != number
+            or not isinstance(payload, dict)
+        ):
+            raise UserError(
+                f"The server's reply is malformed: {kind} number {number} was expected, and it is"
+                f" {brief(message.get('type'))} number {brief(message.get('seq'))}."
+            )
+        return payload
+
+
+def _encode(value: Any) -> Any:
+    """An array as the harness has it: the keys are texts, not bytes."""
+    if isinstance(value, np.ndarray):
+        return {
+            "__ndarray__": True,
+            "data": value.tobytes(),
+            "dtype": value.dtype.str,
+            "shape": list(value.shape),
+        }
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} has no form in msgpack")
+
+
+def _decoded(data: Any) -> dict[str, Any]:
+    if isinstance(data, str):
+        raise UserError(f"The server's reply is malformed: the text {brief(data, 200)}.")
+
+    def array(fields: dict[Any, Any]) -> Any:
+        if "__ndarray__" in fields:
+            return read_array({str(key).encode(): value for key, value in fields.items()}).copy()
+        return fields
+
+    try:
+        check_size(data)
+        message = msgpack.unpackb(data, object_hook=array, max_str_len=MOST_TEXT, max_ext_len=0)
+    except Exception as error:  # msgpack raises many kinds of exception
+        raise UserError(f"The server's reply is malformed: {error}") from error
+    if not isinstance(message, dict):
+        raise UserError(f"The server's reply is malformed: {brief(message)} is no map.")
+    return message
+
+
+def open_websocket(
+    url: str, api_key: str | None, timeout: float, open_timeout: float
+) -> Connection:
+    """Connect to a server that sends its metadata first."""
+    return Client(url, api_key=api_key, timeout=timeout, open_timeout=open_timeout)

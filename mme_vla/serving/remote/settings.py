@@ -1,0 +1,59 @@
+"""Which server a command evaluates, and how it is reached: `configs/server.yaml`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Self
+
+from mme_vla.config.sections import PathText, Positive, PositiveInt, read_section
+from mme_vla.errors import require
+
+Subgoals = Literal["simple", "grounded"]
+
+
+@dataclass(frozen=True)
+class ConnectionSettings:
+    """The section `connection`; the keys and their meaning are those of `configs/server.yaml`."""
+
+    name: str | None = None
+    checkpoint: PathText | None = None
+    api_key: str | None = field(default=None, repr=False)
+    timeout_s: Positive = 600
+    open_s: Positive = 60
+    episodes: PositiveInt | None = None
+    subgoal: Subgoals | None = None
+    keys: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ServerChoice:
+    """A policy server. server: its address. protocol: what it speaks."""
+
+    server: str
+    protocol: Literal["auto", "mme_vla", "robomme", "openpi", "challenge", "harness"] = "auto"
+    connection: ConnectionSettings = ConnectionSettings()
+
+    def __post_init__(self) -> None:
+        scheme = self.server.partition("://")[0]
+        require(
+            scheme in ("ws", "wss", "http", "https") and "://" in self.server,
+            f"server={self.server!r}: write ws://host:port, or http://host:port for the challenge's"
+            " HTTP.",
+        )
+        require(
+            not self.is_http or self.protocol in ("auto", "challenge"),
+            f"protocol={self.protocol} has websockets alone: write server=ws://…",
+        )
+
+    @property
+    def is_http(self) -> bool:
+        return self.server.startswith("http")
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self | None:
+        """Read the keys of a command; None where it names no server."""
+        if config.get("server") is None:
+            return None
+        # An empty environment variable, as compose files leave it, is no key.
+        connection = dict(config.get("connection") or {})
+        connection["api_key"] = connection.get("api_key") or None
+        return read_section(cls, {**config, "connection": connection}, others=True)

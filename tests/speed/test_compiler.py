@@ -1,0 +1,75 @@
+"""Where compiled code is kept, and what happens where nothing can be compiled."""
+
+import logging
+import shutil
+import stat
+from pathlib import Path
+
+import pytest
+import torch
+
+from mme_vla.cli import loading
+from mme_vla.cli.loading import prepare_sampling
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.speed.compiler import CACHE_VARIABLE, keep_compiled_code, missing_compiler
+from mme_vla.testing.small import small_policy
+
+CPU, GPU = torch.device("cpu"), torch.device("cuda")
+
+
+@pytest.fixture(autouse=True)
+def cache_of_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No folder is named, and the user's cache folder is a new one."""
+    # Set first, so that what is set by the code under test is taken back too.
+    monkeypatch.setenv(CACHE_VARIABLE, "")
+    monkeypatch.delenv(CACHE_VARIABLE)
+    monkeypatch.setenv("MME_VLA_CACHE", str(tmp_path / "cache"))
+
+
+def test_compiled_code_is_in_a_folder_that_only_its_user_can_open(tmp_path: Path) -> None:
+    folder = keep_compiled_code()
+    assert folder == tmp_path / "cache" / "compiled"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert keep_compiled_code() == folder
+
+
+def test_a_folder_that_the_user_names_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "elsewhere"))
+    assert keep_compiled_code() == tmp_path / "elsewhere"
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
+    assert missing_compiler(CPU) is None
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert "C++ compiler" in str(missing_compiler(CPU))
+    assert "C compiler (cc, gcc, clang)" in str(missing_compiler(GPU)) or "triton" in str(
+        missing_compiler(GPU)
+    )
+    monkeypatch.setenv("CC", "mycc")
+    assert missing_compiler(GPU) in ("a C compiler (mycc)", "the package triton")
+
+
+@pytest.mark.parametrize("missing", [None, "the C++ compiler g++"])
+def test_layers_stay_eager_with_a_warning_where_no_compiler_is(
+    missing: str | None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    asked: list[bool] = []
+
+    def compile_sampling(policy: MMEPolicy, layers: bool, report: object) -> bool:
+        asked.append(layers)
+        return True
+
+    monkeypatch.setattr(loading, "missing_compiler", lambda device: missing)
+    monkeypatch.setattr(MMEPolicy, "compile_sampling", compile_sampling)
+    with caplog.at_level(logging.INFO):
+        prepare_sampling(small_policy("pi05").eval(), "compiled", logging.getLogger("test"))
+    assert asked == [missing is None]
+    warned = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+    assert len(warned) == (missing is not None)
+    assert all("g++" in text and "sampling=auto" in text for text in warned)

@@ -1,0 +1,103 @@
+"""A compiled chunk has few kernels, whose number is most of its time on a GPU, and is the eager
+one.
+"""
+
+import json
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from torch._dynamo.utils import counters
+from torch._inductor import metrics
+
+from mme_vla.testing.small import random_batch, small_policy
+
+REPOSITORY = Path(__file__).parents[2]
+MOCK_DRIVER = REPOSITORY.parent / "shared" / "noop_gpu"
+
+
+@pytest.fixture
+def nothing_compiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No compiled code before or after, nor kernels and graphs counted."""
+    monkeypatch.setattr(logging.getLogger("torch.__trace"), "disabled", True)
+    torch.compiler.reset()
+    counters.clear()
+    metrics.reset()
+    yield
+    torch.compiler.reset()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("nothing_compiled")
+@pytest.mark.parametrize(
+    ("model", "graphs", "kernels"), [("pi05", 7, 57), ("framesamp_modul", 8, 71)]
+)
+def test_a_compiled_chunk_has_few_kernels_and_graphs_at_any_depth(
+    model: str, graphs: int, kernels: int
+) -> None:
+    depths = {"backbone.depth": 4, "backbone.vision.depth": 1}
+    policy = small_policy(model, **depths).eval()
+    batch = random_batch(policy, 1)
+    noise = torch.randn(1, 20, 32, generator=torch.Generator().manual_seed(0))
+    eager = policy.sample_actions(batch, noise, steps=3)
+    policy.compile_sampling(layers=True)
+    with torch._inductor.config.patch(force_disable_caches=True):
+        compiled = policy.sample_actions(batch, noise, steps=3)
+    torch.testing.assert_close(compiled, eager, atol=1e-5, rtol=0)
+    # The tower, a layer and the last layer of the prefix, a layer of a step, what is around its
+    # layers, and the keys and values of a modulator: first and last layers share their code.
+    assert counters["stats"]["unique_graphs"] == graphs
+    assert metrics.generated_kernel_count <= kernels
+
+
+@pytest.fixture(scope="module")
+def mock_driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A CUDA driver that counts and computes nothing, built from its `stub.c`.
+
+    `MME_VLA_MOCK_DRIVER` names its folder, `../shared/noop_gpu` by default.
+    """
+    source = Path(os.environ.get("MME_VLA_MOCK_DRIVER", MOCK_DRIVER)) / "stub.c"
+    if not source.exists() or torch.version.cuda is None or shutil.which("gcc") is None:
+        pytest.skip("the mock driver, gcc or a CUDA build of torch is missing")
+    packages = Path(torch.__file__).parents[1]
+    library = tmp_path_factory.mktemp("driver") / "libcuda.so.1"
+    includes = ("nvidia/cu13/include", "triton/backends/nvidia/include")
+    command = ["gcc", "-shared", "-fPIC", "-w", *(f"-I{packages / path}" for path in includes)]
+    subprocess.run([*command, "-o", library, source, "-ldl"], check=True)
+    return library
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("model", "launches", "products"),
+    [
+        ("pi05", 1310, 921),
+        ("framesamp_modul", 1900, 1479),
+        ("tokendrop_expert", 1320, 990),
+        ("ttt_expert", 1320, 990),
+        ("rmt_context", 1320, 921),
+    ],
+)
+def test_a_full_size_chunk_launches_few_kernels(
+    model: str, launches: int, products: int, mock_driver: Path
+) -> None:
+    environment = os.environ | {
+        "LD_PRELOAD": str(mock_driver),
+        "LD_LIBRARY_PATH": str(mock_driver.parent),
+        "PYTHONPATH": str(REPOSITORY),
+    }
+    program = REPOSITORY / "benchmarks" / "gpu_kernels.py"
+    command = [sys.executable, str(program), model, "--ways", "compiled"]
+    lines = subprocess.run(
+        command, env=environment, check=True, stdout=subprocess.PIPE, text=True
+    ).stdout.splitlines()
+    counted = json.loads(lines[-1])
+    assert counted["launches"] <= launches
+    assert counted["products"] == products
+    assert counted["waits"] == 0
