@@ -461,7 +461,7 @@ class EpisodeEnv:
 
     def _taken(self, observation: Mapping[str, Any], newest: bool = False) -> dict[str, Any]:
         """An observation with its images: those that are functions are rendered now, or left
-        out if nobody requested them.
+        out where they were not requested.
         """
         frame = dict(observation)
         requested = self.render_request
