@@ -11,8 +11,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAD = """\
-# Versions known to work together, for pip: pip install -c constraints.txt -e .
-# The extra mikasa, and with it the group dev, need uv (docs/benchmark/mikasa.md).
+# Versions known to work together, for pip: pip install -c constraints.txt -e . --group dev
+# The extra mikasa needs uv, or the line in docs/benchmark/mikasa.md.
 # Written by `python scripts/constraints.py` from pyproject.toml. torch pins its own CUDA libraries.
 """
 LIST = re.compile(r"^constraint-dependencies = \[\n(.*?)^\]$", re.DOTALL | re.MULTILINE)

@@ -107,6 +107,19 @@ SUFFICE = [
         "workers=1 render=false output=evaluated execute=1 flow_steps=1",
         "timeout",
     ),
+    Case(
+        ("sim",),
+        f"mme_vla audit model=pi05 backbone=tiny {TINY} task=StopCube episodes=1 max_steps=1"
+        " workers=1 render=false execute=1 flow_steps=1 output=audited",
+        "audit.html",
+    ),
+    Case(
+        ("sim", "mikasa"),
+        f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} env=mikasa tasks=[RememberColor3]"
+        " episodes=1 workers=1 execute=16 flow_steps=1 output=remembered",
+        "timeout",
+        draws=True,
+    ),
     NANO,
     Case(
         ("sim",),
@@ -118,7 +131,7 @@ SUFFICE = [
     Case(
         ("sim",),
         "mme_vla record task=PatternLock episodes=1 frames=[0] workers=1 output=recorded",
-        "recorded: 1 episodes",
+        "recorded: 1 episode",
         draws=True,
     ),
     Case(
@@ -133,6 +146,8 @@ SUFFICE = [
 
 NEED = [
     Case((), "mme_vla.evaluate model=pi05 backbone=tiny", "sim", 2),
+    Case((), "mme_vla audit model=pi05 backbone=tiny task=StopCube output=audited2", "sim", 2),
+    Case(("sim",), "mme_vla.evaluate model=pi05 backbone=tiny env=mikasa", "mikasa", 2),
     Case((), "mme_vla record task=PickXtimes episodes=1 output=recorded2", "sim", 2),
     Case((), "mme_vla gallery task=PickXtimes", "sim", 2),
     Case((), f"{PLAY} player=random", "sim", 2),

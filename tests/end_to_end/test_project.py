@@ -31,7 +31,9 @@ def test_the_tools_come_with_every_extra() -> None:
     extras = pyproject()["project"]["optional-dependencies"]
     groups = pyproject()["dependency-groups"]
     requirement = next(line for line in groups["dev"] if line.startswith("mme-vla["))
-    assert set(re.findall(r"[\w-]+", requirement.partition("[")[2])) == set(extras)
+    listed = set(re.findall(r"[\w-]+", requirement.partition("[")[2]))
+    # pip refuses mikasa's wheel, and has to install the group.
+    assert listed == extras.keys() - {"mikasa"}
 
 
 def test_the_version_is_the_same_everywhere() -> None:
