@@ -57,8 +57,12 @@ def quoted() -> list[str]:
     return [row.split("`")[1] for row in rows]
 
 
+OF_OTHERS = {"Could not load libtorchcodec", "CUDA out of memory", "keepalive ping timeout"}
+"""Messages of the page that PyTorch, torchcodec and websockets print."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("message", quoted())
+@pytest.mark.parametrize("message", sorted(set(quoted()) - OF_OTHERS))
 def test_a_message_of_the_troubleshooting_page_is_one_of_the_library(message: str) -> None:
     fragments = [part.strip() for part in message.split("…") if part.strip()]
     assert fragments
@@ -68,6 +72,7 @@ def test_a_message_of_the_troubleshooting_page_is_one_of_the_library(message: st
 
 def test_the_troubleshooting_page_has_enough_messages() -> None:
     assert len(quoted()) == len(set(quoted())) >= 25
+    assert set(quoted()) >= OF_OTHERS
 
 
 def test_every_task_has_a_video_in_the_gallery() -> None:

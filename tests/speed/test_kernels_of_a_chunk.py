@@ -46,6 +46,7 @@ def test_a_compiled_chunk_has_few_kernels_and_graphs_at_any_depth(
     batch = random_batch(policy, 1)
     noise = torch.randn(1, 20, 32, generator=torch.Generator().manual_seed(0))
     eager = policy.sample_actions(batch, noise, steps=3)
+    policy.processor = None  # no length of prompt is compiled beforehand
     policy.compile_sampling(layers=True)
     with torch._inductor.config.patch(force_disable_caches=True):
         compiled = policy.sample_actions(batch, noise, steps=3)

@@ -15,6 +15,7 @@ from torch import Tensor
 from helpers import REPOSITORY
 from helpers.serving_fakes import Served
 from mme_vla.cli.record import record_environment
+from mme_vla.config import plugins
 from mme_vla.config.plugins import import_plugins
 from mme_vla.data.sources import open_sources
 from mme_vla.embodiment import Embodiment
@@ -58,6 +59,7 @@ def examples() -> Iterator[pytest.MonkeyPatch]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(SERVERS)
         patch.setattr(evaluation, "VecEnv", OneEnv)
+        patch.setattr(plugins, "_imported", dict(plugins._imported))
         import_plugins(["cues"])
         yield patch
 
