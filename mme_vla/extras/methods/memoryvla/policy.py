@@ -266,8 +266,7 @@ class MemoryVlaPolicy(NetworkPolicy):
         )
         for module in (*towers, *layers, *self.core.head.blocks):
             module.compile(**options)
-        if self.memory is not None:
-            self.memory.compile(**options)
+        compile_parts(self.memory, **options)
 
     # Sampling
 
