@@ -201,12 +201,25 @@ class Environment(ABC):
             env.close()
         return digest
 
-    def step_limit(self, split: str, task: str | None = None) -> int:
-        """Steps after which an episode of a task is a timeout; without a task the most of any."""
+    def step_limit(self, split: str) -> int:
+        """Steps after which an episode of a split is a timeout; of tasks that differ the most."""
         if isinstance(self.steps, int):
             return self.steps
-        if task is None:
-            return max(self.steps.values())
+        return max(self.steps.values())
+
+    def task_limit(self, task: str, split: str) -> int:
+        """Steps after which an episode of a task is a timeout.
+
+        Raises:
+            UserError: `steps` lacks the task.
+        """
+        if isinstance(self.steps, int):
+            return self.step_limit(split)
+        require(
+            task in self.steps,
+            f"{type(self).__name__}.steps lacks {task}: add its limit, or give one number for all"
+            " tasks.",
+        )
         return self.steps[task]
 
     def suite_of(self, task: str) -> str | None:
@@ -234,7 +247,7 @@ class Environment(ABC):
     ) -> Any:
         """One episode with the interface of `make_env`: lists of frames, status, goal."""
         spec = self.episode(task, split, episode)
-        limit = max_steps or self.step_limit(split, task)
+        limit = max_steps or self.task_limit(task, split)
         env = _kept.pop((type(self), task, render), None)
         if env is None:
             env = self.make(spec, render)
