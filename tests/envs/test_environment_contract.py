@@ -99,9 +99,9 @@ GO = np.ones(1)
 
 @pytest.fixture(autouse=True)
 def no_kept_scenes() -> Iterator[None]:
-    base._kept.clear()
+    base._idle.clear()
     yield
-    base._kept.clear()
+    base._idle.clear()
 
 
 def steps_until_the_end(env: EpisodeEnv) -> tuple[int, str]:
@@ -257,14 +257,14 @@ def test_a_scene_whose_step_failed_is_not_kept() -> None:
     with pytest.raises(TypeError):
         env.step(None), env.step(None), env.step(None)
     env.close()
-    assert scene.closed and not base._kept
+    assert scene.closed and not base._idle
 
 
 def test_no_more_than_a_few_scenes_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     class Kept(Corridors):
         reuse = True
 
-    monkeypatch.setattr(base, "_KEPT", 1)
+    monkeypatch.setattr(base, "_MAX_IDLE", 1)
     scenes = []
     for task in ("Wide", "Short"):
         env = Kept().open(task, "test", 0)
