@@ -1,11 +1,12 @@
-"""Kernels that one chunk launches at full size: their number is most of its time.
+"""Kernels that one chunk or one update launches at full size: their number is most of a chunk's time.
 
     python benchmarks/gpu_kernels.py pi05 framesamp_modul
     python benchmarks/gpu_kernels.py pi05 --ways eager --steps 1
+    python benchmarks/gpu_kernels.py pi05 --what update --batch 8
 
-One line of JSON for each model and way: launches and matrix products after the memory tokens. It
-needs a mock CUDA driver, as docs/evidence/hardware.md has it: the driver counts, and computes
-nothing. Weights hold whatever was in memory.
+One line of JSON for each model and way: launches and matrix products, of a chunk after the memory
+tokens, of an update by its parts. It needs a mock CUDA driver, as docs/evidence/hardware.md has it:
+the driver counts, and computes nothing. Weights hold whatever was in memory.
 """
 
 import argparse
@@ -15,11 +16,15 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from gpu_memory import DEVICE, batch_of, on_meta
+from gpu_setup import Setup, draws_of
+from gpu_training import updating
 
 from mme_vla import MMEPolicy
+from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import named_noise
 
 WAYS = ("eager", "compiled")
@@ -58,6 +63,23 @@ def kernels_of_chunk(policy: MMEPolicy, steps: int = 10) -> dict[str, int]:
     policy.model.sample(batch, noise, steps, memory)
     after = counted()
     return {what: after[what] - before[what] for what in COUNTERS}
+
+
+def kernels_of_update(model: str, way: str, samples: int, backbone: str) -> dict[str, Any]:
+    """Counts of the third update of one process, by its parts; the first one compiles."""
+    policy = on_meta(model, backbone).to_empty(device=DEVICE)
+    apply_finetuning(policy)
+    setup = Setup(backbone, samples, 1, DEVICE, way == "compiled", "auto")
+    update, _ = updating(policy.train(), setup)
+    batch, draws = batch_of(policy, samples), draws_of(policy, samples, DEVICE)
+    counts: dict[str, dict[str, int]] = {}
+    for _ in range(3):
+        last = counted()
+        for part in update(batch, draws):
+            now = counted()
+            counts[part] = {what: now[what] - last[what] for what in COUNTERS}
+            last = now
+    return counts
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

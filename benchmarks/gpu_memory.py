@@ -32,7 +32,7 @@ from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.training import parallel
 from mme_vla.training.checkpoint import trainable
 from mme_vla.training.optim import EMA, clip_gradients, make_optimizer
-from mme_vla.training.settings import TrainSettings
+from mme_vla.training.settings import ParallelSettings, TrainSettings
 from mme_vla.types import Batch
 
 GIB = 2**30
@@ -111,7 +111,7 @@ def shared(
     policy = on_meta(model, backbone)
     apply_finetuning(policy, mode, frozen_dtype=frozen_dtype)
     policy.train().recompute(recompute == "all" or recompute or False)  # type: ignore[arg-type]
-    mesh = parallel.ParallelSettings("fsdp").mesh("cuda")
+    mesh = ParallelSettings("fsdp").mesh("cuda")
     # No process has weights to send: what comes after the sharding is left out.
     original, parallel.set_model_state_dict = parallel.set_model_state_dict, lambda *_, **__: None
     rank, distributed.get_rank = distributed.get_rank, lambda *_: 1

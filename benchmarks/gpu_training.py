@@ -28,8 +28,8 @@ from torch.utils.data import DataLoader
 
 from mme_vla import MMEPolicy
 from mme_vla.training.optim import EMA, clip_gradients, make_optimizer
-from mme_vla.training.parallel import ParallelSettings, reshard, shard
-from mme_vla.training.settings import TrainSettings
+from mme_vla.training.parallel import reshard, shard
+from mme_vla.training.settings import ParallelSettings, TrainSettings
 from mme_vla.types import Batch
 
 
