@@ -30,7 +30,13 @@ from mme_vla.training.checkpoint import (
 from mme_vla.training.data import SplitData
 from mme_vla.training.logging import Loggers, ProgressLine, Window, read_metrics, resident_gib
 from mme_vla.training.open_loop import OpenLoop, error_lines, open_loop, plot_open_loop
-from mme_vla.training.optim import EMA, clip_gradients, lr_factors, make_optimizer, scheduled_rate
+from mme_vla.training.optim import (
+    EMA,
+    WeightUpdate,
+    lr_factors,
+    make_optimizer,
+    scheduled_rate,
+)
 from mme_vla.training.order import (
     BatchOrder,
     Collate,
@@ -158,6 +164,13 @@ class Trainer:
             restore(run.checkpoint, policy, self.ema, self.optimizer)
         self.model = policy if self.sharded else accelerator.prepare_model(policy)
         self._parameters = list(parameters.values())
+        # What a CPU takes for it was not measured.
+        on_gpu = accelerator.device.type == "cuda"
+        is_adamw = isinstance(self.optimizer, torch.optim.AdamW)
+        one_pass = settings.compile and on_gpu and is_adamw and not self.sharded
+        self.update_weights = WeightUpdate(
+            parameters, self.optimizer, self.ema, settings.clip_norm, one_pass
+        )
         self._shard_writer = ShardWriter() if self.sharded else None
         self.last_checkpoint = run.checkpoint
         self.stopped_by: int | None = None
@@ -249,12 +262,7 @@ class Trainer:
             for name, value in metrics.items():
                 part = value.detach().float() / settings.accumulate
                 sums[name] = sums[name] + part if name in sums else part
-        gradients = [p.grad for p in self._parameters if p.grad is not None]
-        norm = full_value(clip_gradients(gradients, settings.clip_norm))
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-        self.ema.update(step)
-        return {**sums, "grad_norm": norm, "lr": rate}
+        return {**sums, "grad_norm": full_value(self.update_weights(step)), "lr": rate}
 
     @contextmanager
     def _gradients_shared(self, shared: bool) -> Iterator[None]:
