@@ -10,8 +10,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.testing.small import small_policy
 from mme_vla.speed.compiler import missing_compiler
+from mme_vla.testing.small import small_policy
 from mme_vla.training.optim import EMA, WeightUpdate, clip_gradients, learning_rate, make_optimizer
 from mme_vla.training.order import BatchOrder, generator_for, seed_of
 from mme_vla.training.settings import TrainSettings
