@@ -138,13 +138,13 @@ def _check_totals(dataset: Description) -> None:
                 f"{dataset.root}/meta/info.json: {key} is {brief(declared)}, but meta/episodes"
                 f" describes {count} {what}. {_CORRECT}"
             )
-    written = dataset.episodes.declared_lengths
-    if written is None:
+    listed = dataset.episodes.declared_lengths
+    if listed is None:
         return
-    episode = _first(written != lengths)
+    episode = _first(listed != lengths)
     if episode is not None:
         raise UserError(
-            f"{dataset.root}/meta/episodes: episode {episode} has length {written[episode]}, but"
+            f"{dataset.root}/meta/episodes: episode {episode} has length {listed[episode]}, but"
             f" dataset_from_index and dataset_to_index give it {lengths[episode]} rows. {_CORRECT}"
         )
 
@@ -467,14 +467,14 @@ def _read_header(path: Path) -> _Header:
     )
     with decoding(path, "a video", "Copy or convert it again."), av.open(str(path)) as container:
         stream = container.streams.video[0]
-        tick = float(stream.time_base or 0)
+        tick_seconds = float(stream.time_base or 0)
         average, base = float(stream.average_rate or 0), float(stream.base_rate or 0)
         is_constant = abs(average - base) <= 1e-3 * base
         context = stream.codec_context
         header = _Header(
             images=stream.frames,
-            begin=(stream.start_time or 0) * tick,
-            seconds=(stream.duration or 0) * tick,
+            begin=(stream.start_time or 0) * tick_seconds,
+            seconds=(stream.duration or 0) * tick_seconds,
             rate=average if is_constant else 0.0,
             pixel_format=str(context.pix_fmt),
             width=context.width,

@@ -452,12 +452,12 @@ class EpisodeSource:
         """Compare the names of numbers: the dataset's with the robot's, and of states with actions
         relative to them.
         """
-        own = robot.action.names
-        if own == numbered(robot.action.width):
-            own = ()
+        axes = robot.action.names
+        if axes == numbered(robot.action.width):
+            axes = ()
         compare_names(
             self.action_names,
-            own,
+            axes,
             "action",
             f"the dataset {self.name}",
             f"the robot {robot.name}",
