@@ -5,8 +5,8 @@
     python benchmarks/gpu_kernels.py pi05 --what update --batch 8
 
 One line of JSON for each model and way: launches and matrix products, of a chunk after the memory
-tokens. It needs a mock CUDA driver, as docs/evidence/hardware.md has it:
-the driver counts, and computes nothing. Weights hold whatever was in memory.
+tokens. It needs a mock CUDA driver, as docs/evidence/hardware.md has it: the driver counts, and
+computes nothing. Weights hold whatever was in memory.
 """
 
 import argparse
