@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from PIL import Image
 from PIL.Image import Image as Picture
@@ -233,8 +234,8 @@ def integration(source: EpisodeSource) -> Figure:
         "expert": MemoryExpert(sizes),
         "modulator": Modulator(sizes),
     }
-    figure = Figure((WIDTH_IN, 4.6), layout="constrained")
-    panels = figure.subplots(2, 2)
+    figure = Figure((WIDTH_IN, 4.6), layout=ConstrainedLayoutEngine(rect=(0, 0, 0.97, 1)))
+    panels = figure.subplots(2, 2)  # left of an edge that letters of a browser would cross
     for axes, (name, built) in zip(panels.flat, kinds.items(), strict=True):
         experts = {
             "memory": "VLM" if name == "context" else "memory",
