@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mme_vla.policy.base import Policy
 
 FILE = "self_check.safetensors"
-FORMAT = "mme_vla self-check 1"
+FORMAT: Literal["mme_vla self-check 1"] = "mme_vla self-check 1"
 MOST_BYTES = 2_000_000
 """Of the file."""
 MOST_DIFFERENCE = 0.01

@@ -318,12 +318,11 @@ class Trainer:
         """
         self.unchecked = None
         is_first = self.accelerator.is_main_process
-        wanted = self.settings.self_check
-        if self.sharded:
-            wanted = wanted and step == self.settings.steps
-        else:
-            wanted = wanted and is_first
-        if not wanted:
+        if not self.settings.self_check:
+            return None
+        if self.sharded and step < self.settings.steps:
+            return None
+        if not (self.sharded or is_first):
             return None
         with self.ema.applied(), gathered(self.policy):
             if not is_first:
