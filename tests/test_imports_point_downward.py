@@ -13,7 +13,7 @@ from mme_vla.registry import extras
 PACKAGE = REPOSITORY / "mme_vla"
 
 # From the top: a package or top-level module imports only itself and what is below it.
-EXTRAS = ["audit", "nano", "probing", "play", "trajectories", "methods"]
+EXTRAS = ["audit", "mikasa", "nano", "probing", "play", "trajectories", "methods"]
 CORE = [
     "cli",
     "testing",

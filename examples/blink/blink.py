@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 
-from mme_vla import Environment, register
+from mme_vla import Environment, Fact, register
 
 
 class Blink(gymnasium.Env):
@@ -12,10 +12,8 @@ class Blink(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.side, self.time, self.arm = int(self.np_random.integers(2)) * 2 - 1, 0, 0.0
-        return self.observe(), {
-            "goal": "move to where the light was",
-            "video": [self.observe(light=True)] * 4,
-        }
+        video = [self.observe(light=True)] * 4
+        return self.observe(), {"goal": "move to where the light was", "video": video}
 
     def observe(self, light=False):
         image = np.full((64, 64, 3), 40, np.uint8)
@@ -25,10 +23,8 @@ class Blink(gymnasium.Env):
         return {"top": image, "state": np.array([self.arm], np.float32)}
 
     def step(self, action):
-        self.time, self.arm = (
-            self.time + 1,
-            float(np.clip(self.arm + 0.25 * np.clip(action[0], -1, 1), -1, 1)),
-        )
+        self.time += 1
+        self.arm = float(np.clip(self.arm + 0.25 * np.clip(action[0], -1, 1), -1, 1))
         success, over = self.arm * self.side >= 1, abs(self.arm) >= 1
         return self.observe(), float(success), over, self.time >= 20, {"success": success}
 
@@ -50,6 +46,9 @@ class BlinkEnvironment(Environment):
 
     def demonstrate(self, env):
         yield from [np.array([env.side], np.float32)] * 4
+
+    def facts(self, env):
+        return [Fact("light", "left" if env.side < 0 else "right", shown=(0, 3), needed=(4,))]
 
     def choices(self, env):
         return {"move left": [np.array([-1.0])] * 4, "move right": [np.array([1.0])] * 4}

@@ -94,8 +94,8 @@ class BackboneConfig:
 
 
 Hook = Callable[[int, Tensor], Tensor]
-"""`hook(layer, x)`: the input of the action expert's MLP in a layer, made from its residual stream
-x [b, h, d].
+"""`hook(layer, x)`: what the norm before the action expert's MLP reads in a layer, made from its
+residual stream x [b, h, d]. The residual stream itself stays x.
 """
 
 
@@ -103,7 +103,7 @@ class LayerHooks:
     """A hook made of one callable a layer. Compiled layers share one code; any other hook makes
     each compile its own.
 
-    layers: `layers[i](x)` is the input of layer i's MLP.
+    layers: `layers[i](x)` is what the norm before layer i's MLP reads.
     """
 
     def __init__(self, layers: Sequence[Callable[[Tensor], Tensor]]) -> None:

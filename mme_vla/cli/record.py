@@ -76,8 +76,8 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
     to choose the frames, and again with images of them.
 
     Returns:
-        Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed
-        seeds with reasons.
+        Task, episode, the seed that succeeded, steps, stored steps, video steps, the failed seeds
+        with reasons, and the facts.
     """
     from mme_vla.envs.robomme.recording.recorder import Recorder
     from mme_vla.envs.robomme.scene.placement import SceneError
@@ -127,6 +127,7 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
                 "seed": seed,
                 **counts,
                 "failed_seeds": failures,
+                "facts": [fact.to_dict() for fact in result.facts],
             }
             # last: what it tells of is there
             write_json(folder / f"{job.name}.json", done, indent=None)
@@ -279,6 +280,7 @@ def main(cfg: DictConfig) -> None:
                 print(_throughput(n_new, n_new_steps, seconds, run.workers))
         else:
             print(f"{places}: {counted(len(jobs), 'episode')}, all there already.")
+        recording_plan.write_facts(work / "episodes")
         recording_plan.tidy()
         drafts = []
         for job in jobs:

@@ -19,6 +19,7 @@ import numpy as np
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option
+from mme_vla.envs.facts import Fact
 from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
@@ -109,6 +110,12 @@ class Environment(ABC):
         Empty: nothing.
         """
         return {}
+
+    def facts(self, env: Any) -> Sequence[Fact]:
+        """What the episode of `env` has shown so far that is needed later, from the simulator's
+        state: for the score of writing and the table beside a recording. By default nothing.
+        """
+        return ()
 
     def scene_values(self, env: Any) -> Mapping[str, Any] | None:
         """What makes the scene of `env`, right after its reset: plain values, the same on every
@@ -376,6 +383,11 @@ class EpisodeEnv:
             replaced.close()
 
     @property
+    def facts(self) -> Sequence[Fact]:
+        """What the frames since the reset showed, the video's first."""
+        return self.environment.facts(self.env)
+
+    @property
     def hold_action(self) -> Any:
         """The action that keeps the robot where it is."""
         return self.environment.hold(self.env)
@@ -449,7 +461,7 @@ class EpisodeEnv:
 
     def _taken(self, observation: Mapping[str, Any], newest: bool = False) -> dict[str, Any]:
         """An observation with its images: those that are functions are rendered now, or left
-        out if nobody requested them.
+        out where they were not requested.
         """
         frame = dict(observation)
         requested = self.render_request

@@ -1,12 +1,13 @@
 """RoboMME as the entry `mme_vla` of the registry of environments."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import check_benchmark
 from mme_vla.envs import make, metadata
 from mme_vla.envs.base import Environment
+from mme_vla.envs.facts import Fact
 from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
 from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
 from mme_vla.registry import ENVS
@@ -53,6 +54,11 @@ class RoboMME(Environment):
         """What was sampled, and where everything stands; only right after the reset of its task."""
         values: Mapping[str, Any] = env.task.placed_values()
         return values
+
+    def facts(self, env: Any) -> Sequence[Fact]:
+        """What the task's script shows and the simulator knows."""
+        facts: Sequence[Fact] = env.facts
+        return facts
 
     def scene_digest(self, spec: EpisodeSpec) -> str:
         """Without the conditioning video, which does not belong to the scene."""

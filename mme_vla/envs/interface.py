@@ -18,6 +18,7 @@ import torch
 
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.base import Hold
+from mme_vla.envs.facts import Fact, TaskFacts
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import (
@@ -95,6 +96,7 @@ class _Run:
     """One episode under way."""
 
     control: Control
+    facts: TaskFacts
     displayed: "SubTask"
     """Whose text describes the present frame."""
     last_action: np.ndarray
@@ -210,7 +212,9 @@ class RoboMMEEnv(gymnasium.Env):
         self._episodes += 1
         self.scene_digest = scene_digest(task.placed_values())
         control = Control(task, self._step_control, Demonstrator(task, self._step_control))
-        run = self._run = _Run(control, task.progress.displayed, task.reset_action, options=options)
+        run = self._run = _Run(
+            control, TaskFacts(task), task.progress.displayed, task.reset_action, options=options
+        )
         self._grounding.clear()
         self._observer.start()
         # The video is the recorded one, whose texts change when its drops were noticed.
@@ -362,6 +366,11 @@ class RoboMMEEnv(gymnasium.Env):
         return [] if self._run is None else list(self._run.began)
 
     @property
+    def facts(self) -> Sequence[Fact]:
+        """What the frames since the reset showed, the video's first."""
+        return () if self._run is None else tuple(self._run.facts.facts)
+
+    @property
     def steps_counted(self) -> int:
         """Control steps that count towards the limit."""
         return 0 if self._run is None else self._run.count
@@ -385,6 +394,7 @@ class RoboMMEEnv(gymnasium.Env):
             run.began.append(run.returned)
             run.subgoal_text = run.displayed.text
         run.returned += 1
+        run.facts.add(run.in_video)
         run.info = self._info(run, evaluated)
         run.frames.append(frame)
         if self.on_frame is not None:

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from mme_vla.envs.facts import Shown
 from mme_vla.envs.robomme.scene.motions import Cue, Motion, build_cue, show_cue
 from mme_vla.envs.robomme.scene.objects import Disc
 from mme_vla.envs.robomme.scene.placement import Draws
@@ -22,6 +23,15 @@ from mme_vla.envs.subtasks import Choice, Progress, SubTask
 from mme_vla.errors import check_known, require
 
 RECOVERY_MODES = ("z", "xy")
+
+
+def key_pose(subtask: SubTask) -> Shown:
+    """What the end of a sub-task shows: its text, and the objects that it is about."""
+    names = [thing.name for thing in subtask.targets]
+    value = subtask.text
+    if names:
+        value = f"{subtask.text}: {', '.join(names)}"
+    return Shown(value, frozenset(names))
 
 
 class Task(Stage):
@@ -54,8 +64,16 @@ class Task(Stage):
 
     dials: ClassVar[frozenset[str]] = frozenset()
     """Dials of `metadata.DIALS` that the task has."""
-    evidence_choices: ClassVar[str | None] = None
+    fact_choices: ClassVar[str | None] = None
     """Letters of the options whose ends show what is to be remembered; None: all of them."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for former, name in (("evidence", "shown_facts"), ("evidence_choices", "fact_choices")):
+            require(
+                former not in vars(cls),
+                f"{cls.__name__}.{former} is not read any more: define {name} instead.",
+            )
 
     def __init__(
         self,
@@ -156,22 +174,33 @@ class Task(Stage):
         """
         return ()
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
-        """Names of the facts that the present frame shows and that the episode needs later.
+    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
+        """The facts that the current frame shows and that the episode needs later, by their names.
 
         By default the key poses: the end of each sub-task of the video that a policy could choose
-        (`evidence_choices`), or, in a task without a video, of the execution.
+        (`fact_choices`), or, in a task without a video, of the execution, which are counted.
 
         Args:
             ended: the sub-tasks that have ended in the last frames, by their number.
         """
         has_video = any(subtask.video for subtask in self.progress.subtasks)
-        facts = set()
+        shown = {}
         for i, subtask in ended.items():
-            counts = self.evidence_choices is None or subtask.choice in self.evidence_choices
-            if subtask.choice and subtask.video == has_video and counts:
-                facts.add(f"{i} {subtask.text}")
-        return facts
+            counts = self.fact_choices is None or subtask.choice in self.fact_choices
+            if not subtask.choice or subtask.video != has_video or not counts:
+                continue
+            if has_video:
+                shown[f"{i} {subtask.text}"] = key_pose(subtask)
+            else:
+                shown[f"{i} {subtask.text}"] = self.counted(i)
+        return shown
+
+    def counted(self, i: int) -> Shown:
+        """How many sub-tasks with the choice of sub-task `i` are done at its end."""
+        subtasks = self.progress.subtasks[: i + 1]
+        kind = (subtasks[i].choice, subtasks[i].video)
+        count = sum((subtask.choice, subtask.video) == kind for subtask in subtasks)
+        return Shown(str(count), {f"count of {subtasks[i].choice}"}, replaces=True)
 
     def failure(self) -> bool:
         """What counts as failure at any time, whatever the sub-task."""

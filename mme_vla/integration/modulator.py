@@ -1,5 +1,5 @@
-"""Memory as modulator: each action layer's MLP input is scaled and shifted by what the layer reads
-from memory (paper, section 4.3).
+"""Memory as modulator: in each action layer, what the norm before the MLP reads is scaled and
+shifted by what the layer reads from memory (paper, section 4.3).
 """
 
 from collections.abc import Callable

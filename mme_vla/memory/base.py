@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import check_choice, require
+from mme_vla.errors import brief, check_choice, require
 from mme_vla.memory.history import FrameScorer, History, StorageSpec
 from mme_vla.types import HistoryTokens, Labels, MemoryTokens
 
@@ -406,6 +406,22 @@ class FeatureEncoder(nn.Module):
         (0, 0, 0).
         """
         return self.encode(features, self.embed_positions(positions) * mask[..., None])
+
+
+def check_scorer(memory: "Memory") -> None:
+    """Check that a cache stores scores under the key of the scorer that the memory makes.
+
+    Raises:
+        UserError: the keys differ, so that training and episodes would read different scores.
+    """
+    scorer = memory.make_scorer()
+    key = "" if scorer is None else scorer.key
+    require(
+        memory.storage.scorer == key,
+        f"{type(memory).__name__}: storage.scorer={brief(memory.storage.scorer)} is not the key of"
+        f" the scorer that make_scorer() returns ({brief(key)}), so a cache would hold the scores"
+        " of another rule. Pass StorageSpec(…, scorer=<that scorer>.key), with the same options.",
+    )
 
 
 class PerceptualMemory(MemoryModule):

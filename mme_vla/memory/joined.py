@@ -246,6 +246,11 @@ class _Upsampled(FrameScorer):
         self._grid = grid
         self._times = fine // grid
 
+    @property
+    def key(self) -> str:
+        """The member's: its code and options decide the scores."""
+        return self._scorer.key
+
     def frames_scored(self, length: int) -> np.ndarray:
         return self._scorer.frames_scored(length)
 

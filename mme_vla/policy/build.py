@@ -16,7 +16,7 @@ from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, require
 from mme_vla.integration.base import Integration, extension_points
-from mme_vla.memory.base import Memory, MemoryModule
+from mme_vla.memory.base import Memory, MemoryModule, check_scorer
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import policy_class
 from mme_vla.policy.sections import SECTIONS, PolicySections
@@ -35,6 +35,7 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
     """
     memory: Memory = MEMORIES.build(section, d_vision=d_vision, width=width)
     check_grid(memory, grid)
+    check_scorer(memory)
     return memory
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.memory.base import Memory, stack_history
+from mme_vla.memory.base import Memory, check_scorer, stack_history
 from mme_vla.memory.history import CachedHistory, FrameScores, History, OnlineHistory
 from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import moving_frames
@@ -33,6 +33,7 @@ def check_memory(name: str, frames: int = 48, **options: Any) -> None:
     """
     memory: Memory = MEMORIES.build({"name": name, **options}, d_vision=D_VISION, width=WIDTH)
     memory.eval()
+    check_scorer(memory)
     check_selection(memory, frames)
     print(
         f"{name}: select stays in bounds, ignores later frames, repeats, and agrees offline and"

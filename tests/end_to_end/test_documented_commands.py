@@ -47,12 +47,12 @@ NOT_RUN = {
     r"^B=": "sets a shell variable",
     r"torchrun|accelerate launch|--multirun": "needs several GPUs or a cluster",
     r"<|…": "has a place for a file or folder of the reader's own",
-    r"mme_vla\.train ": "trains for minutes or hours",
+    r"mme(_vla\.|-vla )train ": "trains for minutes or hours",
     r"mme(_vla\.|-vla )nano( |$)": "trains for minutes or hours",
     r"mme-vla vision-pretrain ": (
         "trains for minutes; tests/extras/nano/test_vision_pretrain.py runs it on few scenes"
     ),
-    r"mme_vla\.(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": (
+    r"mme(_vla\.|-vla )(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": (
         "needs a policy that was trained before"
     ),
     r"--checkpoint outputs/": "needs a policy that was trained before",
@@ -72,7 +72,7 @@ NOT_RUN = {
     r"mme-vla docs$": "opens a browser; tests/docs builds the site",
     r"mme_vla\.play ": "waits for a player, or plays hundreds of episodes",
     r"mme-vla record ": "records for minutes or hours",
-    r"mme_vla\.evaluate .*checkpoint=nano|tasks=\[PickXtimes,VideoUnmask\]": (
+    r"mme(_vla\.|-vla )evaluate .*checkpoint=nano|tasks=\[PickXtimes,VideoUnmask\]": (
         "evaluates for minutes"
     ),
     r"mme_vla\.probe (checkpoint=nano|compare=)": "needs recorded episodes or finished probes",
@@ -151,7 +151,7 @@ def test_a_documented_command_runs_as_printed(
         monkeypatch.chdir(folder_of(page, root))
         results(words[3:])
         return
-    if re.search(r"mme_vla\.evaluate|mme-vla gallery", command):
+    if re.search(r"mme(_vla\.|-vla )evaluate|mme-vla gallery", command):
         pytest.importorskip(
             "mani_skill", reason="the simulator is not installed: the extra `sim` has it"
         )
@@ -182,7 +182,10 @@ def test_the_words_of_other_documented_commands_are_valid(page: str, command: st
     program, arguments = words[start], words[start + 1 :]
     if program in ("mme-vla", "mme_vla"):
         assert arguments[0] in cli.commands()
-        entry, arguments = f"mme-vla {arguments[0]}", arguments[1:]
+        command_name, arguments = arguments[0], arguments[1:]
+        entry = f"mme-vla {command_name}"
+        if command_name in ("train", "evaluate"):  # typed in both ways, without words of their own
+            entry = f"python -m mme_vla.{command_name}"
     else:
         assert find_spec(program) is not None
         entry = f"python -m {program}"

@@ -1,5 +1,6 @@
 """Recording and showing: rendered episodes, datasets that can be read, runs that resume."""
 
+import csv
 import json
 from collections.abc import Iterator
 from itertools import pairwise
@@ -74,12 +75,20 @@ def test_the_command_saves_both_layouts_and_only_what_is_missing(
     )
     record.main(cfg)
     assert not work.exists()
-    assert "1 episodes" in capsys.readouterr().out
+    assert "1 episode, " in capsys.readouterr().out
     source = EpisodeSource(output)
     (ref,) = list_episodes(find_files([tmp_path / "official"]))
     with open_episode(ref) as episode:
         assert len(source) == 1
         assert len(source.states(0)) == episode.length
+    tables = (output / "meta" / "facts.csv", *(tmp_path / "official").glob("*.facts.csv"))
+    for table in tables:
+        with table.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert [row["fact"].split()[0] for row in rows] == ["1", "2", "3"][: len(rows)] and rows
+        assert all(int(row["from"]) <= int(row["to"]) < len(source.states(0)) for row in rows)
+        assert {row["task"] for row in rows} == {"PatternLock"}
+    assert len(tables) == 2
     record.main(cfg)
     assert "all there already" in capsys.readouterr().out
     jobs.append(record.Job("PatternLock", 1, seed=1, difficulty="easy", recovery=None, retries=3))

@@ -2,6 +2,7 @@
 cannot.
 """
 
+import csv
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -60,5 +61,11 @@ def test_an_interrupted_recording_continues_with_the_missing_episodes(
     assert len(demonstrated) == 5  # three, and the two that were missing
     assert read_json(tmp_path / "data" / "meta" / "info.json", "a dataset")["total_episodes"] == 4
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
+    with (tmp_path / "data" / "meta" / "facts.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["episode"] for row in rows] == ["0", "1", "2", "3"]
+    assert {(row["fact"], row["from"], row["to"], row["needed"]) for row in rows} == {
+        ("light", "0", "3", "4")
+    }
     with pytest.raises(UserError, match="exists already"):
         record_environment(config)

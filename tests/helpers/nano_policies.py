@@ -4,6 +4,7 @@ import numpy as np
 
 from mme_vla import build_policy
 from mme_vla.data.waypoints import Motions
+from mme_vla.envs.facts import Fact
 from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
 
@@ -42,4 +43,5 @@ def demonstration(
         {"front": images},
         boundaries=np.array([0]),
         subgoals=subgoals,
+        facts=[Fact("cover 0", "green: container_1", (0, 31), (66,))],
     )

@@ -3,7 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 
+from mme_vla.errors import UserError
+from mme_vla.memory.base import check_scorer
 from mme_vla.memory.history import FrameScorer
 from mme_vla.memory.tokendrop import ChangeScorer, TokenDrop
 
@@ -43,6 +46,19 @@ def test_another_rule_or_option_has_another_key() -> None:
     }
     assert len(keys) == 5
     assert Brightness().key.startswith("brightness-every2-")
+
+
+class OtherTokenDrop(TokenDrop):
+    """Scores by another rule, and forgets to store the scores under its key."""
+
+    def make_scorer(self) -> OtherRule:
+        return OtherRule(self.storage.grid, self.stride)
+
+
+def test_scores_under_the_key_of_another_rule_are_refused() -> None:
+    check_scorer(TokenDrop(64, 32))
+    with pytest.raises(UserError, match=r"scorer='change8x8-every8' is not the key of the scorer"):
+        check_scorer(OtherTokenDrop(64, 32))
 
 
 def test_a_scorer_names_the_frames_that_it_needs() -> None:

@@ -55,7 +55,6 @@ def begin(variables: Mapping[str, str], work: Callable[..., Any], *arguments: An
     return work(*arguments)
 
 
-_EXTRAS = "mme_vla.extras."
 _INSTALLED = (
     str(Path(errors.__file__).parent),
     *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
@@ -190,8 +189,6 @@ def _plugin_line(error: Exception) -> str | None:
 
 def _is_of_plugin(frame: FrameType) -> bool:
     name = str(frame.f_globals.get("__name__", ""))
-    if name.startswith(_EXTRAS):
-        return True
     packages = {module.partition(".")[0] for module in imported_plugins()}
     if name.partition(".")[0] in packages:
         return True

@@ -16,6 +16,7 @@ import numpy as np
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import Option, read_options
 from mme_vla.embodiment.robomme import CAMERAS, benchmark_action, benchmark_state
+from mme_vla.envs.facts import Fact
 from mme_vla.envs.make import make_task
 from mme_vla.envs.observations import RenderRequest, capture, read_images
 from mme_vla.errors import require
@@ -40,7 +41,7 @@ class Demonstration:
     decisions. images: camera → frame → [256, 256, 3] uint8. boundaries: frames at which a sub-task
     begins, of the video too. subgoals: `simple` and `grounded` → what the simulator says at each
     decision, as it says it at test time. carried_out: whether its motions were carried out one by
-    one, see `record`.
+    one, see `record`. facts: what its frames show; None in files of earlier versions.
     """
 
     task: str
@@ -55,6 +56,7 @@ class Demonstration:
     boundaries: np.ndarray
     subgoals: dict[str, list[str]] = field(default_factory=dict)
     carried_out: bool = False
+    facts: Sequence[Fact] | None = None
 
     def save(self, path: Path) -> None:
         """Write it as one file, which appears whole or not at all."""
@@ -69,6 +71,8 @@ class Demonstration:
             "carried_out",
         )
         about = {name: getattr(self, name) for name in names}
+        if self.facts is not None:
+            about["facts"] = [fact.to_dict() for fact in self.facts]
         arrays = {
             "states": self.states,
             "decisions": self.motions.decisions,
@@ -112,6 +116,8 @@ def _about(path: Path, file: Any) -> dict[str, Any]:
         "carried_out" in about and "boundaries" in file,
         f"{path} is of an earlier version: remove it and record it again.",
     )
+    if "facts" in about:
+        about["facts"] = [Fact.from_dict(fact) for fact in about["facts"]]
     return about
 
 
@@ -283,6 +289,7 @@ def record(
             _boundaries(taken.texts),
             subgoals,
             carried_out,
+            taken.facts,
         )
     finally:
         env.close()
@@ -299,6 +306,7 @@ class _Taken:
     def __init__(self, env: "Task") -> None:
         self.env = env
         self.video = 0
+        self.facts: Sequence[Fact] = ()
         self.states: list[np.ndarray] = []
         self.texts: list[Mapping[str, Any]] = []
         self._snapshots: list[tuple[list[Any], list[float], list[tuple[Any, Any]]]] = []
@@ -365,6 +373,7 @@ def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
     result = Recorder(taken.env, on_step=take, render_request=RenderRequest(now=())).record()
     if not result.success:
         return None
+    taken.facts = result.facts
     return choices_of(steps) if choosing else motions_of(steps)
 
 
@@ -388,6 +397,7 @@ def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None"
             continue
         if info["status"] != "success":
             return None
+        taken.facts = env.facts
         return Motions(np.array(decisions, np.int64), targets[:number])
     return None
 

@@ -162,7 +162,7 @@ def _row(episodes: Sequence[EpisodeWriting]) -> dict[str, Any]:
 
 def oracle_selection(episode: EvidenceEpisode) -> Selection:
     """The first frame of each fact so far, at most `FRAMES`: the ceiling."""
-    first = np.unique([frames[0] for frames in episode.facts.values()]).astype(np.int64)
+    first = np.unique([frames[0] for frames in episode.evidence.values()]).astype(np.int64)
     return lambda step: first[first <= step][-FRAMES:]
 
 
@@ -319,7 +319,9 @@ def score_writing(
             selection = REFERENCES[selector](episode)
         else:
             selection = memory_selection(selector, episode, motion, tower)
-        score = score_episode(selection, episode.facts, episode.length, episode.exec_start, stride)
+        score = score_episode(
+            selection, episode.evidence, episode.length, episode.exec_start, stride
+        )
         if score is not None:
             writing.tasks.setdefault(episode.task, []).append(score)
     return writing

@@ -57,6 +57,9 @@ def test_a_demonstration_is_read_as_it_was_saved(tmp_path: Path) -> None:
     read = Demonstration.load(tmp_path / "a.npz")
     assert (read.goal, read.length, read.exec_start) == (made.goal, made.length, made.exec_start)
     assert read.boundaries.tolist() == [0, 66]
+    assert read.facts == made.facts and made.facts
+    replace(made, facts=None).save(tmp_path / "earlier.npz")
+    assert Demonstration.load(tmp_path / "earlier.npz").facts is None
     assert (
         np.array_equal(read.motions.targets, made.motions.targets)
         and read.subgoals == made.subgoals

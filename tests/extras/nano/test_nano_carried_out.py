@@ -30,6 +30,11 @@ def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand(rende
         )
         assert np.allclose(made.states[frame], now, atol=1e-3), number
         observation, _, ended, _, info = env.step(target)
+    facts = made.facts
+    assert facts is not None
+    assert [fact.value for fact in facts] == [str(i + 1) for i in range(len(facts))]
+    assert [fact.name for fact in env.facts] == [fact.name for fact in facts]
+    assert all(fact.needed and fact.shown[1] < made.length for fact in facts)
     env.close()
     assert ended and info["status"] == "success"
 

@@ -12,6 +12,7 @@ import pytest
 from helpers.rollout_fakes import quick_policy
 from mme_vla import UserError
 from mme_vla.envs.episodes import choose_episodes
+from mme_vla.envs.facts import Fact
 from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.extras.probing.cli.analyse import main
 from mme_vla.extras.probing.evidence import EvidenceEpisode, record_evidence
@@ -35,10 +36,9 @@ FACTS = {"a": np.arange(10), "b": np.arange(20, 30)}
 
 def synthetic(length: int = 300, exec_start: int = 100, number: int = 0) -> EvidenceEpisode:
     """An episode with a reveal and three short events, the last of them in the execution."""
-    facts = {
-        "open": np.arange(32),
-        **{f"event {i}": np.arange(at, at + 16) for i, at in enumerate((50, 90, 170))},
-    }
+    facts = [Fact("open", "red", (0, 31))]
+    for i, at in enumerate((50, 90, 170)):
+        facts.append(Fact(f"event {i}", str(i), (at, at + 15)))
     states = np.random.default_rng(number).normal(size=(length, 8)).astype(np.float32)
     return EvidenceEpisode(
         "Task", number, length, exec_start, facts, np.array([0, 100, 200]), states, {}
@@ -150,7 +150,7 @@ def test_memories_that_read_tokens_are_scored_by_their_policy(name: str) -> None
         for frame in required_frames(memory)
         if frame < 120
     }
-    facts = {name: frames for name, frames in base.facts.items() if frames[-1] < 120}
+    facts = [fact for fact in base.facts if fact.shown[1] < 120]
     row = score_writing(memory, [replace(base, facts=facts, images=images)], policy).to_dict()[
         "mean"
     ]

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from mme_vla.embodiment.robomme import CAMERAS
+from mme_vla.envs.facts import FACTS, Fact, write_facts
 from mme_vla.envs.observations import INTRINSIC
 from mme_vla.envs.robomme.recording.frames import FrameChoice
 from mme_vla.errors import require
@@ -199,6 +200,30 @@ class RecordingPlan:
                 EpisodeRef(episodes / f"{job.name}.h5", job.episode, job.task) for job in self.jobs
             ]
             convert(refs, self.dataset, options)
+
+    def write_facts(self, episodes: Path) -> None:
+        """Write the table of facts of each place that has none, from what is known in `episodes` of
+        every episode.
+
+        There is no table where an earlier version, which knew no facts, recorded an episode.
+        """
+        if not all((episodes / f"{job.name}.json").is_file() for job in self.jobs):
+            return
+        facts = {}
+        for job in self.jobs:
+            known = read_json(episodes / f"{job.name}.json", "what is known of a recorded episode")
+            if "facts" not in known:
+                return
+            facts[job.name] = [Fact.from_dict(fact) for fact in known["facts"]]
+        for place in self.places:
+            if place == self.dataset:
+                table = place / FACTS
+                numbered = list(enumerate(self.jobs))
+            else:
+                table = place.with_suffix(".facts.csv")
+                numbered = [(job.episode, job) for job in self._of(place)]
+            if not table.exists():
+                write_facts(table, [(i, job.task, facts[job.name]) for i, job in numbered])
 
     def tidy(self) -> None:
         """Remove what earlier runs left beside the dataset, which is there; the caller holds the

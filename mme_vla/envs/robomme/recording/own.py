@@ -1,5 +1,6 @@
 """Demonstrations of an environment of the user's own, as a LeRobot v3.0 dataset."""
 
+import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,9 +10,10 @@ import numpy as np
 
 from mme_vla.data.console import progress, quiet_libraries
 from mme_vla.envs.base import Environment
+from mme_vla.envs.facts import FACTS, Fact, write_facts
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import UserError
-from mme_vla.utils import write_atomically
+from mme_vla.utils import parse_json, write_atomically
 
 STATE = "observation.state"
 ACTION = "action"
@@ -34,7 +36,8 @@ def record_own(
     """Demonstrate episodes into a new dataset; those that do not succeed are left out.
 
     The columns are `observation.images.<camera>`, `observation.state`, `action`, and `is_demo` for
-    the frames of a conditioning video. `output` appears when it is whole.
+    the frames of a conditioning video. `meta/facts.csv` has the facts. `output` appears when it is
+    whole.
 
     Args:
         work: folder that keeps each episode until then; those in it are not demonstrated again.
@@ -58,10 +61,15 @@ def record_own(
                     with write_atomically(path) as temporary, temporary.open("wb") as file:
                         np.savez_compressed(file, **columns)  # type: ignore[arg-type]
             advance(1)
+        tables: list[tuple[int, str, list[Fact]]] = []
         for path in filter(Path.is_file, episodes):
             with np.load(path) as loaded:
                 columns = dict(loaded)
             goal = str(columns.pop("task"))
+            # An earlier version kept no facts.
+            facts = parse_json(str(columns.pop("facts", "[]")), str(path), list)
+            task = episodes[path].task
+            tables.append((len(tables), task, [Fact.from_dict(fact) for fact in facts]))
             length = len(columns[STATE])
             for frame in range(length):
                 row = {name: column[frame] for name, column in columns.items()}
@@ -76,6 +84,7 @@ def record_own(
                 " written."
             )
         dataset.finalize()
+    write_facts(draft / FACTS, tables)
     draft.rename(output)
     return frames, failures
 
@@ -96,7 +105,8 @@ def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.n
             rows.append(row)
         if not env.success:
             return None
-        columns = {"task": np.array(env.goal)}
+        facts = json.dumps([fact.to_dict() for fact in env.facts])
+        columns = {"task": np.array(env.goal), "facts": np.array(facts)}
         for name in rows[0]:
             columns[name] = np.stack([row[name] for row in rows])
         return columns

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
+from mme_vla.envs.facts import Fact, TaskFacts
 from mme_vla.envs.grounding import Grounding, project
 from mme_vla.envs.observations import AngleTrack, Include, Observer, RenderRequest
 from mme_vla.envs.robomme.robot.control import PlanningError
@@ -99,6 +100,8 @@ class Recording:
     """Why the demonstration ended early, if it did."""
     frames: list[RecordedStep] = field(default_factory=list)
     """Empty where a callback took the steps."""
+    facts: Sequence[Fact] = ()
+    """Of the stored steps, which count as frames."""
 
 
 class Recorder:
@@ -146,6 +149,7 @@ class Recorder:
         self._in_video: bool | None = None
         self._last_stored: str | int | None = None
         self._result = Recording(success=False, steps=0)
+        self._facts = TaskFacts(task)
         self._demonstrator = Demonstrator(task, self._step, self._note_waypoint)
         task.on_frame = self._on_frame
         try:
@@ -154,6 +158,7 @@ class Recorder:
             self._result.error = str(error) or type(error).__name__
         finally:
             task.on_frame = None
+        self._result.facts = self._facts.facts
         return self._result
 
     def _step(self, action: np.ndarray) -> None:
@@ -188,6 +193,7 @@ class Recorder:
         )
         self._result.stored += 1
         self._result.video += planned.video
+        self._facts.add(planned.video)
         if self._on_step is None:
             self._result.frames.append(step)
         else:

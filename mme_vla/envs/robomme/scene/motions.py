@@ -5,13 +5,14 @@ Motions are functions of the number of control steps done, or of the state of th
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import sapien
 
+from mme_vla.envs.facts import Shown
 from mme_vla.envs.robomme.scene.arithmetic import norm
 from mme_vla.envs.robomme.scene.objects import (
     BELOW_TABLE,
@@ -82,8 +83,16 @@ class Cover:
 
     active = False
 
-    def __init__(self, containers: Sequence[Thing], group: int | None = None) -> None:
-        """`group`: park each container at a place of its own (`parked`); None: all at one."""
+    def __init__(
+        self,
+        containers: Sequence[Thing],
+        group: int | None = None,
+        contents: "Mapping[str, Thing] | None" = None,
+    ) -> None:
+        """`group`: park each container at a place of its own (`parked`); None: all at one.
+        `contents`: what lay open → the container that will stand over it.
+        """
+        self._contents = contents or {}
         self._parts = [
             Appear(container, UNCOVERED_STEPS, parked(group, i))
             for i, container in enumerate(containers)
@@ -94,6 +103,12 @@ class Cover:
         self.active = k < UNCOVERED_STEPS
         for part in self._parts:
             part.apply(k)
+
+    def shown(self) -> Shown:
+        """What lies open, and where."""
+        names = {cube: container.name for cube, container in self._contents.items()}
+        value = ", ".join(f"{cube}: {name}" for cube, name in names.items())
+        return Shown(value, frozenset(names.values()))
 
 
 class Swap:
@@ -158,6 +173,12 @@ class Swap:
         for thing, pose in poses.items():
             thing.move_to(pose)
 
+    def shown(self) -> Shown:
+        """Which two change places."""
+        assert self.partner is not None
+        names = (self.initiator.name, self.partner.name)
+        return Shown(" and ".join(names), frozenset(names), replaces=True)
+
 
 def sequential_swaps(
     initiators: Sequence[Thing], group: Sequence[Thing], start: int, steps: int = SWAP_STEPS
@@ -188,11 +209,13 @@ def planned_swaps(
     ]
 
 
-def active_motions(motions: "Sequence[Cover | Swap | Highlight]") -> set[str]:
-    """Names of the motions that take place, by their kind and number: `swap 0`."""
-    return {
-        f"{type(motion).__name__.lower()} {i}" for i, motion in enumerate(motions) if motion.active
-    }
+def active_motions(motions: "Sequence[Cover | Swap | Highlight]") -> dict[str, Shown]:
+    """The motions that take place, each a fact named by its kind and number: `swap 0`."""
+    shown = {}
+    for i, motion in enumerate(motions):
+        if motion.active:
+            shown[f"{type(motion).__name__.lower()} {i}"] = motion.shown()
+    return shown
 
 
 class Hide:
@@ -240,6 +263,10 @@ class Highlight:
         if self.active:
             place = self._thing.position - [0, 0, self.DEPTH]
         self._disc.move_to(sapien.Pose(place, self._disc.pose.q))
+
+    def shown(self) -> Shown:
+        """Which object is highlighted."""
+        return Shown(self._thing.name, {self._thing.name})
 
 
 def build_mark(env: "Stage", name: str, radius: float, half_length: float) -> Disc:

@@ -50,7 +50,7 @@ class BinFill(Task):
     spectator = ((1, 0, 0.4), (0, 0, 0.4))
     latch_failure = True
     recovery_sampled_per_episode = True
-    evidence_choices = "b"
+    fact_choices = "b"
 
     def build(self, draws: Draws) -> None:
         values = self.values

@@ -37,7 +37,7 @@ class PickXtimes(Task):
 
     latch_failure = True
     dials = frozenset({"count"})
-    evidence_choices = "b"
+    fact_choices = "b"
 
     def plan(self, draws: Draws) -> None:
         self.repetitions = sample_repetitions(self, draws, REPETITIONS[self.difficulty])

@@ -68,7 +68,7 @@ class SwingXtimes(Task):
 
     latch_failure = True
     dials = frozenset({"count"})
-    evidence_choices = "b"
+    fact_choices = "b"
 
     def plan(self, draws: Draws) -> None:
         self.repetitions = sample_repetitions(self, draws, SWINGS[self.difficulty])

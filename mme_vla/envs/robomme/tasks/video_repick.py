@@ -4,6 +4,7 @@ now.
 
 from collections.abc import Mapping
 
+from mme_vla.envs.facts import Shown
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import (
     SWAP_STEPS,
@@ -53,7 +54,7 @@ class VideoRepick(Task):
     latch_failure = True
     recovery_sampled_per_episode = True
     dials = frozenset({"count", "delay"})
-    evidence_choices = "a"
+    fact_choices = "a"
 
     def plan(self, draws: Draws) -> None:
         self.repetitions = self.values.integer(
@@ -153,12 +154,12 @@ class VideoRepick(Task):
 
         return [under(self.cube), *tally(row(self.repetitions), left)]
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
-        facts = super().evidence(ended) | active_motions(self.swaps)
+    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
+        shown = super().shown_facts(ended) | active_motions(self.swaps)
         for i, subtask in ended.items():
             if subtask.choice == "b" and not subtask.video:  # one repetition is done
-                facts.add(f"{i} {subtask.text}")
-        return facts
+                shown[f"{i} {subtask.text}"] = self.counted(i)
+        return shown
 
     def failure(self) -> bool:
         """Notes whether the swaps may begin, one step after their stage is entered; the rules

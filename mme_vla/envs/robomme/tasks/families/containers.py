@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from mme_vla.envs.facts import Shown
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import (
     COVER_STEPS,
@@ -147,9 +148,14 @@ class ContainerTask(Task):
         return PARKED[name] if self.tier else None
 
     @property
+    def contents(self) -> dict[str, Container]:
+        """Colour of each hidden cube → the container over it."""
+        return dict(zip(self.colours, self.over_cubes, strict=False))
+
+    @property
     def targets(self) -> list[tuple[str, Container]]:
         """Colours to be found, in order, each with the container over it."""
-        return list(zip(self.colours, self.over_cubes, strict=False))[: self.pick_count]
+        return list(self.contents.items())[: self.pick_count]
 
     @property
     def all_containers(self) -> list[Container]:
@@ -157,8 +163,7 @@ class ContainerTask(Task):
         return [*self.containers, *self.outer.containers]
 
     def cues(self) -> list[Cue]:
-        pairs = zip(self.colours, self.over_cubes, strict=False)
-        return [under(container, colour) for colour, container in pairs]
+        return [under(container, colour) for colour, container in self.contents.items()]
 
     def picks(self) -> list[SubTask]:
         """Pick up the container over each colour in turn, putting one down before the next."""
@@ -269,11 +274,11 @@ class Unmask(ContainerTask):
                 return
             self.containers.append(container)
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
+    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
         return active_motions([self.cover])
 
     def start_episode(self, draws: Draws) -> None:
-        self.cover = Cover(self.containers, self.parking_group("inner"))
+        self.cover = Cover(self.containers, self.parking_group("inner"), self.contents)
         outer = Cover(self.outer.containers, self.parking_group("outer"))
         self.motions = [self.cover, outer]
 
@@ -377,7 +382,7 @@ class UnmaskSwap(ContainerTask):
         """The step at which the last swap ends."""
         return COVER_STEPS + self.swap_steps * self.swap_count
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
+    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
         return active_motions(self.visible_motions)
 
     def start_episode(self, draws: Draws) -> None:
@@ -387,7 +392,7 @@ class UnmaskSwap(ContainerTask):
             swaps = sequential_swaps(self.initiators, inner, start, steps)
         else:
             swaps = planned_swaps(self.pairs, inner, start, steps)
-        cover = Cover(inner, self.parking_group("inner"))
+        cover = Cover(inner, self.parking_group("inner"), self.contents)
         pairs = list(zip(self.cubes, self.over_cubes, strict=True))
         self.visible_motions: list[Cover | Swap] = [cover, *swaps]
         self.motions = [

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import sapien
 
+from mme_vla.envs.facts import Shown
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, Swap, active_motions, under
 from mme_vla.envs.robomme.scene.objects import Cube, Disc, H
@@ -59,7 +60,7 @@ class VideoPlace(Task):
     """
 
     dials = frozenset({"delay"})
-    evidence_choices = "bc"
+    fact_choices = "bc"
     spot_radius: ClassVar[float]
     """How far the spot where the video puts the cube at its end stays from the edge of
     its region.
@@ -149,8 +150,8 @@ class VideoPlace(Task):
     def cues(self) -> list[Cue]:
         return [under(self.goal_target)]
 
-    def evidence(self, ended: Mapping[int, SubTask]) -> set[str]:
-        return super().evidence(ended) | active_motions(self._swaps)
+    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
+        return super().shown_facts(ended) | active_motions(self._swaps)
 
     def failure(self) -> bool:
         """Notes whether the swap may begin, one step after its stage is entered; the rules belong
