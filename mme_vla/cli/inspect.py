@@ -42,7 +42,7 @@ from mme_vla.policy import mme
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import CHECKPOINTS, STATE, resolve_checkpoint
 from mme_vla.policy.sections import PolicySections
-from mme_vla.policy.self_check import NONE, compare
+from mme_vla.policy.self_check import NO_CHECK, compare
 from mme_vla.training.checkpoint import read_state
 from mme_vla.training.open_loop import (
     LEGEND,
@@ -144,7 +144,7 @@ def show_self_check(inspection: Inspection, console: Console) -> None:
     policy = Policy.from_pretrained(folder, device=device, trust_plugins=inspection.trust_plugins)
     result = compare(policy, folder)
     if result is None:
-        console.print(NONE, highlight=False, soft_wrap=True)
+        console.print(NO_CHECK, highlight=False, soft_wrap=True)
         return
     require(result.passed, result.line)
     console.print(result.line, highlight=False, soft_wrap=True)

@@ -13,7 +13,7 @@ from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import policy_config
 from mme_vla.policy.saving import local_folder
-from mme_vla.policy.self_check import NONE, compare
+from mme_vla.policy.self_check import NO_CHECK, compare
 from mme_vla.serving.server import PolicyServer
 from mme_vla.serving.settings import ServeSettings, is_local
 
@@ -48,7 +48,7 @@ def _report_self_check(policy: Policy, folder: Path) -> None:
     """Log in one line whether a policy answers as it did where it was trained."""
     result = compare(policy, folder)
     if result is None:
-        logger.info("%s", NONE)
+        logger.info("%s", NO_CHECK)
     elif result.passed:
         logger.info("%s", result.line)
     else:

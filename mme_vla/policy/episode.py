@@ -106,8 +106,6 @@ class Episode:
         self._chunk: np.ndarray | None = None
         self.action_prefix: ActionPrefix | None = None
         """See `set_action_prefix`."""
-        self.noise: Mapping[str, Tensor] | None = None
-        """Random numbers of all chunks, in place of new ones; set it to repeat a stored chunk."""
         self._executed = self._no_actions
 
     def observe(
@@ -377,8 +375,6 @@ class Episode:
         """Sample the next chunk's random numbers from this episode's own generator, independent of
         batching.
         """
-        if self.noise is not None:
-            return dict(self.noise)
         return self._policy.sampling_noise(self._generator)
 
     @property

@@ -14,10 +14,10 @@ from torch.utils.data import DataLoader, Dataset
 
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.recording import Recording
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
-from mme_vla.policy.self_check import SelfCheck, record_self_check
+from mme_vla.policy.self_check import SelfCheck, try_self_check
 from mme_vla.speed import Recomputes
 from mme_vla.speed.compiler import keep_compiled_code, missing_compiler
 from mme_vla.training.checkpoint import (
@@ -312,7 +312,7 @@ class Trainer:
         return self.last_checkpoint
 
     def _self_check(self, step: int) -> SelfCheck | None:
-        """What the averaged weights answer to a synthetic history, in the first process.
+        """The self-check of the averaged weights, in the first process.
 
         Weights that are shared among processes come together only at the end of the run.
         """
@@ -327,13 +327,8 @@ class Trainer:
         with self.ema.applied(), gathered(self.policy):
             if not is_first:
                 return None
-            try:
-                return record_self_check(self.policy)
-            except Exception as error:
-                # A checkpoint is not lost because of its check, whatever a policy raises.
-                reason = brief(f"{type(error).__name__}: {error}", 300, quote=False)
-                self.unchecked = reason
-                return None
+            check, self.unchecked = try_self_check(self.policy)
+            return check
 
     def close(self) -> None:
         """Wait until the last checkpoint is on disk."""
