@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from mme_vla import Policy, build_policy
+from mme_vla import MMEPolicy, Policy, build_policy
 from mme_vla.policy.run_folders import locate_checkpoint
 from mme_vla.policy.saving import save_policy
 from mme_vla.policy.self_check import (
@@ -34,7 +34,7 @@ from mme_vla.policy.self_check import (
     relative_difference,
 )
 from mme_vla.processing.normalise import QuantileStats
-from mme_vla.testing.small import unit_stats
+from mme_vla.testing.small import open_gates, unit_stats
 
 SHIPPED = ("nano", "nano16")
 MODELS = (
@@ -56,6 +56,8 @@ def untrained(model: str, seed: int = 0) -> Policy:
     """A small policy of a model, with unit statistics."""
     policy = build_policy(model, seed=seed)
     policy.require_processor().stats = unit_stats(policy.embodiment)
+    if isinstance(policy, MMEPolicy):
+        open_gates(policy)
     return policy.eval()
 
 

@@ -128,10 +128,10 @@ def main(cfg: DictConfig) -> None:
 
 
 def show_self_check(inspection: Inspection, console: Console) -> None:
-    """Print whether `checkpoint` answers what it answered where it was trained.
+    """Print whether `checkpoint` predicts what it predicted where it was trained.
 
     Raises:
-        UserError: it does not, or the file is damaged.
+        UserError: it does not, or its self-check is damaged.
     """
     require(
         inspection.checkpoint is not None and inspection.dataset is None,

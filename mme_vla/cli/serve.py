@@ -45,7 +45,7 @@ def main(cfg: DictConfig) -> None:
 
 
 def _report_self_check(policy: Policy, folder: Path) -> None:
-    """Log in one line whether a policy answers as it did where it was trained."""
+    """Log in one line whether a policy predicts what it predicted where it was trained."""
     result = compare(policy, folder)
     if result is None:
         logger.info("%s", NO_CHECK)

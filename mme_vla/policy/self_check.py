@@ -3,6 +3,7 @@ policy predicted where it was trained. A user who loads the weights compares.
 """
 
 import json
+import warnings
 from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -34,7 +35,7 @@ FLOAT32_TOLERANCE = 1e-3
 """Of `relative_difference` where both chunks were computed in float32 (docs/evidence/self-check.md
 has the figures).
 """
-BFLOAT16_TOLERANCE = 0.05
+BFLOAT16_TOLERANCE = 0.02
 """The same where one was computed in bfloat16."""
 ACTIONS_TOLERANCE = 1e-4
 """Of the robot's actions that the stored chunk becomes: arithmetic of statistics in float32."""
@@ -214,6 +215,23 @@ def try_self_check(policy: "Policy") -> tuple[SelfCheck | None, str | None]:
         return record_self_check(policy), None
     except Exception as error:
         return None, brief(f"{type(error).__name__}: {error}", 300, quote=False)
+
+
+def renew_self_check(policy: "Policy", dtype: str) -> SelfCheck | None:
+    """A self-check of the weights as they are now, for a policy whose checkpoint has one.
+
+    Args:
+        dtype: that the weights will be stored in.
+    """
+    if not policy.has_self_check:
+        return None
+    check, reason = try_self_check(policy)
+    if check is None:
+        warnings.warn(f"saved without a self-check: {reason}", stacklevel=3)
+        return None
+    if dtype == "bfloat16":
+        check = replace(check, precision="bfloat16")
+    return check
 
 
 def read_self_check(folder: Path) -> SelfCheck | None:

@@ -3,7 +3,7 @@ resume needs.
 
     checkpoints/step_000500/
         model.safetensors, config.json, processor.json, norm_stats.json, …   the policy, EMA weights
-        self_check.safetensors   what these weights answer to a synthetic history
+        self_check.safetensors   a synthetic history and the chunk that these weights predict
         raw.safetensors          the trained weights themselves; frozen ones are in
                                  model.safetensors
         optimizer.safetensors    Adam's moments and step counts

@@ -41,7 +41,7 @@ def test_a_check_that_fails_loses_no_checkpoint(
     def fail(policy: object) -> None:
         raise RuntimeError("cannot see")
 
-    monkeypatch.setattr("mme_vla.training.loop.record_self_check", fail)
+    monkeypatch.setattr("mme_vla.policy.self_check.record_self_check", fail)
     built = train(tmp_path)
     assert built.unchecked is not None and "cannot see" in built.unchecked
     assert not (resolve_checkpoint(tmp_path) / FILE).exists()
