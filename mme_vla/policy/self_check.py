@@ -57,7 +57,9 @@ _KINDS: dict[str, tuple[tuple[torch.dtype, int], ...]] = {
     _DEMO: ((torch.bool, 1),),
     _PAST_ACTIONS: _ROWS,
     "view": ((torch.uint8, 4), (torch.int16, 4), (torch.float32, 3)),
-    "noise": tuple((kind, n) for kind in (torch.float32, torch.int64, torch.bool) for n in range(9)),
+    "noise": tuple(
+        (kind, n) for kind in (torch.float32, torch.int64, torch.bool) for n in range(9)
+    ),
 }
 """Dtypes and numbers of axes of the tensors, by the first part of their names."""
 
