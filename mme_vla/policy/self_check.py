@@ -1,5 +1,5 @@
-"""The self-check of a checkpoint: a synthetic observation history, its noise, and the chunk that the
-policy predicted where it was trained. A user who loads the weights compares.
+"""The self-check of a checkpoint: a synthetic observation history, its noise, and the chunk that
+the policy predicted where it was trained. A user who loads the weights compares.
 """
 
 import json
@@ -425,7 +425,7 @@ def _read_about(path: Path) -> _About:
 
 
 def _synthetic_views(robot: Embodiment) -> dict[str, np.ndarray]:
-    """For every camera a shaded ground with a square that moves, and flat depth where it is read."""
+    """Of every camera a shaded ground with a square that moves, and flat depth where it is read."""
     readings = len(robot.readings) // 2
     pixels = _SIZE * _SIZE * (3 * len(robot.cameras) + 2 * readings)
     count = int(np.clip(MOST_BYTES * 3 // 4 // pixels, 1, _FRAMES))

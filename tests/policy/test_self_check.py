@@ -44,7 +44,7 @@ def without_sums(folder: Path) -> Path:
 
 
 def rewrite(folder: Path, **changes: torch.Tensor | None) -> None:
-    """Change tensors of the file as somebody may who writes the sums too."""
+    """Change tensors of the file as an attacker may who writes the sums too."""
     with safe_open(folder / FILE, "pt") as opened:
         about = opened.metadata()
     tensors = {**load_file(folder / FILE), **changes}
