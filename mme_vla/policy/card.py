@@ -15,8 +15,8 @@ CARD_FILE = "README.md"
 _SELF_CHECK = """
 ## Self-check
 
-`self_check.safetensors` holds a synthetic observation history, noise, and the chunk that this policy
-predicted. `mme-vla inspect checkpoint=<this folder> check=true` compares.
+`self_check.safetensors` holds a synthetic observation history, noise, and the chunk that this
+policy predicted. `mme-vla inspect checkpoint=<this folder> check=true` compares.
 """
 
 
