@@ -369,7 +369,7 @@ def alone(result: dict[str, Any], rows: Sequence[Row], minutes: float, output: P
         show(section[name])
         write(output, result)
     for row in missing:
-        print(f"not reached in {minutes:g} minutes: {row}. The same command goes on there.")
+        print(f"not reached in {minutes:g} minutes: {row}. The same command resumes there.")
 
 
 def together(models: Sequence[str], setup: Setup) -> dict[str, Any]:

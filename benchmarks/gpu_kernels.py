@@ -4,7 +4,7 @@
     python benchmarks/gpu_kernels.py pi05 --ways eager --steps 1
 
 One line of JSON for each model and way: launches and matrix products after the memory tokens. It
-asks for a mock CUDA driver, as docs/evidence/hardware.md has it: the driver counts, and computes
+needs a mock CUDA driver, as docs/evidence/hardware.md has it: the driver counts, and computes
 nothing. Weights hold whatever was in memory.
 """
 

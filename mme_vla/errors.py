@@ -24,12 +24,16 @@ class SceneError(RuntimeError):
     """A scene that cannot be laid out from its seed: an object found no place."""
 
 
-def place_of(error: BaseException | None) -> str | None:
-    """Kind, file and line of an error in a plugin's code, which worker processes note; None of
-    others.
+def set_place(error: BaseException, place: str) -> None:
+    """Store where in a plugin's code an error arose: its kind, file and line. The text is pickled
+    with the error.
     """
-    notes = getattr(error, "__notes__", ())
-    return notes[0] if notes else None
+    vars(error).update(plugin_place=place)
+
+
+def place_of(error: BaseException | None) -> str | None:
+    """What `set_place` stored; None of errors that arose elsewhere."""
+    return getattr(error, "plugin_place", None)
 
 
 def text_of(error: BaseException) -> str:

@@ -48,7 +48,7 @@ class BlinkEnvironment(Environment):
         yield from [np.array([env.side], np.float32)] * 4
 
     def facts(self, env):
-        return [Fact("light", "left" if env.side < 0 else "right", shown=(0, 3), needed=(4,))]
+        return [Fact("light", "left" if env.side < 0 else "right", frames=(0, 3), needed=(4,))]
 
     def choices(self, env):
         return {"move left": [np.array([-1.0])] * 4, "move right": [np.array([1.0])] * 4}

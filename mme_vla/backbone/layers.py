@@ -135,7 +135,8 @@ class AdaRMSNorm(nn.Module):
         return Modulation(*float32_linear(self.dense, condition).unsqueeze(1).chunk(3, dim=-1))
 
     def forward(self, x: Tensor, condition: Tensor | Modulation) -> tuple[Tensor, Tensor]:
-        """Normalise [b, n, d]; the second value is the gate, in the condition's float32.
+        """Normalise [b, n, d]; the second value is the gate, in the condition's float32:
+        compiled layers pass it on to the next one as it is, without a kernel that casts it.
 
         `condition` is the raw [b, c] or, when sampling, a modulation made beforehand.
         """

@@ -178,7 +178,7 @@ class CommandParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """End with a mistake of a command line."""
         with print_user_errors():
-            sentence = self._plain(message).rstrip(".")
+            sentence = self._explanation(message).rstrip(".")
             raise UserError(f"{sentence}. `{self.prog} --help` says more.")
         raise AssertionError("a user error ends the process")
 
@@ -195,26 +195,26 @@ class CommandParser(argparse.ArgumentParser):
             )
         self.error(f"{name} {value!r} is not known. {did_you_mean(str(value), choices)}")
 
-    def _plain(self, message: str) -> str:
+    def _explanation(self, message: str) -> str:
         """A message of argparse in the words of the other commands."""
-        kind, _, rest = message.partition(": ")
+        kind, _, detail = message.partition(": ")
         if kind == "unrecognized arguments":
-            return self._unknown_word(rest.split()[0])
+            return self._unknown_word(detail.split()[0])
         if kind == "the following arguments are required":
             names = []
             for action in self._actions:
                 word = str(action.metavar or action.dest)
-                if word in rest.split(", ") and action.nargs != "*":
+                if word in detail.split(", ") and action.nargs != "*":
                     names.append(word)
-            names = names or rest.split(", ")
+            names = names or detail.split(", ")
             return f"A value is needed for {' and '.join(names)}{self._help_of(names[0])}."
         name = kind.removeprefix("argument ")
-        if rest.startswith("expected "):
-            return f"{name} needs {rest.removeprefix('expected ').replace('argument', 'value')}."
-        invalid = re.fullmatch(r"invalid (\w+) value: (.+)", rest, re.DOTALL)
+        if detail.startswith("expected "):
+            return f"{name} needs {detail.removeprefix('expected ').replace('argument', 'value')}."
+        invalid = re.fullmatch(r"invalid (\w+) value: (.+)", detail, re.DOTALL)
         if invalid:
-            wanted = _WANTED.get(invalid[1], f"of type {invalid[1]}")
-            return f"{name} {invalid[2]} does not fit: it is {wanted}."
+            expected = _NUMBERS.get(invalid[1], f"of type {invalid[1]}")
+            return f"{name} {invalid[2]} does not fit: it is {expected}."
         return f"{message[:1].upper()}{message[1:]}."
 
     def _unknown_word(self, word: str) -> str:
@@ -243,7 +243,7 @@ class CommandParser(argparse.ArgumentParser):
         return ""
 
 
-_WANTED = {"int": "a whole number", "float": "a number"}
+_NUMBERS = {"int": "a whole number", "float": "a number"}
 
 
 def _as_option(word: str) -> str:

@@ -133,7 +133,7 @@ def check_open_loop(inspection: Inspection, console: Console) -> OpenLoop:
     )
     require(
         inspection.step is None,
-        "step= chooses the frame at which a memory is drawn: leave it out, or leave out"
+        "step= chooses the frame at which a memory is rendered: leave it out, or leave out"
         " checkpoint=.",
     )
     folder = resolve_checkpoint(Path(inspection.checkpoint))
@@ -328,9 +328,9 @@ def training_rows(folder: Path, sections: PolicySections) -> list[tuple[str, str
     rows = [("data", known), ("training", steps)]
     results = _summary(card.get("results") or {})
     rows.append(("error", results or "not recorded"))
-    found = _open_loop_of(folder)
-    if found is not None:
-        rows.append(("open loop", f"{found.get('episode', 'an episode')}. {found['verdict']}"))
+    check = _open_loop_of(folder)
+    if check is not None:
+        rows.append(("open loop", f"{check.get('episode', 'an episode')}. {check['verdict']}"))
     else:
         rows.append(
             ("open loop", "not recorded; mme-vla inspect checkpoint=… dataset=… compares actions")
@@ -346,11 +346,11 @@ def _open_loop_of(folder: Path) -> Mapping[str, Any] | None:
     if folder.parent.name != CHECKPOINTS or not path.is_file():
         return None
     summary = read_json(path, "the summary of a run")
-    found = summary.get("open_loop")
+    check = summary.get("open_loop")
     is_last = Path(str(summary.get("checkpoint", ""))).name == folder.name
-    if not is_last or not isinstance(found, Mapping) or "verdict" not in found:
+    if not is_last or not isinstance(check, Mapping) or "verdict" not in check:
         return None
-    return found
+    return check
 
 
 def show_details(policy: Policy, folder: Path, console: Console) -> None:

@@ -178,13 +178,7 @@ def _protocol(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> Pro
     """What counts: by default what has records; with `--all`, or by name, what a run is to have."""
     of_split = [record for record in records if args.split in (None, record.split)]
     full = _episodes(records, args.split)
-    how = {
-        "errors": args.errors,
-        "confidence": args.confidence,
-        "samples": args.samples,
-        "seed": args.seed,
-    }
-    recorded = Protocol.of_records(of_split or records, full, **how)
+    recorded = Protocol.of_records(of_split or records, full)
     tasks = recorded.tasks
     if args.tasks is not None:
         tasks = _tasks(args.tasks)
@@ -199,7 +193,15 @@ def _protocol(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> Pro
     else:
         # A task that is named and has no records is to have all episodes.
         numbers = {task: recorded.numbers[task] for task in tasks if task in recorded.numbers}
-    return replace(recorded, tasks=tasks, numbers=numbers)
+    return replace(
+        recorded,
+        tasks=tasks,
+        numbers=numbers,
+        errors=args.errors,
+        confidence=args.confidence,
+        samples=args.samples,
+        seed=args.seed,
+    )
 
 
 def _tasks(words: Sequence[str]) -> tuple[str, ...]:

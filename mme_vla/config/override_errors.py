@@ -59,10 +59,10 @@ class ConfigTree:
             options = error.options or self.loader.get_group_options(group)
             text = f"Unknown {group or 'config'} {name!r}."
             known = did_you_mean(name, options)
-            own = own_file(group, name) if group else None
-            if own is not None:
-                folder = own.parents[len(Path(group).parts)]
-                return f"{text} ./{own} exists: add --config-dir {folder}. {known}"
+            file = nearby_file(group, name) if group else None
+            if file is not None:
+                folder = file.parents[len(Path(group).parts)]
+                return f"{text} ./{file} exists: add --config-dir {folder}. {known}"
             return (
                 f"{text} {known} A file of your own, DIR/{group}/{name}.yaml, is found with"
                 " --config-dir DIR."
@@ -119,7 +119,7 @@ class ConfigTree:
                 )
 
 
-def own_file(group: str, name: str) -> Path | None:
+def nearby_file(group: str, name: str) -> Path | None:
     """A file of the user's in or near the current folder, which the command line does not lead
     to.
     """

@@ -32,7 +32,7 @@ CHOICES = "multi_choice"
 _FIRST_SEED = {"train": 0, "test": 500_000, "val": 1_000_000}
 _OTHER_SPLITS = 2_000_000  # first seed of splits with other names
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
-_KEPT = 4  # scenes that a process keeps for further episodes
+_MAX_IDLE = 4  # environments that a process keeps for further episodes
 
 
 @dataclass(frozen=True)
@@ -201,12 +201,25 @@ class Environment(ABC):
             env.close()
         return digest
 
-    def step_limit(self, split: str, task: str | None = None) -> int:
-        """Steps after which an episode of a task is a timeout; without a task the most of any."""
+    def step_limit(self, split: str) -> int:
+        """Steps after which an episode of a split is a timeout; of tasks that differ the most."""
         if isinstance(self.steps, int):
             return self.steps
-        if task is None:
-            return max(self.steps.values())
+        return max(self.steps.values())
+
+    def task_limit(self, task: str, split: str) -> int:
+        """Steps after which an episode of a task is a timeout.
+
+        Raises:
+            UserError: `steps` lacks the task.
+        """
+        if isinstance(self.steps, int):
+            return self.step_limit(split)
+        require(
+            task in self.steps,
+            f"{type(self).__name__}.steps lacks {task}: add its limit, or give one number for all"
+            " tasks.",
+        )
         return self.steps[task]
 
     def suite_of(self, task: str) -> str | None:
@@ -234,8 +247,8 @@ class Environment(ABC):
     ) -> Any:
         """One episode with the interface of `make_env`: lists of frames, status, goal."""
         spec = self.episode(task, split, episode)
-        limit = max_steps or self.step_limit(split, task)
-        env = _kept.pop((type(self), task, render), None)
+        limit = max_steps or self.task_limit(task, split)
+        env = _idle.pop((type(self), task, render), None)
         if env is None:
             env = self.make(spec, render)
         return EpisodeEnv(self, env, spec, limit, action_space == CHOICES, render)
@@ -248,7 +261,7 @@ def _group_of(task: str, grouping: Mapping[str, Sequence[str]]) -> str | None:
     return None
 
 
-_kept: OrderedDict[tuple[type[Environment], str, bool], Any] = OrderedDict()
+_idle: OrderedDict[tuple[type[Environment], str, bool], Any] = OrderedDict()
 """Environments between two episodes, by environment, task and whether they render."""
 
 
@@ -307,7 +320,7 @@ class EpisodeEnv:
         self.render_request: RenderRequest | None = None
         self.goal = ""
         self._key = (type(environment), spec.task, render)
-        self._whole = True  # no call has failed
+        self._is_reusable = True  # no call has failed
         self._by_choice = by_choice
         self._steps = 0
         self._limit = max_steps
@@ -322,9 +335,8 @@ class EpisodeEnv:
         values = self.environment.scene_values(self.env)
         self.scene_digest = NO_VALUES if values is None else scene_digest(values)
         frames = []
-        for visible in self._video(observation, info):
-            frames.append(self._taken(visible, newest=False))
-        frames.append(self._taken(self._newest, newest=True))
+        for first, is_current in self._first_observations(observation, info):
+            frames.append(self._read_frame(first, is_current))
         return self._lists(frames), self._info(info, False, False)
 
     def step(self, action: Any) -> tuple[dict[str, list[Any]], float, bool, bool, dict[str, Any]]:
@@ -343,7 +355,7 @@ class EpisodeEnv:
             self._steps += 1
             truncated = bool(truncated) or self._steps >= self._limit
             over = terminated or truncated
-            frames.append(self._taken(observation, newest=bool(over) or number == len(parts)))
+            frames.append(self._read_frame(observation, newest=bool(over) or number == len(parts)))
             if over:
                 break
         report = self._info(info, bool(terminated), truncated)
@@ -372,15 +384,15 @@ class EpisodeEnv:
         self.env = None
         if env is None:
             return
-        if not (self.environment.reuse and self._whole):
+        if not (self.environment.reuse and self._is_reusable):
             env.close()
             return
-        replaced = _kept.pop(self._key, None)
-        _kept[self._key] = env
-        if replaced is None and len(_kept) > _KEPT:
-            _, replaced = _kept.popitem(last=False)
-        if replaced is not None:
-            replaced.close()
+        former = _idle.pop(self._key, None)
+        _idle[self._key] = env
+        if former is None and len(_idle) > _MAX_IDLE:
+            _, former = _idle.popitem(last=False)
+        if former is not None:
+            former.close()
 
     @property
     def facts(self) -> Sequence[Fact]:
@@ -398,17 +410,19 @@ class EpisodeEnv:
         """
         observation, info = self._begin()
         self.success = False
-        video = [self._taken(visible) for visible in self._video(observation, info)]
-        frame = self._taken(self._newest)
+        frames = []
+        for first, is_current in self._first_observations(observation, info):
+            frames.append(self._read_frame(first, is_current))
+        *video, frame = frames
         actions = self.environment.demonstrate(self.env)
         action: Any = next(actions, None)
         require(action is not None, f"{self.spec.task}: the demonstrator gives no action.")
-        for visible in video:
-            yield visible, np.zeros_like(action), True
+        for earlier in video:
+            yield earlier, np.zeros_like(action), True
         for _ in range(self.max_steps):
             yield frame, action, False
             observation, _, terminated, truncated, info = self._perform(action)
-            frame = self._taken(observation)
+            frame = self._read_frame(observation)
             self.success = bool(info.get("success", False))
             if terminated or truncated:
                 return
@@ -418,9 +432,9 @@ class EpisodeEnv:
 
     def _begin(self) -> tuple[Mapping[str, Any], dict[str, Any]]:
         """Reset the environment to the scene of the episode."""
-        self._whole = False
+        self._is_reusable = False
         observation, info = self.env.reset(seed=self.spec.seed)
-        self._whole = True
+        self._is_reusable = True
         require(
             isinstance(info.get("goal"), str),
             f"{self.spec.task}: reset() must return the goal in info['goal'].",
@@ -434,32 +448,33 @@ class EpisodeEnv:
 
     def _perform(self, action: Any) -> tuple[Mapping[str, Any], float, bool, bool, dict[str, Any]]:
         """Perform one action; with `success="once"` the first success ends the episode."""
-        self._whole = False
+        self._is_reusable = False
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._whole = True
+        self._is_reusable = True
         if self.environment.success == "once" and info.get("success", False):
             terminated = True
         return observation, reward, terminated, truncated, info
 
-    def _video(
+    def _first_observations(
         self, observation: Mapping[str, Any], info: Mapping[str, Any]
-    ) -> Iterator[Mapping[str, Any]]:
-        """The observations of the conditioning video, each to be read before the next one; the
-        current one is in `_newest` afterwards.
+    ) -> Iterator[tuple[Mapping[str, Any], bool]]:
+        """The observations of the conditioning video and the current one, each to be read before
+        the next, and whether it is the current one.
         """
-        self._newest = observation
-        yield from info.get("video", ())
+        for earlier in info.get("video", ()):
+            yield earlier, False
         if self.environment.cue == "video":
             for _ in range(int(info.get("frozen", 0))):
-                yield self._newest
-                self._newest, _, terminated, truncated, _ = self._perform(self.hold_action)
+                yield observation, False
+                observation, _, terminated, truncated, _ = self._perform(self.hold_action)
                 require(
                     not (terminated or truncated),
                     f"{self.spec.task}: the episode ended within the {info['frozen']} steps of"
                     " info['frozen'], before a policy could act.",
                 )
+        yield observation, True
 
-    def _taken(self, observation: Mapping[str, Any], newest: bool = False) -> dict[str, Any]:
+    def _read_frame(self, observation: Mapping[str, Any], newest: bool = False) -> dict[str, Any]:
         """An observation with its images: those that are functions are rendered now, or left
         out where they were not requested.
         """

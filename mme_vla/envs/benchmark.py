@@ -29,7 +29,7 @@ class RoboMME(Environment):
         """A split of the benchmark, or a variant."""
         metadata.check_split(split)
 
-    def step_limit(self, split: str, task: str | None = None) -> int:
+    def step_limit(self, split: str) -> int:
         """As many as the benchmark allows."""
         return metadata.step_limit(split)
 

@@ -31,14 +31,15 @@ class Fact:
     """Something that frames of an episode show and that it needs later.
 
     name: of the fact; one that is shown again after a gap has two entries. value: what a scene with
-    another value of this fact would have differently. shown: the first and the last frame that show
-    it. needed: frames at which a decision begins that depends on it, ascending. changed: the first
-    frame that shows a fact which replaces it, or moves what it is about; None where there is none.
+    another value of this fact would have differently. frames: the first and the last frame that
+    show it. needed: frames at which a decision begins that depends on it, ascending. changed: the
+    first frame that shows a fact which replaces it, or moves what it is about; None where there is
+    none.
     """
 
     name: str
     value: str
-    shown: tuple[int, int]
+    frames: tuple[int, int]
     needed: tuple[int, ...] = ()
     changed: int | None = None
 
@@ -47,7 +48,7 @@ class Fact:
         return {
             "name": self.name,
             "value": self.value,
-            "shown": list(self.shown),
+            "frames": list(self.frames),
             "needed": list(self.needed),
             "changed": self.changed,
         }
@@ -55,13 +56,13 @@ class Fact:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Fact":
         """What `to_dict` returned."""
-        first, last = values["shown"]
+        first, last = values["frames"]
         needed = tuple(values["needed"])
         return cls(values["name"], values["value"], (first, last), needed, values["changed"])
 
 
 @dataclass(frozen=True)
-class Shown:
+class VisibleFact:
     """A fact that the current frame shows.
 
     subjects: names of what it is about. replaces: what earlier facts said about any of these does
@@ -79,17 +80,17 @@ class FactLog:
     def __init__(self) -> None:
         self.facts: list[Fact] = []
         self._subjects: list[Set[str]] = []
-        self._frames = 0
+        self.n_frames = 0
 
-    def add(self, shown: Mapping[str, Shown], decides: bool = False) -> None:
+    def add(self, visible: Mapping[str, VisibleFact], decides: bool = False) -> None:
         """Add the next frame.
 
         Args:
-            shown: name → what the frame shows of that fact.
+            visible: name → what the frame shows of that fact.
             decides: a decision begins here that depends on all facts so far.
         """
-        frame = self._frames
-        for name, current in shown.items():
+        frame = self.n_frames
+        for name, current in visible.items():
             if self._extend(name, current.value):
                 continue
             if current.replaces:
@@ -98,21 +99,21 @@ class FactLog:
             self._subjects.append(current.subjects)
         if decides:
             self.facts = [replace(fact, needed=(*fact.needed, frame)) for fact in self.facts]
-        self._frames += 1
+        self.n_frames += 1
 
     def _extend(self, name: str, value: str) -> bool:
         """Add the frame to the fact that the frame before showed; whether it did."""
         for i, fact in enumerate(self.facts):
-            first, last = fact.shown
-            if (fact.name, fact.value, last) == (name, value, self._frames - 1):
-                self.facts[i] = replace(fact, shown=(first, self._frames))
+            first, last = fact.frames
+            if (fact.name, fact.value, last) == (name, value, self.n_frames - 1):
+                self.facts[i] = replace(fact, frames=(first, self.n_frames))
                 return True
         return False
 
     def _mark_changed(self, subjects: Set[str]) -> None:
         for i, fact in enumerate(self.facts):
             if fact.changed is None and self._subjects[i] & subjects:
-                self.facts[i] = replace(fact, changed=self._frames)
+                self.facts[i] = replace(fact, changed=self.n_frames)
 
 
 class TaskFacts:
@@ -125,7 +126,6 @@ class TaskFacts:
     def __init__(self, task: Any) -> None:
         self._task = task
         self._log = FactLog()
-        self._frames = 0
         self._ended: dict[int, int] = {}  # number of a sub-task → the first frame after its end
         self._begun = -1  # the newest sub-task of the execution that has begun
 
@@ -138,13 +138,13 @@ class TaskFacts:
         """Add the next frame, which belongs to the conditioning video or to the execution."""
         progress: Progress = self._task.progress
         for i in range(len(self._ended), progress.index):
-            self._ended[i] = self._frames
+            self._ended[i] = self._log.n_frames
         recent = {}
         for i, ended in self._ended.items():
             subtask = progress.subtasks[i]
             # Once the execution begins, the arm is elsewhere than at the end of the video.
             is_visible = subtask.video <= in_video
-            if self._frames - ended < KEY_POSE and is_visible:
+            if self._log.n_frames - ended < KEY_POSE and is_visible:
                 recent[i] = subtask
         # A decision depends on memory where a sub-task begins that fails if something is forgotten.
         decides = False
@@ -152,15 +152,14 @@ class TaskFacts:
         if current is not None and not in_video and progress.index > self._begun:
             self._begun = progress.index
             decides = bool(current.operation)
-        self._log.add(self._task.shown_facts(recent), decides)
-        self._frames += 1
+        self._log.add(self._task.visible_facts(recent), decides)
 
 
 def evidence_of(facts: Iterable[Fact]) -> dict[str, np.ndarray]:
     """Name → the frames that show the fact, ascending."""
     frames: dict[str, np.ndarray] = {}
     for fact in facts:
-        first, last = fact.shown
+        first, last = fact.frames
         span = np.arange(first, last + 1, dtype=np.int64)
         frames[fact.name] = np.union1d(frames.get(fact.name, span), span)
     return frames
@@ -181,4 +180,4 @@ def write_facts(path: Path, episodes: Iterable[tuple[int, str, Sequence[Fact]]])
             for fact in facts:
                 needed = " ".join(map(str, fact.needed))
                 changed = "" if fact.changed is None else fact.changed
-                table.writerow([number, task, fact.name, fact.value, *fact.shown, needed, changed])
+                table.writerow([number, task, fact.name, fact.value, *fact.frames, needed, changed])

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from mme_vla.envs.facts import Shown
+from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.scene.motions import Cue, Motion, build_cue, show_cue
 from mme_vla.envs.robomme.scene.objects import Disc
 from mme_vla.envs.robomme.scene.placement import Draws
@@ -25,13 +25,13 @@ from mme_vla.errors import check_known, require
 RECOVERY_MODES = ("z", "xy")
 
 
-def key_pose(subtask: SubTask) -> Shown:
+def key_pose(subtask: SubTask) -> VisibleFact:
     """What the end of a sub-task shows: its text, and the objects that it is about."""
     names = [thing.name for thing in subtask.targets]
     value = subtask.text
     if names:
         value = f"{subtask.text}: {', '.join(names)}"
-    return Shown(value, frozenset(names))
+    return VisibleFact(value, frozenset(names))
 
 
 class Task(Stage):
@@ -69,7 +69,7 @@ class Task(Stage):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for former, name in (("evidence", "shown_facts"), ("evidence_choices", "fact_choices")):
+        for former, name in (("evidence", "visible_facts"), ("evidence_choices", "fact_choices")):
             require(
                 former not in vars(cls),
                 f"{cls.__name__}.{former} is not read any more: define {name} instead.",
@@ -174,7 +174,7 @@ class Task(Stage):
         """
         return ()
 
-    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
+    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
         """The facts that the current frame shows and that the episode needs later, by their names.
 
         By default the key poses: the end of each sub-task of the video that a policy could choose
@@ -184,23 +184,23 @@ class Task(Stage):
             ended: the sub-tasks that have ended in the last frames, by their number.
         """
         has_video = any(subtask.video for subtask in self.progress.subtasks)
-        shown = {}
+        facts = {}
         for i, subtask in ended.items():
             counts = self.fact_choices is None or subtask.choice in self.fact_choices
             if not subtask.choice or subtask.video != has_video or not counts:
                 continue
             if has_video:
-                shown[f"{i} {subtask.text}"] = key_pose(subtask)
+                facts[f"{i} {subtask.text}"] = key_pose(subtask)
             else:
-                shown[f"{i} {subtask.text}"] = self.counted(i)
-        return shown
+                facts[f"{i} {subtask.text}"] = self.count_fact(i)
+        return facts
 
-    def counted(self, i: int) -> Shown:
+    def count_fact(self, i: int) -> VisibleFact:
         """How many sub-tasks with the choice of sub-task `i` are done at its end."""
         subtasks = self.progress.subtasks[: i + 1]
         kind = (subtasks[i].choice, subtasks[i].video)
         count = sum((subtask.choice, subtask.video) == kind for subtask in subtasks)
-        return Shown(str(count), {f"count of {subtasks[i].choice}"}, replaces=True)
+        return VisibleFact(str(count), {f"count of {subtasks[i].choice}"}, replaces=True)
 
     def failure(self) -> bool:
         """What counts as failure at any time, whatever the sub-task."""

@@ -19,6 +19,10 @@ Number = Annotated[float, Range(-(2.0**63), 2.0**63)]
 OUTCOMES = ("success", "fail", "timeout", "error")
 
 
+ARM = " · "
+"""Between a model and what was done to it, in records and labels."""
+
+
 def display_name(model: str, checkpoint: int | str) -> str:
     """What people call a policy: a shipped one by its checkpoint (`nano`), others by their model.
 
@@ -28,10 +32,6 @@ def display_name(model: str, checkpoint: int | str) -> str:
         return model
     _, dot, arm = model.partition(ARM)
     return f"{checkpoint}{dot}{arm}"
-
-
-ARM = " · "
-"""Between a model and what was done to it, in records and labels."""
 
 
 class RunKey(NamedTuple):
@@ -58,7 +58,7 @@ class RunKey(NamedTuple):
         if self.memory_budget is not None and not self.is_shipped:
             text += f"@{self.memory_budget}"
         if self.event is not None:
-            text += f" · {self.event}"
+            text += f"{ARM}{self.event}"
         return text
 
     @property

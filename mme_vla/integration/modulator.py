@@ -23,7 +23,6 @@ from mme_vla.backbone.layers import (
 )
 from mme_vla.integration.base import Integration, ages_of, checked_position, required
 from mme_vla.registry import INTEGRATIONS
-from mme_vla.speed import CompilesParts
 from mme_vla.types import MemoryTokens
 
 
@@ -73,7 +72,7 @@ class ModulatorLayer(nn.Module):
 
 
 @INTEGRATIONS.register("modulator")
-class Modulator(Integration, CompilesParts):
+class Modulator(Integration):
     """Fills the action expert's hook in every layer; the prefix never sees memory."""
 
     def __init__(

@@ -28,7 +28,6 @@ from mme_vla.memory.base import (
     union_frames,
 )
 from mme_vla.memory.history import History, StorageSpec
-from mme_vla.speed import CompilesParts
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 
@@ -247,7 +246,7 @@ class RecurrentLayer(nn.Module):
         return {}
 
 
-class RecurrentMemory(MemoryModule, CompilesParts):
+class RecurrentMemory(MemoryModule):
     """Encoder → recurrent layer → output projection. Subclasses supply the layer.
 
     Besides its own arguments it takes those of `FrameSchedule` and `FeatureEncoder`.

@@ -38,10 +38,10 @@ from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed import (
     SAMPLING_OPTIONS,
     CapturableSampling,
-    CompilesParts,
     HasAttentionBackends,
     Recompute,
     Recomputes,
+    compile_parts,
 )
 from mme_vla.speed.graphs import CapturedSampling
 from mme_vla.speed.sharding import ShardGroup, backbone_groups
@@ -278,12 +278,11 @@ class MMEPolicy(NetworkPolicy):
 
     def compile(self, **options: Any) -> None:
         """Compile the backbone's tower and layers in place, each by itself, and what memory and
-        integration name (`CompilesParts`).
+        integration override `compile` for.
         """
         self.backbone.compile(**options)
-        for module in self.modules():
-            if isinstance(module, CompilesParts):
-                module.compile(**options)
+        compile_parts(self.memory, **options)
+        compile_parts(self.integration, **options)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
         """The backbone's groups. Memory and integration are in none: they are small, and compute in
@@ -353,8 +352,8 @@ class MMEPolicy(NetworkPolicy):
         if not isinstance(self.backbone, CapturableSampling):
             return False
         stamp = self.backbone.compile_sampling(layers)
-        if layers and isinstance(self.integration, CompilesParts):
-            self.integration.compile(**SAMPLING_OPTIONS)
+        if layers:
+            compile_parts(self.integration, **SAMPLING_OPTIONS)
         on_gpu = self.device.type == "cuda"
         if on_gpu:
             self._sampler = CapturedSampling(self.model.sample, stamp)

@@ -168,8 +168,14 @@ def newest_checkpoint(path: Path) -> Path:
 def locate_checkpoint(source: str | Path) -> str:
     """The checkpoint folder that `source` names; `source` itself where it is none on this machine,
     but on the hub.
+
+    A path of three parts or more whose first folder is on this machine is never of the hub.
+
+    Raises:
+        UserError: a folder on this machine, or a path below one, without a checkpoint.
     """
     path = find_run(Path(source).expanduser())
-    if not path.exists():
+    is_local = len(path.parts) > 2 and Path(path.parts[0]).is_dir()
+    if not (path.exists() or is_local):
         return str(source)
     return str(resolve_checkpoint(path))

@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 import torch
+from torch import nn
 from torch.utils.checkpoint import checkpoint, create_selective_checkpoint_contexts
 
 Recompute = bool | str
@@ -71,12 +72,16 @@ keys and values.
 """
 
 
-class CompilesParts:
-    """Capability of a memory or an integration: it has code that is compiled with the layers."""
+def compile_parts(root: nn.Module | None, **options: Any) -> None:
+    """Compile in place every part of a memory or an integration that overrides `compile`.
 
-    def compile(self, **options: Any) -> None:
-        """Compile it in place; `options` are `torch.compile`'s."""
-        raise NotImplementedError
+    `options` are `torch.compile`'s.
+    """
+    if root is None:
+        return
+    for module in root.modules():
+        if type(module).compile is not nn.Module.compile:
+            module.compile(**options)
 
 
 class HasAttentionBackends:

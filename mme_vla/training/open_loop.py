@@ -20,7 +20,7 @@ from mme_vla.utils.style import COLOURS, EXECUTION, FAINT, look
 STILL = "holding still"
 LAST = "last action"
 MEAN = "mean action"
-_SPOKEN = {STILL: STILL, LAST: f"the {LAST}", MEAN: f"the {MEAN}"}
+_PHRASES = {STILL: STILL, LAST: f"the {LAST}", MEAN: f"the {MEAN}"}
 """In a sentence."""
 ALL = "all"
 """The row of a table that holds means over the numbers."""
@@ -97,23 +97,24 @@ class OpenLoop:
     def verdict(self) -> str:
         """What the numbers say, in one sentence: the policy against the best baseline."""
         name = self.best_baseline
-        own = self.error(self.predicted) / self.scale
+        errors = self.error(self.predicted) / self.scale
         best = self.baseline_error(name) / self.scale
-        worse = [self.names[d] for d in np.flatnonzero(own > best)]
+        worse = [self.names[d] for d in np.flatnonzero(errors > best)]
         means = (
-            f"mean normalised error {own.mean():.3f}, against {best.mean():.3f} of {_SPOKEN[name]}"
+            f"mean normalised error {errors.mean():.3f}, against {best.mean():.3f} of"
+            f" {_PHRASES[name]}"
         )
-        if own.mean() >= best.mean():
+        if errors.mean() >= best.mean():
             return (
-                f"No better than the best baseline: {means}. {len(worse)} of {len(own)} numbers are"
-                " predicted worse."
+                f"No better than the best baseline: {means}. {len(worse)} of {len(errors)} numbers"
+                " are predicted worse."
             )
         if worse:
             return (
-                f"Better than every baseline on average: {means}. {len(worse)} of {len(own)}"
+                f"Better than every baseline on average: {means}. {len(worse)} of {len(errors)}"
                 f" numbers are predicted worse: {', '.join(worse)}."
             )
-        return f"Better than every baseline in all {len(own)} numbers: {means}."
+        return f"Better than every baseline in all {len(errors)} numbers: {means}."
 
 
 def decisions_of(recording: Recording, execute: int, most: int | None) -> list[int]:
@@ -269,16 +270,16 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
             known = int(valid.sum())
             executed = min(result.execute, known)
             chunk = result.predicted[i, :known, d]
-            # The rest begins at the last executed action, so that the line is not broken.
-            rest = slice(max(executed - 1, 0), known)
-            panel.plot(time[i, rest], chunk[rest], color=EXECUTION, lw=1.2, alpha=0.35)
+            # The remainder begins at the last executed action, so that the line is not broken.
+            remainder = slice(max(executed - 1, 0), known)
+            panel.plot(time[i, remainder], chunk[remainder], color=EXECUTION, lw=1.2, alpha=0.35)
             (labels[f"predicted, {result.execute} actions executed"],) = panel.plot(
                 time[i, :executed], chunk[:executed], color=EXECUTION, lw=1.6
             )
             panel.plot(time[i, :1], chunk[:1], "o", color=EXECUTION, ms=4)
-            held = np.full(executed, result.baselines[best][i, d])
+            baseline = np.full(executed, result.baselines[best][i, d])
             (labels[f"best baseline: {best}"],) = panel.plot(
-                time[i, :executed], held, color=COLOURS[0], lw=1.8, ls=":", zorder=4
+                time[i, :executed], baseline, color=COLOURS[0], lw=1.8, ls=":", zorder=4
             )
         panel.set_title(
             f"{result.names[d]}: normalised error {scaled[d]:.2f}, {best} {scaled_best[d]:.2f}",
@@ -344,10 +345,10 @@ def error_lines(summary: Mapping[str, Any]) -> Sequence[str]:
         means += f"{np.mean(values):{_COLUMNS[title]}.3f}"
     lines = [header]
     for d, name in enumerate(names):
-        shown = name
+        label = name
         if len(name) > width:
-            shown = f"{name[: width - 1]}…"
-        row = f"{shown:{width}}{summary['mean_abs_error'][d]:11.4f}"
+            label = f"{name[: width - 1]}…"
+        row = f"{label:{width}}{summary['mean_abs_error'][d]:11.4f}"
         for title, values in columns.items():
             row += f"{values[d]:{_COLUMNS[title]}.3f}"
         lines.append(row)

@@ -3,6 +3,7 @@ demand, kept scenes, the first success, cues, groupings, and errors of its own c
 """
 
 import json
+import pickle
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,14 +12,16 @@ import gymnasium
 import numpy as np
 import pytest
 
+import mme_vla
 from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy
 from mme_vla.cli.record import RecordRun, _rate
 from mme_vla.envs import base
 from mme_vla.envs.base import Environment, EpisodeEnv
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
+from mme_vla.envs.vector import worker
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
-from mme_vla.errors import UserError, text_of
+from mme_vla.errors import UserError, place_of, set_place, text_of
 from mme_vla.evaluation.records import EpisodeRecord, by_run
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.tables import grouping_tables
@@ -96,9 +99,9 @@ GO = np.ones(1)
 
 @pytest.fixture(autouse=True)
 def no_kept_scenes() -> Iterator[None]:
-    base._kept.clear()
+    base._idle.clear()
     yield
-    base._kept.clear()
+    base._idle.clear()
 
 
 def steps_until_the_end(env: EpisodeEnv) -> tuple[int, str]:
@@ -112,10 +115,23 @@ def steps_until_the_end(env: EpisodeEnv) -> tuple[int, str]:
 
 def test_each_task_has_its_own_step_limit() -> None:
     source = Corridors()
-    assert source.step_limit("test") == 9 and source.step_limit("test", "Short") == 4
+    assert source.step_limit("test") == 9 and source.task_limit("Short", "test") == 4
+    with pytest.raises(UserError, match=r"Corridors\.steps lacks Long: add its limit"):
+        source.task_limit("Long", "test")
     assert steps_until_the_end(source.open("Short", "test", 0)) == (4, "timeout")
     assert steps_until_the_end(source.open("Wide", "test", 0)) == (9, "timeout")
     assert steps_until_the_end(source.open("Wide", "test", 0, max_steps=3)) == (3, "timeout")
+
+
+def test_a_class_of_before_gives_its_limit_by_split_alone() -> None:
+    class Halved(Corridors):
+        steps = 9
+
+        def step_limit(self, split: str) -> int:
+            return 2 if split == "val" else 4
+
+    assert steps_until_the_end(Halved().open("Wide", "val", 0)) == (2, "timeout")
+    assert steps_until_the_end(Halved().open("Wide", "test", 0)) == (4, "timeout")
 
 
 @pytest.fixture
@@ -241,14 +257,14 @@ def test_a_scene_whose_step_failed_is_not_kept() -> None:
     with pytest.raises(TypeError):
         env.step(None), env.step(None), env.step(None)
     env.close()
-    assert scene.closed and not base._kept
+    assert scene.closed and not base._idle
 
 
 def test_no_more_than_a_few_scenes_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     class Kept(Corridors):
         reuse = True
 
-    monkeypatch.setattr(base, "_KEPT", 1)
+    monkeypatch.setattr(base, "_MAX_IDLE", 1)
     scenes = []
     for task in ("Wide", "Short"):
         env = Kept().open(task, "test", 0)
@@ -299,6 +315,27 @@ def test_an_error_of_a_plugin_names_its_file_and_line() -> None:
     assert reply.info["error_message"] == f"A test episode 0: {text_of(reply.error)}"
 
 
+def test_a_note_of_other_code_is_no_place() -> None:
+    error = KeyError("a")
+    error.add_note("hint of a library")
+    assert place_of(error) is None and text_of(error) == "'a'"
+    set_place(error, "KeyError, x.py, line 3")
+    assert place_of(pickle.loads(pickle.dumps(error))) == "KeyError, x.py, line 3"
+
+
+def test_a_folder_beside_the_library_is_no_part_of_it(tmp_path: Path) -> None:
+    """Its name may begin alike: `mme_vla_own`."""
+    library = Path(mme_vla.__file__).parent
+    source = "def fail():\n    raise ValueError('own')\n"
+    for folder, expected in ((library, False), (Path(f"{library}_own"), True)):
+        namespace: dict[str, Any] = {"__name__": "outside"}
+        exec(compile(source, str(folder / "scene.py"), "exec"), namespace)
+        with pytest.raises(ValueError, match="own") as caught:
+            namespace["fail"]()
+        frame = caught.traceback[-1].frame.raw
+        assert worker._is_of_plugin(frame) == expected
+
+
 class Failing(InlineEnvs):
     """Each episode's step ends with the next of these errors; None succeeds."""
 
@@ -324,7 +361,7 @@ def _roll(errors: list[Exception | None], retries: int = 0) -> list[EpisodeRecor
 
 def noted(key: str) -> KeyError:
     error = KeyError(key)
-    error.add_note("KeyError, x.py, line 3")
+    set_place(error, "KeyError, x.py, line 3")
     return error
 
 

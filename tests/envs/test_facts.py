@@ -15,11 +15,11 @@ from mme_vla import Fact, UserError
 from mme_vla.config.plugins import import_plugins
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes
-from mme_vla.envs.facts import COLUMNS, FactLog, Shown, evidence_of, write_facts
+from mme_vla.envs.facts import COLUMNS, FactLog, VisibleFact, evidence_of, write_facts
 from mme_vla.envs.metadata import TASK_NAMES
 
-RED = {"cover 0": Shown("red: container_1", {"container_1"})}
-SWAP = {"swap 1": Shown("container_1 and container_2", {"container_1", "container_2"}, True)}
+RED = {"cover 0": VisibleFact("red: container_1", {"container_1"})}
+SWAP = {"swap 1": VisibleFact("container_1 and container_2", {"container_1", "container_2"}, True)}
 
 
 def test_a_fact_is_shown_from_its_first_to_its_last_frame() -> None:
@@ -27,7 +27,7 @@ def test_a_fact_is_shown_from_its_first_to_its_last_frame() -> None:
     for shown in (RED, RED, {}, RED | SWAP, SWAP):
         log.add(shown)
     first, again, swap = log.facts
-    assert (first.shown, again.shown, swap.shown) == ((0, 1), (3, 3), (3, 4))
+    assert (first.frames, again.frames, swap.frames) == ((0, 1), (3, 3), (3, 4))
     assert first.name == again.name and first.value == "red: container_1"
     frames = {name: frames.tolist() for name, frames in evidence_of(log.facts).items()}
     assert frames == {"cover 0": [0, 1, 3], "swap 1": [3, 4]}
@@ -35,13 +35,13 @@ def test_a_fact_is_shown_from_its_first_to_its_last_frame() -> None:
 
 def test_a_fact_changes_where_what_it_is_about_is_moved_or_counted_on() -> None:
     log = FactLog()
-    other = {"cover 1": Shown("blue: container_3", {"container_3"})}
+    other = {"cover 1": VisibleFact("blue: container_3", {"container_3"})}
     for shown in (RED | other, {}, SWAP):
         log.add(shown)
     assert [fact.changed for fact in log.facts] == [2, None, None]
     log = FactLog()
     for i in range(3):
-        log.add({f"visit {i}": Shown(str(i + 1), {"visits"}, replaces=True)})
+        log.add({f"visit {i}": VisibleFact(str(i + 1), {"visits"}, replaces=True)})
     assert [fact.changed for fact in log.facts] == [1, 2, None], "only the first change counts"
 
 
@@ -79,7 +79,7 @@ def test_an_environment_of_ones_own_names_its_facts(monkeypatch: pytest.MonkeyPa
         images = observation["top_rgb_list"]
         assert fact.needed == (len(images) - 1,), "the first frame at which the arm can move"
         yellow = [bool((image == (255, 220, 0)).all(-1).any()) for image in images]
-        first, last = fact.shown
+        first, last = fact.frames
         assert np.flatnonzero(yellow).tolist() == list(range(first, last + 1))
         columns = np.flatnonzero((images[0] == (255, 220, 0)).all(-1).any(0))
         assert (columns.mean() < 32) == (fact.value == "left")
@@ -214,9 +214,9 @@ def test_facts_of_the_simulator_are_those_once_named_by_hand(task: str) -> None:
         assert shown == former.named, difficulty
         for fact in facts:
             assert fact.value
-            needed = [frame for frame in former.decisions if frame >= fact.shown[0]]
+            needed = [frame for frame in former.decisions if frame >= fact.frames[0]]
             assert list(fact.needed) == needed, fact
-            assert fact.changed is None or fact.shown[0] < fact.changed < former.frames
+            assert fact.changed is None or fact.frames[0] < fact.changed < former.frames
         if difficulty == "hard" and task.endswith("UnmaskSwap"):
             assert any(fact.changed is not None for fact in facts), "a swap moves a cube"
 
@@ -227,7 +227,9 @@ def test_a_task_with_the_former_method_is_refused() -> None:
     )
     from mme_vla import Task
 
-    with pytest.raises(UserError, match=r"Old\.evidence is not read any more: define shown_facts"):
+    with pytest.raises(
+        UserError, match=r"Old\.evidence is not read any more: define visible_facts"
+    ):
         type("Old", (Task,), {"evidence": lambda self, ended: set()})
 
 
@@ -242,7 +244,7 @@ def test_a_running_environment_names_the_facts_of_its_frames() -> None:
         (fact,) = environment("mme_vla").facts(env)
         frames = len(observation["joint_state_list"])
         (needed,) = fact.needed
-        assert fact.name == "cover 0" and fact.shown == (0, 31)
+        assert fact.name == "cover 0" and fact.frames == (0, 31)
         assert needed == frames - 1, "the first decision is at the current frame"
         env.reset()
         assert list(environment("mme_vla").facts(env)) == [fact], "a reset begins anew"

@@ -19,7 +19,7 @@ from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.aggregate import Results, aggregate
 from mme_vla.evaluation.results.compare import compare, compare_all
 from mme_vla.evaluation.results.paper import demo_records
-from mme_vla.evaluation.results.report import policy_facts, training_details
+from mme_vla.evaluation.results.report import conclude, policy_facts, training_details
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, TASK_FACTS, Protocol, tasks_of
 from mme_vla.evaluation.results.statistics import (
     bootstrap,
@@ -404,6 +404,30 @@ def small_runs(folder: Path) -> list[str]:
             folder / ("with" if won else "without"), [made[number] for number in (0, 4, 5)]
         )
     return [str(folder), "--samples", "20"]
+
+
+@pytest.mark.parametrize(
+    ("solved", "sentence"),
+    [
+        (
+            (3, 3, 1),
+            "a solves 75.0 % of 4 episodes of StopCube (95 % interval 30.1 to 95.4), as many as b.",
+        ),
+        (
+            (1, 3, 2),
+            "b solves 75.0 % of 4 episodes of StopCube (95 % interval 30.1 to 95.4), the"
+            " most of 3 methods; next is c with 50.0 %.",
+        ),
+    ],
+)
+def test_the_best_of_several_methods_is_named_with_those_that_solve_as_many(
+    solved: tuple[int, ...], sentence: str
+) -> None:
+    made = []
+    for name, n_solved in zip("abc", solved, strict=True):
+        made += records(name, {"StopCube": [number < n_solved for number in range(4)]})
+    results = aggregate(made, Protocol.of_records(made))
+    assert conclude(results, []) == [sentence]
 
 
 def test_a_small_run_shows_what_it_has_within_eighty_columns(

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 from mme_vla.cli import loading
 from mme_vla.cli.loading import prepare_sampling
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.speed import compile_parts
 from mme_vla.speed.compiler import CACHE_VARIABLE, keep_compiled_code, missing_compiler
 from mme_vla.testing.small import small_policy
 
@@ -73,3 +75,19 @@ def test_layers_stay_eager_with_a_warning_where_no_compiler_is(
     warned = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
     assert len(warned) == (missing is not None)
     assert all("g++" in text and "sampling=auto" in text for text in warned)
+
+
+def test_only_parts_with_code_to_compile_are_compiled() -> None:
+    compiled: list[object] = []
+
+    class Part(nn.Module):
+        def compile(self, **options: object) -> None:
+            compiled.append((self, options))
+
+    inner = Part()
+    memory = nn.Sequential(nn.Linear(1, 1), nn.Sequential(inner))
+    compile_parts(memory, dynamic=False)
+    compile_parts(None)
+    assert compiled == [(inner, {"dynamic": False})]
+    assert memory._compiled_call_impl is None
+    assert memory[0]._compiled_call_impl is None

@@ -56,8 +56,8 @@ def begin(variables: Mapping[str, str], work: Callable[..., Any], *arguments: An
 
 
 _INSTALLED = (
-    str(Path(errors.__file__).parent),
-    *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+    Path(errors.__file__).parent,
+    *(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
 )
 """Folders of code that is no plugin's, but for packages that are plugins."""
 LARGE = 4096
@@ -161,7 +161,7 @@ def serve(connection: Any, block: Any, factory: Callable[..., Any]) -> None:
 
 def _portable(error: Exception) -> Exception:
     """The error, or a RuntimeError of its text if the reader would have to import its class; its
-    place in a plugin's code is noted.
+    place in a plugin's code is stored with it.
     """
     place = _plugin_line(error)
     portable: Exception = RuntimeError(f"{type(error).__name__}: {error}")
@@ -172,7 +172,7 @@ def _portable(error: Exception) -> Exception:
         except Exception:
             pass  # its arguments do not survive the way
     if place is not None and not isinstance(error, errors.UserError | errors.SceneError):
-        portable.add_note(f"{type(error).__name__}, {place}")
+        errors.set_place(portable, f"{type(error).__name__}, {place}")
     return portable
 
 
@@ -193,7 +193,9 @@ def _is_of_plugin(frame: FrameType) -> bool:
     if name.partition(".")[0] in packages:
         return True
     file = frame.f_code.co_filename
-    return not file.startswith(("<", *_INSTALLED))
+    if file.startswith("<"):
+        return False
+    return not any(Path(file).is_relative_to(folder) for folder in _INSTALLED)
 
 
 def _hand_over(connection: Any, block: Any, outcome: Any) -> None:

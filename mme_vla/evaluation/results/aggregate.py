@@ -84,7 +84,7 @@ class Figure:
 
     @property
     def is_pale(self) -> bool:
-        """Whether episodes are missing, so that the value says little of the whole."""
+        """Whether episodes are missing, so that the value says little of all of them."""
         return self.mean is None or not self.full
 
 
@@ -380,8 +380,8 @@ def _method(table: pd.DataFrame, protocol: Protocol) -> Method:
     known = None
     other_scenes = any(is_other(run.key.split) for run in runs)
     of_benchmark = any(record.task in TASK_FACTS for record in table["record"])
-    is_plain = key.event is None and key.memory_budget in (None, DEFAULT_BUDGET)
-    if is_plain and of_benchmark and not other_scenes:
+    is_standard = key.event is None and key.memory_budget in (None, DEFAULT_BUDGET)
+    if is_standard and of_benchmark and not other_scenes:
         known = paper.paper_method(key.model, key.subgoal)
     method = Method(
         key.label,
@@ -401,8 +401,8 @@ def _method(table: pd.DataFrame, protocol: Protocol) -> Method:
     success = method.success.reindex(pd.MultiIndex.from_tuples(keys, names=["task", "episode"]))
     for scope in scopes(protocol):
         reported = _reported(known, scope)
-        figure = _figure(success.loc[list(scope.tasks)], method, protocol, reported)
-        figure = replace(figure, full=protocol.has_all(scope.tasks))
+        figure = _figure(success.loc[list(scope.tasks)], method, protocol)
+        figure = replace(figure, paper=reported, full=protocol.has_all(scope.tasks))
         method.figures.setdefault(scope.kind, {})[scope.name] = figure
     # An episode that no run has may be of any difficulty, and keeps the figures incomplete.
     levels = table.groupby(["task", "episode"])["difficulty"].first().reindex(success.index)
@@ -410,15 +410,13 @@ def _method(table: pd.DataFrame, protocol: Protocol) -> Method:
     for level in DIFFICULTIES:
         if (averaged & (levels == level)).any():
             rows = averaged & (levels.isna() | (levels == level))
-            figure = _figure(success[rows], method, protocol, None)
+            figure = _figure(success[rows], method, protocol)
             figure = replace(figure, full=protocol.has_all(protocol.averaged))
             method.figures.setdefault("difficulty", {})[level] = figure
     return method
 
 
-def _figure(
-    success: pd.DataFrame, method: Method, protocol: Protocol, reported: PaperResult | None
-) -> Figure:
+def _figure(success: pd.DataFrame, method: Method, protocol: Protocol) -> Figure:
     """A figure from the runs that have all its episodes.
 
     success: these episodes, as `Method.success` has them.
@@ -430,9 +428,7 @@ def _figure(
     n_done = int(done.to_numpy().sum())
     if not n_complete:
         partial = float(100 * success.stack().mean()) if n_done else None
-        return Figure(
-            None, None, None, n_runs, 0, n_done, success.size, partial=partial, paper=reported
-        )
+        return Figure(None, None, None, n_runs, 0, n_done, success.size, partial)
     trainings = over_trainings(complete, method.runs)
     several = len(trainings.columns) > 1
     units = trainings if several else complete
@@ -451,7 +447,6 @@ def _figure(
         n_complete,
         n_done,
         success.size,
-        paper=reported,
     )
 
 
@@ -464,7 +459,7 @@ def by_task(success: pd.DataFrame) -> dict[str, np.ndarray]:
 
 def _reported(known: PaperMethod | None, scope: Scope) -> PaperResult | None:
     """The paper's number, where it is about the same tasks."""
-    if known is None or not TASK_FACTS.keys() >= set(scope.tasks) or not scope.is_whole:
+    if known is None or not TASK_FACTS.keys() >= set(scope.tasks) or not scope.covers_benchmark:
         return None
     if scope.kind == "task":
         return paper.per_task(known.name)[scope.name]

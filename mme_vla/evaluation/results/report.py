@@ -88,10 +88,12 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     if any(method.paper for method in results.methods):
         whiskers += " Lines across: the paper."
     pale = ""
+    pale_cells = ""
     if any(
         figure.is_pale for method in results.methods for figure in method.figures["task"].values()
     ):
         pale = " Pale: not all episodes of the split; n: how many."
+        pale_cells = " Pale: not all episodes of the split; in brackets how many."
     difficulty = "Mean over tasks of the episodes of a difficulty."
     rings = (
         "Rings: the paper's averages. Neither subgoal predictors nor the encoding of past frames"
@@ -119,7 +121,7 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
         chart = plots.bars(results, "task", wide=n_tasks > 2)
         sections.append(Section("Tasks", chart, caption=whiskers + pale))
     else:
-        text = f"Success rate in percent.{pale.replace('n:', 'in brackets')}"
+        text = f"Success rate in percent.{pale_cells}"
         sections.append(Section("Tasks", plots.heat_map(results), caption=text))
     if groupings := grouping_tables(results):
         sections.append(Section("Groups of tasks", tables=groupings, headed=True))
@@ -183,9 +185,14 @@ def conclude(results: Results, comparisons: Sequence[Comparison]) -> list[str]:
     if best.average.interval is not None:
         low, high = best.average.interval
         text += f" ({100 * protocol.confidence:g} % interval {low:.1f} to {high:.1f})"
-    if len(ranked) > 1:
-        text += f", the most of {len(ranked)} methods; next is {ranked[1].label} with"
-        text += f" {ranked[1].average.value:.1f} %"
+    others = ranked[1:]
+    rate = round(best.average.value or 0, 6)
+    equals = [method.label for method in others if round(method.average.value or 0, 6) == rate]
+    if equals:
+        text += f", as many as {' and '.join(equals)}"
+    elif others:
+        text += f", the most of {len(ranked)} methods; next is {others[0].label} with"
+        text += f" {others[0].average.value:.1f} %"
     return [f"{text}."]
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 from mme_vla.errors import counted, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
@@ -102,13 +102,10 @@ class Protocol:
     groupings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @classmethod
-    def of_records(
-        cls, records: Iterable[EpisodeRecord], episodes: int | None = None, **how: Any
-    ) -> Self:
+    def of_records(cls, records: Iterable[EpisodeRecord], episodes: int | None = None) -> Self:
         """The protocol of what has records: their tasks, and of each the episodes of any run.
 
-        episodes: how many a task has in all; by default up to the last that is recorded. how:
-        further fields.
+        episodes: how many a task has in all; by default up to the last that is recorded.
         """
         recorded: dict[str, set[int]] = {}
         for record in records:
@@ -121,7 +118,7 @@ class Protocol:
         for task in ordered:
             if recorded[task] != set(range(episodes)):
                 numbers[task] = tuple(sorted(recorded[task]))
-        return cls(tuple(ordered), episodes, numbers=numbers, **how)
+        return cls(tuple(ordered), episodes, numbers=numbers)
 
     def __post_init__(self) -> None:
         for holds, message in (
@@ -243,7 +240,7 @@ class Scope(NamedTuple):
     tasks: tuple[str, ...]
 
     @property
-    def is_whole(self) -> bool:
+    def covers_benchmark(self) -> bool:
         """Whether all the benchmark's tasks of this name are in it."""
         if self.kind == "average":
             return set(self.tasks) >= set(PAPER_ORDER)

@@ -66,8 +66,8 @@ def show(figure: Figure) -> str:
     A mean without the incomplete runs states its number of runs.
     """
     if figure.mean is None:
-        so_far = "–" if figure.partial is None else f"{figure.partial:.1f}"
-        return f"{so_far} ({figure.done:,} of {figure.expected:,})"
+        rate = "–" if figure.partial is None else f"{figure.partial:.1f}"
+        return f"{rate} ({figure.done:,} of {figure.expected:,})"
     text = show_mean(figure.mean, figure.std)
     if figure.complete < figure.runs:
         text += f" ({figure.complete} of {figure.runs} runs)"
@@ -339,11 +339,10 @@ def print_table(table: Table, width: int) -> None:
     console = Console(width=10_000)
     console.print(Text(printable(table.title), style="bold italic"), soft_wrap=True)
     for block in blocks:
-        others = sum(needs[number] + _PADDING for number in block)
-        room = width - others - _PADDING - 1
-        console.print(
-            _to_rich(table, [0, *block], [max(least, min(name, room)), *(needs[i] for i in block)])
-        )
+        widths = [needs[number] for number in block]
+        remaining = width - sum(widths) - _PADDING * len(widths) - _PADDING - 1
+        first = max(least, min(name, remaining))
+        console.print(_to_rich(table, [0, *block], [first, *widths]))
 
 
 def _to_rich(table: Table, columns: Sequence[int], widths: Sequence[int]) -> "RichTable":
@@ -351,9 +350,9 @@ def _to_rich(table: Table, columns: Sequence[int], widths: Sequence[int]) -> "Ri
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    made = RichTable()
+    rendered = RichTable()
     for column, width in zip(columns, widths, strict=True):
-        made.add_column(
+        rendered.add_column(
             Text(printable(table.columns[column])),
             justify="left" if column == 0 else "right",
             overflow="fold",
@@ -361,10 +360,10 @@ def _to_rich(table: Table, columns: Sequence[int], widths: Sequence[int]) -> "Ri
         )
     for i, row in enumerate(table.rows):
         if i in table.rules:
-            made.add_section()
+            rendered.add_section()
         cells = [Text(printable(row[column])) for column in columns]
-        made.add_row(*cells, style="bold" if i in table.strong else None)
-    return made
+        rendered.add_row(*cells, style="bold" if i in table.strong else None)
+    return rendered
 
 
 def to_markdown(table: Table) -> str:

@@ -73,7 +73,7 @@ class RolloutSettings:
         source = environment(self.env)
         if self.max_steps != source.step_limit(self.split):
             return self.max_steps
-        return source.step_limit(self.split, task)
+        return source.task_limit(task, self.split)
 
     def worker_count(self, episodes: int) -> int:
         """How many workers run that many episodes."""

@@ -70,7 +70,7 @@ def main(cfg: DictConfig) -> None:
     max_steps = command.max_steps or source.step_limit(command.split)
     limits = {}
     if command.max_steps is None:
-        limits = {spec.task: source.step_limit(spec.split, spec.task) for spec in specs}
+        limits = {spec.task: source.task_limit(spec.task, spec.split) for spec in specs}
     settings = read_section(PlaySettings, {**config, "max_steps": max_steps}, others=True)
     by_hand = command.player["name"] == HUMAN
     built = None if by_hand else build_player(command.player)

@@ -66,7 +66,7 @@ def test_seeds_are_the_protocols_and_limits_the_tasks() -> None:
     assert [len(test), test[0].seed, test[-1].seed] == [50, 4_242_424_242, 4_242_424_291]
     train = {spec.seed for spec in source.episodes("RememberColor3", "train")}
     assert len(train) == 250 and not train & {spec.seed for spec in test}
-    assert source.step_limit("test", "FindImposterShapeAndColor5x3") == 40
+    assert source.task_limit("FindImposterShapeAndColor5x3", "test") == 40
     assert source.step_limit("test") == 2160
     assert source.groups_of("SeqOfColors3-Long") == {"horizon": "Long"}
     assert source.suite_of("SeqOfColors3-Long") == "Capacity"

@@ -18,8 +18,8 @@ pytest.importorskip(
 @pytest.fixture(autouse=True)
 def no_kept_scenes() -> Iterator[None]:
     yield
-    while base._kept:
-        base._kept.popitem()[1].close()
+    while base._idle:
+        base._idle.popitem()[1].close()
 
 
 def opened(task: str, episode: int = 0, env: str = "mikasa", render: bool = False) -> EpisodeEnv:

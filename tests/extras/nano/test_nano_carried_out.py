@@ -34,7 +34,7 @@ def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand(rende
     assert facts is not None
     assert [fact.value for fact in facts] == [str(i + 1) for i in range(len(facts))]
     assert [fact.name for fact in env.facts] == [fact.name for fact in facts]
-    assert all(fact.needed and fact.shown[1] < made.length for fact in facts)
+    assert all(fact.needed and fact.frames[1] < made.length for fact in facts)
     env.close()
     assert ended and info["status"] == "success"
 

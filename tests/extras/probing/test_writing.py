@@ -150,7 +150,7 @@ def test_memories_that_read_tokens_are_scored_by_their_policy(name: str) -> None
         for frame in required_frames(memory)
         if frame < 120
     }
-    facts = [fact for fact in base.facts if fact.shown[1] < 120]
+    facts = [fact for fact in base.facts if fact.frames[1] < 120]
     row = score_writing(memory, [replace(base, facts=facts, images=images)], policy).to_dict()[
         "mean"
     ]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import sapien
 
-from mme_vla.envs.facts import Shown
+from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.scene.arithmetic import norm
 from mme_vla.envs.robomme.scene.objects import (
     BELOW_TABLE,
@@ -104,11 +104,11 @@ class Cover:
         for part in self._parts:
             part.apply(k)
 
-    def shown(self) -> Shown:
+    def fact(self) -> VisibleFact:
         """What lies open, and where."""
         names = {cube: container.name for cube, container in self._contents.items()}
         value = ", ".join(f"{cube}: {name}" for cube, name in names.items())
-        return Shown(value, frozenset(names.values()))
+        return VisibleFact(value, frozenset(names.values()))
 
 
 class Swap:
@@ -173,11 +173,11 @@ class Swap:
         for thing, pose in poses.items():
             thing.move_to(pose)
 
-    def shown(self) -> Shown:
+    def fact(self) -> VisibleFact:
         """Which two change places."""
         assert self.partner is not None
         names = (self.initiator.name, self.partner.name)
-        return Shown(" and ".join(names), frozenset(names), replaces=True)
+        return VisibleFact(" and ".join(names), frozenset(names), replaces=True)
 
 
 def sequential_swaps(
@@ -209,13 +209,13 @@ def planned_swaps(
     ]
 
 
-def active_motions(motions: "Sequence[Cover | Swap | Highlight]") -> dict[str, Shown]:
+def active_motions(motions: "Sequence[Cover | Swap | Highlight]") -> dict[str, VisibleFact]:
     """The motions that take place, each a fact named by its kind and number: `swap 0`."""
-    shown = {}
+    facts = {}
     for i, motion in enumerate(motions):
         if motion.active:
-            shown[f"{type(motion).__name__.lower()} {i}"] = motion.shown()
-    return shown
+            facts[f"{type(motion).__name__.lower()} {i}"] = motion.fact()
+    return facts
 
 
 class Hide:
@@ -264,9 +264,9 @@ class Highlight:
             place = self._thing.position - [0, 0, self.DEPTH]
         self._disc.move_to(sapien.Pose(place, self._disc.pose.q))
 
-    def shown(self) -> Shown:
+    def fact(self) -> VisibleFact:
         """Which object is highlighted."""
-        return Shown(self._thing.name, {self._thing.name})
+        return VisibleFact(self._thing.name, {self._thing.name})
 
 
 def build_mark(env: "Stage", name: str, radius: float, half_length: float) -> Disc:

@@ -4,7 +4,7 @@ pick up just those.
 
 from collections.abc import Mapping
 
-from mme_vla.envs.facts import Shown
+from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, Highlight, active_motions, under
 from mme_vla.envs.robomme.scene.objects import COLOURS, RGB, Cube, H, build_highlight
@@ -91,7 +91,7 @@ class PickHighlight(Task):
         self.motions = [*self.highlights]
         self.picked: set[Cube] = set()
 
-    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
+    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
         return active_motions(self.highlights)
 
     def failure(self) -> bool:

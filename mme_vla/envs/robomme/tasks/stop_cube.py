@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import sapien
 
-from mme_vla.envs.facts import Shown
+from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, row, smoothstep, tally
 from mme_vla.envs.robomme.scene.objects import build_disc, build_moving_cube
@@ -116,11 +116,11 @@ class StopCube(Task):
             return not (self._on_target() and self._in_time())
         return self.steps_done > self.deadline
 
-    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
+    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
         if self.stopped_at is not None or not self._on_target():
             return {}
         visit = self.steps_done // self.interval
-        return {f"visit {visit}": Shown(str(visit + 1), {"visits"}, replaces=True)}
+        return {f"visit {visit}": VisibleFact(str(visit + 1), {"visits"}, replaces=True)}
 
     def checkpoints(self) -> list[int]:
         """Steps until which the arm waits: every 100th, then the one at which to press."""

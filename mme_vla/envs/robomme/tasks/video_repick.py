@@ -4,7 +4,7 @@ now.
 
 from collections.abc import Mapping
 
-from mme_vla.envs.facts import Shown
+from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import (
     SWAP_STEPS,
@@ -154,12 +154,12 @@ class VideoRepick(Task):
 
         return [under(self.cube), *tally(row(self.repetitions), left)]
 
-    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
-        shown = super().shown_facts(ended) | active_motions(self.swaps)
+    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
+        facts = super().visible_facts(ended) | active_motions(self.swaps)
         for i, subtask in ended.items():
             if subtask.choice == "b" and not subtask.video:  # one repetition is done
-                shown[f"{i} {subtask.text}"] = self.counted(i)
-        return shown
+                facts[f"{i} {subtask.text}"] = self.count_fact(i)
+        return facts
 
     def failure(self) -> bool:
         """Notes whether the swaps may begin, one step after their stage is entered; the rules

@@ -38,7 +38,7 @@ from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
-from mme_vla.speed import Recompute
+from mme_vla.speed import Recompute, compile_parts
 from mme_vla.speed.sharding import ShardGroup
 from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 
@@ -266,8 +266,7 @@ class MemoryVlaPolicy(NetworkPolicy):
         )
         for module in (*towers, *layers, *self.core.head.blocks):
             module.compile(**options)
-        if self.memory is not None:
-            self.memory.compile(**options)
+        compile_parts(self.memory, **options)
 
     # Sampling
 

@@ -133,7 +133,7 @@ class AttentionWatch(Watch[AttentionMass]):
     def _layer(self, index: int, block: JointBlock, args: tuple, kwargs: dict[str, Any]) -> None:
         if not self._watching:
             return
-        names = ("segments", "turn", "mask", "condition", "hook", "past")
+        names = ("segments", "rope", "mask", "condition", "hook", "past")
         arguments = {**dict.fromkeys(names), **dict(zip(names, args, strict=False)), **kwargs}
         segments, condition = arguments["segments"], arguments["condition"]
         of_attention = condition.attention if isinstance(condition, LayerModulation) else condition
@@ -147,7 +147,7 @@ class AttentionWatch(Watch[AttentionMass]):
             answers = segment.expert == block.action_expert
             layer: Any = block.experts[segment.expert]
             queries, k, _, _ = layer.project(
-                segment.summed(), arguments["turn"].rows(rows), of_attention if answers else None
+                segment.summed(), arguments["rope"].rows(rows), of_attention if answers else None
             )
             keys.append(k)
             row = rows.stop

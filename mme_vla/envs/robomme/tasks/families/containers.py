@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mme_vla.envs.facts import Shown
+from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import (
     COVER_STEPS,
@@ -274,7 +274,7 @@ class Unmask(ContainerTask):
                 return
             self.containers.append(container)
 
-    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
+    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
         return active_motions([self.cover])
 
     def start_episode(self, draws: Draws) -> None:
@@ -382,7 +382,7 @@ class UnmaskSwap(ContainerTask):
         """The step at which the last swap ends."""
         return COVER_STEPS + self.swap_steps * self.swap_count
 
-    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
+    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
         return active_motions(self.visible_motions)
 
     def start_episode(self, draws: Draws) -> None:

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import sapien
 
-from mme_vla.envs.facts import Shown
+from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, Swap, active_motions, under
 from mme_vla.envs.robomme.scene.objects import Cube, Disc, H
@@ -150,8 +150,8 @@ class VideoPlace(Task):
     def cues(self) -> list[Cue]:
         return [under(self.goal_target)]
 
-    def shown_facts(self, ended: Mapping[int, SubTask]) -> dict[str, Shown]:
-        return super().shown_facts(ended) | active_motions(self._swaps)
+    def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
+        return super().visible_facts(ended) | active_motions(self._swaps)
 
     def failure(self) -> bool:
         """Notes whether the swap may begin, one step after its stage is entered; the rules belong
