@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_episodes, f
 from mme_vla.evaluation.rollout.local import LocalEnvs
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_records
+from mme_vla.extras.audit import audit as audit_module
 from mme_vla.extras.audit.audit import Audit, AuditSettings, run_audit, scenes_a_task
 from mme_vla.extras.audit.conclusion import VERDICTS, resolution
 from mme_vla.extras.probing.card import CONTENT, TIME, Card, measure_card
@@ -135,6 +137,8 @@ def test_each_planted_policy_is_named(
     assert beyond <= losses or fake in ("video", "clock")
     page = result.page.read_text()
     assert VERDICTS[verdict] in page.replace("&#x27;", "'") and f"Audit of {fake}" in page
+    meaning = "begins anew at each decision, with the current frame alone"
+    assert meaning in " ".join(page.split()), "the page lacks what an arm does"
     content = json.loads((tmp_path / "audit.json").read_text())
     assert content["conclusion"]["verdict"] == verdict
     assert content["server"]["protocol"] == "robomme"
@@ -266,6 +270,23 @@ def test_minutes_choose_the_scenes_once_and_say_what_they_cannot_resolve(
     assert {path: path.read_bytes() for path in records} == records
     for path in find_records([tmp_path]):
         assert len(read_records(path)) == 3
+
+
+@pytest.mark.parametrize(("n_recorded", "seconds"), [(0, 2.0), (2, 6.0), (3, 9.0)])
+def test_scenes_of_an_interrupted_pilot_do_not_make_a_scene_look_quick(
+    n_recorded: int, seconds: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    recorded = [SimpleNamespace(seconds=SimpleNamespace(total=9.0))]
+    ended = dict.fromkeys(range(n_recorded), recorded)
+    clock = iter([100.0, 106.0])
+    monkeypatch.setattr(audit_module, "ended_scenes", lambda *_: ended)
+    monkeypatch.setattr(audit_module, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    (tmp_path / "online" / "unprobed").mkdir(parents=True)
+    jobs = choose_episodes("PickXtimes", 6, "test")
+    limit = seconds * audit_module.N_RUNS * 4 / 60  # of four scenes and a little
+    audit_module._affordable_scenes(jobs, tmp_path, 1.01 * limit, lambda _: None)
+    plan = json.loads((tmp_path / "plan.json").read_text())
+    assert plan == {"scenes_a_task": 4, "seconds_a_scene": seconds}
 
 
 def test_scenes_are_as_many_as_the_loss_needs() -> None:
