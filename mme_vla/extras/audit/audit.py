@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +12,7 @@ import numpy as np
 from mme_vla.config.sections import Positive, Range
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import require
-from mme_vla.evaluation.rollout.evaluation import RunOptions
+from mme_vla.evaluation.rollout.evaluation import RunOptions, evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.audit.conclusion import (
@@ -21,6 +21,7 @@ from mme_vla.extras.audit.conclusion import (
     conclude,
     scenes_for,
 )
+from mme_vla.extras.audit.floor import RANDOM, RandomPolicy
 from mme_vla.extras.probing.arms import UNPROBED, slug
 from mme_vla.extras.probing.card import (
     LOSS,
@@ -30,6 +31,7 @@ from mme_vla.extras.probing.card import (
     measure_card,
     percent,
 )
+from mme_vla.extras.probing.interventions import NEEDS
 from mme_vla.extras.probing.recordings import Recording
 from mme_vla.extras.probing.run import ONLINE, ProbePlan, run_probe
 from mme_vla.policy.base import Policy
@@ -38,7 +40,7 @@ from mme_vla.utils import read_json, require_earlier, to_json, write_atomically,
 PAGE, FIGURES, PLAN = "audit.html", "audit.json", "plan.json"
 MARK = "Audit of"  # in the heading of each page
 PILOT = 3  # scenes of each task that are run to learn how long one takes
-N_RUNS = len(INTERVENTIONS) + 2  # the matched run and its repetition among them
+N_RUNS = len(INTERVENTIONS) + 3  # the matched run, its repetition and the random floor among them
 _METHOD = (
     (
         "Every arm runs the scenes of the matched run and changes what the policy is sent, never"
@@ -49,7 +51,8 @@ _METHOD = (
     (
         "Nothing remembered: the episode begins anew at each decision, with the current frame; it"
         " is the floor of a policy that sees the present alone. Own chunks lost: it begins anew and"
-        " gets all frames so far."
+        " gets all frames so far. Random: any option and any point, or chunks from any place of the"
+        " recorded episodes."
     ),
 )
 
@@ -98,10 +101,47 @@ def run_audit(
     if audit.minutes is not None:
         jobs = _affordable_scenes(jobs, folder, audit.minutes, run_matched)
     plan = ProbePlan(lend=recordings, jobs=jobs)
+    references = dict(references or {})
+    notes = []
+    if RANDOM not in references:
+        why = _no_floor(policy, recordings)
+        if why is None:
+            _run_floor(policy, plan, folder / RANDOM, facts, settings, options)
+            references[RANDOM] = str(folder / RANDOM)
+        else:
+            notes.append(f"{RANDOM} was left out: it needs {why}.")
     card = measure_card(policy, plan, folder, facts, settings, options, references, INTERVENTIONS)
+    card = replace(card, notes=[*card.notes, *notes])
     conclusion = conclude(card, audit.resolve)
     _write(card, conclusion, folder, policy)
     return Audit(card, conclusion, folder / PAGE)
+
+
+def _no_floor(policy: Policy, recordings: Sequence[Recording]) -> str | None:
+    """What the random floor needs and lacks, for a message; None where it can be measured."""
+    robot = policy.embodiment
+    if robot.readings:
+        return NEEDS["stream"]
+    if not robot.action.choice and not recordings:
+        return NEEDS["recordings"]
+    return None
+
+
+def _run_floor(
+    policy: Policy,
+    plan: ProbePlan,
+    folder: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    options: RunOptions,
+) -> None:
+    """Run the scenes with chunks that are taken at random."""
+    floor = RandomPolicy(policy, plan.lend).eval()
+    of_floor = RunFacts(
+        RANDOM, "untrained", settings.seed, facts.split, facts.max_steps, event=facts.event
+    )
+    quiet = replace(options, source=None, name=RANDOM, show_forecast=False)
+    evaluate(floor, plan.jobs, folder, of_floor, settings, quiet)
 
 
 def scenes_a_task(audit: AuditSettings, n_tasks: int) -> int:

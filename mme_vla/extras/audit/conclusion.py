@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from mme_vla.evaluation.records import EpisodeKey
+from mme_vla.extras.audit.floor import RANDOM
 from mme_vla.extras.probing.card import CONTENT, TIME, WRONG_SCENE, Card, Loss, grade, percent
 
 FORGET = "nothing remembered"
@@ -97,6 +98,9 @@ def conclude(card: Card, target_loss: float) -> Conclusion:
             sentences.append(f"With {label} it solves {_change(card, card.arms[label])}.")
     if verdict == "content" and _loses(card, TIME):
         sentences.append("It finds what it needs by time: shifted frames mislead it too.")
+    if card.references and RANDOM in card.references:
+        solved = percent(card.references[RANDOM])
+        sentences.append(f"It solves {percent(card.matched)}, and actions at random {solved}.")
     unresolved = [label for label, loss in card.arms.items() if not loss.beyond_noise]
     if unresolved:
         limit = f"one below {percent(finest)} cannot be told here"
