@@ -14,7 +14,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from helpers import REPOSITORY
+from helpers import REPOSITORY, commands
 from helpers.serving_fakes import Served
 from mme_vla.cli.record import record_environment
 from mme_vla.config import plugins
@@ -29,14 +29,15 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_records
 from mme_vla.extras.audit import audit as audit_module
 from mme_vla.extras.audit.audit import Audit, AuditSettings, run_audit, scenes_a_task
-from mme_vla.extras.audit.conclusion import FORGET, VERDICTS, resolution
+from mme_vla.extras.audit.conclusion import FORGET, INTERVENTIONS, VERDICTS, conclude, resolution
 from mme_vla.extras.audit.floor import RANDOM
-from mme_vla.extras.probing.card import CONTENT, TIME, WRONG_SCENE, Card, measure_card
+from mme_vla.extras.probing.card import CONTENT, TIME, WRONG_SCENE, Card, measure_card, run_card
 from mme_vla.extras.probing.recordings import Recording, all_recordings
 from mme_vla.extras.probing.run import ProbePlan
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.run_folders import locate_checkpoint
 from mme_vla.serving.remote.policy import RemotePolicy
 from mme_vla.serving.remote.settings import ConnectionSettings, ServerChoice
 from mme_vla.testing.small import SMALL_VISION, small_policy
@@ -243,7 +244,7 @@ def in_blink(examples: pytest.MonkeyPatch) -> ReadsMemory:
 
 
 @contextmanager
-def served(policy: ReadsMemory, protocol: str) -> Iterator[RemotePolicy]:
+def served(policy: MMEPolicy, protocol: str) -> Iterator[RemotePolicy]:
     """The policy behind this library's server, or behind a stub that has the released server's
     messages, which are openpi's and a buffer.
     """
@@ -263,13 +264,17 @@ def served(policy: ReadsMemory, protocol: str) -> Iterator[RemotePolicy]:
         yield remote
 
 
+COMPARED = (FORGET, TIME, CONTENT, WRONG_SCENE)
+"""Arms that change the same in both cards: in the memory, or in what is sent."""
+
+
 def check_agreement(inside: dict[str, Any], outside: dict[str, Any]) -> None:
     """Compare two cards, as their JSON has them: each loss lies within the other's interval, and is
     beyond noise in both or in none.
     """
     assert inside["scenes"] == outside["scenes"]
     assert inside["matched"] == outside["matched"]
-    for label in (FORGET, TIME, CONTENT, WRONG_SCENE):
+    for label in COMPARED:
         one, other = inside["arms"][label], outside["arms"][label]
         assert one["low"] <= other["loss"] <= one["high"], label
         assert other["low"] <= one["loss"] <= other["high"], label
@@ -300,7 +305,7 @@ def test_the_cards_from_outside_and_from_inside_agree(
     jobs = choose_episodes(task, 14, "test", ENVS[task])
     facts = facts_of(policy, None, None, settings(task), None)
     plan = ProbePlan(lend=lend, jobs=jobs)
-    inside = measure_card(policy, plan, tmp_path / "inside", facts, settings(task), SILENT)
+    inside = run_card(policy, plan, tmp_path / "inside", facts, settings(task), SILENT)
     with served(policy, protocol) as remote:
         outside = audit(remote, task, tmp_path / "outside", lend)
     assert outside.conclusion.verdict == ("clock" if is_clock else "content")
@@ -308,6 +313,38 @@ def test_the_cards_from_outside_and_from_inside_agree(
     inner, outer = inside.memory_or_clock, outside.card.memory_or_clock
     assert inner.score == outer.score == (1.0 if is_clock else 0.0)
     check_agreement(asdict(inside), asdict(outside.card))
+
+
+@pytest.mark.nightly
+@pytest.mark.usefixtures("renderer")
+def test_the_cards_of_the_shipped_policy_agree(tmp_path: Path) -> None:
+    place = locate_checkpoint("nano16")
+    policy = MMEPolicy.from_pretrained(place).eval()
+    recorded = commands.run(
+        "mme_vla",
+        "record",
+        "tasks=[VideoUnmask,SwingXtimes]",
+        "episodes=0-2",
+        "split=val",
+        f"output={tmp_path / 'val'}",
+    )
+    assert recorded.returncode == 0, recorded.stderr
+    lend = all_recordings(open_sources(str(tmp_path / "val"), policy.embodiment))
+    limits = RolloutSettings(
+        seed=7, split="further_easy", max_actions=20, only_possible=True, workers=1
+    )
+    jobs = choose_episodes("VideoUnmask", list(range(2, 8)), limits.split)
+    plan = ProbePlan(lend=lend, jobs=jobs)
+    facts = facts_of(policy, None, place, limits, None)
+    inside = run_card(policy, plan, tmp_path / "inside", facts, limits, SILENT)
+    with served(policy, "mme_vla") as remote:
+        facts = facts_of(remote, None, None, limits, None)
+        arms = {label: INTERVENTIONS[label] for label in COMPARED}
+        outside = measure_card(
+            remote, plan, tmp_path / "outside", facts, limits, SILENT, interventions=arms
+        )
+    check_agreement(asdict(inside), asdict(outside))
+    assert conclude(outside, 1.0).verdict == "content"
 
 
 def test_a_policy_is_audited_alike_here_and_behind_a_server(
