@@ -124,7 +124,7 @@ class ProbedEpisode(Episode):
         width = self._robot.action.width
         executed = np.zeros((len(states), width), np.float32)
         led = np.zeros(len(demo), bool)
-        motions = np.zeros((0, width), np.float32)
+        motions: np.ndarray = np.zeros((0, width), np.float32)
         if actions is not None and self._robot.action.frames is None:
             motions = np.asarray(actions, np.float32)
         elif actions is not None:
