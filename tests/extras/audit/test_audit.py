@@ -45,6 +45,7 @@ from mme_vla.testing.small import SMALL_VISION, small_policy
 pytest.importorskip("lerobot", reason="records a LeRobot dataset: uv sync --inexact --extra data")
 
 EXAMPLES = REPOSITORY / "examples"
+PROCESSES = evaluation.VecEnv
 SILENT = RunOptions(show_progress=False)
 
 
@@ -248,15 +249,15 @@ def served(policy: MMEPolicy, protocol: str) -> Iterator[RemotePolicy]:
     """The policy behind this library's server, or behind a stub that has the released server's
     messages, which are openpi's and a buffer.
     """
-    import stub_servers
-    from served_checkpoint import behind
-
     connection = ConnectionSettings(timeout_s=60, open_s=5)
     with ExitStack() as stack:
         if protocol == "mme_vla":
-            server = stack.enter_context(Served(policy)).server
+            server = stack.enter_context(Served(policy, flow_steps=None)).server
             url = f"ws://127.0.0.1:{server.port}"
         else:
+            import stub_servers
+            from served_checkpoint import behind
+
             stub = stub_servers.Stub(policy=behind(policy))
             url = stack.enter_context(stub_servers.serving(protocol, stub))
         remote = RemotePolicy(ServerChoice(url, protocol, connection), policy.embodiment)
@@ -317,7 +318,10 @@ def test_the_cards_from_outside_and_from_inside_agree(
 
 @pytest.mark.nightly
 @pytest.mark.usefixtures("renderer")
-def test_the_cards_of_the_shipped_policy_agree(tmp_path: Path) -> None:
+def test_the_cards_of_the_shipped_policy_agree(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(evaluation, "VecEnv", PROCESSES)  # which `examples` replaces
     place = locate_checkpoint("nano16")
     policy = MMEPolicy.from_pretrained(place).eval()
     recorded = commands.run(
