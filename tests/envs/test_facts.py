@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from helpers import REPOSITORY
+from helpers.tiers import slow_or_nightly
 from mme_vla import Fact, UserError
 from mme_vla.config.plugins import import_plugins
 from mme_vla.envs.base import environment
@@ -20,6 +21,8 @@ from mme_vla.envs.metadata import TASK_NAMES
 
 RED = {"cover 0": VisibleFact("red: container_1", {"container_1"})}
 SWAP = {"swap 1": VisibleFact("container_1 and container_2", {"container_1", "container_2"}, True)}
+SLOW_TASKS = ("VideoUnmask", "ButtonUnmaskSwap", "StopCube")
+"""One task a way of naming facts; the others are nightly."""
 
 
 def test_a_fact_is_shown_from_its_first_to_its_last_frame() -> None:
@@ -191,8 +194,7 @@ class Former:
         self.frames += 1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("task", slow_or_nightly(TASK_NAMES, SLOW_TASKS.__contains__))
 def test_facts_of_the_simulator_are_those_once_named_by_hand(task: str) -> None:
     pytest.importorskip(
         "mani_skill", reason="the simulator is not installed: the extra `sim` has it"

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from helpers import REPOSITORY, commands
 from helpers.serving_fakes import Served
+from helpers.tiers import slow_or_nightly
 from mme_vla.cli.record import record_environment
 from mme_vla.config import plugins
 from mme_vla.config.plugins import import_plugins
@@ -284,12 +285,15 @@ def check_agreement(inside: dict[str, Any], outside: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(
     ("task", "is_clock", "protocol"),
-    [
-        ("Cues", False, "mme_vla"),
-        ("Cues", True, "mme_vla"),
-        ("Blink", False, "mme_vla"),
-        ("Blink", False, "robomme"),
-    ],
+    slow_or_nightly(
+        [
+            ("Cues", False, "mme_vla"),
+            ("Cues", True, "mme_vla"),
+            ("Blink", False, "mme_vla"),
+            ("Blink", False, "robomme"),
+        ],
+        lambda case: case in (("Cues", False, "mme_vla"), ("Blink", False, "robomme")),
+    ),
 )
 def test_the_cards_from_outside_and_from_inside_agree(
     task: str,
