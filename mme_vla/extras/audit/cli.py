@@ -16,7 +16,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
 from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_episodes, facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.extras.audit.audit import AuditSettings, run_audit, scenes_a_task
+from mme_vla.extras.audit.audit import N_RUNS, AuditSettings, run_audit, scenes_a_task
 from mme_vla.extras.probing.card import card_text
 from mme_vla.extras.probing.recordings import all_recordings
 from mme_vla.policy.build import policy_config
@@ -49,7 +49,7 @@ def main(cfg: DictConfig) -> None:
     recordings = []
     if values["recordings"] is not None:
         recordings = all_recordings(open_sources(values["recordings"], policy.embodiment))
-    logger.info("%d scenes, twelve runs of each at most, into %s", len(jobs), folder)
+    logger.info("%d scenes, %d runs of each at most, into %s", len(jobs), N_RUNS, folder)
     options = RunOptions(source=place)
     try:
         result = run_audit(
@@ -65,6 +65,7 @@ def main(cfg: DictConfig) -> None:
         )
     finally:
         policy.close()
-    print(card_text(result.card))
-    print("\n".join(result.conclusion.sentences))
+    verdict, *reasons = result.conclusion.sentences
+    print(card_text(result.card, verdict))
+    print("\n".join(reasons))
     print(result.page)
