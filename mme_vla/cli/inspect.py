@@ -1,4 +1,4 @@
-"""`python -m mme_vla.inspect`: what is in a checkpoint, a dataset or an episode, what a memory
+"""`mme-vla inspect`: what is in a checkpoint, a dataset or an episode, what a memory
 remembers of it, and what a policy predicts along it.
 """
 

@@ -1,4 +1,4 @@
-"""`python -m mme_vla.results RUN…`: from episode records to tables and a report, beside the paper's
+"""`mme-vla results RUN…`: from episode records to tables and a report, beside the paper's
 numbers.
 
 RUN is a file of episode records, or a folder with `episodes*.jsonl` in it or below; shards and runs
@@ -416,7 +416,7 @@ def _verify_parser() -> argparse.ArgumentParser:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argument_parser("python -m mme_vla.results", __doc__, EXAMPLES)
+    parser = argument_parser("mme-vla results", __doc__, EXAMPLES)
     parser.add_argument(
         "runs", nargs="*", type=Path, metavar="RUN", help="file of episode records, or folder"
     )

@@ -1,4 +1,4 @@
-"""`python -m mme_vla.probe checkpoint=…`: what a policy takes from its memory
+"""`mme-vla probe checkpoint=…`: what a policy takes from its memory
 (configs/probe.yaml).
 """
 
