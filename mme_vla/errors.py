@@ -64,9 +64,9 @@ def check_choice(key: str, value: object, options: Iterable[str]) -> None:
 def check_sizes(section: str, **sizes: int) -> None:
     """Make sure that numbers of a section are whole and at least 1."""
     for key, value in sizes.items():
-        whole = isinstance(value, int) and not isinstance(value, bool)
+        is_integer = isinstance(value, int) and not isinstance(value, bool)
         require(
-            whole and value >= 1,
+            is_integer and value >= 1,
             f"{section}.{key}={brief(value)} must be at least 1, a whole number.",
         )
 

@@ -77,7 +77,7 @@ def check_site(folder: Path) -> None:
         folders.update(parent.as_posix() for parent in Path(name).parents)
     other_files: list[str] = []
     for path in folder.rglob("*"):
-        if not _is_ours(path, folder, sums, folders):
+        if not _is_generated(path, folder, sums, folders):
             other_files.append(path.name)
         if len(other_files) == 5:  # not all of them: the folder may be a home folder
             break
@@ -89,7 +89,7 @@ def check_site(folder: Path) -> None:
     )
 
 
-def _is_ours(path: Path, folder: Path, sums: dict[str, str], folders: set[str]) -> bool:
+def _is_generated(path: Path, folder: Path, sums: dict[str, str], folders: set[str]) -> bool:
     name = path.relative_to(folder).as_posix()
     if path.is_symlink():
         return False

@@ -119,8 +119,8 @@ def test_held_out_episodes_are_those_of_the_training(sample: EpisodeSource) -> N
     assert held_out is not None and held_out.tolist() == [False, True, False, False]
     default = held_out_episodes(sample, DataSettings(sources="sample"), content)
     assert default is not None and default.tolist() == [False, False, False, True]
-    whole = DataSettings(sources=["sample", "other"], val_episodes=(), val_fraction=0.999999)
-    every = held_out_episodes(sample, whole, content)
+    all_but_none = DataSettings(sources=["sample", "other"], val_episodes=(), val_fraction=0.999999)
+    every = held_out_episodes(sample, all_but_none, content)
     assert every is not None and every.all(), "another source was trained on"
     assert held_out_episodes(sample, named, ["another"]) is None
 

@@ -106,8 +106,8 @@ def make_dataset() -> None:
 def train() -> None:
     """The runs, each as its second update left it, on a cache that `cache` made."""
     command("cache", *FRAMESAMP, *DATA)
-    for name, chosen in RUNS.items():
-        arguments = [*chosen, *TRAIN, "train.steps=2", f"output=training/{name}"]
+    for name, model_arguments in RUNS.items():
+        arguments = [*model_arguments, *TRAIN, "train.steps=2", f"output=training/{name}"]
         if name == "sharded":
             launcher = [
                 sys.executable,
@@ -165,10 +165,10 @@ def first_loss(model: str, checkpoint: Path) -> list[float]:
 
 def statistics(run: str) -> dict[str, Any]:
     """The statistics that a run's checkpoint holds, and the goals of the dataset."""
-    found: dict[str, Any] = json.loads(
+    content: dict[str, Any] = json.loads(
         next(Path("training", run).rglob("norm_stats.json")).read_text()
     )
-    return found["norm_stats"]
+    return content["norm_stats"]
 
 
 def dataset() -> dict[str, Any]:
@@ -238,8 +238,8 @@ def probed() -> list[str]:
 def card() -> dict[str, Any]:
     """The report card; what is there already is not run again."""
     command("probe", *CARD)
-    found: dict[str, Any] = json.loads(Path("card", "card.json").read_text())
-    return found
+    content: dict[str, Any] = json.loads(Path("card", "card.json").read_text())
+    return content
 
 
 def board() -> list[list[str]]:
