@@ -1,4 +1,4 @@
-"""`python -m mme_vla.evaluate checkpoint=… tasks=all`: run a policy on the benchmark
+"""`mme-vla evaluate checkpoint=… tasks=all`: run a policy on the benchmark
 (configs/evaluate.yaml).
 """
 
@@ -246,7 +246,7 @@ def report(done: Evaluation, output: Path) -> None:
         )  # fmt: skip
     if any(record.outcome == "error" for record in done.records):
         logger.warning("some episodes ended in an error: the same command tries them again")
-    logger.info("python -m mme_vla.results %s", output)
+    logger.info("mme-vla results %s", output)
 
 
 def report_usage(usage: Usage) -> None:

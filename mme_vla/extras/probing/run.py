@@ -42,20 +42,11 @@ from mme_vla.extras.probing.offline import OfflineSettings, probe_offline
 from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.extras.probing.recordings import Recording, all_recordings
 from mme_vla.extras.probing.report import Notes, check_outputs, write_images, write_page
+from mme_vla.extras.probing.settings import IN_CLOSED_LOOP, NO_DATA
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
 
 OFFLINE, ONLINE = "offline", "online"  # Folders of the lines and of the closed loop
-NO_DATA = (
-    "A probe on recorded episodes needs some: recordings=<dataset>. Those of the benchmark are made"
-    " by `mme-vla record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false"
-    " online=true probes in closed loop alone."
-)
-
-
-IN_CLOSED_LOOP = (
-    "event=…: events act in closed loop: add online=true to the command, or tasks=… in Python."
-)
 
 
 @dataclass(frozen=True)

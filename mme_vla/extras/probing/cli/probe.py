@@ -1,4 +1,4 @@
-"""`python -m mme_vla.probe checkpoint=…`: what a policy takes from its memory
+"""`mme-vla probe checkpoint=…`: what a policy takes from its memory
 (configs/probe.yaml).
 """
 
@@ -11,8 +11,6 @@ from omegaconf import DictConfig
 from mme_vla.cli.command import log_to_terminal, run_configured
 from mme_vla.config.devices import process_device
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, require
-from mme_vla.policy.build import policy_config
 
 logger = logging.getLogger("mme_vla.probe")
 
@@ -21,7 +19,7 @@ def main() -> None:
     """Run the command; the first word `card` means `card=true`."""
     if sys.argv[1:2] == ["card"]:
         sys.argv[1] = "card=true"
-    run_configured("probe", probe)
+    run_configured("probe", probe, check="mme_vla.extras.probing.settings:check_probe")
 
 
 def probe(cfg: DictConfig) -> None:
@@ -44,12 +42,11 @@ def probe(cfg: DictConfig) -> None:
     from mme_vla.extras.probing.recordings import all_recordings
     from mme_vla.extras.probing.report import table_of
     from mme_vla.extras.probing.run import (
-        IN_CLOSED_LOOP,
-        NO_DATA,
         ProbePlan,
         probed_folder,
         run_probe,
     )
+    from mme_vla.policy.build import policy_config
     from mme_vla.utils import safe_name
 
     values = policy_config(cfg)
@@ -58,21 +55,10 @@ def probe(cfg: DictConfig) -> None:
         print(table_of({folder: probed_folder(Path(folder)) for folder in listed}))
         return
     card = values["card"]
-    if not (values["offline"] or values["online"] or card):
-        raise UserError(
-            "offline=false online=false leaves nothing to probe: set one of them to true."
-        )
     if values["server"] is not None:
         # A server chooses a chunk once: recordings are what contents are taken from.
         values["offline"] = False
-        require(
-            values["online"] or card,
-            "server=…: a served policy is probed in closed loop alone: add online=true.",
-        )
-    if values["offline"] and values["recordings"] is None and not card:
-        raise UserError(NO_DATA)
     events = event_arms(values["event"])
-    require(values["online"] or not events, IN_CLOSED_LOOP)
     settings = RolloutSettings.from_config({**values, "event": None})
     offline = read_section(OfflineSettings, values, others=True)
     jobs = []
