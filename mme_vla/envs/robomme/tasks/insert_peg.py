@@ -5,7 +5,9 @@ same with that peg.
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from functools import partial
+from typing import Any
 
 import numpy as np
 import sapien
@@ -132,6 +134,15 @@ class InsertPeg(Task):
             if clear and math.dist(place, box) > FROM_BOX:
                 return place
         raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
+
+    def flip_fact(self) -> dict[str, Any] | None:
+        """The first two pegs, of which the video takes one, change places."""
+        if len(self.pegs) < 2:
+            return None
+        values = deepcopy(self.values.spec)
+        pegs = values["initializations"][-1]["pegs"]
+        pegs[0], pegs[1] = pegs[1], pegs[0]
+        return values
 
     def cues(self) -> list[Cue]:
         return [Cue("white", lambda: on_table(self.ends(self.end)[0].position))]
