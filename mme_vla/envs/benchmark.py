@@ -84,7 +84,7 @@ class RoboMME(Environment):
         return candidates
 
     def tool(self, env: Any) -> Sequence[float]:
-        """x and y of the tool, in metres."""
+        """X and y of the tool, in metres."""
         tool: Sequence[float] = env.tool
         return tool
 

@@ -377,7 +377,7 @@ class RoboMMEEnv(gymnasium.Env):
 
     @property
     def tool(self) -> Sequence[float]:
-        """x and y of the tool, in metres."""
+        """X and y of the tool, in metres."""
         x, y, _ = self.task.tcp_pose.p.tolist()
         return [x, y]
 

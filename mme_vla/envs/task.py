@@ -219,7 +219,7 @@ class Task(Stage):
         return None
 
     def candidates(self) -> Candidates | None:
-        """x and y of what the current sub-task can be carried out on, where a decision of the
+        """X and y of what the current sub-task can be carried out on, where a decision of the
         execution depends on memory; None elsewhere.
 
         By default the objects that the sub-task's option chooses among.

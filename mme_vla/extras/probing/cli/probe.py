@@ -18,9 +18,9 @@ logger = logging.getLogger("mme_vla.probe")
 
 
 def main() -> None:
-    """Run the command; the first word `card` means `card=true`."""
-    if sys.argv[1:2] == ["card"]:
-        sys.argv[1] = "card=true"
+    """Run the command; a first word `card` or `twins` means `card=true` or `twins=true`."""
+    if sys.argv[1:2] in (["card"], ["twins"]):
+        sys.argv[1] += "=true"
     run_configured("probe", probe)
 
 
@@ -50,6 +50,7 @@ def probe(cfg: DictConfig) -> None:
         probed_folder,
         run_probe,
     )
+    from mme_vla.extras.probing.twins import FIGURES, measure_twins
     from mme_vla.utils import safe_name
 
     values = policy_config(cfg)
@@ -58,7 +59,15 @@ def probe(cfg: DictConfig) -> None:
         print(table_of({folder: probed_folder(Path(folder)) for folder in listed}))
         return
     card = values["card"]
-    if not (values["offline"] or values["online"] or card):
+    twins = values["twins"]
+    if twins:
+        for key in ("card", "online", "recordings", "with", "event", "server", "references"):
+            require(
+                not values[key],
+                f"twins=true measures the policy as it is and without memory: leave out {key}=….",
+            )
+        values["offline"] = False
+    if not (values["offline"] or values["online"] or card or twins):
         raise UserError(
             "offline=false online=false leaves nothing to probe: set one of them to true."
         )
@@ -76,7 +85,7 @@ def probe(cfg: DictConfig) -> None:
     settings = RolloutSettings.from_config({**values, "event": None})
     offline = read_section(OfflineSettings, values, others=True)
     jobs = []
-    if values["online"] or card:
+    if values["online"] or card or twins:
         jobs = choose_episodes(
             named_tasks(values), values["episodes"], settings.split, settings.env
         )
@@ -92,15 +101,17 @@ def probe(cfg: DictConfig) -> None:
         choose_numbers(values["recorded"], len(recordings), "the data") if values["offline"] else []
     )
     probed = [recordings[i] for i in numbers]
-    subgoals = (
-        choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
-        if jobs
-        else None
-    )
+    subgoals = None
+    if jobs and not twins:
+        subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
     predictor = None if subgoals is None else str(values["subgoal"]["name"])
     facts = facts_of(policy, name, source, settings, predictor)
     # A shipped policy has a folder of its name; one that an earlier version began continues.
-    kind = "card" if card else "probe"
+    kind = "probe"
+    if card:
+        kind = "card"
+    if twins:
+        kind = "twins"
     model = safe_name(name, "the policy's name")
     folder = Path("outputs", kind, model, str(facts.checkpoint))
     if facts.run.is_shipped and not folder.exists():
@@ -110,7 +121,10 @@ def probe(cfg: DictConfig) -> None:
     plan = ProbePlan(values["with"], probed, recordings, jobs, offline, events)
     options = RunOptions(subgoals, shard, source)
     try:
-        if card:
+        if twins:
+            text = measure_twins(policy.eval(), jobs, folder, facts, settings, options)
+            page = folder / FIGURES
+        elif card:
             graded = run_card(
                 policy.eval(), plan, folder, facts, settings, options, values["references"]
             )
