@@ -380,7 +380,7 @@ def run_twins(
         UserError: the policy reads subgoals, which would tell it the fact.
     """
     require(
-        policy.processor is None or subgoal_kind(policy) is None,
+        subgoal_kind(policy) is None,
         "Twins are for policies without subgoals: what a predictor reports would be measured, not"
         " the policy's memory.",
     )
