@@ -161,10 +161,10 @@ class CountingClient:
                     read += len(self.tokenizer.encode(part["text"]))
                 else:
                     read += IMAGE_TOKENS
-        answer = SimpleNamespace(content=self.next_reply)
+        reply = SimpleNamespace(content=self.next_reply)
         n_output = len(self.tokenizer.encode(self.next_reply))
         return SimpleNamespace(
-            choices=[SimpleNamespace(message=answer, finish_reason="stop")],
+            choices=[SimpleNamespace(message=reply, finish_reason="stop")],
             usage=SimpleNamespace(prompt_tokens=read, completion_tokens=n_output),
         )
 

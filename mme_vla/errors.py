@@ -2,6 +2,10 @@
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from pathlib import Path
+
+CONSTRAINTS = Path(__file__).resolve().parents[1] / "constraints.txt"
+"""The versions known to work together, in a clone."""
 
 
 class UserError(ValueError):
@@ -64,9 +68,9 @@ def check_choice(key: str, value: object, options: Iterable[str]) -> None:
 def check_sizes(section: str, **sizes: int) -> None:
     """Make sure that numbers of a section are whole and at least 1."""
     for key, value in sizes.items():
-        whole = isinstance(value, int) and not isinstance(value, bool)
+        is_integer = isinstance(value, int) and not isinstance(value, bool)
         require(
-            whole and value >= 1,
+            is_integer and value >= 1,
             f"{section}.{key}={brief(value)} must be at least 1, a whole number.",
         )
 
@@ -112,8 +116,15 @@ def missing_extra(what: str, extra: str) -> UserError:
     """The error to raise where the packages of an extra are not installed: what needs them, and
     what installs them.
 
-    `--inexact` keeps the extras that are there already; a plain `uv sync` would take them away.
+    Only a clone has `constraints.txt` beside the package. `--inexact` keeps the extras that are
+    there already; a plain `uv sync` would take them away.
     """
+    if not CONSTRAINTS.is_file():
+        package = f"'mme-vla[{extra}]'"
+        return UserError(
+            f"{what} needs the extra `{extra}`. With pip: pip install {package} (with uv: uv pip"
+            f" install {package})."
+        )
     with_uv, with_pip = (
         f"uv sync --inexact --extra {extra}",
         f"pip install -c constraints.txt -e '.[{extra}]'",

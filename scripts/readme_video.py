@@ -24,7 +24,8 @@ from mme_vla.utils.media import bordered, evenly_spaced, font
 from mme_vla.utils.style import PALETTE
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "images" / "suites.webp"
-SIDE, CAPTION, GAP = 256, 62, 8  # pixels of an image, of the text below it, between episodes
+SIDE, CAPTION, GAP = 256, 76, 8  # pixels of an image, of the text below it, between episodes
+TITLE, GOAL = 13, 14  # sizes of letters, readable on a page of 400 pixels too
 FRAMES, DURATION, LAST, LIMIT = 56, 140, 2500, 2_000_000  # frames, milliseconds, bytes
 
 
@@ -62,14 +63,14 @@ def panel(image: np.ndarray, record: EpisodeRecord, is_last: bool) -> Image.Imag
     draw = ImageDraw.Draw(canvas)
     title = f"{TASK_FACTS[record.task].suite}: {record.task}"
     # A dark ground, which suits pages of both grounds.
-    draw.text((4, SIDE + 3), title, PALETTE["accent"][1], font(13))
+    draw.text((4, SIDE + 4), title, PALETTE["accent"][1], font(TITLE))
     if is_last:
         solved = record.outcome == "success"
         outcome, colour = ("solved", "good") if solved else (record.outcome, "bad")
-        draw.text((SIDE - 4, SIDE + 3), outcome, PALETTE[colour][1], font(13), anchor="ra")
+        draw.text((SIDE - 4, SIDE + 4), outcome, PALETTE[colour][1], font(TITLE), anchor="ra")
     goal = str(record.goal).removeprefix("watch the video carefully, then ")
-    for row, line in enumerate(wrapped(goal, SIDE - 8, 12, 3)):
-        draw.text((4, SIDE + 19 + 14 * row), line, PALETTE["ink"][1], font(12))
+    for row, line in enumerate(wrapped(goal, SIDE - 8, GOAL, 3)):
+        draw.text((4, SIDE + 22 + 16 * row), line, PALETTE["ink"][1], font(GOAL))
     return canvas
 
 

@@ -27,16 +27,16 @@ def build_site(output: Path) -> Path:
             is no clone, or a page has a warning (a broken link, for example). Then the folder is as
             it was.
     """
+    require(
+        SETTINGS.is_file(),
+        f"The pages are in the repository, not in the installed package ({SETTINGS} is missing).",
+    )
     try:
         from mkdocs.commands.build import build
         from mkdocs.config import load_config
         from mkdocs.exceptions import Abort, MkDocsException
     except ImportError:
         raise missing_extra("The documentation site", "docs") from None
-    require(
-        SETTINGS.is_file(),
-        f"The pages are in the repository, not in the installed package ({SETTINGS} is missing).",
-    )
     target = output.resolve()
     check_site(target)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +77,7 @@ def check_site(folder: Path) -> None:
         folders.update(parent.as_posix() for parent in Path(name).parents)
     other_files: list[str] = []
     for path in folder.rglob("*"):
-        if not _is_ours(path, folder, sums, folders):
+        if not _is_generated(path, folder, sums, folders):
             other_files.append(path.name)
         if len(other_files) == 5:  # not all of them: the folder may be a home folder
             break
@@ -89,7 +89,7 @@ def check_site(folder: Path) -> None:
     )
 
 
-def _is_ours(path: Path, folder: Path, sums: dict[str, str], folders: set[str]) -> bool:
+def _is_generated(path: Path, folder: Path, sums: dict[str, str], folders: set[str]) -> bool:
     name = path.relative_to(folder).as_posix()
     if path.is_symlink():
         return False

@@ -78,8 +78,8 @@ def progress(
             if n_new and count < total:
                 seconds = (now - first[0]) / n_new * (total - count)
                 remaining = f", about {_duration_text(seconds)} left"
-            so_far = f"{count:,} of {total:,} {unit}".rstrip()
-            console.print(f"{description}: {so_far} in {_duration_text(now - begun)}{remaining}")
+            counted = f"{count:,} of {total:,} {unit}".rstrip()
+            console.print(f"{description}: {counted} in {_duration_text(now - begun)}{remaining}")
 
         yield count_up
         return

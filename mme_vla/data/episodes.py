@@ -15,35 +15,31 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.consistency import (
-    Description,
     check_consistency,
-    check_mode,
     compare_names,
     compare_stats,
     compare_units,
 )
+from mme_vla.data.frame_tables import check_vectors, flat, open_table, read_index_columns
 from mme_vla.data.hdf5 import SUBGOALS
+from mme_vla.data.image_consistency import check_mode
 from mme_vla.data.lerobot_files import (
     REMEDY,
     RENDERED_SUFFIX,
     SAMPLE,
     SIDE_FILE,
     TASKS,
-    check_vectors,
+    Description,
     content_fingerprint,
     find_columns,
-    flat,
     names_of,
-    open_table,
     read_episode_table,
     read_exec_starts,
-    read_index_columns,
     read_info,
     read_records,
     resolve_root,
-    video_file,
 )
-from mme_vla.data.video import VideoReader
+from mme_vla.data.video import VideoReader, video_file
 from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.action_space import numbered, read_options
@@ -452,12 +448,12 @@ class EpisodeSource:
         """Compare the names of numbers: the dataset's with the robot's, and of states with actions
         relative to them.
         """
-        own = robot.action.names
-        if own == numbered(robot.action.width):
-            own = ()
+        axes = robot.action.names
+        if axes == numbered(robot.action.width):
+            axes = ()
         compare_names(
             self.action_names,
-            own,
+            axes,
             "action",
             f"the dataset {self.name}",
             f"the robot {robot.name}",

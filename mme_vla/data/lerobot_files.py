@@ -8,10 +8,7 @@ take several seconds to import.
 """
 
 import re
-import string
-import sys
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from difflib import get_close_matches
 from hashlib import sha256
@@ -25,7 +22,7 @@ from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import POSE_WIDTH
 from mme_vla.errors import UserError, brief, listed, require
-from mme_vla.utils import decoding, file_sum, inside, read_json, require_file, user_cache
+from mme_vla.utils import decoding, inside, read_json, require_file
 from mme_vla.utils.validation import validated
 
 SIDE_FILE = "meta/robomme_episodes.json"
@@ -363,7 +360,6 @@ def content_fingerprint(
 
 
 _MOST_FRAMES = 2**40  # of a dataset; a larger number is damage
-_FIELDS = {"video_key": ("",), "chunk_index": ("", "d", "03d"), "file_index": ("", "d", "03d")}
 
 
 _HIDDEN = "."
@@ -418,6 +414,41 @@ class EpisodeTable:
     tasks: list[tuple[str, ...]]
     declared_lengths: np.ndarray | None
     videos: Mapping[str, VideoSpans]
+
+
+@dataclass(frozen=True)
+class Description:
+    """What is compared: the parts of a dataset that were read already.
+
+    root: its folder. info: meta/info.json. episodes: meta/episodes. videos, images: columns of the
+    cameras that are videos, and of those stored in the tables.
+    """
+
+    root: Path
+    info: Info
+    episodes: EpisodeTable
+    videos: tuple[str, ...]
+    images: tuple[str, ...]
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self.info.fps
+
+    @property
+    def starts(self) -> np.ndarray:
+        """First row of each episode, [e] int64."""
+        return self.episodes.starts
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Frames of each episode, [e] int64."""
+        return self.episodes.lengths
+
+    def place(self, row: int) -> str:
+        """A row in words, by its episode and frame."""
+        episode = int(np.searchsorted(self.starts, row, side="right")) - 1
+        return f"row {row}, frame {row - int(self.starts[episode])} of episode {episode}"
 
 
 def read_episode_table(root: Path, video_columns: Sequence[str]) -> EpisodeTable:
@@ -550,206 +581,3 @@ def read_tasks(root: Path) -> list[str]:
                 f" task by its row, so the row and task_index must be the same. {expected}"
             )
     return texts
-
-
-INDEX_COLUMNS = ("episode_index", "frame_index", "timestamp", "index", "task_index")
-"""What LeRobot writes of every row beside the recorded values."""
-
-
-def read_index_columns(
-    root: Path, features: Mapping[str, Feature], flags: Sequence[str]
-) -> dict[str, np.ndarray]:
-    """The columns that say which row is which, each [rows]: int64, and `timestamp` float64; those
-    that all files have.
-
-    Args:
-        features: what info.json declares. flags: further columns of one whole number a row, read
-            where they are declared.
-
-    Raises:
-        UserError: a file lacks a declared flag, or a column holds something else than one number a
-            row.
-    """
-    import pyarrow as pa
-    import pyarrow.compute as pc
-    import pyarrow.parquet as pq
-
-    declared = [name for name in flags if name in features]
-    for name in ("episode_index", *declared):
-        if name in features:
-            kind = features[name].dtype
-            require(
-                kind.startswith(("int", "uint", "bool")),
-                f"{root}: {name} is {brief(kind)}; expected whole numbers. {REMEDY}",
-            )
-
-    files = parquet_files(root, "data")
-    with decoding(root / "data", "tables of frames", REMEDY):
-        opened = [pq.ParquetFile(file) for file in files]
-        there = set.intersection(*(set(file.schema_arrow.names) for file in opened))
-        names = [name for name in (*INDEX_COLUMNS, *declared) if name in there]
-        table = pa.concat_tables([file.read(names) for file in opened])
-    lost = [name for name in declared if name not in there]
-    require(
-        not lost,
-        f"{root}: meta/info.json declares {listed(lost)}, which not every file in data/ has."
-        f" {REMEDY}",
-    )
-
-    columns = {}
-    for name in names:
-        values = table[name]
-        with decoding(root / "data", f"numbers ({name})", REMEDY):
-            # One number may stand in a list of its own.
-            if pa.types.is_nested(values.type):
-                sizes = pc.list_value_length(values).fill_null(1)
-                require(
-                    pc.all(pc.equal(sizes, 1)).as_py(),
-                    f"{root}: {name} holds lists; expected one number a row. {REMEDY}",
-                )
-            numbers = flat(values)
-            missing = max(values.null_count, numbers.null_count)
-            require(not missing, f"{root}: {missing} rows have no {name}. {REMEDY}")
-            require(
-                len(numbers) == table.num_rows,
-                f"{root}: {name} has {len(numbers)} numbers in {table.num_rows} rows. {REMEDY}",
-            )
-            target = pa.float64() if name == "timestamp" else pa.int64()
-            columns[name] = numbers.cast(target).to_numpy(zero_copy_only=False)
-    return columns
-
-
-def open_table(root: Path, columns: Sequence[str], features: Mapping[str, Feature]) -> Any:
-    """Memory-map these columns of all tables, through the `datasets` library as LeRobot does.
-
-    Its copy of the tables lies in a folder that is named after their content: the library itself
-    tells them by path and time stamp, which copies and archives may keep while the content is
-    another.
-    """
-    from lerobot.utils.utils import SuppressProgressBars
-
-    from datasets import Dataset, Features
-
-    with decoding(root / "meta" / "info.json", "a description of features", REMEDY):
-        target = Features({name: _kind(features[name]) for name in columns})
-    large = any(features[name].dtype == "image" for name in columns)
-    files = parquet_files(root, "data")
-    folder = user_cache("tables") / _tables_key(root, files, large)
-    with (
-        decoding(root / "data", "tables of frames", REMEDY),
-        nullcontext() if large and sys.stderr.isatty() else SuppressProgressBars(),
-    ):
-        table = Dataset.from_parquet(
-            [str(file) for file in files],
-            columns=list(columns),
-            features=target,
-            cache_dir=str(folder),
-        )
-    return table.with_format("arrow")
-
-
-def _tables_key(root: Path, files: Sequence[Path], large: bool) -> str:
-    """Names the content of tables: all of it, or, where images make them large, the fingerprint and
-    times of change.
-
-    The time of change (ctime) is set by the system whenever content is written; no program can keep
-    it.
-    """
-    digest = sha256()
-    if large:
-        digest.update(content_fingerprint(root, ("data",)).encode())
-    for file in files:
-        content = str(file.stat().st_ctime_ns) if large else file_sum(file)
-        digest.update(f"{file.relative_to(root).as_posix()} {content}\n".encode())
-    return digest.hexdigest()[:16]
-
-
-def flat(column: Any) -> Any:
-    """A column of an arrow table as one flat array; columns of one number may be stored as lists of
-    one.
-    """
-    array = column.combine_chunks() if hasattr(column, "combine_chunks") else column
-    while (
-        hasattr(array, "flatten")
-        and getattr(array.type, "num_fields", 0) == 1
-        and hasattr(array.type, "value_type")
-    ):
-        array = array.flatten()
-    return array
-
-
-def _kind(feature: Feature) -> Any:
-    """What `datasets` calls such a feature. LeRobot could say it, at the price of four seconds for
-    importing it.
-    """
-    import datasets
-
-    if feature.dtype == "image":
-        return datasets.Image()
-    if feature.shape == (1,):
-        return datasets.Value(feature.dtype)
-    if len(feature.shape) == 1:
-        return datasets.List(datasets.Value(feature.dtype), length=feature.shape[0])
-    array = getattr(datasets, f"Array{len(feature.shape)}D")
-    return array(shape=feature.shape, dtype=feature.dtype)
-
-
-def check_vectors(root: Path, table: Any, name: str, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Make sure that every row of a column is `width` finite numbers; one alone may stand without a
-    list around it.
-
-    Returns:
-        The least and the greatest of each number, [width] float64.
-    """
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    least = np.full(width, np.inf)
-    greatest = np.full(width, -np.inf)
-    first = 0
-    for chunk in table.data[name].chunks:
-        # Counting is not enough: rows of 7 and 9 numbers have 8 on average.
-        if pa.types.is_nested(chunk.type):
-            lengths = pc.list_value_length(chunk).fill_null(-1).to_numpy(zero_copy_only=False)
-            numbers = chunk.flatten()
-        else:
-            lengths = np.ones(len(chunk), np.int64)
-            numbers = chunk
-        wrong = lengths != width
-        if not wrong.any():
-            values = numbers.to_numpy(zero_copy_only=False).reshape(-1, width)  # nulls become NaN
-            with np.errstate(over="ignore"):
-                wrong = ~np.isfinite(values.astype(np.float32)).all(axis=1)  # as policies read them
-        if wrong.any():
-            row = int(np.flatnonzero(wrong)[0])
-            value = brief(chunk[row].as_py())
-            raise UserError(
-                f"{root}: row {first + row} has {name} {value}; expected {width} finite numbers"
-                f" within float32 (to 3.4e38). {REMEDY}"
-            )
-        if len(chunk):
-            least = np.minimum(least, values.min(axis=0))
-            greatest = np.maximum(greatest, values.max(axis=0))
-        first += len(chunk)
-    return least, greatest
-
-
-def video_file(root: Path, template: object, view: str, chunk: int, file: int) -> Path:
-    """The place of a video: `video_path` of meta/info.json, filled in."""
-    fields: list[tuple[str, str]] = []
-    try:
-        for _, name, spec, _ in string.Formatter().parse(str(template)):
-            if name is not None:
-                fields.append((name, spec or ""))
-        is_known = all(spec in _FIELDS.get(name, ()) for name, spec in fields)
-    except ValueError:
-        is_known = False
-    if not isinstance(template, str) or not is_known:
-        raise UserError(
-            f"{root / 'meta' / 'info.json'}: video_path is {brief(template)}; expected a path with"
-            f" the fields {{video_key}}, {{chunk_index:03d}} and {{file_index:03d}}. {REMEDY}"
-        )
-
-    return inside(
-        root, template.format(video_key=view, chunk_index=chunk, file_index=file), "video"
-    )

@@ -15,7 +15,7 @@ CHECK = "check:"
 _PREFIX = "observation.images."
 _ON_A_HAND = re.compile(r"wrist|hand|gripper|tool|eef", re.IGNORECASE)
 _GRIPPER = re.compile(r"gripper|finger|jaw|claw", re.IGNORECASE)
-_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_.\-]*")
+_UNQUOTED = re.compile(r"[A-Za-z_][A-Za-z0-9_.\-]*")
 _WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
 """Texts that YAML takes for values."""
 HORIZON, EXECUTE = 20, 16
@@ -113,11 +113,13 @@ def _cameras(features: Mapping[str, Feature]) -> dict[str, str]:
     return cameras
 
 
-def _vectors(features: Mapping[str, Feature], usual: Sequence[str], prefix: str) -> tuple[str, ...]:
+def _vectors(
+    features: Mapping[str, Feature], defaults: Sequence[str], prefix: str
+) -> tuple[str, ...]:
     """The columns that are the state or the action: the usual one, else all vectors of floats whose
     names begin alike.
     """
-    for column in usual:
+    for column in defaults:
         if column in features and features[column].width:
             return (column,)
     columns = []
@@ -150,15 +152,15 @@ def _camera_lines(name: str, column: str, feature: Feature) -> list[str]:
     return lines
 
 
-def _key_lines(columns: Sequence[str], usual: Sequence[str]) -> list[str]:
-    if len(columns) == 1 and columns[0] in usual:
+def _key_lines(columns: Sequence[str], defaults: Sequence[str]) -> list[str]:
+    if len(columns) == 1 and columns[0] in defaults:
         return []
     return [f"  key: [{', '.join(map(_text, columns))}]"]
 
 
 def _text(value: str) -> str:
     """A text in YAML that stays the text it is: no value, and no reference to another key."""
-    if _PLAIN.fullmatch(value) and value.lower() not in _WORDS:
+    if _UNQUOTED.fullmatch(value) and value.lower() not in _WORDS:
         return value
     return json.dumps(value.replace("${", "\\${"), ensure_ascii=False)
 

@@ -7,6 +7,7 @@ an image.
 """
 
 import os
+import string
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, require
-from mme_vla.utils import decoding, files_to_hold
+from mme_vla.data.lerobot_files import REMEDY
+from mme_vla.errors import UserError, brief, require
+from mme_vla.utils import decoding, files_to_hold, inside
 
 # images: a target further ahead than this is sought, a nearer one is decoded up to
 _SEEK_BEYOND = 64
+_FIELDS = {"video_key": ("",), "chunk_index": ("", "d", "03d"), "file_index": ("", "d", "03d")}
 
 
 class VideoReader:
@@ -127,3 +130,24 @@ class VideoReader:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)  # type: ignore[misc]
+
+
+def video_file(root: Path, template: object, view: str, chunk: int, file: int) -> Path:
+    """The place of a video: `video_path` of meta/info.json, filled in."""
+    fields: list[tuple[str, str]] = []
+    try:
+        for _, name, spec, _ in string.Formatter().parse(str(template)):
+            if name is not None:
+                fields.append((name, spec or ""))
+        is_known = all(spec in _FIELDS.get(name, ()) for name, spec in fields)
+    except ValueError:
+        is_known = False
+    if not isinstance(template, str) or not is_known:
+        raise UserError(
+            f"{root / 'meta' / 'info.json'}: video_path is {brief(template)}; expected a path with"
+            f" the fields {{video_key}}, {{chunk_index:03d}} and {{file_index:03d}}. {REMEDY}"
+        )
+
+    return inside(
+        root, template.format(video_key=view, chunk_index=chunk, file_index=file), "video"
+    )

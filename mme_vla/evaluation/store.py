@@ -333,7 +333,7 @@ class Claims:
             return False
         if records not in finished_by:
             path = self.folder / records
-            is_running = records == self.records or _is_held(path, claim)
+            is_running = records == self.records or _is_locked(path, claim)
             finished_by[records] = None if is_running else _finished_in(path)
         done = finished_by[records]
         return done is None or key in done
@@ -369,7 +369,7 @@ def _finished_in(path: Path) -> set[EpisodeKey]:
     return finished(read_records(path)) if path.exists() else set()
 
 
-def _is_held(path: Path, claim: Claim) -> bool:
+def _is_locked(path: Path, claim: Claim) -> bool:
     """Whether a process writes to a file of records.
 
     Where the file system has no locks, a process of this machine is looked up by its number, and

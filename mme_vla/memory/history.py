@@ -41,9 +41,9 @@ class StorageSpec:
         check_sizes("memory", grid=self.grid)
         check_choice("memory.pooling", self.pooling, ("mean", "max"))
         every = self.keep_every
-        is_whole = isinstance(every, int) and every >= 1
+        is_integer = isinstance(every, int) and every >= 1
         require(
-            is_whole,
+            is_integer,
             f"memory: keeping every {every}th frame is not possible: give a whole number, at"
             " least 1.",
         )

@@ -19,6 +19,7 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.identity import PolicyIdentity
 from mme_vla.policy.saving import load_policy, push_folder, save_policy
 from mme_vla.policy.sections import PolicySections
+from mme_vla.policy.self_check import renew_self_check
 from mme_vla.types import Noise, stack_noise
 
 if TYPE_CHECKING:
@@ -80,6 +81,10 @@ class Policy(nn.Module):
     loss_weights: Mapping[str, float] | None = None
     """Weights of auxiliary losses by name, which training sets from `train.losses`. None for a
     policy that has no such losses, and weighs no samples (`Batch.weight`).
+    """
+    has_self_check: bool = False
+    """Whether the checkpoint that it was loaded from has a self-check. It is recorded again, of the
+    weights as they are then, where the policy is saved.
     """
 
     @property
@@ -338,12 +343,15 @@ class Policy(nn.Module):
     ) -> None:
         """Write weights, configuration, statistics and tokenizer, with checksums in `SHA256SUMS`.
 
+        A policy that was loaded from a checkpoint with a self-check gets a new one of its weights.
+
         Args:
             dtype: of the stored weights: `float32` or `bfloat16`.
             card: facts for the model card, kept in the configuration: `data` (text), `recipe`,
                 `results` (tables), `license`, `base_model`, `datasets` (ids on the hub).
         """
-        save_policy(self, Path(folder), dtype=dtype, card=card)
+        check = renew_self_check(self, dtype)
+        save_policy(self, Path(folder), dtype=dtype, card=card, self_check=check)
 
     def push_to_hub(
         self,
@@ -366,7 +374,7 @@ class Policy(nn.Module):
                 `save_pretrained`.
         """
         with tempfile.TemporaryDirectory() as folder:
-            save_policy(self, Path(folder), dtype=dtype, card=card)
+            self.save_pretrained(folder, dtype=dtype, card=card)
             return push_folder(
                 Path(folder),
                 repo_id,

@@ -144,10 +144,12 @@ def write_boxes(text: str, points: Sequence[Point]) -> str:
     start, *pieces = text.split(BBOX)
     if len(pieces) != len(points):
         raise ValueError(f"{len(pieces)} {BBOX} marks for {len(points)} points in {brief(text)}.")
-    written = start
+    text_with_boxes = start
     for (y, x), piece in zip(points, pieces, strict=True):
-        written += f"<|box_start|>({to_thousandths(y)},{to_thousandths(x)})<|box_end|>{piece}"
-    return written
+        text_with_boxes += (
+            f"<|box_start|>({to_thousandths(y)},{to_thousandths(x)})<|box_end|>{piece}"
+        )
+    return text_with_boxes
 
 
 def parse_subgoal(reply: str) -> Parsed:

@@ -38,13 +38,13 @@ def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = Fa
         names = [
             path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
         ]
-    chosen = sorted(set(names) - {SUMS})
+    files = sorted(set(names) - {SUMS})
     table: dict[str, str] = {}
     if keep and (folder / SUMS).exists():
         table = _read_sums(folder / SUMS)
     with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
-        sums = pool.map(lambda name: file_sum(folder / name), chosen)
-        table.update(zip(chosen, sums, strict=True))
+        sums = pool.map(lambda name: file_sum(folder / name), files)
+        table.update(zip(files, sums, strict=True))
     with write_atomically(folder / SUMS) as draft:
         draft.write_text("".join(f"{table[name]}  {name}\n" for name in sorted(table)))
 

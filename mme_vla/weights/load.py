@@ -151,7 +151,7 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
         )
     checkpoint = open_source(source, revision)
     if checkpoint.format == "ours":
-        matched, left = _match_ours(policy, checkpoint, str(source))
+        matched, left = _match_local(policy, checkpoint, str(source))
     else:
         matched, left = _match_foreign(policy, checkpoint, str(source))
     state = policy.state_dict()
@@ -161,7 +161,7 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
     return Start(sorted(matched), sorted(set(state) - set(matched)), left)
 
 
-def _match_ours(
+def _match_local(
     policy: Policy, checkpoint: Source, source: str
 ) -> tuple[dict[str, Tensor], list[str]]:
     """The tensors of a checkpoint of ours that a policy has too, and the names of a memory's that
@@ -257,8 +257,8 @@ def _reduced(
             incomplete.append(f"{member}.")
     table = {}
     for name, pieces in adapter.table.items():
-        is_held = name not in absent and not name.startswith(tuple(incomplete))
-        if is_held or name not in local:
+        is_present = name not in absent and not name.startswith(tuple(incomplete))
+        if is_present or name not in local:
             table[name] = pieces
     return replace(adapter, table=table)
 

@@ -215,8 +215,8 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
         stores[key] = ts.open(
             spec, create=True, dtype=array.dtype, shape=array.shape, context=context
         )
-    writes = [store.result().write(arrays[key]) for key, store in stores.items()]
-    for write in writes:
+    futures = [store.result().write(arrays[key]) for key, store in stores.items()]
+    for write in futures:
         write.result()
     about = {"tree_metadata": leaves, "use_ocdbt": True, "use_zarr3": False}
     (params / METADATA).write_text(json.dumps(about))

@@ -253,14 +253,14 @@ def pi05_of(policy: Policy) -> Pi05Backbone:
     return backbone
 
 
-def wrong_policy(policy: Policy, held: str, change: str) -> UserError:
+def wrong_policy(policy: Policy, contents: str, change: str) -> UserError:
     """Make the error for a policy that a format does not hold.
 
-    held: the methods it holds. change: what to set instead.
+    contents: the methods it holds. change: what to set instead.
     """
     name = PolicySections.of(policy.config).name or "this"
     return UserError(
-        f"This format holds {held}; {name} is a {type(policy).__name__}. Set {change}."
+        f"This format holds {contents}; {name} is a {type(policy).__name__}. Set {change}."
     )
 
 

@@ -18,6 +18,7 @@ import pytest
 from helpers import command_series
 from helpers.h5_files import write_file
 from helpers.installed import is_installed, modules_beyond, needs, without_modules
+from helpers.tiers import slow_or_nightly
 from mme_vla.cli import commands
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import find_records, read_folders
@@ -264,8 +265,14 @@ def name_of(case: Case) -> str:
     return f"{'+'.join(case.extras) or 'none'}:{command}:{case.says}"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", SUFFICE, ids=name_of)
+def needs_few_processes(case: Case) -> bool:
+    """Each set of extras is a process: without any, and with the simulator alone, are slow tests;
+    the other sets are nightly.
+    """
+    return case.extras in ((), ("sim",))
+
+
+@pytest.mark.parametrize("case", slow_or_nightly(SUFFICE, needs_few_processes, name_of))
 def test_the_command_runs_with_this_extra_alone(
     outcomes: Callable[[Case], tuple[int, str]], case: Case
 ) -> None:
@@ -273,7 +280,7 @@ def test_the_command_runs_with_this_extra_alone(
     assert code == case.code and case.says in output, output[-3000:]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_nano_run_again_computes_nothing_twice(
     outcomes: Callable[[Case], tuple[int, str]], folder: Path
 ) -> None:
@@ -295,8 +302,7 @@ def test_nano_run_again_computes_nothing_twice(
     assert len(read_folders(find_records([nano / "further" / "framesamp_modul"]))) == 2
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", NEED, ids=name_of)
+@pytest.mark.parametrize("case", slow_or_nightly(NEED, needs_few_processes, name_of))
 def test_a_command_names_the_extra_that_it_needs(
     outcomes: Callable[[Case], tuple[int, str]], case: Case
 ) -> None:

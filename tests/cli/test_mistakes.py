@@ -61,9 +61,9 @@ def test_a_reply_says_what_to_type(
     tmp_path: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    answer = reply(line.split(" "), monkeypatch, capsys)
-    assert answer.startswith("Error: ")
-    assert typed in answer
+    printed = reply(line.split(" "), monkeypatch, capsys)
+    assert printed.startswith("Error: ")
+    assert typed in printed
     assert not list(tmp_path.iterdir())
 
 
@@ -81,8 +81,8 @@ def test_a_file_that_is_not_searched_is_named(
     (tmp_path / place).mkdir(parents=True)
     (tmp_path / place / "mine.yaml").write_text("name: mine\n")
     monkeypatch.chdir(tmp_path)
-    answer = reply(["train", "model=mine"], monkeypatch, capsys)
-    assert f"./{place}/mine.yaml exists: add --config-dir {folder}." in answer
+    printed = reply(["train", "model=mine"], monkeypatch, capsys)
+    assert f"./{place}/mine.yaml exists: add --config-dir {folder}." in printed
     elsewhere = reply(["train", "model=other"], monkeypatch, capsys)
     assert "A file of your own, DIR/model/other.yaml, is found with --config-dir DIR." in elsewhere
 
@@ -108,8 +108,8 @@ def test_the_name_latest_is_reserved(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    answer = reply(["train", "output=outputs/pi05/latest"], monkeypatch, capsys)
-    assert "'latest' is reserved" in answer
+    printed = reply(["train", "output=outputs/pi05/latest"], monkeypatch, capsys)
+    assert "'latest' is reserved" in printed
     assert not list(tmp_path.iterdir())
 
 

@@ -305,7 +305,7 @@ def test_no_key_of_a_command_has_the_name_of_a_folder_that_it_does_not_choose_fr
 ) -> None:
     # Hydra reads such a word of the command line as a choice, and refuses it.
     tree = OmegaConf.to_container(OmegaConf.load(file))
-    chosen = {
+    selected = {
         str(key).split("@")[0]
         for entry in tree["defaults"]
         if isinstance(entry, dict)
@@ -314,4 +314,4 @@ def test_no_key_of_a_command_has_the_name_of_a_folder_that_it_does_not_choose_fr
     folders = {
         folder.name for tree in library_trees() for folder in tree.iterdir() if folder.is_dir()
     }
-    assert not (set(tree) & folders) - chosen
+    assert not (set(tree) & folders) - selected

@@ -25,8 +25,8 @@ from helpers.lerobot_tables import (
     cell,
     change,
     change_info,
-    own_robot,
-    picture,
+    custom_robot,
+    grey_image,
     table,
     write_dataset,
     write_video,
@@ -47,7 +47,7 @@ TASKS = ("open the drawer", "close the drawer")
 
 
 def opened(root: Path, **action: Any) -> EpisodeSource:
-    return EpisodeSource(root, robot=own_robot(**action))
+    return EpisodeSource(root, robot=custom_robot(**action))
 
 
 def frames_read(source: EpisodeSource, episode: int) -> list[int]:
@@ -372,18 +372,18 @@ def test_a_video_that_does_not_hold_the_rows_is_refused_on_opening(
     tmp_path: Path, frames, rate, words
 ) -> None:
     write_dataset(tmp_path, video=True)
-    write_video(tmp_path / VIDEO, [picture(SHADE * i) for i in range(frames)], rate)
+    write_video(tmp_path / VIDEO, [grey_image(SHADE * i) for i in range(frames)], rate)
     with pytest.raises(UserError, match=words):
         opened(tmp_path)
 
 
 def test_a_video_with_more_pictures_than_rows_is_read_where_they_lie(tmp_path: Path) -> None:
     write_dataset(tmp_path, video=True)
-    write_video(tmp_path / VIDEO, [picture(SHADE * i) for i in range(12)])
+    write_video(tmp_path / VIDEO, [grey_image(SHADE * i) for i in range(12)])
     change(tmp_path, EPISODES, f"videos/{CAMERA}/from_timestamp", [0.0, 0.7])
     change(tmp_path, EPISODES, f"videos/{CAMERA}/to_timestamp", [0.5, 1.1])
     assert frames_read(opened(tmp_path), 1) == [7, 8, 9, 10]
-    twice = [picture(SHADE * (i // 2)) for i in range(18)]  # twice as many a second
+    twice = [grey_image(SHADE * (i // 2)) for i in range(18)]  # twice as many a second
     write_video(tmp_path / VIDEO, twice, 2 * FPS)
     change(tmp_path, EPISODES, f"videos/{CAMERA}/from_timestamp", [0.0, 0.5])
     change(tmp_path, EPISODES, f"videos/{CAMERA}/to_timestamp", [0.5, 0.9])
@@ -433,7 +433,7 @@ def test_pictures_of_more_than_eight_bits_are_refused_wherever_they_are(
     tmp_path: Path, image, kind, words
 ) -> None:
     write_dataset(tmp_path)
-    cells = [cell(picture(0))] * 9
+    cells = [cell(grey_image(0))] * 9
     change(tmp_path, ROWS, CAMERA, pa.array([cells[0]] * 5 + [cell(image, kind)] + cells[:3]))
     with pytest.raises(UserError, match=rf"observation.images.top holds depth.*{words}"):
         opened(tmp_path)
@@ -489,10 +489,10 @@ def test_the_same_names_in_another_order_are_refused_and_other_names_named(
     with pytest.raises(
         UserError, match=r"another order\. the source 0: shoulder, elbow.*the source 1: elbow"
     ):
-        open_sources([str(roots[0]), str(roots[1])], own_robot())
-    assert len(open_sources([str(roots[0]), str(roots[2])], own_robot())) == 2
+        open_sources([str(roots[0]), str(roots[1])], custom_robot())
+    assert len(open_sources([str(roots[0]), str(roots[2])], custom_robot())) == 2
     assert not caplog.text
-    open_sources([str(roots[0]), str(roots[3])], own_robot())
+    open_sources([str(roots[0]), str(roots[3])], custom_robot())
     assert (
         "have different names. the source 0: shoulder, elbow, gripper; the source 3: hip"
         in caplog.text
@@ -528,9 +528,9 @@ def test_sources_of_other_rates_and_other_units_are_noticed(tmp_path: Path, capl
     first = write_dataset(tmp_path / "first", states=states)
     second = write_dataset(tmp_path / "second", states=np.degrees(states), fps=30)
     third = write_dataset(tmp_path / "third", states=3 * states)
-    open_sources([str(first), str(third)], own_robot())
+    open_sources([str(first), str(third)], custom_robot())
     assert not caplog.text
-    open_sources([str(first), str(second)], own_robot())
+    open_sources([str(first), str(second)], custom_robot())
     assert "first has 10 frames per second, second has 30" in caplog.text
     assert "The state of first and of second seem to have different units" in caplog.text
 

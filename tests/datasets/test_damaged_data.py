@@ -136,7 +136,7 @@ def test_what_stands_in_a_files_place_is_reported_without_waiting_and_without_th
     "template", ["../{video_key}.mp4", "{video_key.__class__}", "{chunk_index:99999999d}", 7]
 )
 def test_a_template_of_videos_stays_in_the_dataset(copy: Path, template: object) -> None:
-    from mme_vla.data.lerobot_files import video_file
+    from mme_vla.data.video import video_file
 
     with pytest.raises(UserError, match=r"video_path|outside"):
         video_file(copy, template, "image", 0, 0)

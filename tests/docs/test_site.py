@@ -18,7 +18,7 @@ from mme_vla.config.trees import library_files
 from mme_vla.errors import UserError
 from mme_vla.utils.style import css
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 
 class Page(HTMLParser):

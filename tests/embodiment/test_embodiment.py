@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.config.composition import compose
 from mme_vla.config.trees import library_files
-from mme_vla.data.lerobot_files import check_vectors
+from mme_vla.data.frame_tables import check_vectors
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import check_benchmark, embodiment_of
 from mme_vla.policy.saving import composition_digest

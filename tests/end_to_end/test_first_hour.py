@@ -113,9 +113,9 @@ def bounds_of_the_page() -> tuple[float, float]:
 
 
 def centimetres(line: str) -> float:
-    found = re.search(r"off by ([\d.]+) cm", line)
-    assert found is not None, line
-    return float(found[1])
+    match = re.search(r"off by ([\d.]+) cm", line)
+    assert match is not None, line
+    return float(match[1])
 
 
 @pytest.mark.nightly
@@ -132,14 +132,14 @@ def test_the_shortest_path_leads_to_a_memory_in_closed_loop(tmp_path: Path) -> N
         ["bash", "-c", script], cwd=clone, env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    *printed, own, without, place = done.stdout.strip().splitlines()
+    *printed, video_line, without, place = done.stdout.strip().splitlines()
     assert place == f"{clone}/mme_vla/__init__.py"
     assert printed[-1].endswith("outputs/small/page.md"), "the result follows the page at once"
     assert "nanobind" not in done.stderr and "Traceback" not in done.stderr
     below, above = bounds_of_the_page()
-    for line, model in ((own, "video_frames_modul"), (without, "pi05")):
+    for line, model in ((video_line, "video_frames_modul"), (without, "pi05")):
         assert re.fullmatch(rf"{model}\S*: off by [\d.]+ cm on .*, \d of 4 episodes solved", line)
-    assert centimetres(own) < below and centimetres(without) > above
+    assert centimetres(video_line) < below and centimetres(without) > above
     output = clone / "examples" / "first_hour" / "outputs" / "small"
     records = read_folders(find_records([output]))
     assert sorted((record.model.partition("-")[0], record.episode) for record in records) == [

@@ -75,19 +75,19 @@ class _Terminal(io.StringIO):
 
 
 @pytest.fixture
-def shown_before_imports(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def output_before_imports(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What standard error held at each import of a command's module; the modules do nothing."""
-    shown: list[str] = []
+    outputs: list[str] = []
 
     def slow_import(name: str) -> SimpleNamespace:
         assert isinstance(sys.stderr, io.StringIO)
-        shown.append(sys.stderr.getvalue())
+        outputs.append(sys.stderr.getvalue())
         return SimpleNamespace(main=lambda *_: None)
 
     monkeypatch.setattr(cli, "import_module", slow_import)
     monkeypatch.delitem(sys.modules, "mme_vla.cli.train")  # as in a process that begins
     monkeypatch.delenv("LOCAL_RANK", raising=False)
-    return shown
+    return outputs
 
 
 @pytest.mark.parametrize(
@@ -96,25 +96,25 @@ def shown_before_imports(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_a_terminal_gets_a_line_before_the_imports(
     stream: type[io.StringIO],
     message: str,
-    shown_before_imports: list[str],
+    output_before_imports: list[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sys, "stderr", stream())
     monkeypatch.setattr(sys, "argv", ["train", f"output={tmp_path / 'run'}"])
     cli.run("train")
-    assert shown_before_imports == [message]
+    assert output_before_imports == [message]
 
 
 def test_help_imports_no_command(
-    shown_before_imports: list[str], monkeypatch: pytest.MonkeyPatch
+    output_before_imports: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "stderr", _Terminal())
     monkeypatch.setattr(sys, "argv", ["train", "--help"])
     with pytest.raises(SystemExit) as ended:
         cli.run("train")
     assert ended.value.code in (None, 0)
-    assert not shown_before_imports
+    assert not output_before_imports
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ def test_the_example_is_the_one_on_the_page() -> None:
     assert text.strip() in (REPOSITORY / "docs" / "extend" / "environments.md").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_environment_of_ones_own_works_in_every_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

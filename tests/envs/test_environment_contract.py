@@ -50,12 +50,12 @@ class Corridor(gymnasium.Env):
     def observe(self) -> dict[str, Any]:
         time = self.time
 
-        def picture() -> np.ndarray:
+        def top_image() -> np.ndarray:
             assert time == self.time, "an image is rendered before the next step"
             self.renders.append(time)
             return np.full((2, 2, 3), time, np.uint8)
 
-        return {"top": picture, "state": np.array([self.place], np.float32)}
+        return {"top": top_image, "state": np.array([self.place], np.float32)}
 
     def step(self, action: Any) -> tuple[dict, float, bool, bool, dict]:
         self.time += 1
@@ -201,17 +201,17 @@ def _robot() -> Any:
 
 
 def test_the_cue_is_part_of_the_execution_or_a_conditioning_video() -> None:
-    class Shown(Corridors):
+    class WithVideo(Corridors):
         cue = "video"
 
     frames, _ = Corridors().open("Wide", "test", 0).reset()
     assert len(frames["state_list"]) == 1
-    env = Shown().open("Wide", "test", 0)
+    env = WithVideo().open("Wide", "test", 0)
     frames, _ = env.reset()
     assert [image[0, 0, 0] for image in frames["top_rgb_list"]] == [0, 1, 2]
     frames, *_ = env.step(GO)
     assert frames["state_list"][0].item() == 1, "the first action of the policy has an effect"
-    demonstrated = list(Shown().open("Wide", "test", 0).demonstration())
+    demonstrated = list(WithVideo().open("Wide", "test", 0).demonstration())
     assert [visible for *_, visible in demonstrated[:4]] == [True, True, False, False]
     assert [bool(action.any()) for _, action, _ in demonstrated[:3]] == [False, False, True]
 
@@ -227,20 +227,20 @@ def test_with_success_once_the_first_success_ends_an_episode() -> None:
 
 
 def test_a_process_keeps_an_environment_for_the_next_episode_of_its_task() -> None:
-    class Kept(Corridors):
+    class Reusable(Corridors):
         reuse = True
 
-    first = Kept().open("Wide", "test", 0)
+    first = Reusable().open("Wide", "test", 0)
     scene = first.env
     steps_until_the_end(first)
     first.close()
     first.close()  # closing twice is harmless
-    second = Kept().open("Wide", "test", 1)
-    beside = Kept().open("Wide", "test", 2)
+    second = Reusable().open("Wide", "test", 1)
+    beside = Reusable().open("Wide", "test", 2)
     assert second.env is scene and not scene.closed and beside.env is not scene
-    assert Kept().open("Short", "test", 1).env is not scene
+    assert Reusable().open("Short", "test", 1).env is not scene
     second.close()
-    assert Kept().open("Wide", "test", 1, render=False).env is not scene
+    assert Reusable().open("Wide", "test", 1, render=False).env is not scene
     fresh = Corridors().open("Wide", "test", 0)
     fresh_scene = fresh.env
     fresh.close()
@@ -261,13 +261,13 @@ def test_a_scene_whose_step_failed_is_not_kept() -> None:
 
 
 def test_no_more_than_a_few_scenes_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Kept(Corridors):
+    class Reusable(Corridors):
         reuse = True
 
     monkeypatch.setattr(base, "_MAX_IDLE", 1)
     scenes = []
     for task in ("Wide", "Short"):
-        env = Kept().open(task, "test", 0)
+        env = Reusable().open(task, "test", 0)
         scenes.append(env.env)
         env.close()
     assert [scene.closed for scene in scenes] == [True, False]

@@ -29,7 +29,7 @@ STOCK = Path(sapien.__file__).parent / "vulkan_shader" / PACK
 SQUARE = np.array(
     [[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]]], np.float32
 )
-SHOWN_FROM_THE_FRONT = np.array(
+FACING_THE_CAMERA = np.array(
     [-0.06, 0.356, -0.323, -2.108, -0.115, 1.209, 0.294, 0.04, 0.04], np.float32
 )
 
@@ -212,7 +212,7 @@ def test_hiding_links_out_of_sight_and_reading_without_a_copy_change_no_pixel(
     rng, hidden = np.random.default_rng(0), Counter[str]()
     for _ in range(6):
         offset = np.append(rng.uniform(-0.6, 0.6, 7), [0, 0]).astype(np.float32)
-        scene.agent.robot.set_qpos(SHOWN_FROM_THE_FRONT + offset)
+        scene.agent.robot.set_qpos(FACING_THE_CAMERA + offset)
         for name, sensor_name in SENSORS.items():
             capture(scene, [name])
             actual = read_images(scene, name, rgb=True, depth=True, segmentation=True)
@@ -303,7 +303,7 @@ def images_of_the_body() -> tuple[np.ndarray, int]:
     task = env.task
     body = task.agent.robot.links_map["camera_link"]._objs[0].entity.per_scene_id
     images = []
-    for qpos in (task.qpos, SHOWN_FROM_THE_FRONT):
+    for qpos in (task.qpos, FACING_THE_CAMERA):
         task.agent.robot.set_qpos(qpos[None])
         frame = env._observer.frame({})
         images.append(np.stack([frame["front_rgb"], frame["wrist_rgb"]]))

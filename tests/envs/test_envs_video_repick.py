@@ -13,7 +13,7 @@ from mme_vla.envs.robomme.tasks.video_repick import VideoRepick
 
 ONCE = 2  # a seed: one repetition and three swaps
 FIRST, SECOND = (f"pick up the correct cube for the {i} time" for i in ("first", "second"))
-SHOWN = ["pick up the cube", "drop the cube on the table"]
+VIDEO_SUBGOALS = ["pick up the cube", "drop the cube on the table"]
 PUT, PRESS = "put it down", "press the button to finish"
 
 SCENE = (VideoRepick, 1, "hard")  # two repetitions, no swaps
@@ -31,7 +31,7 @@ def pressed_after(env: VideoRepick, steps: int) -> bool:
 def test_the_video_ends_with_the_swaps_one_after_another(build_task):
     env = build_task(VideoRepick, ONCE, "medium")
     assert env.repetitions == 1 and env.swap_count == 3
-    video = [*SHOWN, *["static"] * 4, "NO RECORD"]
+    video = [*VIDEO_SUBGOALS, *["static"] * 4, "NO RECORD"]
     assert [step.text for step in env.progress.subtasks] == [*video, FIRST, PUT, PRESS]
     assert env.goals() == [
         (

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from helpers import REPOSITORY
+from helpers.tiers import slow_or_nightly
 from mme_vla import Fact, UserError
 from mme_vla.config.plugins import import_plugins
 from mme_vla.envs.base import environment
@@ -20,12 +21,14 @@ from mme_vla.envs.metadata import TASK_NAMES
 
 RED = {"cover 0": VisibleFact("red: container_1", {"container_1"})}
 SWAP = {"swap 1": VisibleFact("container_1 and container_2", {"container_1", "container_2"}, True)}
+SLOW_TASKS = ("VideoUnmask", "ButtonUnmaskSwap", "StopCube")
+"""One task a way of naming facts; the others are nightly."""
 
 
 def test_a_fact_is_shown_from_its_first_to_its_last_frame() -> None:
     log = FactLog()
-    for shown in (RED, RED, {}, RED | SWAP, SWAP):
-        log.add(shown)
+    for frame_facts in (RED, RED, {}, RED | SWAP, SWAP):
+        log.add(frame_facts)
     first, again, swap = log.facts
     assert (first.frames, again.frames, swap.frames) == ((0, 1), (3, 3), (3, 4))
     assert first.name == again.name and first.value == "red: container_1"
@@ -36,8 +39,8 @@ def test_a_fact_is_shown_from_its_first_to_its_last_frame() -> None:
 def test_a_fact_changes_where_what_it_is_about_is_moved_or_counted_on() -> None:
     log = FactLog()
     other = {"cover 1": VisibleFact("blue: container_3", {"container_3"})}
-    for shown in (RED | other, {}, SWAP):
-        log.add(shown)
+    for frame_facts in (RED | other, {}, SWAP):
+        log.add(frame_facts)
     assert [fact.changed for fact in log.facts] == [2, None, None]
     log = FactLog()
     for i in range(3):
@@ -191,8 +194,7 @@ class Former:
         self.frames += 1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("task", slow_or_nightly(TASK_NAMES, SLOW_TASKS.__contains__))
 def test_facts_of_the_simulator_are_those_once_named_by_hand(task: str) -> None:
     pytest.importorskip(
         "mani_skill", reason="the simulator is not installed: the extra `sim` has it"
@@ -210,8 +212,8 @@ def test_facts_of_the_simulator_are_those_once_named_by_hand(task: str) -> None:
         finally:
             env.close()
         assert facts, difficulty
-        shown = {name: frames.tolist() for name, frames in evidence_of(facts).items()}
-        assert shown == former.named, difficulty
+        frame_facts = {name: frames.tolist() for name, frames in evidence_of(facts).items()}
+        assert frame_facts == former.named, difficulty
         for fact in facts:
             assert fact.value
             needed = [frame for frame in former.decisions if frame >= fact.frames[0]]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from helpers import REPOSITORY
+from helpers.tiers import slow_or_nightly
 
 pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
 import gymnasium
@@ -21,8 +22,9 @@ from mme_vla.envs import rendering
 from mme_vla.errors import UserError
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", ["StopCube", "PatternLock"])
+@pytest.mark.parametrize(
+    "task", slow_or_nightly(["StopCube", "PatternLock"], lambda task: task == "StopCube")
+)
 def test_tasks_of_gripper_and_stick_pass_gymnasiums_check(task: str) -> None:
     env = gymnasium.make(f"mme_vla/{task}-v0", images=False, max_steps=50)
     try:
@@ -98,11 +100,10 @@ def run_fresh(code: str, seconds: int = 300) -> str:
     return finished.stdout
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("beginning", FRESH.values(), ids=FRESH)
-def test_a_fresh_process_makes_a_task(beginning: str) -> None:
+@pytest.mark.parametrize("name", slow_or_nightly(FRESH, lambda name: name == "an import"))
+def test_a_fresh_process_makes_a_task(name: str) -> None:
     code = (
-        f"{beginning}\nenv = gymnasium.make(name,"
+        f"{FRESH[name]}\nenv = gymnasium.make(name,"
         " images=False)\nprint(env.reset(seed=0)[1]['status'])\nenv.close()"
     )
     assert run_fresh(code).split() == ["ongoing"]

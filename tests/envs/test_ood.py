@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers.tiers import slow_or_nightly
+
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from mme_vla.envs import metadata
@@ -31,6 +33,8 @@ CELLS = {
     ("VideoUnmask", "ButtonUnmask"): (13, 13, 12, 12),
     ("MoveCube", "InsertPeg"): (0, 0, 0, 50),
 }
+SLOW_TASKS = ("VideoUnmask", "PickXtimes", "RouteStick")
+"""One task a robot and kind of scene; the others are nightly."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -213,8 +217,7 @@ def test_a_distractor_cube_is_a_wrong_cube() -> None:
         assert set(distractors) <= set(env.choices()[0].candidates or ())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("task", slow_or_nightly(TASK_NAMES, SLOW_TASKS.__contains__))
 def test_the_demonstrator_solves_the_first_row(task: str) -> None:
     env = make_task(task, render=False, **metadata.episode(task, "ood", 0).options)
     result = Recorder(env, render=False).record()

@@ -133,7 +133,7 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Shown:
+class Displayed:
     """A frame of a replay: its text, whether it belongs to the video, and whether the robot touches
     something.
     """
@@ -152,7 +152,7 @@ def in_order(texts: Iterable[str]) -> list[str]:
     return [word for word, _ in groupby(texts)]
 
 
-def first_contact(displayed: list[Shown]) -> int:
+def first_contact(displayed: list[Displayed]) -> int:
     """The first frame in which the robot touches something; the number of frames where there is
     none.
     """
@@ -191,9 +191,9 @@ def test_replaying_the_execution_succeeds(episode: Episode, space: str) -> None:
     )
     # drops and waits are judged as when the episode was recorded
     env.task.recording = space == "joint_angle"
-    displayed: list[Shown] = []
+    displayed: list[Displayed] = []
     env.on_frame = lambda frame, info, in_video: displayed.append(
-        Shown(info["simple_subgoal_online"], in_video, touches(env.task))
+        Displayed(info["simple_subgoal_online"], in_video, touches(env.task))
     )
     observation, info = env.reset()
     assert info["task_goal"] == episode.goals and info["available_multi_choices"] == episode.options
@@ -218,7 +218,7 @@ def test_replaying_the_execution_succeeds(episode: Episode, space: str) -> None:
         check_ends(words, recorded, first_contact(displayed) - start)
 
 
-def check_video(episode: Episode, displayed: list[Shown], states: list[np.ndarray]) -> None:
+def check_video(episode: Episode, displayed: list[Displayed], states: list[np.ndarray]) -> None:
     """The video has the recorded frames, each with its text and its joint positions."""
     official = episode.words("simple_subgoal_online", range(episode.execution))
     contact = first_contact(displayed)

@@ -22,7 +22,7 @@ from mme_vla.envs.robomme.robot.kinematics import Arm, matrix_of
 from mme_vla.envs.robomme.robot.planning import CONTROL_STEP, goal_in_base, plan_screw
 
 FILE = "screw_plans.json.gz"
-KEPT = Path(__file__).resolve().parents[1] / "data" / FILE
+LOCAL = Path(__file__).resolve().parents[1] / "data" / FILE
 OTHERS = (
     Path(
         os.environ.get("MME_VLA_PLANS") or Path(__file__).resolve().parents[3] / "shared" / "plans"
@@ -38,7 +38,7 @@ def arm() -> Iterator[Arm]:
     scene.close()
 
 
-@pytest.mark.parametrize("path", [KEPT, OTHERS], ids=["kept", "shared"])
+@pytest.mark.parametrize("path", [LOCAL, OTHERS], ids=["kept", "shared"])
 def test_screw_plans_equal_the_reference(arm: Arm, path: Path) -> None:
     if not path.is_file():
         pytest.skip(f"no reference plans: {path} is absent (set MME_VLA_PLANS)")
@@ -63,9 +63,9 @@ def test_poses_keep_double_precision(arm: Arm) -> None:
 
 
 def test_goals_take_the_length_of_quaternions_in_single_precision(arm: Arm) -> None:
-    held = np.array([0.00250886, 0.99119306, 0.13237302, 0.00056358], np.float32)
+    grasp = np.array([0.00250886, 0.99119306, 0.13237302, 0.00056358], np.float32)
     for scale in (1, np.float32(1 + 2e-7)):
-        target = sapien.Pose([0, 0, 0.2], held * scale)
+        target = sapien.Pose([0, 0, 0.2], grasp * scale)
         single = goal_in_base(arm.base, target, np.float32)
         np.testing.assert_allclose(single[:3, :3] @ single[:3, :3].T, np.eye(3), atol=1e-14)
         assert 0 < np.abs(single - goal_in_base(arm.base, target, np.float64)).max() < 1e-9

@@ -208,8 +208,8 @@ def test_what_is_absent_of_a_rollout_is_not_written() -> None:
     bare = json.loads(record().to_json())
     assert not {"env", "chunks", "events", "made_up", "extra"} & set(bare)
     full = record(suite="Counting", chunks=0, events=({"event": "restart", "step": 0},))
-    written = json.loads(full.to_json())
-    assert (written["suite"], written["chunks"]) == ("Counting", 0)
+    fields = json.loads(full.to_json())
+    assert (fields["suite"], fields["chunks"]) == ("Counting", 0)
     assert EpisodeRecord.from_json(full.to_json()) == full
 
 

@@ -446,7 +446,7 @@ def test_a_small_run_shows_what_it_has_within_eighty_columns(
 
 
 @pytest.mark.parametrize(
-    ("words", "shown"),
+    ("words", "expected"),
     [
         (["--all"], ["100.0 (3 of 800)", "StopCube"]),
         (["--tasks", "[StopCube,VideoUnmask]"], ["100.0 (3 of 53)", "StopCube"]),
@@ -457,11 +457,11 @@ def test_a_small_run_shows_what_it_has_within_eighty_columns(
     ],
 )
 def test_tasks_and_episodes_are_named_as_everywhere(
-    words: list[str], shown: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], expected: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     main([*small_runs(tmp_path), *words])
     printed = capsys.readouterr().out
-    for text in shown:
+    for text in expected:
         assert text in printed
 
 
@@ -572,7 +572,7 @@ def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
 
 
 @pytest.mark.parametrize(
-    ("config", "said"),
+    ("config", "detail"),
     [
         (
             {"memory": {"name": "ttt"}, "card": {"recipe": {"lr": "1e-4", "steps": 5}}},
@@ -587,13 +587,13 @@ def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
     ],
 )
 def test_a_submission_shows_settings_of_unusual_kinds_as_they_are(
-    config: dict[str, object], said: str
+    config: dict[str, object], detail: str
 ) -> None:
     methods = aggregate(
         records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [1, 1, 1, 1]}), SMALL
     ).methods
     run = {"settings": {"model": "a", "checkpoint": 100}, "notes": {"policy": policy_facts(config)}}
-    assert said in training_details(methods, [run])
+    assert detail in training_details(methods, [run])
 
 
 HOSTILE = "\x1b]0;title\x07\x1b[2J"

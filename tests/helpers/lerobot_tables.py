@@ -24,7 +24,7 @@ FPS = 10
 SHADE = 20  # frame i of the dataset is grey of SHADE · i
 
 
-def own_robot(**action: Any) -> Embodiment:
+def custom_robot(**action: Any) -> Embodiment:
     """A robot of one's own with three numbers and one camera."""
     return Embodiment.from_dict(
         {
@@ -37,7 +37,7 @@ def own_robot(**action: Any) -> Embodiment:
     )
 
 
-def picture(shade: int) -> np.ndarray:
+def grey_image(shade: int) -> np.ndarray:
     return np.full((32, 32, 3), shade % 256, np.uint8)
 
 
@@ -95,7 +95,7 @@ def write_dataset(
                             for name, values in vectors.items()}  # fmt: skip
     rows |= {"timestamp": np.float32(frames / fps), "frame_index": frames, "episode_index": episode}
     rows |= {"index": np.arange(total), "task_index": episode}
-    images = [picture(SHADE * i) for i in range(total)]
+    images = [grey_image(SHADE * i) for i in range(total)]
     if not video:
         rows[CAMERA] = pa.array([cell(image) for image in images])
     table(root / ROWS, rows)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from helpers import REPOSITORY
+from helpers.tiers import slow_or_nightly
 
 THIRD_PARTY = {"torch", "numpy", "einops", "timm"}
 MAX_MODULES = 25
@@ -42,8 +43,9 @@ def third_party(module: str) -> set[str]:
     return roots - set(sys.stdlib_module_names) - {"mme_vla"}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", ["README.md", "docs/start/python.md"])
+@pytest.mark.parametrize(
+    "page", slow_or_nightly(["README.md", "docs/start/python.md"], lambda page: page == "README.md")
+)
 def test_example_trains_and_imports_little(page: str) -> None:
     code = example(page) + REPORT
     result = subprocess.run(

@@ -41,29 +41,29 @@ def test_bank_modul_answers_by_what_it_remembers() -> None:
 MOMENTS = torch.tensor([[1.0, 0.0], [0.0, 1.0], [3.0, 4.0], [4.0, 3.0], [0.0, -1.0]])
 # Cosines of neighbours are 0, 0.8, 0.96 and −0.6: (3, 4) and (4, 3) become (3.5, 3.5) when a fourth
 # moment comes, and (0, 1) becomes one with that when the fifth comes.
-HELD = {
+ENTRIES = {
     "fifo": ([[3.0, 4.0], [4.0, 3.0], [0.0, -1.0]], [32, 48, 64]),
     "tome": ([[1.0, 0.0], [1.75, 2.25], [0.0, -1.0]], [0, 16, 64]),
 }
 
 
-@pytest.mark.parametrize("consolidation", HELD)
+@pytest.mark.parametrize("consolidation", ENTRIES)
 def test_a_bank_holds_the_same_whether_it_is_filled_at_once_or_one_by_one(
     consolidation: str,
 ) -> None:
     bank = MemoryBank(2, length=3, time_code=False, consolidation=consolidation)
     moments, times = MOMENTS[None, :, None], torch.arange(0, 80, 16)[None]
     valid = torch.ones(1, 5, dtype=torch.bool)
-    expected, expected_times = HELD[consolidation]
+    expected, expected_times = ENTRIES[consolidation]
 
     at_once = bank.replay(moments, times, valid)
-    held = moments[:, :0], times[:, :0], valid[:, :0]
+    streamed = moments[:, :0], times[:, :0], valid[:, :0]
     for place in range(5):
         new = slice(place, place + 1)
-        held = bank.replay(
-            torch.cat([held[0], moments[:, new]], 1),
-            torch.cat([held[1], times[:, new]], 1),
-            torch.cat([held[2], valid[:, new]], 1),
+        streamed = bank.replay(
+            torch.cat([streamed[0], moments[:, new]], 1),
+            torch.cat([streamed[1], times[:, new]], 1),
+            torch.cat([streamed[2], valid[:, new]], 1),
         )
     padding = torch.tensor([[False]])
     padded = bank.replay(
@@ -71,6 +71,6 @@ def test_a_bank_holds_the_same_whether_it_is_filled_at_once_or_one_by_one(
         torch.cat([times[:, :1], times], 1),
         torch.cat([padding, valid], 1),
     )
-    for entries, entry_times, is_entry in (at_once, held, padded):
+    for entries, entry_times, is_entry in (at_once, streamed, padded):
         assert entries[0, :, 0].tolist() == expected
         assert entry_times[0].tolist() == expected_times and is_entry.all()

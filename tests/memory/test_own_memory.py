@@ -83,7 +83,7 @@ def test_its_file_makes_it_a_choice_for_any_integration_and_beside_another(monke
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_own_memory_trains_and_is_evaluated_on_nano(tmp_path):
     pytest.importorskip(
         "mani_skill", reason="the simulator is not installed: the extra `sim` has it"

@@ -70,23 +70,23 @@ def sizes_of(model: str) -> dict[str, Any]:
 
 def words(settings: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Settings as words of a command line."""
-    found: list[str] = []
+    arguments: list[str] = []
     for key, value in settings.items():
-        found += (
+        arguments += (
             words(value, f"{prefix}{key}.")
             if isinstance(value, Mapping)
             else [f"{prefix}{key}={value}"]
         )
-    return found
+    return arguments
 
 
 def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings as keywords of `build_policy`: dotted keys become mappings."""
-    found: dict[str, Any] = {}
+    sections: dict[str, Any] = {}
     for key, value in settings.items():
         section, _, name = key.partition(".")
-        found.setdefault(section, {})[name] = value
-    return found
+        sections.setdefault(section, {})[name] = value
+    return sections
 
 
 def uniform(name: str, shape: Sequence[int]) -> np.ndarray:

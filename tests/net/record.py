@@ -60,35 +60,35 @@ def record_models(scratch: Path) -> None:
     from net import models
     from net.archives import pack
 
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for file in sorted((REPOSITORY / "configs" / "model").glob("*.yaml")):
         folder = scratch / "models" / file.stem
         models.build(file.stem, folder, scratch / "built" / file.stem)
-        found[file.stem] = models.figures(mme_vla.Policy.from_pretrained(folder))
+        results[file.stem] = models.figures(mme_vla.Policy.from_pretrained(folder))
         models.strip(folder)
-        print(file.stem, found[file.stem]["loss"], flush=True)
+        print(file.stem, results[file.stem]["loss"], flush=True)
     pack(scratch / "models", NET / "models.tar.xz")
-    write("models.json.xz", found)
+    write("models.json.xz", results)
 
 
 def record_replies(scratch: Path) -> None:
     """The replies to mistaken command lines."""
     from net import replies
 
-    folder, found = replies.prepare(scratch / "mistakes", NET / "models.tar.xz"), {}
+    folder, results = replies.prepare(scratch / "mistakes", NET / "models.tar.xz"), {}
     signal.signal(signal.SIGALRM, too_long)
     for line in replies.mistakes():
         signal.alarm(LONGEST)
         try:
-            found[line] = replies.reply(line, folder)
+            results[line] = replies.reply(line, folder)
         except Exception as error:  # a defect is no reply to keep
             print(f"{line}: left out, {type(error).__name__}: {error}", flush=True)
             continue
         finally:
             signal.alarm(0)
-        if not found[line]["code"]:
+        if not results[line]["code"]:
             print(f"{line}: was accepted", flush=True)
-    write("replies.json", found)
+    write("replies.json", results)
 
 
 def too_long(number: int, frame: object) -> None:
@@ -140,26 +140,26 @@ def record_figures(scratch: Path) -> None:
     without_loss = [model for model, figures in expected.items() if figures["loss"] is None]
     for model in {runs.POLICY, *without_loss}:
         models.restore(saved / model)
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     with inside(place):
         Path("policy").symlink_to(saved / runs.POLICY)
-        found["actions"] = {
+        results["actions"] = {
             run: models.figures(mme_vla.Policy.from_pretrained(Path("training", run)))["actions"]
             for run in runs.RUNS
         }
-        found["dataset"] = runs.dataset()
-        found["results"] = runs.result_rows()
-        found["probe"] = runs.probed()
-        found["card"] = runs.card()
-        found["board"] = runs.board()
-        found["first_loss"] = {}
+        results["dataset"] = runs.dataset()
+        results["results"] = runs.result_rows()
+        results["probe"] = runs.probed()
+        results["card"] = runs.card()
+        results["board"] = runs.board()
+        results["first_loss"] = {}
         for model in without_loss:
             try:
-                found["first_loss"][model] = runs.first_loss(model, saved / model)
+                results["first_loss"][model] = runs.first_loss(model, saved / model)
             except EndedError as error:  # SAM2Act+ finds no keyframe in a dataset this small
                 print(error, flush=True)
-        found["resumed"] = {run: runs.resume(run) for run in runs.RUNS}
-    write("runs.json.xz", found)
+        results["resumed"] = {run: runs.resume(run) for run in runs.RUNS}
+    write("runs.json.xz", results)
 
 
 def record_formats(scratch: Path) -> None:

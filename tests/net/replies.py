@@ -286,15 +286,15 @@ def essential(line: str, text: str) -> list[str]:
     in it.
     """
     text = re.sub(r"<repository>\S*", "", USAGE.sub("", text))
-    found = {
+    names = {
         word
         for word in typed(line)
         if len(word) > 2 and re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text)
     }
-    found |= {next(filter(None, match)) for match in QUOTED.findall(text)}
-    found |= {*KEY.findall(text), *PLACE.findall(text)}
-    found = {word.partition("<")[0].strip() for word in found}  # what follows is a placeholder
-    return sorted(found - {""})
+    names |= {next(filter(None, match)) for match in QUOTED.findall(text)}
+    names |= {*KEY.findall(text), *PLACE.findall(text)}
+    names = {word.partition("<")[0].strip() for word in names}  # what follows is a placeholder
+    return sorted(names - {""})
 
 
 def missing(expected: Mapping[str, Any], text: str) -> list[str]:

@@ -15,10 +15,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from net.archives import EndedError, command, run
+from net.archives import PACKAGE_PATH, EndedError, command, run
 from net.models import PI05, sizes_of, words
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 DATA = ["data=lerobot", "data.sources=[dataset]", "data.cache.root=cache"]
 TRAIN = [
     *DATA, "data.val_episodes=[1]", "logger=none",
@@ -106,8 +105,8 @@ def make_dataset() -> None:
 def train() -> None:
     """The runs, each as its second update left it, on a cache that `cache` made."""
     command("cache", *FRAMESAMP, *DATA)
-    for name, chosen in RUNS.items():
-        arguments = [*chosen, *TRAIN, "train.steps=2", f"output=training/{name}"]
+    for name, model_arguments in RUNS.items():
+        arguments = [*model_arguments, *TRAIN, "train.steps=2", f"output=training/{name}"]
         if name == "sharded":
             launcher = [
                 sys.executable,
@@ -117,7 +116,7 @@ def train() -> None:
                 "--nproc-per-node",
                 "2",
             ]
-            variables = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+            variables = {**os.environ, "PYTHONPATH": str(PACKAGE_PATH)}
             launched = [
                 *launcher,
                 "-m",
@@ -165,10 +164,10 @@ def first_loss(model: str, checkpoint: Path) -> list[float]:
 
 def statistics(run: str) -> dict[str, Any]:
     """The statistics that a run's checkpoint holds, and the goals of the dataset."""
-    found: dict[str, Any] = json.loads(
+    content: dict[str, Any] = json.loads(
         next(Path("training", run).rglob("norm_stats.json")).read_text()
     )
-    return found["norm_stats"]
+    return content["norm_stats"]
 
 
 def dataset() -> dict[str, Any]:
@@ -238,8 +237,8 @@ def probed() -> list[str]:
 def card() -> dict[str, Any]:
     """The report card; what is there already is not run again."""
     command("probe", *CARD)
-    found: dict[str, Any] = json.loads(Path("card", "card.json").read_text())
-    return found
+    content: dict[str, Any] = json.loads(Path("card", "card.json").read_text())
+    return content
 
 
 def board() -> list[list[str]]:

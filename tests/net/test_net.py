@@ -73,10 +73,10 @@ def mistaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_reply_to_a_mistake_says_no_less(line: str, mistaken: Path) -> None:
     if line.startswith("harness"):
         pytest.importorskip("vla_eval", reason="needs the extra harness")
-    answer = replies.reply(line, mistaken)
-    shown = replies.difference(REPLIES[line]["text"], answer["text"])
-    assert answer["code"] == REPLIES[line]["code"], shown
-    assert not replies.missing(REPLIES[line], answer["text"]), shown
+    current = replies.reply(line, mistaken)
+    changes = replies.difference(REPLIES[line]["text"], current["text"])
+    assert current["code"] == REPLIES[line]["code"], changes
+    assert not replies.missing(REPLIES[line], current["text"]), changes
 
 
 # Datasets, runs and what was measured

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers.lerobot_tables import own_robot
+from helpers.lerobot_tables import custom_robot
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError
 from mme_vla.processing.processor import Processor
@@ -23,17 +23,17 @@ def ids(processor: Any, goal: str, **more: Any) -> list[int]:
     return processor.prompt(goal, **more)[0].tolist()
 
 
-def own_processor(**settings: Any) -> Processor:
+def custom_processor(**settings: Any) -> Processor:
     sections = {
         "backbone": small_policy("pi05").config["backbone"],
         "processor": {"tokenizer": "sample", **settings},
-        "embodiment": own_robot(horizon=20).to_dict(),
+        "embodiment": custom_robot(horizon=20).to_dict(),
     }
     return Processor.from_sections(sections)
 
 
 def test_a_new_policy_of_ones_own_robot_reads_what_it_was_trained_on(tmp_path: Path) -> None:
-    processor = own_processor()
+    processor = custom_processor()
     assert ids(processor, GOAL) == ids(processor, GOAL.lower())
     processor.save(tmp_path)
     assert json.loads((tmp_path / "processor.json").read_text())["goal_case"] == "lower"
@@ -42,14 +42,14 @@ def test_a_new_policy_of_ones_own_robot_reads_what_it_was_trained_on(tmp_path: P
 
 
 def test_subgoals_are_spelled_alike_too() -> None:
-    processor = own_processor(prompt="subgoal")
+    processor = custom_processor(prompt="subgoal")
     assert ids(processor, GOAL, subgoal="Grasp IT") == ids(processor, GOAL, subgoal="grasp it")
-    goal_text = own_processor(prompt="subgoal", goal_case="given")
+    goal_text = custom_processor(prompt="subgoal", goal_case="given")
     assert ids(goal_text, GOAL, subgoal="Grasp IT") != ids(goal_text, GOAL, subgoal="grasp it")
 
 
 def test_a_checkpoint_from_before_keeps_its_tokens(tmp_path: Path) -> None:
-    processor = own_processor()
+    processor = custom_processor()
     processor.save(tmp_path)
     path = tmp_path / "processor.json"
     settings = json.loads(path.read_text())
@@ -64,13 +64,13 @@ def test_the_benchmarks_robots_take_goals_as_they_are_given(tmp_path: Path) -> N
     processor = small_policy("pi05").require_processor()
     assert ids(processor, GOAL) != ids(processor, GOAL.lower())
     assert "goal_case" not in processor.to_config()
-    assert goal_case(ROBOMME_JOINT) == "given" and goal_case(own_robot()) == "lower"
+    assert goal_case(ROBOMME_JOINT) == "given" and goal_case(custom_robot()) == "lower"
 
 
 def test_the_rule_can_be_chosen_and_a_wrong_word_is_named() -> None:
-    assert ids(own_processor(goal_case="given"), GOAL) != ids(own_processor(), GOAL)
+    assert ids(custom_processor(goal_case="given"), GOAL) != ids(custom_processor(), GOAL)
     with pytest.raises(UserError, match=r"processor.goal_case='upper'"):
-        own_processor(goal_case="upper")
+        custom_processor(goal_case="upper")
 
 
 def test_an_episode_without_a_goal_is_refused_when_its_prompt_is_made() -> None:
@@ -105,7 +105,7 @@ def test_a_server_refuses_a_request_without_a_goal(goal: Any) -> None:
 def test_simplememvla_spells_alike() -> None:
     from mme_vla.extras.methods.simplememvla.processor import PromptSettings, SimpleMemVlaProcessor
 
-    robot = own_robot(horizon=20)
+    robot = custom_robot(horizon=20)
     goal_text, lower = (
         SimpleMemVlaProcessor(PromptSettings(tokenizer="bytes", goal_case=case), robot, 32)
         for case in (None, "lower")

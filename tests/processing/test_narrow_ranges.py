@@ -12,7 +12,7 @@ import torch
 from omegaconf import OmegaConf
 
 from helpers import REPOSITORY
-from helpers.lerobot_tables import own_robot, write_dataset
+from helpers.lerobot_tables import custom_robot, write_dataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.data.statistics import check_ranges, compute_norm_stats
@@ -44,7 +44,7 @@ def source_of(root: Path, numbers: np.ndarray, states: np.ndarray | None = None)
         video=True,
         names=["x", "grip", "z"],
     )
-    return EpisodeSource(root, robot=own_robot())
+    return EpisodeSource(root, robot=custom_robot())
 
 
 def seldom(at: int, value: float = 0.0) -> np.ndarray:
@@ -61,7 +61,7 @@ def test_a_number_that_seldom_moves_is_named_refused_or_widened(
     tmp_path: Path, exact: bool, at: int, caplog
 ) -> None:
     source = source_of(tmp_path, seldom(at), states=np.zeros((FRAMES, 3)))
-    options: dict[str, Any] = {"horizon": 1, "robot": own_robot(), "exact": exact}
+    options: dict[str, Any] = {"horizon": 1, "robot": custom_robot(), "exact": exact}
     with pytest.raises(
         UserError, match=r"grip of the action has q01 .* and q99 .*, but values from 0 to 1.*widen"
     ):
@@ -88,7 +88,7 @@ def test_a_number_that_seldom_moves_is_named_refused_or_widened(
 )
 def test_ordinary_numbers_are_accepted(tmp_path: Path, numbers: np.ndarray, caplog) -> None:
     compute_norm_stats(
-        [source_of(tmp_path, numbers)], horizon=4, robot=own_robot(), narrow="refuse"
+        [source_of(tmp_path, numbers)], horizon=4, robot=custom_robot(), narrow="refuse"
     )
     assert not caplog.text
 
@@ -98,7 +98,7 @@ def test_a_state_is_compared_as_well(tmp_path: Path) -> None:
     states[40, 2] = 1e5
     source = source_of(tmp_path, np.sin(np.arange(FRAMES)), states)
     with pytest.raises(UserError, match=r"z of the state has q01 .*1?e?\+05|100000"):
-        compute_norm_stats([source], horizon=1, robot=own_robot(), exact=True, narrow="refuse")
+        compute_norm_stats([source], horizon=1, robot=custom_robot(), exact=True, narrow="refuse")
 
 
 def test_statistics_of_other_data_are_compared_with_these(tmp_path: Path) -> None:
@@ -111,8 +111,8 @@ def test_statistics_of_other_data_are_compared_with_these(tmp_path: Path) -> Non
     with pytest.raises(
         UserError, match=r"grip of the action has q01 -1 and q99 1, but values from -29\d\.\d+ to"
     ):
-        check_ranges(stats, [source], horizon=1, robot=own_robot())
-    widened = check_ranges(stats, [source], horizon=1, robot=own_robot(), narrow="widen")
+        check_ranges(stats, [source], horizon=1, robot=custom_robot())
+    widened = check_ranges(stats, [source], horizon=1, robot=custom_robot(), narrow="widen")
     assert widened.actions.q01[1] < -299 and widened.actions.q01[0] == -1
 
 

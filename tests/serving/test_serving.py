@@ -172,7 +172,7 @@ def test_a_client_that_goes_while_its_video_is_encoded_stops_the_work(policy):
 
 
 @pytest.mark.parametrize(
-    ("message", "said"),
+    ("message", "reason"),
     [
         (b"garbage", "not a msgpack message"),
         ("text", "binary"),
@@ -193,13 +193,15 @@ def test_a_client_that_goes_while_its_video_is_encoded_stops_the_work(policy):
         (pack(challenge(*course()[0], first=False)), "is_first_step"),
     ],
 )
-def test_a_bad_message_is_answered_with_the_reason_and_the_connection_stays(policy, message, said):
+def test_a_bad_message_is_answered_with_the_reason_and_the_connection_stays(
+    policy, message, reason
+):
     with Served(policy, limits=Limits(frames=50)) as served:
         with connect(f"ws://127.0.0.1:{served.server.port}", compression=None) as raw:
             raw.recv(10)
             raw.send(message)
             reply = raw.recv(10)
-            assert isinstance(reply, str) and said in reply and "Traceback" not in reply
+            assert isinstance(reply, str) and reason in reply and "Traceback" not in reply
             raw.send(pack({"reset": True}))
             assert b"reset_finished" in raw.recv(10)
         with served.client() as client:
@@ -228,11 +230,11 @@ def test_a_refused_request_leaves_the_episode_as_it_was(policy):
         with served.client() as client:
             first = by_challenge(client, parts[:1])
             small = tuple(images[:, :32] for images in parts[1][:2])
-            for message, said in (
+            for message, reason in (
                 ({"front_rgb_list": 3}, "task_goal"),
                 (challenge(*small, *parts[1][2:], first=False), "had [64, 64] before"),
             ):
-                with pytest.raises(UserError, match=re.escape(said)):
+                with pytest.raises(UserError, match=re.escape(reason)):
                     client.request(message)
             second = client.request(challenge(*parts[1], first=False))["actions"]
         np.testing.assert_array_equal(np.concatenate([*first, second]), np.concatenate(expected))

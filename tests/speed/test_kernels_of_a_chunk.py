@@ -16,6 +16,7 @@ import torch
 from torch._dynamo.utils import counters
 from torch._inductor import metrics
 
+from helpers.tiers import slow_or_nightly
 from mme_vla.testing.small import random_batch, small_policy
 
 REPOSITORY = Path(__file__).parents[2]
@@ -33,10 +34,10 @@ def nothing_compiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     torch.compiler.reset()
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("nothing_compiled")
 @pytest.mark.parametrize(
-    ("model", "graphs", "kernels"), [("pi05", 7, 57), ("framesamp_modul", 8, 71)]
+    ("model", "graphs", "kernels"),
+    slow_or_nightly([("pi05", 7, 57), ("framesamp_modul", 8, 71)], lambda case: case[0] == "pi05"),
 )
 def test_a_compiled_chunk_has_few_kernels_and_graphs_at_any_depth(
     model: str, graphs: int, kernels: int

@@ -68,13 +68,13 @@ def test_policy_sees_the_episode_as_a_running_one(policy: MMEPolicy, sample: Epi
     result = open_loop(policy, recording, "episode 0", most=3, seed=5)
     episode = policy.start_episode(sample.goal(0), seed_of(5, "open loop"))
     chunks = []
-    seen = 0
+    observed = 0
     start = int(sample.exec_starts[0])
     for step in result.steps.tolist():
-        frames = np.arange(seen, step + 1)
+        frames = np.arange(observed, step + 1)
         views = {name: sample.frames(0, frames, name) for name in ("front", "wrist")}
-        episode.observe(views, sample.states(0, seen, step + 1), frames < start)
-        seen = step + 1
+        episode.observe(views, sample.states(0, observed, step + 1), frames < start)
+        observed = step + 1
         chunks.append(policy.act(episode))
     assert result.steps[0] == start and len(chunks) == 3
     np.testing.assert_array_equal(result.predicted, chunks)

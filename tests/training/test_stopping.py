@@ -16,7 +16,7 @@ from mme_vla.policy.run_folders import resolve_checkpoint
 from mme_vla.training.logging import ProgressLine, Window, read_metrics
 from mme_vla.training.stopping import stop_requests
 
-ASKED_ONCE = """
+STOP_ONCE = """
 import os, signal, sys
 from torch import distributed
 from mme_vla.training.stopping import stop_requests
@@ -48,7 +48,7 @@ def test_a_stop_signal_saves_and_leaves(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_all_processes_stop_after_the_same_update_when_one_is_queried(tmp_path: Path) -> None:
-    (tmp_path / "asked.py").write_text(ASKED_ONCE)
+    (tmp_path / "asked.py").write_text(STOP_ONCE)
     words = (str(tmp_path / "asked.py"), str(tmp_path / "meeting"))
     started = [commands.start(*words, str(rank)) for rank in range(2)]
     assert [commands.finish(process).stdout.strip() for process in started] == [

@@ -10,7 +10,7 @@ from mme_vla.utils.style import PALETTE, css, figure, svg, themed
 
 HEX = re.compile(r"(?<!\w)#[0-9a-f]{6}\b", re.IGNORECASE)
 SUFFIXES = ("*.py", "*.css", "*.html", "*.js", "*.svg")
-SAID_BESIDE = {"mme_vla/utils/style.py", "tests/utils/test_style.py"}
+EXCEPT = {"mme_vla/utils/style.py", "tests/utils/test_style.py"}
 
 
 def luminance(colour: str) -> float:
@@ -53,7 +53,7 @@ def test_no_file_has_colours_of_its_own() -> None:
         ["git", "ls-files", *SUFFIXES], cwd=REPOSITORY, capture_output=True, text=True, check=True
     )
     others = {}
-    for name in set(listed.stdout.split()) - SAID_BESIDE:
+    for name in set(listed.stdout.split()) - EXCEPT:
         text = (REPOSITORY / name).read_text(encoding="utf-8")
         if unknown := set(map(str.lower, HEX.findall(text))) - known:
             others[name] = unknown

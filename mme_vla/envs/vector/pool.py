@@ -379,12 +379,12 @@ def make_vec_env(
         f"env={env} takes no reward, include, {listed(SceneOptions.__annotations__)}: they are for"
         f" env={ROBOMME}.",
     )
-    chosen = None if episodes is None else list(episodes)
+    selection = None if episodes is None else list(episodes)
     jobs = []
     for name in names:
         if env == ROBOMME:
             check_names(name, action_space, scene.get("difficulty"), scene.get("seed"))
-        numbers = chosen
+        numbers = selection
         if numbers is None:
             numbers = list(range(len(source.episodes(name, split))))
         for number in numbers:

@@ -85,7 +85,7 @@ class Hand:
                 return
             yield self.action(offset, gripper=gripper)
 
-    def rest(self, steps: int, gripper: float) -> Actions:
+    def hold(self, steps: int, gripper: float) -> Actions:
         """Stay for so many steps."""
         for _ in range(steps):
             yield self.action(gripper=gripper)
@@ -114,7 +114,7 @@ _TRAVEL = 0.16  # height at which the hand passes over cubes and button
 def touch_several(hand: Hand) -> Actions:
     """Bunch, Seq and ChainOfColors: touch the cubes one after the other, and press the button."""
     scene = hand.scene
-    yield from hand.rest(6, CLOSED)  # cubes are put back into place for some steps
+    yield from hand.hold(6, CLOSED)  # cubes are put back into place for some steps
     for key in scene.true_color_indices[0].tolist():
         cube = scene.cubes[key]
         top = place_of(cube) + _up(scene.CUBE_HALFSIZE + 0.005 + _ABOVE_CUBE)
@@ -173,10 +173,10 @@ def grasp(hand: Hand, place: Any) -> Actions:
     """
     yield from hand.go(lambda: place() + _up(0.08), 0.015, OPEN)
     yield from hand.go(place, 0.008, OPEN, steps=15)
-    yield from hand.rest(3, CLOSED)
+    yield from hand.hold(3, CLOSED)
 
 
-def turn(hand: Hand) -> Actions:
+def rotate(hand: Hand) -> Actions:
     """RotateLenient and RotateStrict: take the peg in its middle and turn it.
 
     Fingers that close askew turn the peg until it lies between them, so the hand need not be right
@@ -184,13 +184,13 @@ def turn(hand: Hand) -> Actions:
     """
     scene = hand.scene
     peg = scene.peg
-    asked = float(scene.target_angle[0])
+    goal_angle = float(scene.target_angle[0])
     across = _wrapped(_yaw_of(peg) + np.pi / 2 - hand.yaw)
     ways = []
     for half_turns in (-1, 0, 1):
         for askew in np.linspace(-_ASKEW, _ASKEW, 9):
             to_grasp = across + half_turns * np.pi + askew
-            to_end = asked - askew
+            to_end = goal_angle - askew
             ways.append((abs(to_grasp) + abs(to_end), to_grasp))
     goal = hand.yaw + min(ways)[1]
     for _ in range(60):
@@ -200,7 +200,7 @@ def turn(hand: Hand) -> Actions:
             break
         yield hand.action(offset, left)
     yield from hand.go(lambda: place_of(peg), 0.01, OPEN, steps=8)
-    yield from hand.rest(3, CLOSED)
+    yield from hand.hold(3, CLOSED)
     place = hand.position
     while True:
         left = float(scene.angle_diff[0])
@@ -269,7 +269,7 @@ _SCRIPTS: dict[str, Callable[[Hand], Actions]] = {
     "ChainOfColors": touch_several,
     "InterceptGrab": catch,
     "Intercept": catch_and_carry,
-    "Rotate": turn,
+    "Rotate": rotate,
     "TakeItBack": take_back,
 }
 """Beginning of the name of a task's class → its script; the longer ones first."""

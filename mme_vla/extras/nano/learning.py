@@ -140,8 +140,8 @@ class Reflection:
         points = actions[..., self.columns]
         reflected = (reflect_points((points + 1) * half + low, signs, exchange) - low) / half - 1
         # the others stay equal to the last bit
-        moved = changes.any(0).view(-1, *[1] * (points.ndim - 1))
-        actions[..., self.columns] = torch.where(moved, reflected, points).to(actions.dtype)
+        in_motion = changes.any(0).view(-1, *[1] * (points.ndim - 1))
+        actions[..., self.columns] = torch.where(in_motion, reflected, points).to(actions.dtype)
         history = batch.history
         if history is not None:
             history = replace(history, features=reflect(history.features, signs, exchange))

@@ -58,7 +58,7 @@ def write_page(
         for run in folders:
             label = model if len(folders) == 1 else f"{model}, {run.name}"
             curves[label] = learning_curve(run)
-    is_drawn = plot_curves(curves, folder / CURVES)
+    has_curves = plot_curves(curves, folder / CURVES)
     text = render(
         "nano.md",
         config=nano.config,
@@ -71,7 +71,7 @@ def write_page(
         lead=[comparison.verdict for comparison in comparisons] or [solved(records)],
         notes=results.notes,
         minutes={stage: spent for stage, spent in minutes.items() if round(spent, 1) > 0},
-        curves=CURVES if is_drawn else None,
+        curves=CURVES if has_curves else None,
         videos=[(video.stem, video.relative_to(folder)) for video in videos],
     )
     with write_atomically(folder / PAGE) as draft:

@@ -74,10 +74,10 @@ def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
             if isinstance(thing, Button) and pressed(thing):
                 yield "pressed button", position, ids
             if _in_gripper(env, name, position):
-                held = f"held {name}"
-                if held not in CLASSES:
-                    held = "other held object"
-                yield held, position, ids
+                class_name = f"held {name}"
+                if class_name not in CLASSES:
+                    class_name = "other held object"
+                yield class_name, position, ids
     for name, disc in lit:
         yield name, disc.position, disc.segmentation_ids
 

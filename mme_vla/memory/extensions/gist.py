@@ -175,8 +175,8 @@ class Gist(FrameMemory):
         order = torch.arange(frames, device=x.device)
         gist_frames = order.repeat_interleave(self.gists)[None]
         token_frames = order.repeat_interleave(self.storage.grid**2)[None]
-        is_own = gist_frames[:, :, None] == token_frames[:, None, :]
-        reads_tokens = is_own & history.mask[:, None, :]
+        same_frame = gist_frames[:, :, None] == token_frames[:, None, :]
+        reads_tokens = same_frame & history.mask[:, None, :]
         gist_mask = valid.repeat_interleave(self.gists, 1)
         reads_gists = not_later(gist_frames, gist_frames) & gist_mask[:, None, :]
         mask = torch.cat([reads_tokens, reads_gists], 2)

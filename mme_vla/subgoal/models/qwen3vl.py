@@ -54,8 +54,8 @@ class Question:
             {"role": "user", "content": parts},
         ]
         if self.target is not None:
-            answer = [{"type": "text", "text": self.target}]
-            messages.append({"role": "assistant", "content": answer})
+            reply = [{"type": "text", "text": self.target}]
+            messages.append({"role": "assistant", "content": reply})
         return messages
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from helpers import REPOSITORY
 from helpers.serving_fakes import Served
+from helpers.tiers import slow_or_nightly
 from mme_vla.cli.record import record_environment
 from mme_vla.config import plugins
 from mme_vla.config.plugins import import_plugins
@@ -206,7 +207,7 @@ def remembering(robot: Embodiment) -> ReadsMemory:
     return policy.eval()
 
 
-@pytest.mark.parametrize("is_clock", [False, True])
+@pytest.mark.parametrize("is_clock", slow_or_nightly([False, True], lambda is_clock: not is_clock))
 def test_the_cards_from_outside_and_from_inside_agree(
     is_clock: bool,
     remembering: ReadsMemory,

@@ -66,19 +66,19 @@ def test_images_on_demand_are_those_of_the_simulators_own_observations() -> None
     assert info["task_goal"] == [
         "Observe the cube's color, wait, then touch the cube of the same color."
     ]
-    own = gymnasium.make(
+    reference = gymnasium.make(
         "RememberColor3-VLA-v0", num_envs=1, obs_mode="rgb", control_mode="pd_ee_delta_pose",
         reward_mode="normalized_dense", sim_backend="physx_cpu", render_backend="cpu",
     )  # fmt: skip
-    observation, _ = own.reset(seed=env.spec.seed)
+    observation, _ = reference.reset(seed=env.spec.seed)
     action = np.zeros(7, np.float32)
     for _ in range(3):
         for name, camera in (("top", "base_camera"), ("wrist", "hand_camera")):
             image = observation["sensor_data"][camera]["rgb"][0].numpy()
             np.testing.assert_array_equal(frames[f"{name}_rgb_list"][-1], image)
         frames, *_ = env.step(action)
-        observation, *_ = own.step(action)
-    own.close()
+        observation, *_ = reference.step(action)
+    reference.close()
 
 
 @pytest.mark.parametrize(

@@ -214,10 +214,10 @@ def test_the_goal_selects_classes_by_its_words_and_not_by_what_is_behind_them() 
         read = backbone.condition_on_prompt(tokens, ids, masks)
         padded = backbone.condition_on_prompt(tokens, torch.where(masks, ids, 7), masks)
         selected = reader(ids, masks)
-    seen = backbone.vision.token_width
-    assert torch.equal(read, padded) and torch.equal(read[..., :seen], tokens[..., :seen])
+    width = backbone.vision.token_width
+    assert torch.equal(read, padded) and torch.equal(read[..., :width], tokens[..., :width])
     expected = torch.einsum("bqk,bnkf->bnqf", selected, by_class(tokens)).flatten(-2)
-    assert torch.allclose(read[..., seen:], expected) and torch.allclose(
+    assert torch.allclose(read[..., width:], expected) and torch.allclose(
         selected.sum(-1), torch.tensor(1.0)
     )
     assert not torch.allclose(selected[0], selected[1])

@@ -81,7 +81,7 @@ def test_a_pointer_points_at_classes_of_the_query_that_it_weighs() -> None:
 
 def test_a_pointer_that_learned_a_class_at_some_places_finds_it_at_others() -> None:
     torch.manual_seed(0)
-    pointer, asked, selected = (
+    pointer, queries, selected = (
         Pointer(8, 32, 2),
         torch.ones(1, 1, 8),
         torch.full((1, 2, len(CLASSES)), 1 / len(CLASSES)),
@@ -102,7 +102,7 @@ def test_a_pointer_that_learned_a_class_at_some_places_finds_it_at_others() -> N
     for _ in range(40):
         for tokens, target in scenes:
             optimizer.zero_grad()
-            output = torch.cat([torch.zeros(1, 1, 3), pointer(asked, tokens, selected)], -1)
+            output = torch.cat([torch.zeros(1, 1, 3), pointer(queries, tokens, selected)], -1)
             head.loss(
                 lambda x, time, output=output: output,
                 target,
@@ -111,7 +111,7 @@ def test_a_pointer_that_learned_a_class_at_some_places_finds_it_at_others() -> N
             optimizer.step()
     for place in torch.rand(6, 4).tolist():
         tokens, target = scene(place)
-        output = torch.cat([torch.zeros(1, 1, 3), pointer(asked, tokens, selected)], -1)
+        output = torch.cat([torch.zeros(1, 1, 3), pointer(queries, tokens, selected)], -1)
         chunk = head.scores(output, torch.zeros(1, 1, 3))
         assert (chunk - target)[..., 1:].abs().max() < 0.1
 
@@ -173,9 +173,9 @@ def test_the_target_of_a_map_is_where_the_history_shows_the_selected_class() -> 
     with torch.no_grad():
         pointer.recall.weight.zero_()
         pointer.recall.bias.copy_(torch.cat([place_waves(place), torch.full((16,), 9.0)]))
-    seen, empty = image_of((RED, 0.43, 0.31)), torch.zeros(1, 64, TOKEN_WIDTH)
+    image, empty = image_of((RED, 0.43, 0.31)), torch.zeros(1, 64, TOKEN_WIDTH)
     # No frame shows the blue cube: its map is no error.
-    loss = pointer.localization_loss(torch.ones(1, 1, 8), history_of(empty, seen, empty), selected)
+    loss = pointer.localization_loss(torch.ones(1, 1, 8), history_of(empty, image, empty), selected)
     assert loss.item() < 1e-3
     elsewhere = pointer.localization_loss(
         torch.ones(1, 1, 8), history_of(empty, image_of((RED, 0.6, 0.1))), selected

@@ -148,9 +148,9 @@ class PatternLock(Task):
             video=True,
         )
         legs = list(itertools.pairwise(self.path))
-        shown = [self._move(previous, goal, video=True) for previous, goal in legs]
+        video_moves = [self._move(previous, goal, video=True) for previous, goal in legs]
         moves = [self._move(previous, goal, video=False) for previous, goal in legs]
-        return [approach, *shown, *end_stick_video(self), *moves]
+        return [approach, *video_moves, *end_stick_video(self), *moves]
 
     def _move(self, previous: Disc, goal: Disc, video: bool) -> SubTask:
         others = [disc for disc in self.discs if disc is not previous and disc is not goal]

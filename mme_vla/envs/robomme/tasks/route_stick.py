@@ -179,9 +179,9 @@ class RouteStick(Task):
             video=True,
         )
         legs = list(zip(self.route, self.route[1:], self.directions, strict=False))
-        shown = [self._move(*leg, video=True) for leg in legs]
+        video_moves = [self._move(*leg, video=True) for leg in legs]
         moves = [self._move(*leg, video=False) for leg in legs]
-        return [approach, *shown, *end_stick_video(self, HOME_STEPS), *moves]
+        return [approach, *video_moves, *end_stick_video(self, HOME_STEPS), *moves]
 
     def _move(self, previous: Disc, goal: Disc, direction: Direction, video: bool) -> SubTask:
         others = [disc for disc in self.all_discs if disc is not previous and disc is not goal]

@@ -169,12 +169,12 @@ class ContainerTask(Task):
     def picks(self) -> list[SubTask]:
         """Pick up the container over each colour in turn, putting one down before the next."""
         steps: list[SubTask] = []
-        held: Container | None = None
+        lifted: Container | None = None
         for colour, container in self.targets:
-            if held is not None:
-                steps.append(self._put_down(held))
+            if lifted is not None:
+                steps.append(self._put_down(lifted))
             steps.append(self._pick_up(colour, container))
-            held = container
+            lifted = container
         return steps
 
     def _pick_up(self, colour: str, container: Container) -> SubTask:
