@@ -74,6 +74,11 @@ class ProbePlan:
     offline: OfflineSettings = field(default_factory=OfflineSettings)
     events: Sequence[str] = ()
 
+    @property
+    def n_goals(self) -> int:
+        """How many goals the episodes to take from have."""
+        return len({recording.goal for recording in self.lend})
+
 
 @dataclass(frozen=True)
 class Probe:
@@ -103,9 +108,8 @@ def run_probe(
         n_donors = len(donor_names)
         if any(recording.name in donor_names for recording in plan.recordings):
             n_donors -= 1  # never the probed one
-        n_goals = len({recording.goal for recording in plan.lend})
         arms, left_out = choose_arms(
-            plan.arms, policy, channel, n_donors, boundaries=has_boundaries, n_goals=n_goals
+            plan.arms, policy, channel, n_donors, boundaries=has_boundaries, n_goals=plan.n_goals
         )
         require(
             policy.info.resamples,
@@ -122,14 +126,13 @@ def run_probe(
         _on_recordings(policy, arms, plan, folder / OFFLINE, facts, options)
     if plan.jobs:
         has_boundaries = options.base is make_env and settings.env == "mme_vla"
-        n_goals = len({recording.goal for recording in plan.lend})
         arms, not_in_loop = choose_arms(
             plan.arms,
             policy,
             channel,
             len(plan.lend),
             boundaries=has_boundaries,
-            n_goals=n_goals,
+            n_goals=plan.n_goals,
         )
         left_out += [f"In closed loop {note}" for note in not_in_loop if note not in left_out]
         _in_closed_loop(policy, arms, plan, folder / ONLINE, facts, settings, options)

@@ -27,7 +27,7 @@ def main() -> None:
 def probe(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
     from mme_vla.cli.evaluate import choose_subgoals, report_usage
-    from mme_vla.cli.loading import PolicyChoice, load_policy
+    from mme_vla.cli.loading import PolicyChoice, load_policy, release
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import choose_numbers, named_tasks
@@ -133,7 +133,7 @@ def probe(cfg: DictConfig) -> None:
             page = run_probe(policy.eval(), plan, folder, facts, settings, options).page
             text = (folder / "table.md").read_text(encoding="utf-8")
     finally:
-        policy.close()
+        release(policy)
         if subgoals is not None:
             report_usage(subgoals.usage)
             subgoals.close()
