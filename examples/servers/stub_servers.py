@@ -1,4 +1,4 @@
-"""A small server for each protocol that `evaluate server=…` speaks, to try it without weights.
+"""A small server for each protocol of `evaluate server=…`, to try it without weights.
 
     python stub_servers.py openpi --port 8000
     python stub_servers.py robomme --port 8001 --fault nan --after 3
