@@ -1,7 +1,7 @@
 r"""What this GPU does with the library: a table, a JSON file, and exit code 1 where it is below the
 goals.
 
-    # at most nine minutes; once more: the next rows
+    # begins no row after nine minutes; once more: the next rows
     python benchmarks/gpu.py --output gpu.json
     python benchmarks/gpu.py --parts chunk --models pi05
     # adds what many processes take to that file

@@ -1,11 +1,12 @@
-"""Kernels that one chunk launches at full size: their number is most of its time.
+"""Kernels that a chunk or an update launches at full size: their number is most of a chunk's time.
 
     python benchmarks/gpu_kernels.py pi05 framesamp_modul
     python benchmarks/gpu_kernels.py pi05 --ways eager --steps 1
+    python benchmarks/gpu_kernels.py pi05 --what update --batch 8
 
-One line of JSON for each model and way: launches and matrix products after the memory tokens. It
-needs a mock CUDA driver, as docs/evidence/hardware.md has it: the driver counts, and computes
-nothing. Weights hold whatever was in memory.
+One line of JSON for each model and way: launches and matrix products, of a chunk after the memory
+tokens. It needs a mock CUDA driver, as docs/evidence/hardware.md has it: the driver counts, and
+computes nothing. Weights hold whatever was in memory.
 """
 
 import argparse
@@ -18,8 +19,11 @@ from dataclasses import replace
 
 import torch
 from gpu_memory import DEVICE, batch_of, on_meta
+from gpu_setup import Setup, draws_of
+from gpu_training import updating
 
 from mme_vla import MMEPolicy
+from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import named_noise
 
 WAYS = ("eager", "compiled")
@@ -60,6 +64,21 @@ def kernels_of_chunk(policy: MMEPolicy, steps: int = 10) -> dict[str, int]:
     return {what: after[what] - before[what] for what in COUNTERS}
 
 
+def kernels_of_update(model: str, way: str, samples: int, backbone: str) -> dict[str, int]:
+    """Counts of the third update of one process; the first ones compile."""
+    policy = on_meta(model, backbone).to_empty(device=DEVICE)
+    apply_finetuning(policy)
+    setup = Setup(backbone, samples, 1, DEVICE, way == "compiled", "auto")
+    update, _ = updating(policy.train(), setup)
+    batch, draws = batch_of(policy, samples), draws_of(policy, samples, DEVICE)
+    for _ in range(2):
+        update(batch, draws)
+    before = counted()
+    update(batch, draws)
+    after = counted()
+    return {what: after[what] - before[what] for what in COUNTERS}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Count and print."""
     parser = argparse.ArgumentParser(
@@ -68,16 +87,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("models", nargs="+")
     parser.add_argument("--backbone", default="pi05", help="a file of configs/backbone")
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
-    parser.add_argument("--steps", type=int, default=10, help="Euler steps")
+    parser.add_argument("--what", choices=("chunk", "update"), default="chunk")
+    parser.add_argument("--steps", type=int, default=10, help="Euler steps of a chunk")
+    parser.add_argument("--batch", type=int, default=8, help="samples of an update")
     args = parser.parse_args(arguments)
     # The mock driver has no cuDNN.
     torch.backends.cudnn.enabled = False
     for model in args.models:
         for way in args.ways:
-            policy = full_size(model, way, args.backbone)
-            numbers = kernels_of_chunk(policy, args.steps)
+            if args.what == "update":
+                numbers = kernels_of_update(model, way, args.batch, args.backbone)
+            else:
+                numbers = kernels_of_chunk(full_size(model, way, args.backbone), args.steps)
             print(json.dumps({"model": model, "way": way, **numbers}), flush=True)
-            del policy
             gc.collect()
             torch.compiler.reset()
     return 0

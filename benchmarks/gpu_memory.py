@@ -31,8 +31,8 @@ from mme_vla import MMEPolicy, build_policy
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.training import parallel
 from mme_vla.training.checkpoint import trainable
-from mme_vla.training.optim import EMA, clip_gradients, make_optimizer
-from mme_vla.training.settings import TrainSettings
+from mme_vla.training.optim import EMA, WeightUpdate, make_optimizer
+from mme_vla.training.settings import ParallelSettings, TrainSettings
 from mme_vla.types import Batch
 
 GIB = 2**30
@@ -111,7 +111,7 @@ def shared(
     policy = on_meta(model, backbone)
     apply_finetuning(policy, mode, frozen_dtype=frozen_dtype)
     policy.train().recompute(recompute == "all" or recompute or False)  # type: ignore[arg-type]
-    mesh = parallel.ParallelSettings("fsdp").mesh("cuda")
+    mesh = ParallelSettings("fsdp").mesh("cuda")
     # No process has weights to send: what comes after the sharding is left out.
     original, parallel.set_model_state_dict = parallel.set_model_state_dict, lambda *_, **__: None
     rank, distributed.get_rank = distributed.get_rank, lambda *_: 1
@@ -134,13 +134,11 @@ def _updates(policy: MMEPolicy, samples: int, reshard: Callable[[], None]) -> di
         for name, value in policy.training_noise(samples, torch.Generator()).items()
     }
     allocated = torch.cuda.memory_allocated()
-    for _ in range(3):  # moments come with the first
+    update_weights = WeightUpdate(learning, optimizer, ema, 1.0)
+    for done in range(3):  # moments come with the first
         torch.cuda.reset_peak_memory_stats()
         policy(batch, draws)[0].backward()
-        clip_gradients([p.grad for p in learning.values() if p.grad is not None], 1.0)
-        optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
-        ema.update(0)
+        update_weights(done)
     return {"held before": allocated / GIB, **_peaks()}
 
 

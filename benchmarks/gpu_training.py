@@ -27,9 +27,9 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
 from mme_vla import MMEPolicy
-from mme_vla.training.optim import EMA, clip_gradients, make_optimizer
-from mme_vla.training.parallel import ParallelSettings, reshard, shard
-from mme_vla.training.settings import TrainSettings
+from mme_vla.training.optim import EMA, WeightUpdate, make_optimizer
+from mme_vla.training.parallel import reshard, shard
+from mme_vla.training.settings import ParallelSettings, TrainSettings
 from mme_vla.types import Batch
 
 
@@ -60,15 +60,14 @@ def updating(
         learning.values(), TrainSettings(steps=1, batch_size=setup.batch, lr=1e-5)
     )
     ema = EMA(learning, 0.999, reshard=partial(reshard, policy))
+    one_pass = setup.compiled and setup.device.type == "cuda" and strategy != "fsdp"
+    update_weights = WeightUpdate(learning, optimizer, ema, 1.0, one_pass)
     losses: list[Tensor] = []
 
     def update(batch: Batch, draws: dict[str, Tensor]) -> None:
         loss, _ = model(batch, draws)
         loss.backward()
-        clip_gradients([p.grad for p in learning.values() if p.grad is not None], 1.0)
-        optimizer.step()
-        optimizer.zero_grad(set_to_none=True)
-        ema.update(0)
+        update_weights(len(losses))
         losses.append(loss.detach())
 
     return update, losses

@@ -19,7 +19,7 @@ from mme_vla import build_policy
 from mme_vla.config.composition import compose
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
-from mme_vla.testing.small import MODELS
+from mme_vla.testing.small import NEURAL
 
 GIB = 2**30
 FULL_PRECISION = 4  # bytes
@@ -59,7 +59,7 @@ def main() -> None:
         for words in RECIPES:
             print(of_recipe(words), flush=True)
         return
-    for name in MODELS:
+    for name in ("pi05", *NEURAL):
         print(of_model(name, args.backbone))
 
 

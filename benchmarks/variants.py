@@ -16,7 +16,7 @@ import torch
 from timing import alternate, machine
 
 from mme_vla import build_policy
-from mme_vla.testing.small import MODELS, random_batch
+from mme_vla.testing.small import NEURAL, random_batch
 
 
 def training_step(policy, batch):
@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument(
-        "--models", nargs="+", default=MODELS, choices=MODELS, metavar="NAME", help="besides pi05"
+        "--models", nargs="+", default=NEURAL, choices=NEURAL, metavar="NAME", help="besides pi05"
     )
     parser.add_argument(
         "--memory", nargs="*", default=[], metavar="KEY=VALUE", help="options of their memories"
@@ -74,10 +74,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    models, memory = (
-        ["pi05", *(name for name in args.models if name != "pi05")],
-        dict(o.split("=") for o in args.memory),
-    )
+    models = ["pi05", *args.models]
+    memory = dict(o.split("=") for o in args.memory)
     options = {name: {"memory": memory} if name != "pi05" else {} for name in models}
     policies = {
         name: build_policy(name, backbone=args.backbone, device=device, **options[name])

@@ -2,6 +2,10 @@
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from pathlib import Path
+
+CONSTRAINTS = Path(__file__).resolve().parents[1] / "constraints.txt"
+"""The versions known to work together, in a clone."""
 
 
 class UserError(ValueError):
@@ -112,8 +116,15 @@ def missing_extra(what: str, extra: str) -> UserError:
     """The error to raise where the packages of an extra are not installed: what needs them, and
     what installs them.
 
-    `--inexact` keeps the extras that are there already; a plain `uv sync` would take them away.
+    Only a clone has `constraints.txt` beside the package. `--inexact` keeps the extras that are
+    there already; a plain `uv sync` would take them away.
     """
+    if not CONSTRAINTS.is_file():
+        package = f"'mme-vla[{extra}]'"
+        return UserError(
+            f"{what} needs the extra `{extra}`. With pip: pip install {package} (with uv: uv pip"
+            f" install {package})."
+        )
     with_uv, with_pip = (
         f"uv sync --inexact --extra {extra}",
         f"pip install -c constraints.txt -e '.[{extra}]'",

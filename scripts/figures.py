@@ -2,7 +2,9 @@
 
     # memory, history, budget, integration
     python scripts/figures.py
-    python scripts/figures.py probe --probe outputs/probe      # from the folder of a finished probe
+    # from the folder of a finished probe
+    python scripts/figures.py probe --probe outputs/probe
+    python scripts/figures.py probe ages entries --probe P --recordings R --output docs/images
     python scripts/figures.py memory --output outputs/figures
 
 Selections come from the memories themselves, at their full-size options, on episode 0 of
@@ -23,11 +25,16 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from PIL import Image
+from PIL.Image import Image as Picture
 
 from mme_vla.backbone.base import BackboneConfig, ExpertConfig, VisionConfig
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.extras.probing.findings import Findings
+from mme_vla.extras.probing.recordings import all_recordings
+from mme_vla.extras.probing.report import decay, effects, remembered_image
 from mme_vla.extras.probing.run import probed_folder
 from mme_vla.integration.base import Integration
 from mme_vla.integration.context import Context, MemoryExpert
@@ -38,7 +45,7 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.rmt import RMT
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.memory.ttt import TTT
-from mme_vla.utils.style import COLOURS, EXECUTION, FAINT, INK, LINE, VIDEO, look, rgb, svg
+from mme_vla.utils.style import COLOURS, EXECUTION, FAINT, LINE, VIDEO, look, rgb, svg
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "concepts" / "figures"
@@ -227,8 +234,8 @@ def integration(source: EpisodeSource) -> Figure:
         "expert": MemoryExpert(sizes),
         "modulator": Modulator(sizes),
     }
-    figure = Figure((WIDTH_IN, 4.6), layout="constrained")
-    panels = figure.subplots(2, 2)
+    figure = Figure((WIDTH_IN, 4.6), layout=ConstrainedLayoutEngine(rect=(0, 0, 0.97, 1)))
+    panels = figure.subplots(2, 2)  # left of an edge that letters of a browser would cross
     for axes, (name, built) in zip(panels.flat, kinds.items(), strict=True):
         experts = {
             "memory": "VLM" if name == "context" else "memory",
@@ -266,34 +273,11 @@ def integration(source: EpisodeSource) -> Figure:
     return figure
 
 
-def probe(folder: Path) -> Figure:
-    """The change of the chunk under each intervention of a finished probe, beside the policy's own
-    spread.
-    """
-    effects = probed_folder(folder).arms()
-    names = sorted(effects, key=lambda arm: effects[arm].change)
-    changes = [effects[name].change for name in names]
-    spread = np.mean([each.spread for each in effects.values()])
-    figure = Figure((WIDTH_IN, 0.36 * len(names) + 1.2), layout="constrained")
-    axes = figure.subplots()
-    bars = axes.barh(names, changes, color=COLOURS[0])
-    axes.axvline(spread, color=EXECUTION, ls="--", label="own spread: noise alone")
-    # Beside the line where it would cross a number.
-    for bar, change in zip(bars, changes, strict=True):
-        axes.annotate(
-            f"{change:.2f}",
-            (max(change, spread), bar.get_y() + bar.get_height() / 2),
-            (4, 0),
-            textcoords="offset points",
-            va="center",
-            color=INK,
-        )
-    axes.set_xlim(0, 1.12 * max(changes))
-    axes.set_xlabel("change of the chunk, normalised actions")
-    axes.grid(True, axis="x")
-    axes.grid(False, axis="y")
-    axes.legend(loc="lower right")
-    return figure
+def entries(findings: Findings, recordings: Path) -> Picture:
+    """The step of a probe at which an entry mattered most: its entries and the current frame."""
+    (lines,) = findings.matters_most().values()  # of the one task
+    by_name = {each.name: each for each in all_recordings([EpisodeSource(str(recordings))])}
+    return remembered_image(lines, by_name[lines[0].recording], columns=3)
 
 
 def with_webp(text: str) -> str:
@@ -311,6 +295,8 @@ def with_webp(text: str) -> str:
 FIGURES: dict[str, Callable[[EpisodeSource], Figure]] = {
     "memory": memory, "history": history, "budget": budget, "integration": integration,
 }  # fmt: skip
+PROBED: dict[str, Callable[[Findings], str]] = {"probe": effects, "ages": decay}
+"""Figures of a finished probe, as on its page."""
 
 
 def main() -> None:
@@ -320,22 +306,29 @@ def main() -> None:
     parser.add_argument(
         "figures",
         nargs="*",
-        choices=[[], *FIGURES, "probe"],
+        choices=[[], *FIGURES, *PROBED, "entries"],
         metavar="figure",
-        help="by default all but probe",
+        help="by default all but those of a probe: probe, ages and entries",
     )
     parser.add_argument("--probe", type=Path, help="folder of a finished probe")
+    parser.add_argument(
+        "--recordings", type=Path, help="recorded episodes of the probe, for entries"
+    )
     parser.add_argument("--output", type=Path, default=FOLDER)
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     for name in options.figures or FIGURES:
         path = options.output / f"{name}.svg"
-        with look():
-            if name == "probe":
-                figure = probe(options.probe)
-            else:
+        if name == "entries":
+            path = path.with_suffix(".webp")
+            image = entries(probed_folder(options.probe), options.recordings)
+            image.save(path, "WEBP", quality=85, method=6)
+        elif name in PROBED:
+            path.write_text(PROBED[name](probed_folder(options.probe)), encoding="utf-8")
+        else:
+            with look():
                 figure = FIGURES[name](EpisodeSource("sample"))
-            path.write_text(with_webp(svg(figure)), encoding="utf-8")
+                path.write_text(with_webp(svg(figure)), encoding="utf-8")
         print(f"{path}: {path.stat().st_size:,} bytes")
 
 

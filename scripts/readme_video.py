@@ -20,11 +20,12 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.scopes import TASK_FACTS
 from mme_vla.evaluation.store import read_records
 from mme_vla.utils import write_atomically
-from mme_vla.utils.media import bordered, evenly_spaced, font
+from mme_vla.utils.media import BORDER, bordered, evenly_spaced, font
 from mme_vla.utils.style import PALETTE
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "images" / "suites.webp"
-SIDE, CAPTION, GAP = 256, 62, 8  # pixels of an image, of the text below it, between episodes
+SIDE, CAPTION, GAP = 256, 76, 8  # pixels of an image, of the text below it, between episodes
+TITLE, GOAL = 13, 14  # sizes of letters, readable on a page of 400 pixels too
 FRAMES, DURATION, LAST, LIMIT = 56, 140, 2500, 2_000_000  # frames, milliseconds, bytes
 
 
@@ -34,8 +35,9 @@ def front_views(path: Path) -> list[np.ndarray]:
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     images = []
     for i in evenly_spaced(len(frames), FRAMES):
-        image = frames[i][:SIDE, :SIDE]
-        red, green, blue = image[:6, :6].mean((0, 1))
+        image = frames[i][BORDER : BORDER + SIDE, BORDER : BORDER + SIDE]
+        # The margin of a conditioning video's frames is red.
+        red, green, blue = frames[i][: BORDER - 2, : BORDER - 2].mean((0, 1))
         images.append(bordered(image) if red > 180 and max(green, blue) < 80 else image)
     return images + images[-1:] * (FRAMES - len(images))
 
@@ -62,14 +64,14 @@ def panel(image: np.ndarray, record: EpisodeRecord, is_last: bool) -> Image.Imag
     draw = ImageDraw.Draw(canvas)
     title = f"{TASK_FACTS[record.task].suite}: {record.task}"
     # A dark ground, which suits pages of both grounds.
-    draw.text((4, SIDE + 3), title, PALETTE["accent"][1], font(13))
+    draw.text((4, SIDE + 4), title, PALETTE["accent"][1], font(TITLE))
     if is_last:
         solved = record.outcome == "success"
         outcome, colour = ("solved", "good") if solved else (record.outcome, "bad")
-        draw.text((SIDE - 4, SIDE + 3), outcome, PALETTE[colour][1], font(13), anchor="ra")
+        draw.text((SIDE - 4, SIDE + 4), outcome, PALETTE[colour][1], font(TITLE), anchor="ra")
     goal = str(record.goal).removeprefix("watch the video carefully, then ")
-    for row, line in enumerate(wrapped(goal, SIDE - 8, 12, 3)):
-        draw.text((4, SIDE + 19 + 14 * row), line, PALETTE["ink"][1], font(12))
+    for row, line in enumerate(wrapped(goal, SIDE - 8, GOAL, 3)):
+        draw.text((4, SIDE + 22 + 16 * row), line, PALETTE["ink"][1], font(GOAL))
     return canvas
 
 

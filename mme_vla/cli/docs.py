@@ -27,16 +27,16 @@ def build_site(output: Path) -> Path:
             is no clone, or a page has a warning (a broken link, for example). Then the folder is as
             it was.
     """
+    require(
+        SETTINGS.is_file(),
+        f"The pages are in the repository, not in the installed package ({SETTINGS} is missing).",
+    )
     try:
         from mkdocs.commands.build import build
         from mkdocs.config import load_config
         from mkdocs.exceptions import Abort, MkDocsException
     except ImportError:
         raise missing_extra("The documentation site", "docs") from None
-    require(
-        SETTINGS.is_file(),
-        f"The pages are in the repository, not in the installed package ({SETTINGS} is missing).",
-    )
     target = output.resolve()
     check_site(target)
     target.parent.mkdir(parents=True, exist_ok=True)

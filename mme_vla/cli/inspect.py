@@ -43,6 +43,7 @@ from mme_vla.policy import mme
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import CHECKPOINTS, STATE, resolve_checkpoint, shipped_name
 from mme_vla.policy.sections import PolicySections
+from mme_vla.policy.self_check import NO_CHECK, compare
 from mme_vla.training.checkpoint import read_state
 from mme_vla.training.open_loop import (
     LEGEND,
@@ -74,6 +75,7 @@ class Inspection:
     device: str
     output: PathText
     all: bool
+    check: bool
     trust_plugins: bool
     embodiment: Mapping[str, Any]
     backbone: Mapping[str, Any]
@@ -92,6 +94,9 @@ def main(cfg: DictConfig) -> None:
     """
     inspection = Inspection.from_config(resolved(cfg))
     console = Console(markup=False)
+    if inspection.check:
+        show_self_check(inspection, console)
+        return
     if inspection.checkpoint is not None and inspection.dataset is not None:
         check_open_loop(inspection, console)
         return
@@ -121,6 +126,29 @@ def main(cfg: DictConfig) -> None:
     name = str(inspection.memory["name"])
     image = draw_memory(source, episode, step, memory, name, Path(inspection.output), console)
     console.print(f"image: {image}", highlight=False, soft_wrap=True)
+
+
+def show_self_check(inspection: Inspection, console: Console) -> None:
+    """Print whether `checkpoint` predicts what it predicted where it was trained.
+
+    Raises:
+        UserError: it does not, or its self-check is damaged.
+    """
+    require(
+        inspection.checkpoint is not None and inspection.dataset is None,
+        "check=true compares a checkpoint with its own self-check: name checkpoint=<folder>, and"
+        " no dataset.",
+    )
+    assert inspection.checkpoint is not None
+    folder = resolve_checkpoint(Path(inspection.checkpoint))
+    device = find_device(inspection.device)
+    policy = Policy.from_pretrained(folder, device=device, trust_plugins=inspection.trust_plugins)
+    result = compare(policy, folder)
+    if result is None:
+        console.print(NO_CHECK, highlight=False, soft_wrap=True)
+        return
+    require(result.passed, result.line)
+    console.print(result.line, highlight=False, soft_wrap=True)
 
 
 def check_open_loop(inspection: Inspection, console: Console) -> OpenLoop:

@@ -143,6 +143,16 @@ def _connect(choice: PolicyChoice, server: ServerChoice, logger: logging.Logger)
     return LoadedPolicy(policy, name, None)
 
 
+def release(policy: Policy) -> None:
+    """Close the connections of a policy that a server computes."""
+    if policy.info.server is None:
+        return
+    from mme_vla.serving.remote.policy import RemotePolicy  # the extra `serve`
+
+    if isinstance(policy, RemotePolicy):
+        policy.close()
+
+
 SAMPLING = ("auto", "eager", "graph", "compiled")
 """How a command computes chunks: `sampling` of configs/evaluate.yaml and configs/serve.yaml."""
 

@@ -4,12 +4,16 @@ import asyncio
 import logging
 import os
 import signal
+from pathlib import Path
 
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import log_to_terminal
 from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling
+from mme_vla.policy.base import Policy
 from mme_vla.policy.build import policy_config
+from mme_vla.policy.saving import local_folder
+from mme_vla.policy.self_check import NO_CHECK, compare
 from mme_vla.serving.server import PolicyServer
 from mme_vla.serving.settings import ServeSettings, is_local
 
@@ -23,6 +27,8 @@ def main(cfg: DictConfig) -> None:
     choice = PolicyChoice.from_config(config)
     log_to_terminal(logger, clock=True)
     policy, name, source = load_policy(choice, "serve", logger)
+    if source is not None:
+        _report_self_check(policy, local_folder(source, choice.revision))
     prepare_sampling(policy, str(cfg.sampling), logger)
     trained = choice.checkpoint is not None
     server = PolicyServer(policy, settings, name=name, trained=trained, source=source)
@@ -36,6 +42,17 @@ def main(cfg: DictConfig) -> None:
             server.metadata["subgoal"],
         )
     asyncio.run(run(server))
+
+
+def _report_self_check(policy: Policy, folder: Path) -> None:
+    """Log in one line whether a policy predicts what it predicted where it was trained."""
+    result = compare(policy, folder)
+    if result is None:
+        logger.info("%s", NO_CHECK)
+    elif result.passed:
+        logger.info("%s", result.line)
+    else:
+        logger.warning("%s", result.line)
 
 
 async def run(server: PolicyServer) -> None:

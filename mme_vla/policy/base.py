@@ -19,6 +19,7 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.identity import PolicyIdentity
 from mme_vla.policy.saving import load_policy, push_folder, save_policy
 from mme_vla.policy.sections import PolicySections
+from mme_vla.policy.self_check import renew_self_check
 from mme_vla.types import Noise, stack_noise
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ class PolicyInfo:
     max_running: most episodes that it can act in at the same time; None for any number.
     identity: what records call a policy that does not compute here; None for what its configuration
     says.
+    server: what a receipt names of the server where the policy computes, its metadata and times so
+        far; None for a policy that computes here.
     history_dtype: of stored vision tokens (`Policy.encode_frames`).
     processor_sizes: sizes of the network that its processor must have too, by the name of the
         processor's attribute, such as `image_size` or `embodiment.action.horizon`. A checkpoint in
@@ -51,6 +54,7 @@ class PolicyInfo:
     resamples: bool = True
     max_running: int | None = None
     identity: PolicyIdentity | None = None
+    server: Mapping[str, Any] | None = None
     history_dtype: torch.dtype = torch.bfloat16
     processor_sizes: Mapping[str, object] = field(default_factory=dict)
 
@@ -80,6 +84,10 @@ class Policy(nn.Module):
     loss_weights: Mapping[str, float] | None = None
     """Weights of auxiliary losses by name, which training sets from `train.losses`. None for a
     policy that has no such losses, and weighs no samples (`Batch.weight`).
+    """
+    _renews_self_check: bool = False
+    """Whether the checkpoint that it was loaded from has a self-check. It is recorded again, of the
+    weights as they are then, where the policy is saved.
     """
 
     @property
@@ -242,15 +250,6 @@ class Policy(nn.Module):
         """
         return False
 
-    def conditions(self) -> dict[str, Any]:
-        """What a receipt names of this policy beside code and files; a server's metadata, if it
-        computes there.
-        """
-        return {}
-
-    def close(self) -> None:
-        """Free what the policy holds outside of this process."""
-
     def observation(self, episodes: Sequence[Episode]) -> Any:
         """The current observations of episodes, as a batch of the processor's kind on the policy's
         device.
@@ -338,12 +337,15 @@ class Policy(nn.Module):
     ) -> None:
         """Write weights, configuration, statistics and tokenizer, with checksums in `SHA256SUMS`.
 
+        A policy that was loaded from a checkpoint with a self-check gets a new one of its weights.
+
         Args:
             dtype: of the stored weights: `float32` or `bfloat16`.
             card: facts for the model card, kept in the configuration: `data` (text), `recipe`,
                 `results` (tables), `license`, `base_model`, `datasets` (ids on the hub).
         """
-        save_policy(self, Path(folder), dtype=dtype, card=card)
+        check = renew_self_check(self, dtype)
+        save_policy(self, Path(folder), dtype=dtype, card=card, self_check=check)
 
     def push_to_hub(
         self,
@@ -366,7 +368,7 @@ class Policy(nn.Module):
                 `save_pretrained`.
         """
         with tempfile.TemporaryDirectory() as folder:
-            save_policy(self, Path(folder), dtype=dtype, card=card)
+            self.save_pretrained(folder, dtype=dtype, card=card)
             return push_folder(
                 Path(folder),
                 repo_id,

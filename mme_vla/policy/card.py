@@ -12,14 +12,23 @@ from mme_vla.errors import brief, require
 from mme_vla.policy.sections import PolicySections
 
 CARD_FILE = "README.md"
+_SELF_CHECK = """
+## Self-check
+
+`self_check.safetensors` holds a synthetic observation history, noise, and the chunk that this
+policy predicted. `mme-vla inspect checkpoint=<this folder> check=true` compares.
+"""
 
 
-def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
+def model_card(policy: nn.Module, config: Mapping[str, Any], self_check: bool = False) -> str:
     """Write a card from a policy's configuration.
 
     Its section `card` may hold `data` (words), `recipe` and `results` (name → value); what is
     absent is said to be. For the hub's front matter also `license`, `base_model` and `datasets`
     (ids on the hub).
+
+    Args:
+        self_check: whether one lies beside the card.
 
     Raises:
         UserError: `recipe` or `results` is no mapping.
@@ -50,6 +59,7 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
     }
     if sections.adapters:
         rows["adapters"] = f"LoRA, rank {sections.adapters.get('rank')}, not merged"
+    check = _SELF_CHECK if self_check else ""
     memory = "with a memory of the episode" if sections.memory else "without memory"
     return f"""---
 {front_matter(name, known)}
@@ -66,7 +76,7 @@ A policy of the MME-VLA library (`{type(policy).__name__}`) {memory}.
 ```python
 {example(config)}
 ```
-
+{check}
 ## Data
 
 {known.get("data") or "Not recorded."}

@@ -21,6 +21,8 @@ from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
 from mme_vla.policy.run_folders import newest_checkpoint
 from mme_vla.policy.sections import KNOWN_SECTIONS, PolicySections
+from mme_vla.policy.self_check import FILE as SELF_CHECK
+from mme_vla.policy.self_check import SelfCheck
 from mme_vla.policy.tensor_files import (
     assign_tensors,
     dtype_of,
@@ -223,33 +225,43 @@ def save_policy(
     dtype: str = "float32",
     card: Mapping[str, Any] | None = None,
     facts: Mapping[str, Any] | None = None,
+    self_check: SelfCheck | None = None,
 ) -> None:
     """Write a policy to a folder; see `Policy.save_pretrained`.
 
     Args:
         facts: sections that join the policy's configuration in the file.
+        self_check: of these weights, to lie beside them.
     """
     kind = dtype_of(dtype)
     if card is not None:
         policy.config["card"] = {**PolicySections.of(policy.config).card, **card}
     save_tensors(policy.state_dict(), folder, dtype=kind)
-    settings = save_settings(policy, folder, facts)
+    settings = save_settings(policy, folder, facts, self_check)
     # without the card, which people edit
     write_sums(folder, [*settings, *list_weight_files(folder)])
 
 
 def save_settings(
-    policy: "Policy", folder: Path, facts: Mapping[str, Any] | None = None
+    policy: "Policy",
+    folder: Path,
+    facts: Mapping[str, Any] | None = None,
+    self_check: SelfCheck | None = None,
 ) -> list[str]:
     """Write all files of a checkpoint but the weights; return the names of those that get
     checksums.
     """
     config = {**policy.config, **(facts or {})}
     (folder / CONFIG).write_text(json.dumps(config, indent=2, ensure_ascii=False) + "\n")
-    (folder / CARD_FILE).write_text(model_card(policy, config))
-    if policy.processor is None:
-        return [CONFIG]
-    return [CONFIG, *policy.processor.save(folder)]
+    written = [CONFIG]
+    if self_check is None:
+        (folder / SELF_CHECK).unlink(missing_ok=True)  # of the weights that lay here before
+    else:
+        written.append(self_check.write(folder))
+    (folder / CARD_FILE).write_text(model_card(policy, config, self_check is not None))
+    if policy.processor is not None:
+        written += policy.processor.save(folder)
+    return written
 
 
 def load_policy[P: "Policy"](
@@ -310,6 +322,7 @@ def load_policy[P: "Policy"](
     recompute_buffers(policy)
     policy.processor = load_processor(folder, tokenizer)
     check_processor(policy, str(source))
+    policy._renews_self_check = (folder / SELF_CHECK).is_file()
     if kind == torch.bfloat16:
         policy.requires_grad_(False)
     return policy.to(device).eval()

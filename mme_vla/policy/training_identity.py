@@ -36,6 +36,7 @@ _TRAIN_WITHOUT_EFFECT = (
     "prefetch_gb",
     "workers",
     "open_loop_chunks",
+    "self_check",
     "device",
     "seed",
 )

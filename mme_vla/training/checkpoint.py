@@ -3,6 +3,7 @@ resume needs.
 
     checkpoints/step_000500/
         model.safetensors, config.json, processor.json, norm_stats.json, …   the policy, EMA weights
+        self_check.safetensors   a synthetic history and the chunk that these weights predict
         raw.safetensors          the trained weights themselves; frozen ones are in
                                  model.safetensors
         optimizer.safetensors    Adam's moments and step counts
@@ -30,6 +31,7 @@ from mme_vla.errors import UserError, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
 from mme_vla.policy.saving import save_policy, save_settings
+from mme_vla.policy.self_check import SelfCheck
 from mme_vla.policy.tensor_files import (
     assign_tensors,
     cast,
@@ -75,6 +77,7 @@ def save_checkpoint(
     config: Mapping[str, Any],
     keep: KeepRule,
     facts: Mapping[str, Any] | None = None,
+    self_check: SelfCheck | None = None,
 ) -> Path:
     """Write `folder`/step_…; it appears whole or not at all. Then remove what `keep` does not hold
     on to.
@@ -82,13 +85,14 @@ def save_checkpoint(
     Args:
         config: of the training, for `training_state.json`.
         facts: sections that join the policy's own configuration.
+        self_check: of the averaged weights.
     """
     from safetensors.torch import save_file
 
     target, draft = _places(folder, step)
     shutil.rmtree(draft, ignore_errors=True)
     with ema.applied():
-        save_policy(policy, draft, facts=facts)
+        save_policy(policy, draft, facts=facts, self_check=self_check)
     parameters = trainable(policy)
     save_file({name: _on_cpu(p) for name, p in parameters.items()}, draft / RAW)
     moments = {}
@@ -115,11 +119,13 @@ def save_shards(
     keep: KeepRule,
     facts: Mapping[str, Any] | None = None,
     hurry: bool = False,
+    self_check: SelfCheck | None = None,
 ) -> Path:
     """Begin to write `folder`/step_… of a sharded run; all processes call it and wait for the
     copies alone.
 
     Args:
+        self_check: as for `save_checkpoint`; the first process writes it.
         hurry: let the checkpoint appear as soon as it can be resumed from, and write the policy's
             weights into it after; otherwise it appears whole or not at all.
     """
@@ -132,7 +138,7 @@ def save_shards(
     if first:
         shutil.rmtree(draft, ignore_errors=True)
         (draft / SHARDS).mkdir(parents=True)
-        about = [*save_settings(policy, draft, facts), STATE]
+        about = [*save_settings(policy, draft, facts, self_check), STATE]
 
     def finish() -> None:
         place, notes = draft, shard_notes(draft)

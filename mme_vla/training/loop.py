@@ -17,6 +17,7 @@ from mme_vla.data.recording import Recording
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
+from mme_vla.policy.self_check import SelfCheck, try_self_check
 from mme_vla.speed import Recomputes
 from mme_vla.speed.compiler import keep_compiled_code, missing_compiler
 from mme_vla.training.checkpoint import (
@@ -30,7 +31,13 @@ from mme_vla.training.checkpoint import (
 from mme_vla.training.data import SplitData
 from mme_vla.training.logging import Loggers, ProgressLine, Window, read_metrics, resident_gib
 from mme_vla.training.open_loop import OpenLoop, error_lines, open_loop, plot_open_loop
-from mme_vla.training.optim import EMA, clip_gradients, lr_factors, make_optimizer, scheduled_rate
+from mme_vla.training.optim import (
+    EMA,
+    WeightUpdate,
+    lr_factors,
+    make_optimizer,
+    scheduled_rate,
+)
 from mme_vla.training.order import (
     BatchOrder,
     Collate,
@@ -158,8 +165,17 @@ class Trainer:
             restore(run.checkpoint, policy, self.ema, self.optimizer)
         self.model = policy if self.sharded else accelerator.prepare_model(policy)
         self._parameters = list(parameters.values())
+        # What a CPU takes for it was not measured.
+        on_gpu = accelerator.device.type == "cuda"
+        is_adamw = isinstance(self.optimizer, torch.optim.AdamW)
+        one_pass = settings.compile and on_gpu and is_adamw and not self.sharded
+        self.update_weights = WeightUpdate(
+            parameters, self.optimizer, self.ema, settings.clip_norm, one_pass
+        )
         self._shard_writer = ShardWriter() if self.sharded else None
         self.last_checkpoint = run.checkpoint
+        self.unchecked: str | None = None
+        """Why the last checkpoint has no self-check although it should."""
         self.stopped_by: int | None = None
         """The signal that ended `run` early."""
 
@@ -205,6 +221,8 @@ class Trainer:
                         self.validate(done, line, loggers)
                     if saving:
                         self.save(done, stopping)
+                        if self.unchecked is not None:
+                            line.say(f"no self-check in the checkpoint: {self.unchecked}")
                 if stopping:
                     self.stopped_by = stop.signal
                     line.say(
@@ -249,12 +267,7 @@ class Trainer:
             for name, value in metrics.items():
                 part = value.detach().float() / settings.accumulate
                 sums[name] = sums[name] + part if name in sums else part
-        gradients = [p.grad for p in self._parameters if p.grad is not None]
-        norm = full_value(clip_gradients(gradients, settings.clip_norm))
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-        self.ema.update(step)
-        return {**sums, "grad_norm": norm, "lr": rate}
+        return {**sums, "grad_norm": full_value(self.update_weights(step)), "lr": rate}
 
     @contextmanager
     def _gradients_shared(self, shared: bool) -> Iterator[None]:
@@ -296,14 +309,34 @@ class Trainer:
         """
         folder, keep = self.run_info.checkpoints, self.settings.keep
         saved = (self.policy, self.ema, self.optimizer, self.config, keep, self.facts)
+        check = self._self_check(step)
         if self._shard_writer is not None:
-            save_shards(self._shard_writer, folder, step, *saved, hurry=stopping)
+            save_shards(self._shard_writer, folder, step, *saved, hurry=stopping, self_check=check)
         else:
             if self.accelerator.is_main_process:
-                save_checkpoint(folder, step, *saved)
+                save_checkpoint(folder, step, *saved, self_check=check)
             self.accelerator.wait_for_everyone()
         self.last_checkpoint = folder / checkpoint_name(step)
         return self.last_checkpoint
+
+    def _self_check(self, step: int) -> SelfCheck | None:
+        """The self-check of the averaged weights, in the first process.
+
+        Weights that are shared among processes come together only at the end of the run.
+        """
+        self.unchecked = None
+        is_first = self.accelerator.is_main_process
+        if not self.settings.self_check:
+            return None
+        if self.sharded and step < self.settings.steps:
+            return None
+        if not (self.sharded or is_first):
+            return None
+        with self.ema.applied(), gathered(self.policy):
+            if not is_first:
+                return None
+            check, self.unchecked = try_self_check(self.policy)
+            return check
 
     def close(self) -> None:
         """Wait until the last checkpoint is on disk."""

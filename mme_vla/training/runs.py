@@ -46,6 +46,7 @@ MAY_DIFFER = (
     "train.prefetch_gb",
     "train.workers",
     "train.open_loop_chunks",
+    "train.self_check",
     "train.device",
     "data.cache",
     "data.content",

@@ -118,6 +118,7 @@ class TrainSettings:
     save_every: PositiveInt = 1000
     keep: KeepRule = field(default_factory=KeepRule)
     open_loop_chunks: NonNegativeInt = 32
+    self_check: bool = True
     losses: Mapping[str, NonNegative] | None = None
     seed: int = 42
 

@@ -23,6 +23,8 @@ from mme_vla.cli.inspect import (
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose, resolved
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.policy.saving import save_policy
+from mme_vla.policy.self_check import NO_CHECK, record_self_check
 from mme_vla.testing.small import unit_stats
 from mme_vla.training.settings import DataSettings, TrainRun
 
@@ -91,6 +93,31 @@ def test_all_shows_the_configuration_and_statistics(tmp_path: Path, console: Con
     text = console.export_text()
     assert "budget=64" in text and "normalisation of the state" in text
     assert text.count("│ joint 1") == 2, "the state's numbers have the names of the action's"
+
+
+def test_a_checkpoint_is_compared_with_its_self_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = build_policy("pi05")
+    policy.require_processor().stats = unit_stats(policy.embodiment)
+    command = [f"checkpoint={tmp_path}", "check=true", "device=cpu"]
+    policy.save_pretrained(tmp_path)
+    main(compose("inspect", command))
+    assert capsys.readouterr().out == f"{NO_CHECK}\n"
+
+    check = record_self_check(policy)
+    save_policy(policy, tmp_path, self_check=check)
+    main(compose("inspect", command))
+    line = capsys.readouterr().out
+    assert line.startswith("self-check: passed") and line.count("\n") == 1
+
+    other = build_policy("pi05", seed=5)
+    other.require_processor().stats = unit_stats(other.embodiment)
+    save_policy(other, tmp_path, self_check=check)
+    with pytest.raises(UserError, match=r"^self-check: FAILED.*fetch the checkpoint again"):
+        main(compose("inspect", command))
+    with pytest.raises(UserError, match="name checkpoint="):
+        main(compose("inspect", ["check=true"]))
 
 
 @pytest.fixture

@@ -2,10 +2,13 @@
 publishes it.
 """
 
+import ast
 import re
 import shutil
 from email import message_from_string
 from email.message import Message
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import published
@@ -182,3 +185,17 @@ def test_the_readme_of_the_benchmarks_names_every_script() -> None:
     text = (REPOSITORY / "benchmarks" / "README.md").read_text()
     scripts = re.findall(r"^\| `(\w+\.py)` \|", text, re.MULTILINE)
     assert sorted(scripts) == sorted(p.name for p in (REPOSITORY / "benchmarks").glob("*.py"))
+
+
+@pytest.mark.slow
+def test_benchmarks_import_what_the_library_has() -> None:
+    missing = []
+    for script in sorted((REPOSITORY / "benchmarks").glob("*.py")):
+        for node in ast.walk(ast.parse(script.read_text())):
+            if not isinstance(node, ast.ImportFrom) or not str(node.module).startswith("mme_vla"):
+                continue
+            module = import_module(str(node.module))
+            for name in (alias.name for alias in node.names):
+                if not hasattr(module, name) and find_spec(f"{node.module}.{name}") is None:
+                    missing.append(f"{script.name}: {node.module}.{name}")
+    assert not missing

@@ -3,6 +3,7 @@ and trains.
 """
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -75,9 +76,13 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             str(python),
             "-c",
             pins,
+            "pytest",
+            "pytest-timeout",
         ]
         if (
-            subprocess.run([*order, str(wheel)], cwd=REPOSITORY, capture_output=True).returncode
+            subprocess.run(
+                [*order, f"mme-vla[sim] @ {wheel.as_uri()}"], cwd=REPOSITORY, capture_output=True
+            ).returncode
             == 0
         ):
             return python
@@ -89,6 +94,9 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     zipfile.ZipFile(wheel).extractall(site_packages)
     (site_packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    script = python.with_name("mme-vla")
+    script.write_text(f"#!{python}\nfrom mme_vla.__main__ import main\nmain()\n")
+    script.chmod(0o755)
     return python
 
 
@@ -126,6 +134,33 @@ def test_a_policy_builds_and_trains_from_the_wheel_alone(installed: Path, tmp_pa
     assert kind == "MMEPolicy"
     assert imported == "False"  # writing datasets needs it, and seconds to import it
     assert list((tmp_path / "run").rglob("*.safetensors"))
+
+
+@pytest.mark.nightly
+def test_the_commands_of_the_readme_work_from_the_wheel(
+    installed: Path, tmp_path: Path, renderer: str
+) -> None:
+    readme = (REPOSITORY / "README.md").read_text()
+    *commands, site = blocks("bash", readme.partition("## Try it")[2])[0].splitlines()
+    assert len(commands) == 3 and site == "mme-vla docs"  # its pages are in a clone
+    train = blocks("bash", readme)[0].partition("uv run ")[2].strip()
+    python = blocks("python", readme)[0]
+    (tmp_path / "block.py").write_text(python)
+    help_texts = ["mme-vla --version", "mme-vla --help", "mme-vla results --demo"]
+    inspect = "mme-vla inspect checkpoint=nano"
+    for command in [*help_texts, inspect, train, "python block.py", *commands]:
+        line = f'PATH="{installed.parent}:$PATH" HOME="{tmp_path}" {command}'
+        run(["bash", "-c", line], cwd=tmp_path)
+    assert list(tmp_path.rglob("*.mp4"))
+    refused = subprocess.run(
+        [installed.with_name("mme-vla"), "docs"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert refused.returncode == 2 and "pages are in the repository" in refused.stderr
+
+
+def blocks(language: str, text: str) -> list[str]:
+    """The blocks of code of a page."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
 def source_files(folder: str, inside: str) -> set[str]:

@@ -12,6 +12,11 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from unittest import mock
 
+import mme_vla
+
+PACKAGE_PATH = Path(mme_vla.__file__).resolve().parents[1]
+"""Where the library was imported from: the clone, or the packages of an environment."""
+
 
 def pack(folder: Path, archive: Path) -> None:
     """Pack the files below a folder, without times and owners."""

@@ -15,10 +15,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from net.archives import EndedError, command, run
+from net.archives import PACKAGE_PATH, EndedError, command, run
 from net.models import PI05, sizes_of, words
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 DATA = ["data=lerobot", "data.sources=[dataset]", "data.cache.root=cache"]
 TRAIN = [
     *DATA, "data.val_episodes=[1]", "logger=none",
@@ -117,7 +116,7 @@ def train() -> None:
                 "--nproc-per-node",
                 "2",
             ]
-            variables = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+            variables = {**os.environ, "PYTHONPATH": str(PACKAGE_PATH)}
             launched = [
                 *launcher,
                 "-m",

@@ -6,8 +6,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
+
+from net.archives import PACKAGE_PATH
 
 COMMANDS = {
     "import mme_vla": ["-c", "import mme_vla"],
@@ -20,7 +21,7 @@ def measure(words: Sequence[str], repeats: int = 1) -> dict[str, Any]:
     """Median of the seconds that a fresh process takes, and the modules that it imports, Python's
     own included.
     """
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    environment = {**os.environ, "PYTHONPATH": str(PACKAGE_PATH)}
     seconds = []
     for _ in range(repeats):
         begun = time.perf_counter()

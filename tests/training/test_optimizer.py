@@ -1,16 +1,18 @@
 """The optimizer reproduces the released recipe."""
 
 import json
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
-from torch import nn
+from torch import Tensor, nn
 
 from mme_vla.errors import UserError
+from mme_vla.speed.compiler import missing_compiler
 from mme_vla.testing.small import small_policy
-from mme_vla.training.optim import EMA, clip_gradients, learning_rate, make_optimizer
+from mme_vla.training.optim import EMA, WeightUpdate, clip_gradients, learning_rate, make_optimizer
 from mme_vla.training.order import BatchOrder, generator_for, seed_of
 from mme_vla.training.settings import TrainSettings
 
@@ -52,6 +54,65 @@ def test_gradients_below_the_norm_stay_as_they_are() -> None:
     clip_gradients(zero, 1.0)
     assert small[0].tolist() == pytest.approx([0.3, 0.4])
     assert zero[0].tolist() == [0, 0]
+
+
+class SmallTraining:
+    """Weights of several shapes, of which some do not decay, and what updates them."""
+
+    def __init__(self, one_pass: bool) -> None:
+        generator = torch.Generator().manual_seed(0)
+        self.weights = nn.ParameterDict()
+        for i, shape in enumerate([(7, 5), (33,), (1,), (16, 8)]):
+            self.weights[str(i)] = nn.Parameter(torch.randn(shape, generator=generator))
+        parameters = dict(self.weights.items())
+        settings = TrainSettings(steps=1, batch_size=1, lr=1e-2, decay_min_dim=2, weight_decay=0.1)
+        self.optimizer = make_optimizer(parameters.values(), settings)
+        self.ema = EMA(parameters, 0.99, warmup=True)
+        self.update = WeightUpdate(parameters, self.optimizer, self.ema, 1.0, one_pass)
+
+    def step(self, done: int) -> float:
+        """An update with gradients below the norm and above it in turn."""
+        generator = torch.Generator().manual_seed(done)
+        scale = 10.0 if done % 2 else 0.01
+        for parameter in self.weights.values():
+            parameter.grad = scale * torch.randn(parameter.shape, generator=generator)
+        for group in self.optimizer.param_groups:
+            group["lr"] = 1e-2 / (done + 1)
+        return float(self.update(done))
+
+    def numbers(self) -> list[Tensor]:
+        moments = [value for state in self.optimizer.state.values() for value in state.values()]
+        return [*self.weights.values(), *self.ema.tensors().values(), *moments]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(missing_compiler(torch.device("cpu")) is not None, reason="needs a compiler")
+def test_one_pass_equals_clipping_optimizer_and_average_within_rounding() -> None:
+    torch.compiler.reset()
+    passes, one_pass = SmallTraining(False), SmallTraining(True)
+    for done in range(4):
+        assert passes.step(done) == one_pass.step(done)
+        assert all(p.grad is None for p in one_pass.weights.values())
+        for expected, value in zip(passes.numbers(), one_pass.numbers(), strict=True):
+            torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-6)
+    # From a checkpoint it continues to the last bit.
+    resumed = SmallTraining(True)
+    resumed.weights.load_state_dict(one_pass.weights.state_dict())
+    resumed.ema.load(one_pass.ema.tensors())
+    resumed.optimizer.load_state_dict(deepcopy(one_pass.optimizer.state_dict()))
+    assert resumed.step(4) == one_pass.step(4)
+    pairs = zip(resumed.numbers(), one_pass.numbers(), strict=True)
+    assert all(torch.equal(first, second) for first, second in pairs)
+
+
+def test_an_update_without_a_gradient_leaves_that_weight_as_it_is() -> None:
+    training = SmallTraining(True)
+    training.step(0)
+    before = training.weights["0"].detach().clone()
+    for name, parameter in training.weights.items():
+        parameter.grad = None if name == "0" else torch.ones_like(parameter)
+    training.update(1)
+    assert torch.equal(training.weights["0"], before)
 
 
 def test_average_is_exchanged_in_and_out() -> None:

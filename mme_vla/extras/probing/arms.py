@@ -192,7 +192,7 @@ def lacking(
         "subgoal": policy.require_processor().prompt_spec.reads_subgoal,
         "recordings": recordings > 0 and not robot.readings,
         "boundaries": boundaries,
-        "stream": robot.action.frames is not None and not robot.readings,
+        "stream": not robot.readings,
         "goals": n_goals > 1,
     }
     for need in sorted(arm.needs):

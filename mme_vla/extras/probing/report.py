@@ -289,9 +289,9 @@ def decay(findings: Findings) -> str:
                 axes.scatter(
                     [e.age for e in mine],
                     [e.change for e in mine],
-                    s=8,
+                    s=12,
                     color=colour,
-                    alpha=0.25,
+                    alpha=0.45,
                     lw=0,
                 )
                 means = [point.change for _, point in points]
@@ -357,11 +357,11 @@ UNITS = (
 )
 
 
-def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image":
+def remembered_image(lines: Sequence[EntryLine], recording: Recording, columns: int = 8) -> "Image":
     """The frames remembered at a step, each with its age and how the chunk changes without it; the
     current one last.
 
-    lines: of one step. recording: theirs.
+    lines: of one step. recording: theirs. columns: frames a row.
     """
     step, tiles = lines[0].step, []
     for line in sorted(lines, key=lambda line: line.time):
@@ -369,7 +369,7 @@ def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image
         tiles.append(Tile(recording.frame(line.time), label, VIDEO if line.video else EXECUTION))
     tiles.append(Tile(recording.frame(step), f"now: frame {step}", NOW))
     title = f"{lines[0].task or recording.name}: change of the chunk without each entry"
-    return contact_sheet(tiles, min(len(tiles), 8), title, None)
+    return contact_sheet(tiles, columns, title)
 
 
 MARK = "takes from its memory"  # stands in the heading of each page and table

@@ -28,6 +28,13 @@ def check_probe(config: Mapping[str, Any]) -> None:
     if config["compare"] is not None:
         return
     check_config(config)
+    if config["twins"]:
+        for key in ("card", "online", "recordings", "with", "event", "server", "references"):
+            require(
+                not config[key],
+                f"twins=true measures the policy as it is and without memory: leave out {key}=….",
+            )
+        return
     in_closed_loop = config["online"] or config["card"]
     is_served = config["server"] is not None
     require(
