@@ -191,8 +191,8 @@ def test_the_words_of_other_documented_commands_are_valid(page: str, command: st
         return
     if arguments[:1] == ["board"]:  # a command of its own, with options
         return
-    if arguments[:1] == ["card"]:
-        arguments[0] = "card=true"
+    if arguments[:1] in (["card"], ["twins"]):
+        arguments[0] += "=true"
     # Words that a line above the command defines
     arguments = [word for word in arguments if not word.startswith("$")]
     arguments = trust_as_override(arguments)
