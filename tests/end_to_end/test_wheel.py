@@ -123,6 +123,8 @@ def test_the_source_archive_holds_what_the_wheel_is_made_of(tmp_path: Path) -> N
         "LICENSE",
         "constraints.txt",
         "tests/end_to_end/test_wheel.py",
+        ".ci/run",
+        ".github/workflows/tests.yml",
     } <= packed
 
 
