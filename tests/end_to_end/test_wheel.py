@@ -72,6 +72,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             "--offline",
             "--link-mode",
             "symlink",
+            "--no-compile-bytecode",
             "--python",
             str(python),
             "-c",
