@@ -3,7 +3,7 @@ r"""Compose the README's moving picture: an episode of each suite, with its goal
 The policy is the one for all sixteen tasks that ships with the library.
 
     # VideoUnmaskSwap 13, PickXtimes 6, VideoRepick 12 and RouteStick 4
-    python -m mme_vla.evaluate checkpoint=nano16 tasks=PickXtimes episodes=[6] split=reserved \
+    mme-vla evaluate checkpoint=nano16 tasks=PickXtimes episodes=[6] split=reserved \
         seed=7 max_actions=20 only_possible=true video=all output=outputs/suites/PickXtimes
     python scripts/readme_video.py outputs/suites/*
 """
@@ -20,7 +20,7 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.scopes import TASK_FACTS
 from mme_vla.evaluation.store import read_records
 from mme_vla.utils import write_atomically
-from mme_vla.utils.media import bordered, evenly_spaced, font
+from mme_vla.utils.media import BORDER, bordered, evenly_spaced, font
 from mme_vla.utils.style import PALETTE
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "images" / "suites.webp"
@@ -35,8 +35,9 @@ def front_views(path: Path) -> list[np.ndarray]:
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
     images = []
     for i in evenly_spaced(len(frames), FRAMES):
-        image = frames[i][:SIDE, :SIDE]
-        red, green, blue = image[:6, :6].mean((0, 1))
+        image = frames[i][BORDER : BORDER + SIDE, BORDER : BORDER + SIDE]
+        # The margin of a conditioning video's frames is red.
+        red, green, blue = frames[i][: BORDER - 2, : BORDER - 2].mean((0, 1))
         images.append(bordered(image) if red > 180 and max(green, blue) < 80 else image)
     return images + images[-1:] * (FRAMES - len(images))
 

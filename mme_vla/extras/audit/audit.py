@@ -2,15 +2,16 @@
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
+
 from mme_vla.config.sections import Positive, Range
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import require
-from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.rollout.evaluation import RunOptions, evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -20,28 +21,38 @@ from mme_vla.extras.audit.conclusion import (
     conclude,
     scenes_for,
 )
+from mme_vla.extras.audit.floor import RANDOM, RandomPolicy
 from mme_vla.extras.probing.arms import UNPROBED, slug
-from mme_vla.extras.probing.card import Card, measure_card, percent, tables_of
+from mme_vla.extras.probing.card import (
+    LOSS,
+    Card,
+    card_page,
+    ended_scenes,
+    measure_card,
+    percent,
+)
+from mme_vla.extras.probing.interventions import NEEDS
 from mme_vla.extras.probing.recordings import Recording
-from mme_vla.extras.probing.run import ONLINE, ProbePlan
+from mme_vla.extras.probing.run import ONLINE, ProbePlan, run_probe
 from mme_vla.policy.base import Policy
 from mme_vla.utils import read_json, require_earlier, to_json, write_atomically, write_json
 
 PAGE, FIGURES, PLAN = "audit.html", "audit.json", "plan.json"
-MARK = "Audit of"  # stands in the heading of each page
-PILOT = 3  # scenes that are run to learn how long one takes
-_HOW = (
+MARK = "Audit of"  # in the heading of each page
+PILOT = 3  # scenes of each task that are run to learn how long one takes
+N_RUNS = len(INTERVENTIONS) + 3  # the matched run, its repetition and the random floor among them
+_METHOD = (
     (
         "Every arm runs the scenes of the matched run and changes what the policy is sent, never"
         " its weights or its memory. Noise is that of the matched run where the policy takes a"
-        " seed. A loss is the matched success minus the arm's, with a 95 % interval (paired"
-        " bootstrap over scenes). It is beyond noise if the interval lies above 0 and the loss"
-        " exceeds the share of scenes that end otherwise when the matched run is repeated."
+        " seed."
     ),
+    LOSS,
     (
         "Nothing remembered: the episode begins anew at each decision, with the current frame; it"
         " is the floor of a policy that sees the present alone. Own chunks lost: it begins anew and"
-        " gets all frames so far."
+        " gets all frames so far. Random: any option and any point, or chunks from any place of the"
+        " recorded episodes."
     ),
 )
 
@@ -82,12 +93,55 @@ def run_audit(
     """
     for name, mark in ((PAGE, MARK), (FIGURES, "conclusion")):
         require_earlier(folder / name, mark)
-    chosen = _within_budget(policy, jobs, folder, facts, settings, options, audit)
-    plan = ProbePlan(lend=recordings, jobs=chosen)
+    require(jobs, "There is no scene: name some with tasks=… and episodes=….")
+
+    def run_matched(plan: ProbePlan) -> None:
+        run_probe(policy, plan, folder, facts, settings, options)
+
+    if audit.minutes is not None:
+        jobs = _affordable_scenes(jobs, folder, audit.minutes, run_matched)
+    plan = ProbePlan(lend=recordings, jobs=jobs)
+    references = dict(references or {})
+    notes = []
+    if RANDOM not in references:
+        why = _no_floor(policy, recordings)
+        if why is None:
+            _run_floor(policy, plan, folder / RANDOM, facts, settings, options)
+            references[RANDOM] = str(folder / RANDOM)
+        else:
+            notes.append(f"{RANDOM} was left out: it needs {why}.")
     card = measure_card(policy, plan, folder, facts, settings, options, references, INTERVENTIONS)
+    card = replace(card, notes=[*card.notes, *notes])
     conclusion = conclude(card, audit.resolve)
     _write(card, conclusion, folder, policy)
     return Audit(card, conclusion, folder / PAGE)
+
+
+def _no_floor(policy: Policy, recordings: Sequence[Recording]) -> str | None:
+    """What the random floor needs and lacks, for a message; None where it can be measured."""
+    robot = policy.embodiment
+    if robot.readings:
+        return NEEDS["stream"]
+    if not robot.action.choice and not recordings:
+        return NEEDS["recordings"]
+    return None
+
+
+def _run_floor(
+    policy: Policy,
+    plan: ProbePlan,
+    folder: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    options: RunOptions,
+) -> None:
+    """Run the scenes with chunks that are taken at random."""
+    floor = RandomPolicy(policy, plan.lend).eval()
+    of_floor = RunFacts(
+        RANDOM, "untrained", settings.seed, facts.split, facts.max_steps, event=facts.event
+    )
+    quiet = replace(options, source=None, name=RANDOM, show_forecast=False)
+    evaluate(floor, plan.jobs, folder, of_floor, settings, quiet)
 
 
 def scenes_a_task(audit: AuditSettings, n_tasks: int) -> int:
@@ -95,57 +149,62 @@ def scenes_a_task(audit: AuditSettings, n_tasks: int) -> int:
     return math.ceil(scenes_for(audit.resolve) / max(n_tasks, 1))
 
 
-def _within_budget(
-    policy: Policy,
-    jobs: Sequence[Job],
-    folder: Path,
-    facts: RunFacts,
-    settings: RolloutSettings,
-    options: RunOptions,
-    audit: AuditSettings,
+def _affordable_scenes(
+    jobs: Sequence[Job], folder: Path, minutes: float, run_matched: Callable[[ProbePlan], None]
 ) -> list[Job]:
     """As many of the scenes as the minutes allow, the same for each task; a repeated command takes
     those of before.
     """
-    require(jobs, "There is no scene: name some with tasks=… and episodes=….")
-    if audit.minutes is None:
-        return list(jobs)
     by_task: dict[str, list[Job]] = {}
     for job in jobs:
         by_task.setdefault(job.task, []).append(job)
     path = folder / PLAN
     if path.is_file():
-        most = int(read_json(path, "an audit's plan")["scenes_a_task"])
+        n_scenes = int(read_json(path, "an audit's plan")["scenes_a_task"])
     else:
         # A few scenes of the matched run tell how long one takes; they count.
-        pilot = [job for members in by_task.values() for job in members[:PILOT]]
-        output = folder / ONLINE / slug(UNPROBED.name)
-        begun = time.monotonic()
-        noted = replace(options, notes={"arm": UNPROBED.name})
-        evaluate(policy, pilot, output, facts, settings, noted)
-        seconds = (time.monotonic() - begun) / len(pilot)
-        n_runs = len(INTERVENTIONS) + 2  # the matched run, and its repetition
-        affordable = 60 * audit.minutes / (seconds * n_runs)
-        most = max(PILOT, int(affordable / len(by_task)))
-        most = min(most, max(map(len, by_task.values())))
-        write_json(path, {"scenes_a_task": most, "seconds_a_scene": round(seconds, 3)})
-    return [job for members in by_task.values() for job in members[:most]]
+        pilot = ProbePlan(
+            arms=(), jobs=[job for of_task in by_task.values() for job in of_task[:PILOT]]
+        )
+        seconds = _seconds_a_scene(pilot, folder / ONLINE / slug(UNPROBED.name), run_matched)
+        affordable = int(60 * minutes / (seconds * N_RUNS * len(by_task)))
+        n_scenes = min(max(PILOT, affordable), max(map(len, by_task.values())))
+        write_json(path, {"scenes_a_task": n_scenes, "seconds_a_scene": round(seconds, 3)})
+    return [job for of_task in by_task.values() for job in of_task[:n_scenes]]
+
+
+def _seconds_a_scene(
+    pilot: ProbePlan, records: Path, run_matched: Callable[[ProbePlan], None]
+) -> float:
+    """Run the scenes that have no record, and measure how long one takes.
+
+    records: their folder.
+    """
+    n_recorded = 0
+    if records.is_dir():
+        n_recorded = len(ended_scenes(records, pilot))
+    begun = time.monotonic()
+    run_matched(pilot)
+    seconds = time.monotonic() - begun
+    n_measured = len(pilot.jobs) - n_recorded
+    if n_measured:
+        return seconds / n_measured
+    # An interrupted audit left all records: each has its time, which counts waiting for others.
+    ended = ended_scenes(records, pilot).values()
+    return float(np.mean([record.seconds.total for of_scene in ended for record in of_scene]))
 
 
 def _write(card: Card, conclusion: Conclusion, folder: Path, policy: Policy) -> None:
-    server = policy.conditions().get("server")
-    content = {"conclusion": asdict(conclusion), "card": asdict(card), "server": server}
+    content = {
+        "conclusion": asdict(conclusion),
+        "card": asdict(card),
+        "server": policy.info.server,
+    }
     write_json(folder / FIGURES, to_json(content))
-    short, histories = tables_of(card)
-    sections = [
-        Section("Conclusion", paragraphs=conclusion.sentences),
-        Section(histories.title, tables=[histories]),
-        Section(short.title, tables=[short]),
-        Section("How the numbers are made", paragraphs=_HOW),
-    ]
-    title = f"{MARK} {card.model}"
-    subtitle = f"checkpoint {card.checkpoint}, {card.scenes} scenes"
+    verdict, *reasons = conclusion.sentences
+    detail = ""
     if conclusion.resolution is not None:
-        subtitle += f", losses from {percent(conclusion.resolution)} on can be told"
+        detail = f"losses from {percent(conclusion.resolution)} on can be told"
+    page = card_page(card, MARK, verdict, _METHOD, reasons, detail)
     with write_atomically(folder / PAGE) as draft:
-        draft.write_text(html_page(title, sections, subtitle, card.notes), encoding="utf-8")
+        draft.write_text(page, encoding="utf-8")

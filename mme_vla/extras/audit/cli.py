@@ -8,7 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import log_to_terminal
-from mme_vla.cli.loading import PolicyChoice, load_policy
+from mme_vla.cli.loading import PolicyChoice, load_policy, release
 from mme_vla.config.devices import process_device
 from mme_vla.config.sections import read_section
 from mme_vla.data.sources import open_sources
@@ -16,7 +16,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
 from mme_vla.evaluation.rollout.evaluation import RunOptions, choose_episodes, facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.extras.audit.audit import AuditSettings, run_audit, scenes_a_task
+from mme_vla.extras.audit.audit import N_RUNS, AuditSettings, run_audit, scenes_a_task
 from mme_vla.extras.probing.card import card_text
 from mme_vla.extras.probing.recordings import all_recordings
 from mme_vla.policy.build import policy_config
@@ -49,7 +49,7 @@ def main(cfg: DictConfig) -> None:
     recordings = []
     if values["recordings"] is not None:
         recordings = all_recordings(open_sources(values["recordings"], policy.embodiment))
-    logger.info("%d scenes, twelve runs of each at most, into %s", len(jobs), folder)
+    logger.info("%d scenes, %d runs of each at most, into %s", len(jobs), N_RUNS, folder)
     options = RunOptions(source=place)
     try:
         result = run_audit(
@@ -64,7 +64,8 @@ def main(cfg: DictConfig) -> None:
             values["references"],
         )
     finally:
-        policy.close()
-    print(card_text(result.card))
-    print("\n".join(result.conclusion.sentences))
+        release(policy)
+    verdict, *reasons = result.conclusion.sentences
+    print(card_text(result.card, verdict))
+    print("\n".join(reasons))
     print(result.page)

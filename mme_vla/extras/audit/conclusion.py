@@ -4,12 +4,13 @@ from dataclasses import dataclass
 from functools import cache
 
 from mme_vla.evaluation.records import EpisodeKey
+from mme_vla.extras.audit.floor import RANDOM
 from mme_vla.extras.probing.card import CONTENT, TIME, WRONG_SCENE, Card, Loss, grade, percent
 
 FORGET = "nothing remembered"
 NO_VIDEO = "no video"
 ORDER = "order-broken"
-OWN = "own chunks lost"
+REPLAY = "own chunks lost"
 LAST = "last frames pushed out"
 GOAL = "another goal"
 STATE = "state frozen"
@@ -20,13 +21,13 @@ INTERVENTIONS = {
     ORDER: "shuffle_frames",
     TIME: "pause:64",
     LAST: "linger:16",
-    OWN: "replay",
+    REPLAY: "replay",
     WRONG_SCENE: "distract:1",
     GOAL: "goal_swap",
     STATE: "freeze_state",
 }
 """What an audit changes of what a policy is sent, and the interventions that do it."""
-OF_HISTORY = (FORGET, NO_VIDEO, CONTENT, TIME, OWN)
+OF_HISTORY = (FORGET, NO_VIDEO, CONTENT, TIME, REPLAY)
 """Changes of which each alone shows that something before the current frame is read."""
 
 VERDICTS = {
@@ -84,28 +85,31 @@ def scenes_for(loss: float) -> int:
     return scenes
 
 
-def conclude(card: Card, wanted: float) -> Conclusion:
+def conclude(card: Card, target_loss: float) -> Conclusion:
     """The conclusion of a card whose interventions are `INTERVENTIONS`.
 
-    wanted: the loss that was to be resolved.
+    target_loss: the loss that was to be resolved.
     """
     verdict = _verdict(card)
     finest = max(resolution(card.scenes), card.noise)
     sentences = [VERDICTS[verdict]]
-    for label in (FORGET, NO_VIDEO, CONTENT, TIME, OWN, LAST, GOAL):
+    for label in (FORGET, NO_VIDEO, CONTENT, TIME, REPLAY, LAST, GOAL):
         if label in card.arms and card.arms[label].beyond_noise:
             sentences.append(f"With {label} it solves {_change(card, card.arms[label])}.")
     if verdict == "content" and _loses(card, TIME):
         sentences.append("It finds what it needs by time: shifted frames mislead it too.")
+    if card.references and RANDOM in card.references:
+        solved = percent(card.references[RANDOM])
+        sentences.append(f"It solves {percent(card.matched)}, and actions at random {solved}.")
     unresolved = [label for label, loss in card.arms.items() if not loss.beyond_noise]
     if unresolved:
         limit = f"one below {percent(finest)} cannot be told here"
         if finest > 1:
             limit = "none can be told here"
         sentences.append(f"No loss beyond noise with {', '.join(unresolved)}: {limit}.")
-    if finest > wanted:
+    if finest > target_loss:
         sentences.append(
-            f"resolve={wanted:g} was not reached with {card.scenes} scenes and a noise of"
+            f"resolve={target_loss:g} was not reached with {card.scenes} scenes and a noise of"
             f" {percent(card.noise)}: give more scenes (episodes=…, minutes=…)."
         )
     return Conclusion(verdict, tuple(sentences), finest if finest <= 1 else None)
@@ -122,7 +126,7 @@ def _verdict(card: Card) -> str:
         return "last frames" if is_short else "content"
     if _loses(card, TIME):
         return "clock"
-    if _loses(card, OWN):
+    if _loses(card, REPLAY):
         return "own chunks"
     return "history"
 

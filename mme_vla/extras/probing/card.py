@@ -53,13 +53,15 @@ of 0.
 AGAIN, PAGE, FIGURES = "again", "card.html", "card.json"
 MARK = "Report card of"  # stands in the heading of each page
 _SAMPLES = 10_000  # of the bootstrap
-_HOW = (
-    (
-        "Every arm runs the scenes of the matched run with its noise. A loss is the matched success"
-        " minus the arm's, with a 95 % interval (paired bootstrap over scenes). It is beyond noise"
-        " if the interval lies above 0 and the loss exceeds the share of scenes that end otherwise"
-        " when the matched run is repeated with other noise."
-    ),
+LOSS = (
+    "A loss is the matched success minus the arm's, with a 95 % interval (paired bootstrap over"
+    " scenes, exact where all of them agree). It is beyond noise if the interval lies above 0 and"
+    " the loss exceeds the share of scenes that end otherwise when the matched run is repeated with"
+    " other noise."
+)
+"""What a loss is, for pages."""
+_METHOD = (
+    f"Every arm runs the scenes of the matched run with its noise. {LOSS}",
     (
         "The memory-or-clock score is the loss under time shift / (that loss + the loss under"
         " content swap): 1 where a policy reads only time, 0 where it reads only content. It is"
@@ -144,6 +146,10 @@ class Card:
     references: dict[str, float] | None = None
     notes: Sequence[str] = ()
 
+    def intervention(self, label: str) -> str:
+        """The intervention of an arm, by default that of `ARMS`."""
+        return {**ARMS, **self.interventions}.get(label, "")
+
 
 Outcomes = Mapping[EpisodeKey, float]
 """Success of each scene."""
@@ -191,9 +197,8 @@ def measure_card(
     arms = {label: read_arm(word) for label, word in interventions.items()}
     possible, notes = [], []
     for label, arm in arms.items():
-        n_goals = len({recording.goal for recording in plan.lend})
         why = lacking(
-            arm, policy, channel, len(plan.lend), boundaries=in_simulation, n_goals=n_goals
+            arm, policy, channel, len(plan.lend), boundaries=in_simulation, n_goals=plan.n_goals
         )
         if why is None:
             possible.append(label)
@@ -223,34 +228,35 @@ def measure_card(
         notes.append(writing)
 
     # The scenes that are the same in every run.
-    unprobed = _scenes(folder / ONLINE / slug(UNPROBED.name), plan)
-    equal = _scenes(folder / AGAIN, plan)
-    probed = {label: _scenes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
+    unprobed = ended_scenes(folder / ONLINE / slug(UNPROBED.name), plan)
+    equal = ended_scenes(folder / AGAIN, plan)
+    probed = {
+        label: ended_scenes(folder / ONLINE / slug(arms[label].name), plan) for label in possible
+    }
     same = pair([unprobed, equal, *probed.values()])
     notes += same.gaps("The arms")
     require(same.keys or not same.left_out, " ".join(same.gaps("The arms")))
-    shown = {}
+    success_of_references = {}
     for name, records in others.items():
         beside = pair([unprobed, records])
         notes += beside.notes(f"references.{name}")
         if beside.keys:
-            shown[name] = _mean(_success(records, beside.keys))
+            success_of_references[name] = _mean(_success(records, beside.keys))
     matched, repeated = (_success(side, same.keys) for side in (unprobed, equal))
     outcomes = {label: _success(side, same.keys) for label, side in probed.items()}
     suite_of = environment(settings.env).suite_of
     suites = {job.task: suite for job in plan.jobs if (suite := suite_of(job.task))}
-    card = replace(
+    return replace(
         grade(matched, outcomes, repeated),
         model=facts.model,
         checkpoint=facts.checkpoint,
         interventions={label: interventions[label] for label in possible},
         suites=clock_scores(matched, outcomes, repeated, suites),
         recovery=recovered,
-        references=shown,
+        references=success_of_references,
         notes=notes,
         writing=writing if isinstance(writing, dict) else None,
     )
-    return card
 
 
 def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> Card:
@@ -381,8 +387,8 @@ def _success(records: Scenes, keys: Iterable[EpisodeKey]) -> dict[EpisodeKey, fl
     return outcomes_of(record for key in keys for record in records[key])
 
 
-def _scenes(folder: Path, plan: ProbePlan) -> Scenes:
-    """Records of the card's scenes in a folder; those that ended in an error are left out."""
+def ended_scenes(folder: Path, plan: ProbePlan) -> Scenes:
+    """Records of the plan's scenes in a folder; those that ended in an error are left out."""
     scenes = {(job.task, job.split, job.episode) for job in plan.jobs}
     records = read_folders(path for path in find_records([folder]) if path.parent == folder)
     by_scene: Scenes = {}
@@ -394,7 +400,7 @@ def _scenes(folder: Path, plan: ProbePlan) -> Scenes:
 
 def _reference(name: str, place: str, plan: ProbePlan) -> Scenes:
     """Records of another run on the scenes of the card."""
-    records = _scenes(Path(place).expanduser(), plan)
+    records = ended_scenes(Path(place).expanduser(), plan)
     require(
         records,
         f"references.{name}={place} holds no record of the card's scenes: evaluate it on the same"
@@ -464,11 +470,10 @@ def tables_of(card: Card) -> list[Table]:
     if card.writing is not None:
         mean = card.writing["mean"]
         rows.append(["score of writing", f"{mean['score']:.2f} (chance {mean['chance']:.2f})"])
-    words = {**ARMS, **card.interventions}
     arms = [["matched", "", percent(card.matched), "", "", "", ""]]
     for label, loss in card.arms.items():
         arms.append([
-            label, words.get(label, ""), percent(loss.success), percent(loss.loss),
+            label, card.intervention(label), percent(loss.success), percent(loss.loss),
             f"[{100 * loss.low:.0f}, {100 * loss.high:.0f}]", f"{loss.lost} : {loss.gained}",
             "yes" if loss.beyond_noise else "no",
         ])  # fmt: skip
@@ -515,29 +520,53 @@ def conclude_card(card: Card) -> str:
 def write_card(card: Card, folder: Path) -> None:
     """Write the page and the JSON."""
     write_json(folder / FIGURES, to_json(asdict(card)))
-    meanings = meanings_of(ARMS.values())
-    short, histories = tables_of(card)
-    terms = [(label, meanings[ARMS[label]]) for label in card.arms]
-    sections = [
-        Section(short.title, tables=[short]),
-        Section(histories.title, tables=[histories], terms=[("matched", UNPROBED.meaning), *terms]),
-        Section("How the numbers are made", paragraphs=_HOW),
-    ]
-    page = html_page(
-        f"{MARK} {display_name(card.model, card.checkpoint)}",
-        sections,
-        f"checkpoint {card.checkpoint} · {counted(card.scenes, 'scene')} in closed loop",
-        lead=conclude_card(card),
-        footnotes=card.notes,
-    )
+    page = card_page(card, MARK, conclude_card(card), _METHOD)
     with write_atomically(folder / PAGE) as draft:
         draft.write_text(page, encoding="utf-8")
 
 
-def card_text(card: Card) -> str:
-    """The card in Markdown."""
-    lead = f"**{escape_markdown(conclude_card(card))}**\n"
-    return "\n".join([lead, *map(to_markdown, tables_of(card)), *card.notes])
+def card_page(
+    card: Card,
+    mark: str,
+    lead: str,
+    method: Sequence[str],
+    reasons: Sequence[str] = (),
+    detail: str = "",
+) -> str:
+    """The card as an HTML page.
+
+    Args:
+        mark: what its heading begins with. lead: the conclusion. method: how the numbers are made.
+            reasons: what the conclusion follows from. detail: end of the subtitle.
+    """
+    meanings = meanings_of(map(card.intervention, card.arms))
+    terms = [("matched", UNPROBED.meaning)]
+    terms += [(label, meanings.get(card.intervention(label), "")) for label in card.arms]
+    short, histories = tables_of(card)
+    sections = []
+    if reasons:
+        sections.append(Section("What the conclusion follows from", paragraphs=reasons))
+    sections += [
+        Section(short.title, tables=[short]),
+        Section(histories.title, tables=[histories], terms=terms),
+        Section("How the numbers are made", paragraphs=method),
+    ]
+    sizes = [f"checkpoint {card.checkpoint}", f"{counted(card.scenes, 'scene')} in closed loop"]
+    if detail:
+        sizes.append(detail)
+    return html_page(
+        f"{mark} {display_name(card.model, card.checkpoint)}",
+        sections,
+        " · ".join(sizes),
+        lead=lead,
+        footnotes=card.notes,
+    )
+
+
+def card_text(card: Card, lead: str = "") -> str:
+    """The card in Markdown. lead: the conclusion, by default that of `conclude_card`."""
+    bold = f"**{escape_markdown(lead or conclude_card(card))}**\n"
+    return "\n".join([bold, *map(to_markdown, tables_of(card)), *card.notes])
 
 
 def _score(score: ClockScore) -> str:

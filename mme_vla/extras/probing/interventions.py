@@ -26,7 +26,7 @@ NEEDS = {
     "pauses": "a memory that sees frames at which nothing is decided",
     "subgoal": "a policy that reads subgoals",
     "recordings": "recorded episodes to take from: name them with recordings=…",
-    "stream": "a robot with one action a frame, and without depth",
+    "stream": "a robot without depth",
     "goals": "recorded episodes with several goals",
     "boundaries": (
         "sub-tasks whose beginnings are told: by recordings with subgoals, in closed loop by"

@@ -121,9 +121,15 @@ class ProbedEpisode(Episode):
         actions: np.ndarray | None,
     ) -> None:
         """Keep frames until the policy decides."""
-        executed = np.zeros((len(states), self._robot.action.width), np.float32)
-        if actions is not None:
+        width = self._robot.action.width
+        executed = np.zeros((len(states), width), np.float32)
+        led = np.zeros(len(demo), bool)
+        motions: np.ndarray = np.zeros((0, width), np.float32)
+        if actions is not None and self._robot.action.frames is None:
+            motions = np.asarray(actions, np.float32)
+        elif actions is not None:
             executed[~demo] = actions
+            led = ~demo
         if self._start is None and not demo.all():
             self._start = np.asarray(states[int(demo.sum())], np.float32)
         new = Shown(
@@ -132,7 +138,9 @@ class ProbedEpisode(Episode):
             demo=demo,
             numbers=numbers,
             actions=executed,
-            led=~demo if actions is not None else np.zeros(len(demo), bool),
+            led=led,
+            motions=motions,
+            ends=np.full(len(motions), numbers.max(initial=0)),
             before={},
             start=self._start,
         )
@@ -322,6 +330,7 @@ class ProbedPolicy(Policy):
             max_actions=inner.info.max_actions,
             max_running=inner.info.max_running,
             identity=inner.info.identity,
+            server=inner.info.server,
             history_dtype=inner.info.history_dtype,
         )
         if arm.parts:
@@ -329,9 +338,6 @@ class ProbedPolicy(Policy):
 
     def start_episode(self, goal: str, seed: int = 0) -> ProbedEpisode:
         return ProbedEpisode(self, goal, seed)
-
-    def conditions(self) -> dict[str, Any]:
-        return self.inner.conditions()
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
         return self.inner.sampling_noise(generator)

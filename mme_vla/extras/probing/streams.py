@@ -22,9 +22,11 @@ class Shown:
 
     views: by camera, [t, H, W, 3] uint8. states: [t, s]. demo: whether a frame is of the
     conditioning video, bool [t]. numbers: which frame of the episode it is, int64 [t]. actions: [t,
-    w], each the one that led to its frame. led: bool [t], False where none did. before: by camera
-    the images right before these, as many as the arm's `lag`, fewer at the beginning. start: the
-    state [s] at the first execution frame, once it was observed.
+    w], each the one that led to its frame. led: bool [t], False where none did. motions: [n, w],
+    actions that are motions of any length, in place of these. ends: int64 [n], the number of the
+    last frame that came with each. before: by camera the images right before these, as many as the
+    arm's `lag`, fewer at the beginning. start: the state [s] at the first execution frame, once it
+    was observed.
     """
 
     views: Mapping[str, np.ndarray]
@@ -33,6 +35,8 @@ class Shown:
     numbers: np.ndarray
     actions: np.ndarray
     led: np.ndarray
+    motions: np.ndarray
+    ends: np.ndarray
     before: Mapping[str, np.ndarray]
     start: np.ndarray | None = None
 
@@ -40,7 +44,10 @@ class Shown:
         return len(self.states)
 
     def take(self, order: np.ndarray) -> "Shown":
-        """These frames in another order: repeated, left out, exchanged."""
+        """These frames in another order: repeated, left out, exchanged. A motion stays with the
+        frame at its end.
+        """
+        has_end = np.isin(self.ends, self.numbers[order])
         return replace(
             self,
             views={name: view[order] for name, view in self.views.items()},
@@ -49,6 +56,8 @@ class Shown:
             numbers=self.numbers[order],
             actions=self.actions[order],
             led=self.led[order],
+            motions=self.motions[has_end],
+            ends=self.ends[has_end],
         )
 
     def join(self, after: "Shown") -> "Shown":
@@ -63,6 +72,8 @@ class Shown:
             numbers=np.concatenate([self.numbers, after.numbers]),
             actions=np.concatenate([self.actions, after.actions]),
             led=np.concatenate([self.led, after.led]),
+            motions=np.concatenate([self.motions, after.motions]),
+            ends=np.concatenate([self.ends, after.ends]),
             start=after.start,
         )
 
@@ -77,6 +88,8 @@ class Shown:
             actions = None
             if has_actions:
                 actions = self.actions[part]
+            elif len(self.motions):
+                actions = self.motions
             views = {name: view[part] for name, view in self.views.items()}
             episode.observe(views, states, self.demo[part], actions)
 

@@ -319,7 +319,7 @@ def test_a_card_without_another_scene_to_show_has_no_recovery(
     ended = {
         EpisodeKey(record.task, record.episode): [record] for record in records("test", [1, 1])
     }
-    monkeypatch.setattr(card_module, "_scenes", lambda *_: ended)
+    monkeypatch.setattr(card_module, "ended_scenes", lambda *_: ended)
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
     options = RunOptions(base=make_choice_env)
     card = run_card(reader(TIME), plan, tmp_path, FACTS, RolloutSettings(), options)

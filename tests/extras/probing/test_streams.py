@@ -15,10 +15,13 @@ from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.rollout.evaluation import RunOptions, facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.extras.probing.arms import read_arm
 from mme_vla.extras.probing.offline import OfflineSettings
+from mme_vla.extras.probing.probed import ProbedPolicy
 from mme_vla.extras.probing.recordings import all_recordings
 from mme_vla.extras.probing.run import ProbePlan, run_probe
 from mme_vla.policy.base import Policy
+from mme_vla.policy.episode import Episode
 from mme_vla.serving.remote.policy import RemotePolicy
 from mme_vla.serving.remote.settings import ConnectionSettings, ServerChoice
 
@@ -134,6 +137,42 @@ def test_a_policy_that_is_loaded_here_takes_the_same_arms(
     digests = {name: text.split('"actions_sha256":"')[1][:16] for name, text in records.items()}
     # All frames are shown again: a memory of frames acts alike. Anything else changes it.
     assert (digests[arm] == digests["unprobed"]) == (arm == "replay")
+
+
+@pytest.mark.parametrize(
+    ("arm", "expected"),
+    [
+        ("replay", [(5, None), (8, [1.0]), (10, [1.0, 2.0])]),
+        ("forget", [(1, None), (1, [1.0]), (1, [2.0])]),
+        ("linger:2", [(7, None), (5, [1.0]), (4, [2.0])]),
+    ],
+)
+def test_motions_of_any_length_come_with_the_frames_at_their_end(
+    arm: str, expected: list[tuple[int, list[float] | None]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = quick_policy("framesamp_modul", 8, embodiment="robomme_choice_front").eval()
+    observed = []
+
+    def note(
+        episode: Episode, frames: Any, states: np.ndarray, demo: Any, actions: Any = None
+    ) -> None:
+        first_numbers = None
+        if actions is not None:
+            first_numbers = actions[:, 0].tolist()
+        observed.append((len(states), first_numbers))
+
+    monkeypatch.setattr(Episode, "observe", note)
+    episode = ProbedPolicy(policy, read_arm(arm)).start_episode("pick up the cube")
+    for number, count in enumerate((5, 3, 2)):
+        demo = np.zeros(count, bool)
+        actions = np.full((1, 10), float(number))
+        if number == 0:
+            demo[:4] = True
+            actions = None
+        images = {"front": np.zeros((count, 64, 64, 3), np.uint8)}
+        episode.observe(images, np.zeros((count, 8), np.float32), demo, actions)
+        episode.show_collected()
+    assert observed == expected
 
 
 def test_what_acts_in_episodes_is_not_probed_at_recorded_steps(stubs: Any, tmp_path: Path) -> None:
