@@ -13,7 +13,7 @@ from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, comparison_table, show, span
 from mme_vla.extras.nano.board import Board, Row, Separation, published_success
 from mme_vla.extras.nano.rows import CHOICES
-from mme_vla.utils.style import COLOURS, FAINT, INK, LINE, figure, legend, svg
+from mme_vla.utils.style import COLOURS, FAINT, INK, LINE, figure, legend, log_scale, svg
 
 PAINT = {"policy": COLOURS[0], "floor": FAINT, "ceiling": COLOURS[2]}
 LOCAL = COLOURS[1]
@@ -294,7 +294,7 @@ def budget_figure(board: Board) -> str:
                 color=COLOURS[number % len(COLOURS)],
                 label=model,
             )
-        axes.set_xscale("log", base=2)
+        log_scale(axes.xaxis, {row.facts.budget or 0 for rows in several.values() for row in rows})
         axes.set_xlabel("memory tokens")
         axes.set_ylabel("success (%)")
         axes.set_ylim(bottom=0)
