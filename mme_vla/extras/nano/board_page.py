@@ -262,6 +262,7 @@ def success_figure(board: Board) -> str:
             of_trainings = row.mean(board.protocol.tasks)
             axes.plot(of_trainings, np.full(len(of_trainings), at), "|", color=INK, ms=7)
         axes.set_yticks(range(len(rows)), [row.name for row in rows])
+        axes.set_ylim(-0.6, len(rows) - 0.4)
         axes.set_xlim(0, 100)
         axes.set_xlabel("success over all tasks (%); strokes: trainings")
         axes.grid(True, axis="x", color=LINE)
