@@ -472,23 +472,24 @@ def test_no_redirect_is_followed() -> None:
 
 @pytest.mark.slow
 def test_a_server_that_reads_nothing_is_waited_for_no_longer_than_the_time_out() -> None:
-    def idle(peer: Any) -> None:
-        peer.send(pack({}))
-        over.wait(20)
-
     over = threading.Event()
-    with websocket_serve(idle, "127.0.0.1", 0, max_queue=1) as server:
+    late: list[bool] = []
+
+    def read_nothing(peer: Any) -> None:
+        peer.send(pack({}))
+        late.append(not over.wait(20))
+
+    with websocket_serve(read_nothing, "127.0.0.1", 0, max_queue=1, max_size=None) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
         client = Client(f"ws://127.0.0.1:{server.socket.getsockname()[1]}", timeout=1)
-        frames = np.zeros((1, 2**24), np.uint8)
-        try:
-            with pytest.raises((ConnectionError, TimeoutError)):
-                for _ in range(8):
-                    client.request({"images": frames})
-        finally:
-            over.set()
-            server.shutdown()
+        for _ in range(64):  # after so many that wait, the server reads no more of the stream
+            client._socket.send(b"x")
+        with pytest.raises(ConnectionError, match="closed the connection"):
+            client.request({"images": np.zeros((4, 2**24), np.uint8)})
+        assert not late, "the server ended it"
+        over.set()
+        server.shutdown()
         thread.join(10)
 
 

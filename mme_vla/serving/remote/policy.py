@@ -374,7 +374,8 @@ class RemotePolicy(Policy):
         try:
             reply = self._act(episode, frames)
         except ConnectionError:
-            if not self.protocol.stateless:
+            # Without a connection the episode was closed, by an interrupt.
+            if not self.protocol.stateless or episode.connection is None:
                 raise
             # A server without a memory can be asked the same once more.
             self._begin(episode, frames)
