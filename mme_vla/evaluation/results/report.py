@@ -34,7 +34,8 @@ class Section:
 
     figure: SVG from `plots.svg`. headed: whether tables stand under their titles. folded: tables
     behind a summary. images: name and WEBP in base64. terms: words that its tables and figure use,
-    and what each means. half: whether it takes half the width, beside another.
+    and what each means. links: texts and addresses below the figures. half: whether it takes half
+    the width, beside another.
     """
 
     title: str
@@ -46,6 +47,7 @@ class Section:
     folded: Sequence[tuple[str, Table]] = ()
     images: Sequence[tuple[str, str]] = ()
     terms: Sequence[tuple[str, str]] = ()
+    links: Sequence[tuple[str, str]] = ()
     half: bool = False
 
 

@@ -33,7 +33,8 @@ from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.evidence import record_evidence
 from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.lines import MomentLine
-from mme_vla.extras.probing.run import OFFLINE, ONLINE, ProbePlan, run_probe
+from mme_vla.extras.probing.report import ONLINE
+from mme_vla.extras.probing.run import OFFLINE, ProbePlan, run_probe
 from mme_vla.extras.probing.writing import required_frames, score_writing
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy

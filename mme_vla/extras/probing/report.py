@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 import numpy as np
 
@@ -349,6 +350,8 @@ def _plot_dial(
 
 
 PAGE, TABLE, IMAGES = "page.html", "table.md", "remembered"
+ONLINE = "online"
+"""Folder of the closed loop."""
 VIDEO, EXECUTION, NOW = rgb("video"), rgb("series-1"), rgb("border")
 UNITS = (
     "Change: distance of two chunks of actions that start from the same noise, in normalised"
@@ -463,10 +466,11 @@ def write_page(
         episodes = max(comparison.episodes for comparison in comparisons)
         sizes.append(f"{counted(episodes, 'scene')} in closed loop")
         table = loop_table(comparisons, meanings)
-        section = Section("In closed loop", tables=[table], terms=LOOP_COLUMNS)
+        videos = _videos(folder)
+        section = Section("In closed loop", tables=[table], terms=LOOP_COLUMNS, links=videos)
         if not any(comparison.wins or comparison.losses for comparison in comparisons):
             folded = [(f"{counted(len(table.rows), 'arm')}, all with equal outcomes", table)]
-            section = Section("In closed loop", folded=folded, terms=LOOP_COLUMNS)
+            section = Section("In closed loop", folded=folded, terms=LOOP_COLUMNS, links=videos)
         else:
             tables.append(loop_table(comparisons, None))
         sections.append(section)
@@ -491,6 +495,15 @@ def write_page(
         with write_atomically(folder / file) as draft:
             draft.write_text(content, encoding="utf-8")
     return folder / PAGE
+
+
+def _videos(folder: Path) -> list[tuple[str, str]]:
+    """Each video of the closed loop: its arm and name, and its address from the page."""
+    videos = []
+    for path in sorted((folder / ONLINE).rglob("*.mp4")):
+        place = path.relative_to(folder)
+        videos.append((f"{place.parts[1]}: {path.stem}", quote(place.as_posix())))
+    return videos
 
 
 def _terms_of(tables: Sequence[Table], meanings: Mapping[str, str]) -> list[tuple[str, str]]:

@@ -41,12 +41,19 @@ from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.offline import OfflineSettings, probe_offline
 from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.extras.probing.recordings import Recording, all_recordings
-from mme_vla.extras.probing.report import Notes, check_outputs, write_images, write_page
+from mme_vla.extras.probing.report import (
+    ONLINE,
+    Notes,
+    check_outputs,
+    write_images,
+    write_page,
+)
 from mme_vla.extras.probing.settings import IN_CLOSED_LOOP, NO_DATA
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
 
-OFFLINE, ONLINE = "offline", "online"  # Folders of the lines and of the closed loop
+OFFLINE = "offline"
+"""Folder of the lines."""
 
 
 @dataclass(frozen=True)

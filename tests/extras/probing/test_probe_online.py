@@ -106,6 +106,20 @@ def test_each_arm_has_a_heading_and_its_name_in_every_line(
     assert [line.partition(": ")[0] for line in episodes] == names
 
 
+def test_the_page_links_the_videos_of_the_closed_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_inline_envs(monkeypatch)
+    videos = tmp_path / "online" / "shuffle" / "videos"
+    videos.mkdir(parents=True)
+    (videos / "success & more.mp4").touch()
+    page = probe_both(tmp_path).page.read_text()
+    assert (
+        '<a href="online/shuffle/videos/success%20%26%20more.mp4">shuffle: success &amp; more</a>'
+        in page
+    )
+
+
 def test_a_policy_that_ignores_its_memory_gets_one_sentence(tmp_path: Path) -> None:
     recordings = made_up()
     plan = ProbePlan(None, recordings, recordings, (), OfflineSettings(1, 2, 2, True, 2))
