@@ -131,10 +131,10 @@ def _connect(choice: PolicyChoice, server: ServerChoice, logger: logging.Logger)
     policy = RemotePolicy(server, robot, choice.config.get("execute"))
     assert policy.info.identity is not None
     name = policy.info.identity.model
-    spoken = policy.protocol.name
+    protocol = policy.protocol.name
     if policy.detected is not None:
-        spoken += f" ({policy.detected})"
-    logger.info("%s at %s, which speaks %s", name, server.server, spoken)
+        protocol += f" ({policy.detected})"
+    logger.info("%s at %s, protocol %s", name, server.server, protocol)
     if policy.info.max_running is not None:
         logger.info("episodes at the same time: at most %d", policy.info.max_running)
     return LoadedPolicy(policy, name, None)

@@ -209,11 +209,11 @@ def test_a_run_whose_server_dies_is_continued_and_nothing_is_counted_twice(
 
     stub = stubs.Stub()
 
-    def dies_in_the_second_episode(seen: Any) -> np.ndarray:
+    def dies_in_the_second_episode(stream: Any) -> np.ndarray:
         if len(stub.requests) == 7:
             server.shutdown()
             raise stubs.FaultError
-        return stubs.hold_still(seen)
+        return stubs.hold_still(stream)
 
     stub.policy = dies_in_the_second_episode
     server = stubs.make_server("challenge", stub)
@@ -349,8 +349,8 @@ def test_what_cannot_be_served_is_refused_before_the_first_episode(
 
 
 def test_the_challenge_executes_whole_chunks(stubs: Any, inline: None, tmp_path: Path) -> None:
-    def long(seen: Any) -> np.ndarray:
-        return np.repeat(seen.states[-1][None], 20, axis=0)
+    def long(stream: Any) -> np.ndarray:
+        return np.repeat(stream.states[-1][None], 20, axis=0)
 
     with stubs.serving("challenge", stubs.Stub(policy=long)) as url:
         policy = connect(url, "challenge")

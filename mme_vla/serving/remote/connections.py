@@ -15,7 +15,7 @@ from mme_vla.serving.client import Client, decoded_map, open_socket
 from mme_vla.serving.codec import MOST_TEXT, check_size, msgpack, pack, read_array
 
 PAUSE_S = 0.5  # between two attempts to open a connection
-STARTUP_S = 2.0  # in which a server that speaks first sends its metadata
+STARTUP_S = 2.0  # in which a server that begins by itself sends its metadata
 
 
 class Connection(Protocol):
@@ -109,7 +109,7 @@ class HttpConnection:
 
 
 class HarnessConnection:
-    """The protocol of vla-evaluation-harness 0.8: typed messages with a number, the client speaks
+    """The protocol of vla-evaluation-harness 0.8: typed messages with a number, the client
     first.
 
     Args:

@@ -205,7 +205,7 @@ class RemotePolicy(Policy):
             execute: actions of a chunk that the rollout executes; None for the robot's number.
 
         Raises:
-            UserError: there is no server, it speaks no known protocol, or it cannot serve this
+            UserError: there is no server, it has no known protocol, or it cannot serve this
                 robot.
         """
         super().__init__()
@@ -222,7 +222,7 @@ class RemotePolicy(Policy):
             first = open_patiently(self.protocol.open, choice.connection.open_s)
         except TimeoutError as error:
             raise UserError(
-                f"{error} It speaks another protocol than {name}, or is still loading: set"
+                f"{error} It has another protocol than {name}, or is still loading: set"
                 " protocol=… or connection.open_s=…"
             ) from None
         self.metadata = first.metadata
@@ -308,11 +308,11 @@ class RemotePolicy(Policy):
         return rows
 
     def conditions(self) -> dict[str, Any]:
-        """The server, for a receipt: its address, what it speaks, and what it says of itself."""
+        """The server, for a receipt: its address, its protocol, and what it says of itself."""
         server = {
             "address": self.protocol.choice.server,
             "protocol": self.protocol.name,
-            "metadata": plain(self.metadata),
+            "metadata": json_value(self.metadata),
         }
         if self.traffic.seconds:
             server["times"] = self.traffic.summary()
@@ -466,7 +466,7 @@ def _identity(choice: ServerChoice, protocol: str, metadata: Mapping[str, Any]) 
     return PolicyIdentity(connection.name or protocol, connection.checkpoint or "served")
 
 
-def plain(value: Any, depth: int = 4) -> Any:
+def json_value(value: Any, depth: int = 4) -> Any:
     """A server's metadata as JSON has it: texts, numbers, lists and maps; of others their text."""
     if value is None or isinstance(value, bool | int | str):
         return value
@@ -474,8 +474,9 @@ def plain(value: Any, depth: int = 4) -> Any:
         return value if np.isfinite(value) else str(value)
     if depth and isinstance(value, Mapping):
         return {
-            brief(str(key), 80, quote=False): plain(one, depth - 1) for key, one in value.items()
+            brief(str(key), 80, quote=False): json_value(one, depth - 1)
+            for key, one in value.items()
         }
     if depth and isinstance(value, list | tuple):
-        return [plain(one, depth - 1) for one in value[:64]]
+        return [json_value(one, depth - 1) for one in value[:64]]
     return brief(value, 200)

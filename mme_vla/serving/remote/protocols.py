@@ -29,7 +29,7 @@ from mme_vla.serving.remote.connections import (
 from mme_vla.serving.remote.settings import ServerChoice
 from mme_vla.serving.requests import IMAGE_KEYS
 
-OWN = "mme_vla"  # what this library's server calls itself
+SERVER_NAME = "mme_vla"  # what this library's server calls itself
 
 
 @dataclass
@@ -76,7 +76,7 @@ class ServerProtocol:
             self.subgoal = f"{choice.connection.subgoal}_subgoal"
         require(
             not choice.connection.keys or self.name == "openpi",
-            f"connection.keys are for protocol=openpi; this server speaks {self.name}.",
+            f"connection.keys are for protocol=openpi; this server's protocol is {self.name}.",
         )
         self.check()
 
@@ -123,15 +123,15 @@ class ServerProtocol:
             message[keys.get(name, key)] = np.ascontiguousarray(frames.views[name][-1])
         message[keys.get("state", "observation/state")] = frames.states[-1]
         message[keys.get("prompt", "prompt")] = frames.goal
-        return message | self._said(frames)
+        return message | self._subgoal_field(frames)
 
-    def _said(self, frames: NewFrames) -> dict[str, Any]:
+    def _subgoal_field(self, frames: NewFrames) -> dict[str, Any]:
         if self.subgoal is None or frames.subgoal is None:
             return {}
         return {self.subgoal: frames.subgoal}
 
 
-class OwnProtocol(ServerProtocol):
+class LibraryProtocol(ServerProtocol):
     """This library's server, with its extensions of the challenge's lists: any robot, a seed, the
     executed actions.
     """
@@ -143,7 +143,7 @@ class OwnProtocol(ServerProtocol):
 
     def describe(self, metadata: Mapping[str, Any]) -> None:
         require(
-            metadata.get("server") == OWN,
+            metadata.get("server") == SERVER_NAME,
             f"protocol=mme_vla: {self.choice.server} is no server of this library; set"
             " protocol=auto.",
         )
@@ -153,8 +153,8 @@ class OwnProtocol(ServerProtocol):
             " describes no robot: update it, or set protocol=challenge.",
         )
         robot = Embodiment.from_dict(metadata["robot"])
-        robot = robot.with_horizon(_whole(metadata, "horizon"))
-        action = replace(robot.action, execute=_whole(metadata, "execute"))
+        robot = robot.with_horizon(_count(metadata, "horizon"))
+        action = replace(robot.action, execute=_count(metadata, "execute"))
         self.robot = replace(robot, action=action)
         kind = metadata.get("subgoal")
         self.subgoal = self.subgoal if kind is None else str(kind)
@@ -168,7 +168,7 @@ class OwnProtocol(ServerProtocol):
             "is_first_step": frames.first,
             "state_list": frames.states,
             **_lists(self.robot, frames),
-            **self._said(frames),
+            **self._subgoal_field(frames),
         }
         if frames.first:
             message["exec_start_idx"] = frames.n_video
@@ -207,7 +207,7 @@ class ChallengeProtocol(ServerProtocol):
             **_lists(self.robot, frames),
             "joint_state_list": list(frames.states[:, :ARM_JOINTS]),
             "gripper_state_list": list(grippers),
-            **self._said(frames),
+            **self._subgoal_field(frames),
         })  # fmt: skip
 
 
@@ -234,7 +234,7 @@ class RobommeProtocol(ServerProtocol):
 
 
 class OpenpiProtocol(ServerProtocol):
-    """openpi's policy server, and those that speak as it does: the current frame alone."""
+    """openpi's policy server, and those with the same messages: the current frame alone."""
 
     name = "openpi"
     stateless = True
@@ -301,23 +301,29 @@ class HarnessProtocol(ServerProtocol):
 
 PROTOCOLS: Mapping[str, type[ServerProtocol]] = {
     kind.name: kind
-    for kind in (OwnProtocol, RobommeProtocol, OpenpiProtocol, ChallengeProtocol, HarnessProtocol)
+    for kind in (
+        LibraryProtocol,
+        RobommeProtocol,
+        OpenpiProtocol,
+        ChallengeProtocol,
+        HarnessProtocol,
+    )
 }
 
 
 @dataclass(frozen=True)
 class Detection:
-    """What a server turned out to speak, and how that was told."""
+    """The protocol of a server, and how it was recognised."""
 
     protocol: str
     reason: str
 
 
 def detect(choice: ServerChoice) -> Detection:
-    """Ask a server what it speaks.
+    """Find the protocol of a server.
 
     Raises:
-        UserError: no server, or one that speaks none of the protocols.
+        UserError: no server, or one with none of the protocols.
     """
     connection = choice.connection
     if choice.is_http:
@@ -335,7 +341,7 @@ def detect(choice: ServerChoice) -> Detection:
         harness.close()
         return Detection("harness", "it waits for a greeting and returns one")
     try:
-        if client.metadata.get("server") == OWN:
+        if client.metadata.get("server") == SERVER_NAME:
             return Detection("mme_vla", "its metadata say so")
         try:
             reply = client.request({"reset": True})
@@ -371,7 +377,7 @@ def _check_benchmark(protocol: ServerProtocol) -> None:
     )
 
 
-def _whole(metadata: Mapping[str, Any], key: str) -> int:
+def _count(metadata: Mapping[str, Any], key: str) -> int:
     value = metadata.get(key)
     require(
         isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 4096,

@@ -26,7 +26,7 @@ class ConnectionSettings:
 
 @dataclass(frozen=True)
 class ServerChoice:
-    """A policy server. server: its address. protocol: what it speaks."""
+    """A policy server. server: its address. protocol: of its messages."""
 
     server: str
     protocol: Literal["auto", "mme_vla", "robomme", "openpi", "challenge", "harness"] = "auto"
