@@ -1,5 +1,7 @@
 """`Client`: talk to a policy server from Python, in either schema."""
 
+import socket
+import struct
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from typing import Any, Self
@@ -17,8 +19,11 @@ try:
         InvalidURI,
     )
     from websockets.sync.client import connect
+    from websockets.uri import parse_uri
 except ImportError as error:
     raise missing_extra("The client", "serve") from error
+
+LARGEST_REPLY = 2**26  # bytes; a chunk has some thousand
 
 
 class FullError(UserError, ConnectionError):
@@ -152,7 +157,8 @@ class Client:
                 f"No answer from {self.url} within {timeout:g} s; call reconnect()."
             ) from None
         if isinstance(response, str):
-            raise UserError(f"The server refuses this request: {response}")
+            reason = brief(response, 2000, quote=False)
+            raise UserError(f"The server refuses this request: {reason}")
         try:
             return decoded_map(response)
         except UserError:
@@ -163,31 +169,44 @@ class Client:
 def open_socket(
     url: str, headers: Mapping[str, str], open_timeout: float, pong_timeout: float
 ) -> Any:
-    """Open a websocket without compression or a limit on messages.
+    """Open a websocket without compression, for replies of at most `LARGEST_REPLY` bytes.
 
     Args:
-        open_timeout: seconds to wait for the handshake. pong_timeout: for the reply to a ping.
+        open_timeout: seconds to wait for the handshake. pong_timeout: for the reply to a ping, and
+            for a server that reads nothing of what is sent.
 
     Raises:
-        UserError: not an address, or the server refuses this client.
+        UserError: not an address, or the server refuses this client, or redirects it.
         ConnectionError: there is no server, or (`FullError`) no place for this client now.
     """
     try:
+        address = parse_uri(url)
+    except InvalidURI as error:
+        raise UserError(f"{url!r} is not an address such as ws://127.0.0.1:8001: {error}") from None
+    try:
+        stream = socket.create_connection((address.host, address.port), open_timeout)
+    except OSError as error:
+        raise ConnectionError(f"No policy server responds at {url}: {error}") from error
+    stream.settimeout(None)
+    seconds = struct.pack("ll", int(pong_timeout), int(pong_timeout % 1 * 1e6))
+    stream.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, seconds)
+    try:
         return connect(
             url,
+            sock=stream,  # of this host alone: a redirect would take the key and the images along
             additional_headers=dict(headers),
             compression=None,
-            max_size=None,
+            max_size=LARGEST_REPLY,
             open_timeout=open_timeout,
             ping_timeout=pong_timeout,
             proxy=None,
         )
-    except InvalidURI as error:
-        raise UserError(f"{url!r} is not an address such as ws://127.0.0.1:8001: {error}") from None
+    except ValueError as error:  # a redirect, for a socket that is open
+        raise UserError(f"The server at {url} is elsewhere: {error}") from None
     except InvalidHandshake as error:
         reply = getattr(getattr(error, "response", None), "body", b"") or b""
-        message = bytes(reply).decode(errors="replace").strip()
-        text = f"The server at {url} refuses the connection: {message or error}"
+        message = bytes(reply).decode(errors="replace").strip() or str(error)
+        text = f"The server at {url} refuses the connection: {brief(message, 400, quote=False)}"
         is_full = isinstance(error, InvalidStatus) and error.response.status_code == 503
         if is_full:
             raise FullError(text) from None

@@ -3,13 +3,17 @@ of `serving/remote`, with good and with malformed replies.
 """
 
 import re
+import socket
 import threading
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
+from websockets.sync.server import serve as websocket_serve
 
 from helpers import REPOSITORY
 from helpers.rollout_fakes import use_inline_envs
@@ -25,7 +29,11 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import read_records
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.serving.remote.policy import RemotePolicy
+from mme_vla.serving.client import Client
+from mme_vla.serving.codec import pack
+from mme_vla.serving.remote.connections import HarnessConnection, HttpConnection, _encode
+from mme_vla.serving.remote.policy import RemotePolicy, _identity, _RefusedError, plain
+from mme_vla.serving.remote.protocols import HarnessProtocol, NewFrames, OwnProtocol
 from mme_vla.serving.remote.settings import ConnectionSettings, ServerChoice
 
 BRIEF = ConnectionSettings(timeout_s=1, open_s=2)
@@ -361,3 +369,269 @@ def test_the_challenge_executes_whole_chunks(stubs: Any, inline: None, tmp_path:
         (record,) = run(policy, tmp_path / "b", PICK[:1], execute=20)
         policy.close()
     assert (record.outcome, record.chunks) == ("timeout", 3)
+
+
+@pytest.mark.parametrize(
+    "server",
+    ["ws://me:hush@h:1", "http://me:hush@h:1", "ws://h:1/?key=hush", "me:hush@h:1", "ws://h#hush"],
+)
+def test_an_address_with_a_secret_is_refused_and_not_repeated(server: str) -> None:
+    with pytest.raises(UserError, match="MME_VLA_SERVER_KEY") as caught:
+        ServerChoice(server)
+    assert "hush" not in str(caught.value)
+
+
+@pytest.mark.parametrize("server", ["ws://", "ws://h:port", "http://h:99999", "ftp://h:1"])
+def test_an_address_without_host_or_port_is_refused(server: str) -> None:
+    with pytest.raises(UserError, match=r"write ws://host:port"):
+        ServerChoice(server)
+
+
+def test_a_key_with_a_line_break_is_refused_and_not_repeated() -> None:
+    with pytest.raises(UserError, match=r"connection\.api_key .* line break") as caught:
+        ConnectionSettings(api_key="hush\n")
+    assert "hush" not in str(caught.value)
+    section = {"server": "ws://h:1", "connection": {"api_key": 1234}}
+    choice = ServerChoice.from_config(section)
+    assert choice is not None and choice.connection.api_key == "1234"
+
+
+class Peer:
+    """A server that writes prepared bytes to whoever connects, and holds the connection."""
+
+    def __init__(self, *parts: bytes, pause_s: float = 0, read: bool = True) -> None:
+        self.parts = parts
+        self.pause_s = pause_s
+        self.read = read
+        self.stop = threading.Event()
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self.listener.getsockname()[1]
+        self.received = b""
+        self.thread = threading.Thread(target=self.serve, daemon=True)
+
+    def serve(self) -> None:
+        with self.listener, suppress(OSError):
+            while not self.stop.is_set():
+                stream, _ = self.listener.accept()
+                with stream, suppress(OSError):
+                    if self.read:
+                        self.received += stream.recv(65536)
+                    for part in self.parts:
+                        stream.sendall(part)
+                        self.stop.wait(self.pause_s)
+                    self.stop.wait(5)
+
+    def __enter__(self) -> "Peer":
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop.set()
+        with suppress(OSError):
+            self.listener.shutdown(socket.SHUT_RDWR)
+        self.thread.join(10)
+
+
+@pytest.mark.slow
+def test_http_waits_for_a_whole_reply_no_longer_than_its_time() -> None:
+    head = b"HTTP/1.1 200 OK\r\nContent-Length: 1000000\r\n\r\n"
+    for parts in ([head, *[b"x"] * 100], [b"HTTP/1.1 100 Continue\r\n\r\n"] * 100):
+        with Peer(*parts, pause_s=0.1) as peer, pytest.raises(TimeoutError, match=r"within 0\.5 s"):
+            HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=0.5)
+
+
+def test_http_takes_no_reply_that_is_cut_short_or_has_no_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mme_vla.serving.remote.connections.LARGEST_REPLY", 1000)
+    endless = Peer(b"HTTP/1.1 200 OK\r\n\r\n" + b"x" * 2000)
+    with endless as peer, pytest.raises(UserError, match="malformed: more than 1,000 bytes"):
+        HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=5)
+    with Peer(b"HTTP/1.1 200 OK\r\nContent-Length: 9\r\n\r\n\x80") as peer:
+        peer.stop.set()  # closes after what it has written
+        with pytest.raises(ConnectionError, match="IncompleteRead"):
+            HttpConnection(f"http://127.0.0.1:{peer.port}", timeout=5)
+
+
+def test_http_sends_the_path_of_the_address() -> None:
+    with Peer(b"HTTP/1.1 200 OK\r\nContent-Length: 1\r\n\r\n\x80") as peer:
+        HttpConnection(f"http://127.0.0.1:{peer.port}/policy/", timeout=5).close()
+    assert peer.received.startswith(b"GET /policy/metadata HTTP/1.1")
+
+
+def test_no_redirect_is_followed() -> None:
+    with Peer() as other:
+        place = f"//127.0.0.1:{other.port}/"
+        moved = b"HTTP/1.1 302 Found\r\nContent-Length: 0\r\nLocation: %s\r\n\r\n"
+        with Peer(moved % f"ws:{place}".encode()) as peer, pytest.raises(UserError):
+            Client(f"ws://127.0.0.1:{peer.port}", api_key="k", open_timeout=2)
+        with Peer(moved % f"http:{place}".encode()) as peer, pytest.raises(UserError, match="302"):
+            HttpConnection(f"http://127.0.0.1:{peer.port}", "k", timeout=2)
+    assert other.received == b""
+
+
+@pytest.mark.slow
+def test_a_server_that_reads_nothing_is_waited_for_no_longer_than_the_time_out() -> None:
+    def idle(peer: Any) -> None:
+        peer.send(pack({}))
+        over.wait(20)
+
+    over = threading.Event()
+    with websocket_serve(idle, "127.0.0.1", 0, max_queue=1) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        client = Client(f"ws://127.0.0.1:{server.socket.getsockname()[1]}", timeout=1)
+        frames = np.zeros((1, 2**24), np.uint8)
+        try:
+            with pytest.raises((ConnectionError, TimeoutError)):
+                for _ in range(8):
+                    client.request({"images": frames})
+        finally:
+            over.set()
+            server.shutdown()
+        thread.join(10)
+
+
+def test_a_message_larger_than_any_reply_ends_the_connection(
+    stubs: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mme_vla.serving.client.LARGEST_REPLY", 1000)
+    request = {
+        "front": np.zeros((2, 2, 3), np.uint8),
+        "observation/state": np.zeros(8, np.float32),
+        "prompt": "",
+    }
+    stub = stubs.Stub(policy=lambda _: np.zeros((99, 8)))
+    too_big = pytest.raises(ConnectionError, match=r"1009|too big")
+    with stubs.serving("openpi", stub) as url, Client(url, timeout=5) as client, too_big:
+        client.request(request)
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        {"actions": np.full((16, 8), -(2**63))},
+        {"actions": np.full((16, 8), 1e300)},
+        {"actions": np.zeros((16, 8), np.bool_)},
+        {"actions": np.full((16, 8), "1")},
+        {"actions": [[0.0] * 8] * 16},
+    ],
+    ids=["least integer", "overflow", "truth values", "texts", "lists"],
+)
+def test_numbers_that_are_no_actions_are_refused(
+    reply: dict[str, Any], stubs: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with stubs.serving("openpi", stubs.Stub()) as url:
+        policy = connect(url, "openpi")
+        with pytest.raises(_RefusedError, match="malformed"):
+            policy._chunk(reply)
+        policy.close()
+
+
+class Recorded:
+    """A connection whose replies are prepared."""
+
+    def __init__(self, *replies: Any) -> None:
+        self.metadata: dict[str, Any] = {}
+        self.replies = list(replies)
+
+    def request(self, message: Any) -> Any:
+        return self.replies.pop(0)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+ARRAY = np.zeros(2)
+
+
+@pytest.mark.parametrize("field", ["type", "seq", "payload"])
+def test_an_array_in_place_of_a_text_is_a_malformed_reply(field: str) -> None:
+    connection = HarnessConnection.__new__(HarnessConnection)
+    connection.url = "ws://h:1"
+    connection._timeout = 1
+    message = {"type": "action", "seq": 3, "payload": {}} | {field: ARRAY}
+    data = msgpack.packb(message, default=_encode)
+    connection._socket = type("Socket", (), {"recv": lambda self, timeout: data})()
+    with pytest.raises(UserError, match="malformed"):
+        connection._reply("action", 3)
+
+
+def test_metadata_of_another_kind_are_refused_or_left_out() -> None:
+    choice = ServerChoice("ws://h:1", "mme_vla")
+    harness = HarnessProtocol(choice, ROBOMME_JOINT)
+    harness.describe({"observation_params": ARRAY})
+    harness.describe({"observation_params": {"send_subgoal": ARRAY}})
+    assert harness.subgoal is None
+    params = {"send_subgoal": True, "subgoal_mode": "x" * 999}
+    with pytest.raises(UserError, match="none of simple_subgoal, grounded_subgoal"):
+        harness.describe({"observation_params": params})
+    with pytest.raises(UserError, match="is no server of this library"):
+        OwnProtocol(choice, ROBOMME_JOINT).describe({"server": ARRAY})
+
+
+def test_lists_of_several_lengths_are_a_malformed_action() -> None:
+    harness = HarnessProtocol(ServerChoice("ws://h:1", "harness"), ROBOMME_JOINT)
+    image = np.zeros((1, 2, 2, 3), np.uint8)
+    frames = NewFrames(
+        goal="",
+        subgoal=None,
+        options=(),
+        views=dict.fromkeys(ROBOMME_JOINT.camera_names, image),
+        states=np.zeros((1, 8), np.float32),
+        n_video=0,
+        executed=None,
+        first=True,
+        seed=0,
+    )
+    with pytest.raises(UserError, match="malformed: actions are"):
+        harness.act(Recorded({"actions": [[1.0], [1.0, 2.0]]}), frames)
+
+
+@pytest.mark.parametrize("name", ["../../elsewhere", "/etc", "..", "a/b", "x" * 101])
+@pytest.mark.parametrize("key", ["model", "checkpoint"])
+def test_a_servers_names_lead_out_of_no_folder(key: str, name: str) -> None:
+    metadata = {"identity": {"model": "m", "checkpoint": 3} | {key: name}}
+    choice = ServerChoice("ws://h:1")
+    with pytest.raises(UserError, match=r"cannot name a folder"):
+        _identity(choice, "mme_vla", metadata)
+    named = ConnectionSettings(name="mine", checkpoint="7")
+    identity = _identity(replace(choice, connection=named), "mme_vla", metadata)
+    assert (identity.model, identity.checkpoint) == ("mine", "7")
+
+
+def test_a_receipt_holds_no_more_than_a_part_of_large_metadata() -> None:
+    metadata = {str(n): "x" * 10_000 for n in range(1000)}
+    part = plain(metadata)
+    assert len(part) == 64 and all(len(text) <= 400 for text in part.values())
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "challenge", "challenge-http"])
+def test_an_interrupt_ends_requests_that_wait_for_a_reply(
+    protocol: str, stubs: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    requested = threading.Event()
+    release = threading.Event()
+    late: list[bool] = []
+
+    def wait_for_the_test(seen: Any) -> np.ndarray:
+        requested.set()
+        late.append(not release.wait(20))
+        return stubs.hold_still(seen)
+
+    def interrupt(futures: Any) -> None:
+        requested.wait(5)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mme_vla.serving.remote.policy.wait", interrupt)
+    with stubs.serving(protocol, stubs.Stub(policy=wait_for_the_test)) as url:
+        policy = connect(url, protocol.removesuffix("-http"), timeout_s=60)
+        episode = policy.start_episode("")
+        image = np.zeros((1, 4, 4, 3), np.uint8)
+        views = dict.fromkeys(ROBOMME_JOINT.camera_names, image)
+        episode.observe(views, np.zeros((1, 8), np.float32))
+        with pytest.raises(KeyboardInterrupt):
+            policy.predict_chunk(None, [episode], {})
+        policy._threads.shutdown(wait=True)
+        assert not late, "the request waited for its reply"
+        release.set()

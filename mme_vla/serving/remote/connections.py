@@ -1,21 +1,24 @@
-"""Connections to servers: by websocket (`Client`), by HTTP, and as the harness talks."""
+"""Connections to servers: by websocket (`Client`), by HTTP, and with the harness's messages."""
 
 import http.client
+import socket
 import ssl
+import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 import numpy as np
 
 from mme_vla.errors import UserError, brief
-from mme_vla.serving.client import Client, decoded_map, open_socket
+from mme_vla.serving.client import LARGEST_REPLY, Client, decoded_map, open_socket
 from mme_vla.serving.codec import MOST_TEXT, check_size, msgpack, pack, read_array
 
 PAUSE_S = 0.5  # between two attempts to open a connection
-STARTUP_S = 2.0  # in which a server that begins by itself sends its metadata
+STARTUP_S = 2.0  # in which a server that sends its metadata first has sent them
 
 
 class Connection(Protocol):
@@ -55,12 +58,20 @@ class HttpConnection:
     """The challenge's HTTP: `/metadata`, `/reset` and `/infer`, in one session.
 
     Args:
-        url: `http://host:port`. api_key: of the server, if it has one. timeout: seconds to wait for
-            a reply.
+        url: `http://host:port`, with the path before `/metadata` if there is one. api_key: of the
+            server, if it has one. timeout: seconds to wait for a reply, all of it. open_timeout:
+            for the connection.
     """
 
-    def __init__(self, url: str, api_key: str | None = None, timeout: float = 600) -> None:
-        self.url = url
+    def __init__(
+        self,
+        url: str,
+        api_key: str | None = None,
+        timeout: float = 600,
+        open_timeout: float = 60,
+    ) -> None:
+        self.url = url.rstrip("/")
+        self._timeout = timeout
         address = urlsplit(url)
         self._headers = {
             "Content-Type": "application/msgpack",
@@ -70,14 +81,15 @@ class HttpConnection:
         if api_key is not None:
             self._headers["Authorization"] = f"Api-Key {api_key}"
         host = address.hostname or ""
+        self._path = address.path.rstrip("/")
         self._http: http.client.HTTPConnection
         if address.scheme == "https":
             context = ssl.create_default_context()
             self._http = http.client.HTTPSConnection(
-                host, address.port, timeout=timeout, context=context
+                host, address.port, timeout=open_timeout, context=context
             )
         else:
-            self._http = http.client.HTTPConnection(host, address.port, timeout=timeout)
+            self._http = http.client.HTTPConnection(host, address.port, timeout=open_timeout)
         self.metadata = self._exchange("GET", "/metadata", None)
 
     def request(self, message: Mapping[str, Any]) -> dict[str, Any]:
@@ -85,19 +97,46 @@ class HttpConnection:
         return self._exchange("POST", path, pack(message))
 
     def close(self) -> None:
+        if self._http.sock is not None:
+            _shut(self._http.sock)
         self._http.close()
 
+    def _open(self) -> socket.socket:
+        """The open socket, whose time-out is no longer that of the connection."""
+        if self._http.sock is None:
+            self._http.connect()
+        self._http.sock.settimeout(self._timeout)
+        return self._http.sock
+
     def _exchange(self, method: str, path: str, body: bytes | None) -> dict[str, Any]:
+        late = threading.Event()
         try:
-            self._http.request(method, path, body, self._headers)
-            response = self._http.getresponse()
-            content = response.read()
-        except TimeoutError:
-            self.close()
-            raise TimeoutError(f"No answer from {self.url}{path} in time.") from None
+            stream = self._open()
+            # The socket's time-out is that of one read, and a byte now and then is within it.
+            watch = threading.Timer(self._timeout, _shut, (stream, late))
+            watch.daemon = True
+            watch.start()
+            try:
+                self._http.request(method, self._path + path, body, self._headers)
+                response = self._http.getresponse()
+                content = response.read(LARGEST_REPLY + 1)
+            finally:
+                watch.cancel()
+            if response.length and len(content) <= LARGEST_REPLY:
+                raise http.client.IncompleteRead(content, response.length)
         except (OSError, http.client.HTTPException) as error:
             self.close()
+            if late.is_set():
+                raise TimeoutError(
+                    f"No answer from {self.url}{path} within {self._timeout:g} s."
+                ) from None
             raise ConnectionError(f"No policy server responds at {self.url}: {error}") from error
+        if len(content) > LARGEST_REPLY:
+            self.close()
+            raise UserError(
+                f"The server's reply is malformed: more than {LARGEST_REPLY:,} bytes from"
+                f" {self.url}{path}."
+            )
         if response.status == http.HTTPStatus.OK:
             return decoded_map(content)
         reason = brief(content.decode(errors="replace").strip(), 400, quote=False)
@@ -108,9 +147,16 @@ class HttpConnection:
         raise UserError(f"The server refuses this request: {text}")
 
 
+def _shut(stream: socket.socket, late: threading.Event | None = None) -> None:
+    """Shut a socket, which another thread may be reading."""
+    if late is not None:
+        late.set()
+    with suppress(OSError):  # it may be closed already
+        stream.shutdown(socket.SHUT_RDWR)
+
+
 class HarnessConnection:
-    """The protocol of vla-evaluation-harness 0.8: typed messages with a number, the client
-    first.
+    """The protocol of vla-evaluation-harness 0.8: typed messages with a number, the client's first.
 
     Args:
         url: `ws://host:port`. timeout: seconds to wait for a reply. open_timeout: for the
@@ -176,13 +222,12 @@ class HarnessConnection:
             )
         message = _decoded(data)
         payload = message.get("payload")
-        if message.get("type") == "error":
+        # As texts: an array in their place has no single truth value.
+        name = str(message.get("type"))
+        if name == "error":
             raise UserError(f"The server refuses this request: {brief(payload, 400)}")
-        if (
-            message.get("type") != kind
-            or message.get("seq") != number
-            or not isinstance(payload, dict)
-        ):
+        is_reply = name == kind and str(message.get("seq")) == str(number)
+        if not is_reply or not isinstance(payload, dict):
             raise UserError(
                 f"The server's reply is malformed: {kind} number {number} was expected, and it is"
                 f" {brief(message.get('type'))} number {brief(message.get('seq'))}."

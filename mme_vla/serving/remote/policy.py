@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
+from itertools import islice
 from typing import Any
 from weakref import WeakSet
 
@@ -29,10 +30,12 @@ from mme_vla.processing.normalise import NormStats
 from mme_vla.serving.remote.connections import Connection, open_patiently
 from mme_vla.serving.remote.protocols import PROTOCOLS, NewFrames, ServerProtocol, detect
 from mme_vla.serving.remote.settings import ServerChoice
+from mme_vla.utils import safe_name
 
 LARGEST_ACTION = 1e4
 """Largest size of a number of an action: radians, metres and shares are far below."""
 LONGEST_CHUNK = 4096  # actions
+_MOST_ENTRIES = 64  # of a list or map of a server's metadata, in a receipt
 _MS_KEYS = ("infer_ms", "infer_time_ms")
 """Where servers say how long they computed: openpi's in `server_timing`, RoboMME's beside the
 actions.
@@ -205,8 +208,7 @@ class RemotePolicy(Policy):
             execute: actions of a chunk that the rollout executes; None for the robot's number.
 
         Raises:
-            UserError: there is no server, it has no known protocol, or it cannot serve this
-                robot.
+            UserError: there is no server, its protocol is not known, or it cannot serve this robot.
         """
         super().__init__()
         self.weights = nn.Parameter(torch.zeros(0), requires_grad=False)
@@ -220,9 +222,11 @@ class RemotePolicy(Policy):
                 self.detected = detection.reason
             self.protocol: ServerProtocol = PROTOCOLS[name](choice, robot)
             first = open_patiently(self.protocol.open, choice.connection.open_s)
-        except TimeoutError as error:
+        except UserError:
+            raise
+        except (ConnectionError, TimeoutError) as error:
             raise UserError(
-                f"{error} It has another protocol than {name}, or is still loading: set"
+                f"{error} Its protocol is another than {name}, or it is still loading: set"
                 " protocol=… or connection.open_s=…"
             ) from None
         self.metadata = first.metadata
@@ -298,7 +302,12 @@ class RemotePolicy(Policy):
         )
         remote = [_remote(episode) for episode in episodes]
         futures = [self._threads.submit(self._request, episode) for episode in remote]
-        wait(futures)
+        try:
+            wait(futures)
+        except BaseException:  # an interrupt: requests that wait for a reply end with theirs
+            for episode in remote:
+                episode.close()
+            raise
         chunks = [future.result() for future in futures]
         length = self._chunk_length or 1
         rows = torch.full((len(remote), length, self.embodiment.action.width), torch.nan)
@@ -308,7 +317,7 @@ class RemotePolicy(Policy):
         return rows
 
     def conditions(self) -> dict[str, Any]:
-        """The server, for a receipt: its address, its protocol, and what it says of itself."""
+        """The server, for a receipt: its address, its protocol, and its metadata."""
         server = {
             "address": self.protocol.choice.server,
             "protocol": self.protocol.name,
@@ -403,8 +412,8 @@ class RemotePolicy(Policy):
             problem = f"{len(actions)} actions"
         elif not np.isfinite(actions).all():
             problem = "actions that are not finite"
-        elif np.abs(actions).max() > LARGEST_ACTION:
-            problem = f"an action of {float(np.abs(actions).max()):.3g}"
+        elif (largest := np.abs(actions.astype(np.float64)).max()) > LARGEST_ACTION:
+            problem = f"an action of {largest:.3g}"
         if problem is not None:
             raise _RefusedError(
                 f"The server's reply is malformed: {problem}; expected numbers [actions, {width}],"
@@ -456,6 +465,12 @@ def _identity(choice: ServerChoice, protocol: str, metadata: Mapping[str, Any]) 
     described = metadata.get("identity") if protocol == "mme_vla" else None
     if isinstance(described, Mapping):
         identity = read_section(PolicyIdentity, described, "the server's identity")
+        # These name folders of this machine.
+        if connection.name is None:
+            safe_name(identity.model, "the server's name of its policy (connection.name)")
+        if connection.checkpoint is None:
+            checkpoint = str(identity.checkpoint)
+            safe_name(checkpoint, "the server's name of its checkpoint (connection.checkpoint)")
         return PolicyIdentity(
             connection.name or identity.model,
             identity.checkpoint if connection.checkpoint is None else connection.checkpoint,
@@ -468,15 +483,15 @@ def _identity(choice: ServerChoice, protocol: str, metadata: Mapping[str, Any]) 
 
 def json_value(value: Any, depth: int = 4) -> Any:
     """A server's metadata as JSON has it: texts, numbers, lists and maps; of others their text."""
-    if value is None or isinstance(value, bool | int | str):
+    if value is None or isinstance(value, bool | int):
         return value
+    if isinstance(value, str):
+        return brief(value, 400, quote=False)
     if isinstance(value, float):
         return value if np.isfinite(value) else str(value)
     if depth and isinstance(value, Mapping):
-        return {
-            brief(str(key), 80, quote=False): json_value(one, depth - 1)
-            for key, one in value.items()
-        }
+        entries = islice(value.items(), _MOST_ENTRIES)
+        return {brief(str(key), 80, quote=False): plain(one, depth - 1) for key, one in entries}
     if depth and isinstance(value, list | tuple):
-        return [json_value(one, depth - 1) for one in value[:64]]
+        return [plain(one, depth - 1) for one in value[:_MOST_ENTRIES]]
     return brief(value, 200)

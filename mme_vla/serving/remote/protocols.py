@@ -11,13 +11,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.serving.remote.connections import (
     STARTUP_S,
     Connection,
@@ -26,7 +26,7 @@ from mme_vla.serving.remote.connections import (
     open_patiently,
     open_websocket,
 )
-from mme_vla.serving.remote.settings import ServerChoice
+from mme_vla.serving.remote.settings import ServerChoice, Subgoals
 from mme_vla.serving.requests import IMAGE_KEYS
 
 SERVER_NAME = "mme_vla"  # what this library's server calls itself
@@ -76,7 +76,7 @@ class ServerProtocol:
             self.subgoal = f"{choice.connection.subgoal}_subgoal"
         require(
             not choice.connection.keys or self.name == "openpi",
-            f"connection.keys are for protocol=openpi; this server's protocol is {self.name}.",
+            f"connection.keys are for protocol=openpi; this server has {self.name}.",
         )
         self.check()
 
@@ -143,7 +143,7 @@ class LibraryProtocol(ServerProtocol):
 
     def describe(self, metadata: Mapping[str, Any]) -> None:
         require(
-            metadata.get("server") == SERVER_NAME,
+            str(metadata.get("server")) == OWN,
             f"protocol=mme_vla: {self.choice.server} is no server of this library; set"
             " protocol=auto.",
         )
@@ -157,7 +157,7 @@ class LibraryProtocol(ServerProtocol):
         action = replace(robot.action, execute=_count(metadata, "execute"))
         self.robot = replace(robot, action=action)
         kind = metadata.get("subgoal")
-        self.subgoal = self.subgoal if kind is None else str(kind)
+        self.subgoal = self.subgoal if kind is None else _subgoal_kind(str(kind))
 
     def begin(self, connection: Connection, frames: NewFrames) -> None:
         connection.request({"reset": True, "seed": frames.seed})
@@ -195,7 +195,9 @@ class ChallengeProtocol(ServerProtocol):
     def open(self) -> Connection:
         connection = self.choice.connection
         if self.choice.is_http:
-            return HttpConnection(self.choice.server, connection.api_key, connection.timeout_s)
+            return HttpConnection(
+                self.choice.server, connection.api_key, connection.timeout_s, connection.open_s
+            )
         return super().open()
 
     def act(self, connection: Connection, frames: NewFrames) -> dict[str, Any]:
@@ -234,7 +236,7 @@ class RobommeProtocol(ServerProtocol):
 
 
 class OpenpiProtocol(ServerProtocol):
-    """openpi's policy server, and those with the same messages: the current frame alone."""
+    """openpi's policy server, and those with its messages: the current frame alone."""
 
     name = "openpi"
     stateless = True
@@ -258,10 +260,10 @@ class HarnessProtocol(ServerProtocol):
         return HarnessConnection(self.choice.server, connection.timeout_s, connection.open_s)
 
     def describe(self, metadata: Mapping[str, Any]) -> None:
-        params = metadata.get("observation_params") or {}
-        if isinstance(params, Mapping) and params.get("send_subgoal"):
+        params = metadata.get("observation_params")
+        if isinstance(params, Mapping) and params.get("send_subgoal") is True:
             kind = params.get("subgoal_mode", "grounded")
-            self.subgoal = self.subgoal or f"{kind}_subgoal"
+            self.subgoal = self.subgoal or _subgoal_kind(f"{kind}_subgoal")
         self.robot = self.robot.with_horizon(1)
 
     def begin(self, connection: Connection, frames: NewFrames) -> None:
@@ -289,7 +291,12 @@ class HarnessProtocol(ServerProtocol):
                 video = frames.views[self.robot.memory_camera]
                 message["video_history"] = list(video[: frames.n_video])
             reply = connection.request(message)
-        action = np.asarray(reply.get("actions"))
+        try:
+            action = np.asarray(reply.get("actions"))
+        except ValueError:  # lists of several lengths
+            raise UserError(
+                f"The server's reply is malformed: actions are {brief(reply.get('actions'))}."
+            ) from None
         if action.ndim == 1:
             action = action[None]
         return {**reply, "actions": action}
@@ -320,7 +327,7 @@ class Detection:
 
 
 def detect(choice: ServerChoice) -> Detection:
-    """Find the protocol of a server.
+    """Recognise the protocol of a server.
 
     Raises:
         UserError: no server, or one with none of the protocols.
@@ -341,11 +348,11 @@ def detect(choice: ServerChoice) -> Detection:
         harness.close()
         return Detection("harness", "it waits for a greeting and returns one")
     try:
-        if client.metadata.get("server") == SERVER_NAME:
+        if str(client.metadata.get("server")) == OWN:
             return Detection("mme_vla", "its metadata say so")
         try:
             reply = client.request({"reset": True})
-        except UserError:
+        except (UserError, ConnectionError):
             return Detection("openpi", "it knows no reset")
         if "reset_finished" not in reply:
             return Detection("openpi", "it takes a reset for an observation")
@@ -377,7 +384,17 @@ def _check_benchmark(protocol: ServerProtocol) -> None:
     )
 
 
-def _count(metadata: Mapping[str, Any], key: str) -> int:
+def _subgoal_kind(text: str) -> str:
+    kinds = [f"{kind}_subgoal" for kind in get_args(Subgoals)]
+    require(
+        text in kinds,
+        f"The server's metadata are malformed: it reads {brief(text)}, which is none of"
+        f" {listed(kinds)}.",
+    )
+    return text
+
+
+def _whole(metadata: Mapping[str, Any], key: str) -> int:
     value = metadata.get(key)
     require(
         isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 4096,

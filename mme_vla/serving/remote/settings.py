@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
+from urllib.parse import urlsplit
 
 from mme_vla.config.sections import PathText, Positive, PositiveInt, read_section
 from mme_vla.errors import require
@@ -16,12 +17,20 @@ class ConnectionSettings:
 
     name: str | None = None
     checkpoint: PathText | None = None
-    api_key: str | None = field(default=None, repr=False)
+    api_key: PathText | None = field(default=None, repr=False)
     timeout_s: Positive = 600
     open_s: Positive = 60
     episodes: PositiveInt | None = None
     subgoal: Subgoals | None = None
     keys: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        key = self.api_key or ""
+        require(
+            key.isascii() and key.isprintable(),
+            "connection.api_key (MME_VLA_SERVER_KEY) holds a line break or another character that"
+            " no header takes.",
+        )
 
 
 @dataclass(frozen=True)
@@ -33,9 +42,14 @@ class ServerChoice:
     connection: ConnectionSettings = ConnectionSettings()
 
     def __post_init__(self) -> None:
-        scheme = self.server.partition("://")[0]
+        # Messages, logs, receipts and cards name the address; this message does not.
         require(
-            scheme in ("ws", "wss", "http", "https") and "://" in self.server,
+            not set("@?#") & set(self.server),
+            "server=… holds a user, a password or a query, which records would name: write"
+            " scheme://host:port/path alone, and set MME_VLA_SERVER_KEY to the key.",
+        )
+        require(
+            _is_address(self.server),
             f"server={self.server!r}: write ws://host:port, or http://host:port for the challenge's"
             " HTTP.",
         )
@@ -57,3 +71,13 @@ class ServerChoice:
         connection = dict(config.get("connection") or {})
         connection["api_key"] = connection.get("api_key") or None
         return read_section(cls, {**config, "connection": connection}, others=True)
+
+
+def _is_address(text: str) -> bool:
+    if text.partition("://")[0] not in ("ws", "wss", "http", "https"):
+        return False
+    try:
+        address = urlsplit(text)
+        return bool(address.hostname) and address.port != 0
+    except ValueError:  # a port that is no number
+        return False
