@@ -491,7 +491,9 @@ def json_value(value: Any, depth: int = 4) -> Any:
         return value if np.isfinite(value) else str(value)
     if depth and isinstance(value, Mapping):
         entries = islice(value.items(), _MOST_ENTRIES)
-        return {brief(str(key), 80, quote=False): plain(one, depth - 1) for key, one in entries}
+        return {
+            brief(str(key), 80, quote=False): json_value(one, depth - 1) for key, one in entries
+        }
     if depth and isinstance(value, list | tuple):
-        return [plain(one, depth - 1) for one in value[:_MOST_ENTRIES]]
+        return [json_value(one, depth - 1) for one in value[:_MOST_ENTRIES]]
     return brief(value, 200)

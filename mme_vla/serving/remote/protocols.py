@@ -143,7 +143,7 @@ class LibraryProtocol(ServerProtocol):
 
     def describe(self, metadata: Mapping[str, Any]) -> None:
         require(
-            str(metadata.get("server")) == OWN,
+            str(metadata.get("server")) == SERVER_NAME,
             f"protocol=mme_vla: {self.choice.server} is no server of this library; set"
             " protocol=auto.",
         )
@@ -348,7 +348,7 @@ def detect(choice: ServerChoice) -> Detection:
         harness.close()
         return Detection("harness", "it waits for a greeting and returns one")
     try:
-        if str(client.metadata.get("server")) == OWN:
+        if str(client.metadata.get("server")) == SERVER_NAME:
             return Detection("mme_vla", "its metadata say so")
         try:
             reply = client.request({"reset": True})
@@ -394,7 +394,7 @@ def _subgoal_kind(text: str) -> str:
     return text
 
 
-def _whole(metadata: Mapping[str, Any], key: str) -> int:
+def _count(metadata: Mapping[str, Any], key: str) -> int:
     value = metadata.get(key)
     require(
         isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 4096,
