@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mme_vla.backbone.base import Backbone
     from mme_vla.embodiment import Embodiment
     from mme_vla.envs.base import Environment
-    from mme_vla.envs.facts import Fact
+    from mme_vla.envs.facts import Candidates, Fact
     from mme_vla.envs.make import make_env
     from mme_vla.envs.task import Task
     from mme_vla.envs.vector.pool import make_vec_env
@@ -41,7 +41,7 @@ _MODULES = {
     "backbone.base": ["Backbone"],
     "embodiment": ["Embodiment"],
     "envs.base": ["Environment"],
-    "envs.facts": ["Fact"],
+    "envs.facts": ["Candidates", "Fact"],
     "envs.make": ["make_env"],
     "envs.task": ["Task"],
     "envs.vector.pool": ["make_vec_env"],
@@ -73,6 +73,7 @@ __all__ = [
     "Backbone",
     "Batch",
     "CachedHistory",
+    "Candidates",
     "Embodiment",
     "Environment",
     "Episode",

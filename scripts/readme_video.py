@@ -3,7 +3,7 @@ r"""Compose the README's moving picture: an episode of each suite, with its goal
 The policy is the one for all sixteen tasks that ships with the library.
 
     # VideoUnmaskSwap 13, PickXtimes 6, VideoRepick 12 and RouteStick 4
-    python -m mme_vla.evaluate checkpoint=nano16 tasks=PickXtimes episodes=[6] split=reserved \
+    mme-vla evaluate checkpoint=nano16 tasks=PickXtimes episodes=[6] split=reserved \
         seed=7 max_actions=20 only_possible=true video=all output=outputs/suites/PickXtimes
     python scripts/readme_video.py outputs/suites/*
 """

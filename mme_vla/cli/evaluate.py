@@ -1,4 +1,4 @@
-"""`python -m mme_vla.evaluate checkpoint=… tasks=all`: run a policy on the benchmark
+"""`mme-vla evaluate checkpoint=… tasks=all`: run a policy on the benchmark
 (configs/evaluate.yaml).
 """
 
@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mme_vla.cli.command import log_to_terminal
-from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling, words_of
+from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling, release, words_of
 from mme_vla.config.devices import process_device
 from mme_vla.config.sections import PathText, read_section
 from mme_vla.envs.base import environment
@@ -164,10 +164,10 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
             events,
             options,
         )
-        if server := policy.conditions().get("server"):
-            logger.info("server: %s", server.get("times"))
+        if policy.info.server is not None:
+            logger.info("server: %s", policy.info.server.get("times"))
     finally:
-        policy.close()
+        release(policy)
         if subgoals is not None:
             report_usage(subgoals.usage)
             subgoals.close()
@@ -246,7 +246,7 @@ def report(done: Evaluation, output: Path) -> None:
         )  # fmt: skip
     if any(record.outcome == "error" for record in done.records):
         logger.warning("some episodes ended in an error: the same command tries them again")
-    logger.info("python -m mme_vla.results %s", output)
+    logger.info("mme-vla results %s", output)
 
 
 def report_usage(usage: Usage) -> None:

@@ -119,7 +119,9 @@ def main(cfg: DictConfig) -> None:
             entries.append((spec.task, env.goals()[0], image_name))
             env.close()
             advance(1)
-    page.write_text(render("gallery.md", entries=entries))
+    names = list(dict.fromkeys(task for task, _, _ in entries))
+    title = counted(len(names), "task") if len(names) > 1 else names[0]
+    page.write_text(render("gallery.md", title=title, entries=entries))
     print(f"{page}: {counted(len(entries), 'task')}.")
 
 

@@ -1,4 +1,4 @@
-"""`python -m mme_vla.inspect`: what is in a checkpoint, a dataset or an episode, what a memory
+"""`mme-vla inspect`: what is in a checkpoint, a dataset or an episode, what a memory
 remembers of it, and what a policy predicts along it.
 """
 
@@ -36,11 +36,12 @@ from mme_vla.data.statistics import normalised_states
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.action_space import numbered
 from mme_vla.errors import UserError, printable, require
+from mme_vla.evaluation.records import display_name
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.policy import mme
 from mme_vla.policy.base import Policy
-from mme_vla.policy.run_folders import CHECKPOINTS, STATE, resolve_checkpoint
+from mme_vla.policy.run_folders import CHECKPOINTS, STATE, resolve_checkpoint, shipped_name
 from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.self_check import NO_CHECK, compare
 from mme_vla.training.checkpoint import read_state
@@ -168,6 +169,7 @@ def check_open_loop(inspection: Inspection, console: Console) -> OpenLoop:
     device = find_device(inspection.device)
     policy = Policy.from_pretrained(folder, device=device, trust_plugins=inspection.trust_plugins)
     name = str(PolicySections.of(policy.config).name or "policy")
+    name = display_name(name, shipped_name(folder) or str(folder))
     source = EpisodeSource(inspection.dataset, inspection.exec_starts, robot=policy.embodiment)
     data = data_of(folder)
     held_out = None if data is None else held_out_episodes(source, *data)
@@ -348,8 +350,7 @@ def training_rows(folder: Path, sections: PolicySections) -> list[tuple[str, str
         state = read_state(folder)
         data = state["config"].get("data", {})
         train = state["config"].get("train", {})
-        sources = [source_name(entry) for entry in listed_sources(data.get("sources"))]
-        known = f"{data.get('name', 'data')}: {', '.join(sources)}"
+        known = ", ".join(source_name(entry) for entry in listed_sources(data.get("sources")))
         steps = f"{state['step']:,} of {train.get('steps', 0):,} updates"
         steps += f", batches of {train.get('batch_size')}, learning rate {train.get('lr')}"
         steps += f", seed {state['config'].get('seed')}"

@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -16,9 +17,10 @@ from mme_vla.config.devices import find_device
 from mme_vla.config.sections import PathText, read_section
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError, check_choice, require
+from mme_vla.evaluation.records import display_name
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_from_config
-from mme_vla.policy.run_folders import locate_checkpoint
+from mme_vla.policy.run_folders import locate_checkpoint, shipped_name
 from mme_vla.policy.sections import SECTIONS, PolicySections
 from mme_vla.processing.normalise import NormStats
 from mme_vla.serving.remote.settings import ServerChoice
@@ -90,7 +92,8 @@ def load_policy(
             trust_plugins=choice.trust_plugins,
         )
         name = str(PolicySections.of(policy.config).name or "policy")
-        logger.info("%s from %s, on %s", name, where, device)
+        title = display_name(name, shipped_name(Path(where)) or where)
+        logger.info("%s from %s, on %s", title, where, device)
         return LoadedPolicy(policy, name, where)
     require(
         any(word.startswith("model=") for word in named),
@@ -138,6 +141,16 @@ def _connect(choice: PolicyChoice, server: ServerChoice, logger: logging.Logger)
     if policy.info.max_running is not None:
         logger.info("episodes at the same time: at most %d", policy.info.max_running)
     return LoadedPolicy(policy, name, None)
+
+
+def release(policy: Policy) -> None:
+    """Close the connections of a policy that a server computes."""
+    if policy.info.server is None:
+        return
+    from mme_vla.serving.remote.policy import RemotePolicy  # the extra `serve`
+
+    if isinstance(policy, RemotePolicy):
+        policy.close()
 
 
 SAMPLING = ("auto", "eager", "graph", "compiled")

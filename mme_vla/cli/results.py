@@ -1,4 +1,4 @@
-"""`python -m mme_vla.results RUN…`: from episode records to tables and a report, beside the paper's
+"""`mme-vla results RUN…`: from episode records to tables and a report, beside the paper's
 numbers.
 
 RUN is a file of episode records, or a folder with `episodes*.jsonl` in it or below; shards and runs
@@ -355,21 +355,17 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
 
 
 def _tables(results: Results, comparisons: list[Comparison], detailed: bool = True) -> list[Table]:
+    """The tables of the terminal, the outcome first."""
     tables = [overview(results), *grouping_tables(results)]
-    if detailed:
-        details = []
-        for method in results.methods:
-            table = detail(method, results)
-            if len(table.rows) > 1:  # one row is in the overview
-                details.append(table)
-        tables = [
-            *details,
-            *process_tables(results),
-            *subgoal_tables(results),
-            runs_table(results),
-            *tables,
-        ]
-    return [*tables, comparison_table(comparisons)] if comparisons else tables
+    if comparisons:
+        tables.append(comparison_table(comparisons))
+    if not detailed:
+        return tables
+    for method in results.methods:
+        table = detail(method, results)
+        if len(table.rows) > 1:  # one row is in the overview
+            tables.append(table)
+    return [*tables, *process_tables(results), *subgoal_tables(results), runs_table(results)]
 
 
 def _pairs(
@@ -420,7 +416,7 @@ def _verify_parser() -> argparse.ArgumentParser:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argument_parser("python -m mme_vla.results", __doc__, EXAMPLES)
+    parser = argument_parser("mme-vla results", __doc__, EXAMPLES)
     parser.add_argument(
         "runs", nargs="*", type=Path, metavar="RUN", help="file of episode records, or folder"
     )

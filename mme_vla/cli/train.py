@@ -1,4 +1,4 @@
-"""`python -m mme_vla.train model=tokendrop_expert`: train a policy (configs/train.yaml)."""
+"""`mme-vla train model=tokendrop_expert`: train a policy (configs/train.yaml)."""
 
 import shlex
 import time

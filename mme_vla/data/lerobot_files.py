@@ -176,26 +176,28 @@ def find_columns(root: Path, features: Mapping[str, Feature], robot: Embodiment)
     if missing:
         plural = "" if len(missing) == 1 else "s"
         message = (
-            f"{root} lacks the feature{plural} {', '.join(missing)}; it has"
-            f" {listed(features)}. These are the names of the robot {robot.name!r}: choose"
-            " embodiment=<the robot this dataset is of>, or name its columns in a"
-            " configs/embodiment file of your own."
+            f"{root} lacks the feature{plural} {', '.join(missing)}; it has {listed(features)}."
+        )
+        has_cameras = all(name in columns for name in robot.camera_names)
+        if robot.action.space is not None and has_cameras:
+            raise UserError(
+                f"{message} The robot {robot.name!r} acts in another space than this dataset's"
+                " actions are of. Take a dataset that `mme-vla record` or `mme-vla convert` wrote,"
+                " which has poses and waypoints too, or another robot: embodiment=robomme_joint, or"
+                " a checkpoint that was trained in joint angles."
+            )
+        message += (
+            f" These are the names of the robot {robot.name!r}: choose embodiment=<the robot this"
+            " dataset is of>, or name its columns in a configs/embodiment file of your own."
         )
         for name in missing:
             near = _near_column(name, features)
             if near is not None:
                 message += f" Did you mean `key: {near}` for {name}?"
-        # A robot without the cameras is another one.
-        if robot.action.space is not None and all(name in columns for name in robot.camera_names):
-            message += (
-                " (RoboMME's poses and waypoints are columns of datasets that this library converts"
-                " or records.)"
-            )
-        else:
-            message += (
-                f" `mme-vla inspect dataset={root}` drafts that file, and"
-                " docs/extend/your-robot.md explains it."
-            )
+        message += (
+            f" `mme-vla inspect dataset={root}` drafts that file, and docs/extend/your-robot.md"
+            " explains it."
+        )
         raise UserError(message)
 
     cameras = {name: columns[name] for name in robot.camera_names}

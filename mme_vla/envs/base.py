@@ -12,14 +12,14 @@ which become the conditioning video), `frozen` (on reset: steps in which no acti
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option
-from mme_vla.envs.facts import Fact
+from mme_vla.envs.facts import Candidates, Fact
 from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
@@ -115,6 +115,30 @@ class Environment(ABC):
         """What the episode of `env` has shown so far that is needed later, from the simulator's
         state: for the score of writing and the table beside a recording. By default nothing.
         """
+        return ()
+
+    def twin(self, spec: EpisodeSpec) -> Mapping[str, Any] | None:
+        """The scene of `spec` with another value of one fact and everything else equal: what
+        `make` finds as `spec.row`. By default there is none.
+        """
+        return None
+
+    def candidates(self, env: Any) -> Candidates | None:
+        """What the next motion of `env` can go to, where a decision depends on a fact; None where
+        none does, and by default.
+        """
+        return None
+
+    def tool(self, env: Any) -> Sequence[float]:
+        """Where the robot's tool is [d], in the unit of the `candidates`.
+
+        Raises:
+            UserError: the environment does not say.
+        """
+        require(
+            False,
+            f"{type(self).__name__} has candidates and no place of the tool: implement tool(env).",
+        )
         return ()
 
     def scene_values(self, env: Any) -> Mapping[str, Any] | None:
@@ -244,11 +268,19 @@ class Environment(ABC):
         action_space: str | None = None,
         max_steps: int | None = None,
         render: bool = True,
+        row: Mapping[str, Any] | None = None,
     ) -> Any:
-        """One episode with the interface of `make_env`: lists of frames, status, goal."""
+        """One episode with the interface of `make_env`: lists of frames, status, goal.
+
+        row: builds the scene of these values (`twin`).
+        """
         spec = self.episode(task, split, episode)
         limit = max_steps or self.task_limit(task, split)
-        env = _idle.pop((type(self), task, render), None)
+        env = None
+        if row is None:
+            env = _idle.pop((type(self), task, render), None)
+        else:
+            spec = replace(spec, row=row)
         if env is None:
             env = self.make(spec, render)
         return EpisodeEnv(self, env, spec, limit, action_space == CHOICES, render)
@@ -280,10 +312,11 @@ def open_episode(
     action_space: str | None = None,
     max_steps: int | None = None,
     render: bool = True,
+    row: Mapping[str, Any] | None = None,
 ) -> Any:
     """One episode of the environment of this name; importable by worker processes."""
     return environment(env).open(
-        task, split, episode, action_space=action_space, max_steps=max_steps, render=render
+        task, split, episode, action_space=action_space, max_steps=max_steps, render=render, row=row
     )
 
 
@@ -384,7 +417,7 @@ class EpisodeEnv:
         self.env = None
         if env is None:
             return
-        if not (self.environment.reuse and self._is_reusable):
+        if not (self.environment.reuse and self._is_reusable) or self.spec.row is not None:
             env.close()
             return
         former = _idle.pop(self._key, None)
@@ -398,6 +431,16 @@ class EpisodeEnv:
     def facts(self) -> Sequence[Fact]:
         """What the frames since the reset showed, the video's first."""
         return self.environment.facts(self.env)
+
+    @property
+    def candidates(self) -> Candidates | None:
+        """What the next motion can go to."""
+        return self.environment.candidates(self.env)
+
+    @property
+    def tool(self) -> Sequence[float]:
+        """Where the robot's tool is."""
+        return self.environment.tool(self.env)
 
     @property
     def hold_action(self) -> Any:

@@ -7,7 +7,7 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import check_benchmark
 from mme_vla.envs import make, metadata
 from mme_vla.envs.base import Environment
-from mme_vla.envs.facts import Fact
+from mme_vla.envs.facts import Candidates, Fact
 from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
 from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
 from mme_vla.registry import ENVS
@@ -60,6 +60,34 @@ class RoboMME(Environment):
         facts: Sequence[Fact] = env.facts
         return facts
 
+    def twin(self, spec: EpisodeSpec) -> Mapping[str, Any] | None:
+        """The row of the scene in which the task's `flip_fact` changed one fact."""
+        from mme_vla.envs.robomme.scene.placement import SceneError
+
+        self.check_installed()
+        try:
+            task = make.make_task(spec.task, render=False, **spec.options)
+        except SceneError:
+            return None
+        try:
+            task.reset()
+            values = task.flip_fact()
+            return None if values is None else task.scene_values() | {"spec": values}
+        except SceneError:
+            return None
+        finally:
+            task.close()
+
+    def candidates(self, env: Any) -> Candidates | None:
+        """What the current sub-task can be carried out on."""
+        candidates: Candidates | None = env.candidates
+        return candidates
+
+    def tool(self, env: Any) -> Sequence[float]:
+        """X and y of the tool, in metres."""
+        tool: Sequence[float] = env.tool
+        return tool
+
     def scene_digest(self, spec: EpisodeSpec) -> str:
         """Without the conditioning video, which does not belong to the scene."""
         from mme_vla.envs.robomme.scene.placement import SceneError
@@ -86,6 +114,9 @@ class RoboMME(Environment):
         action_space: str | None = None,
         max_steps: int | None = None,
         render: bool = True,
+        row: Mapping[str, Any] | None = None,
     ) -> Any:
         action_space = action_space or make.ACTION_SPACES[0]
-        return make.make_env(task, split, episode, action_space, max_steps=max_steps, render=render)
+        return make.make_env(
+            task, split, episode, action_space, max_steps=max_steps, render=render, row=row
+        )

@@ -62,6 +62,18 @@ class Fact:
 
 
 @dataclass(frozen=True)
+class Candidates:
+    """What the robot's next motion can go to, where the facts so far decide which is correct.
+
+    places: [n, d], in metres or any unit of the environment. correct: indices of the places that
+    the facts name.
+    """
+
+    places: Sequence[Sequence[float]]
+    correct: Sequence[int]
+
+
+@dataclass(frozen=True)
 class VisibleFact:
     """A fact that the current frame shows.
 

@@ -18,7 +18,7 @@ import torch
 
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.base import Hold
-from mme_vla.envs.facts import Fact, TaskFacts
+from mme_vla.envs.facts import Candidates, Fact, TaskFacts
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import (
@@ -369,6 +369,17 @@ class RoboMMEEnv(gymnasium.Env):
     def facts(self) -> Sequence[Fact]:
         """What the frames since the reset showed, the video's first."""
         return () if self._run is None else tuple(self._run.facts.facts)
+
+    @property
+    def candidates(self) -> Candidates | None:
+        """What the next motion can go to, where a decision depends on a fact."""
+        return self.task.candidates()
+
+    @property
+    def tool(self) -> Sequence[float]:
+        """X and y of the tool, in metres."""
+        x, y, _ = self.task.tcp_pose.p.tolist()
+        return [x, y]
 
     @property
     def steps_counted(self) -> int:

@@ -111,7 +111,7 @@ def check_sessions(split: str, sessions: int) -> None:
     require(
         required == sessions,
         f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown."
-        " `python -m mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded"
+        " `mme-vla evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded"
         " ones; callers that show them themselves make the scenes of split=test, which are the"
         " same.",
     )

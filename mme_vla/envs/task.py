@@ -12,11 +12,12 @@ from typing import Any, ClassVar
 
 import torch
 
-from mme_vla.envs.facts import VisibleFact
+from mme_vla.envs.facts import Candidates, VisibleFact
 from mme_vla.envs.robomme.scene.motions import Cue, Motion, build_cue, show_cue
 from mme_vla.envs.robomme.scene.objects import Disc
 from mme_vla.envs.robomme.scene.placement import Draws
 from mme_vla.envs.robomme.scene.stage import Stage
+from mme_vla.envs.robomme.scene.things import Thing
 from mme_vla.envs.robomme.scene.values import Values
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.envs.subtasks import Choice, Progress, SubTask
@@ -32,6 +33,13 @@ def key_pose(subtask: SubTask) -> VisibleFact:
     if names:
         value = f"{subtask.text}: {', '.join(names)}"
     return VisibleFact(value, frozenset(names))
+
+
+def candidates_among(things: Sequence[Thing], correct: Sequence[Thing]) -> Candidates:
+    """Things as candidates, those that are also in `correct` as the correct ones."""
+    numbers = {id(thing) for thing in correct}
+    indices = [i for i, thing in enumerate(things) if id(thing) in numbers]
+    return Candidates([thing.position[:2].tolist() for thing in things], indices)
 
 
 class Task(Stage):
@@ -201,6 +209,28 @@ class Task(Stage):
         kind = (subtasks[i].choice, subtasks[i].video)
         count = sum((subtask.choice, subtask.video) == kind for subtask in subtasks)
         return VisibleFact(str(count), {f"count of {subtasks[i].choice}"}, replaces=True)
+
+    def flip_fact(self) -> dict[str, Any] | None:
+        """The values (`values.spec`) of a scene that differs from this one in a single fact: the
+        goal, every place and what is to be done look the same once the fact has been shown.
+
+        By default None: what the robot itself did, such as a count, is no value of a scene.
+        """
+        return None
+
+    def candidates(self) -> Candidates | None:
+        """X and y of what the current sub-task can be carried out on, where a decision of the
+        execution depends on memory; None elsewhere.
+
+        By default the objects that the sub-task's option chooses among.
+        """
+        subtask = self.progress.current
+        if subtask is None or subtask.video or not subtask.operation:
+            return None
+        for choice in self.choices():
+            if choice.label == subtask.choice and choice.candidates is not None:
+                return candidates_among(choice.candidates, subtask.targets)
+        return None
 
     def failure(self) -> bool:
         """What counts as failure at any time, whatever the sub-task."""

@@ -191,7 +191,8 @@ def receipt(
     path = receipt_file(records)
     here = _conditions(policy.device.type == "cuda", renders, _extras_of(policy))
     here["checkpoint"] = _checkpoint(source)
-    here |= policy.conditions()
+    if policy.info.server is not None:
+        here["server"] = dict(policy.info.server)
     conditions: list[dict[str, Any]] = []
     if path.exists():
         conditions = read_receipt(path)["conditions"]
@@ -215,7 +216,8 @@ def receipt(
     try:
         yield
     finally:
-        here |= policy.conditions()  # a server's times are known now
+        if policy.info.server is not None:
+            here["server"] = dict(policy.info.server)  # its times are known now
         write()
 
 

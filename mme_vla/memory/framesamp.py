@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
 from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.sizes import LEAST_FRAMES, budget_frames
 from mme_vla.registry import MEMORIES
 
 
@@ -32,20 +32,6 @@ def evenly_spaced_stored_frames(storage: StorageSpec, step: int, count: int) -> 
     return stored[evenly_spaced_frames(len(stored) - 1, count)]
 
 
-def budget_frames(budget: int, grid: int, at_least: int = 1) -> int:
-    """How many frames of grid×grid tokens a budget holds; raises `UserError` unless it holds whole
-    ones, and enough.
-    """
-    check_sizes("memory", budget=budget, grid=grid)
-    least = max(budget // grid**2, at_least) * grid**2
-    require(
-        budget == least,
-        f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames, at least"
-        f" {at_least}: choose a multiple of {grid**2}, such as {least}.",
-    )
-    return budget // grid**2
-
-
 @MEMORIES.register("framesamp")
 class FrameSamp(PerceptualMemory):
     """budget / grid² frames of grid×grid tokens each: 32 frames of 16 tokens as released."""
@@ -66,7 +52,7 @@ class FrameSamp(PerceptualMemory):
             every: frames 0 and k·every − 1 can be remembered; the others are neither rendered nor
                 encoded. 1: all.
         """
-        frames = budget_frames(budget, grid)
+        frames = budget_frames(budget, grid, LEAST_FRAMES["framesamp"])
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
         self.frames = frames
 

@@ -39,6 +39,8 @@ class PolicyInfo:
     max_running: most episodes that it can act in at the same time; None for any number.
     identity: what records call a policy that does not compute here; None for what its configuration
     says.
+    server: what a receipt names of the server where the policy computes, its metadata and times so
+        far; None for a policy that computes here.
     history_dtype: of stored vision tokens (`Policy.encode_frames`).
     processor_sizes: sizes of the network that its processor must have too, by the name of the
         processor's attribute, such as `image_size` or `embodiment.action.horizon`. A checkpoint in
@@ -52,6 +54,7 @@ class PolicyInfo:
     resamples: bool = True
     max_running: int | None = None
     identity: PolicyIdentity | None = None
+    server: Mapping[str, Any] | None = None
     history_dtype: torch.dtype = torch.bfloat16
     processor_sizes: Mapping[str, object] = field(default_factory=dict)
 
@@ -82,7 +85,7 @@ class Policy(nn.Module):
     """Weights of auxiliary losses by name, which training sets from `train.losses`. None for a
     policy that has no such losses, and weighs no samples (`Batch.weight`).
     """
-    has_self_check: bool = False
+    _renews_self_check: bool = False
     """Whether the checkpoint that it was loaded from has a self-check. It is recorded again, of the
     weights as they are then, where the policy is saved.
     """
@@ -246,15 +249,6 @@ class Policy(nn.Module):
             Whether more remains. A recurrent memory reads its next list of frames so.
         """
         return False
-
-    def conditions(self) -> dict[str, Any]:
-        """What a receipt names of this policy beside code and files; a server's metadata, if it
-        computes there.
-        """
-        return {}
-
-    def close(self) -> None:
-        """Free what the policy holds outside of this process."""
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         """The current observations of episodes, as a batch of the processor's kind on the policy's

@@ -8,7 +8,11 @@ from pathlib import Path
 from mme_vla.errors import UserError, require
 from mme_vla.registry import extensions
 
+OUTPUTS = "outputs"
+"""The folder of the current one in which commands write."""
 CHECKPOINTS = "checkpoints"
+EXAMPLE = f"{OUTPUTS}/<model>/<date>/{CHECKPOINTS}/step_000500"
+"""A checkpoint's folder, for messages."""
 STATE = "training_state.json"
 """The file of a checkpoint that is written last: where it is, the checkpoint is whole."""
 _STEP = re.compile(r"step_(\d+)")
@@ -88,6 +92,14 @@ def shipped_checkpoints() -> dict[str, Path]:
     return by_name
 
 
+def shipped_name(folder: Path) -> str | None:
+    """The name under which a checkpoint folder ships; None for any other folder."""
+    for name, shipped in shipped_checkpoints().items():
+        if shipped == folder:
+            return name
+    return None
+
+
 def find_run(path: Path) -> Path:
     """`path`, the newest run where it ends in `latest`, or the checkpoint that ships under this
     name (`shipped_checkpoints`).
@@ -139,9 +151,10 @@ def resolve_checkpoint(path: Path) -> Path:
         f"The folder {path} holds no checkpoint, and hides the one that ships under this name:"
         " rename it, or run the command in another folder.",
     )
+    reason = "" if path.exists() else " there is no such folder;"
     raise UserError(
-        f"No checkpoint at {path}: expected a folder such as"
-        " outputs/<model>/<date>/checkpoints/step_000500, or the run folder above it."
+        f"No checkpoint at {path}:{reason} expected a folder such as {EXAMPLE}, or the run folder"
+        " above it."
     )
 
 
@@ -169,13 +182,30 @@ def locate_checkpoint(source: str | Path) -> str:
     """The checkpoint folder that `source` names; `source` itself where it is none on this machine,
     but on the hub.
 
-    A path of three parts or more whose first folder is on this machine is never of the hub.
-
     Raises:
-        UserError: a folder on this machine, or a path below one, without a checkpoint.
+        UserError: a folder on this machine, or a path of `check_on_machine`, without a checkpoint.
     """
     path = find_run(Path(source).expanduser())
-    is_local = len(path.parts) > 2 and Path(path.parts[0]).is_dir()
-    if not (path.exists() or is_local):
+    check_on_machine(path)
+    if not path.exists():
         return str(source)
     return str(resolve_checkpoint(path))
+
+
+def check_on_machine(path: Path) -> None:
+    """Refuse a missing path that cannot be of the hub: its names are `owner/name` or
+    `owner/name/folder`, relative, and not in `outputs/`.
+
+    A path of three parts or more whose first folder is on this machine is never of the hub.
+    """
+    if path.exists():
+        return
+    parts = path.parts
+    below_folder = len(parts) > 2 and Path(parts[0]).is_dir()
+    is_path = path.is_absolute() or parts[0] in (OUTPUTS, "..")
+    require(
+        len(parts) > 1 and not is_path and not below_folder,
+        f"No checkpoint at {path}: there is no such folder. Expected one with a config.json, such"
+        f" as {EXAMPLE}, the run folder above it, a checkpoint that ships"
+        f" ({', '.join(shipped_checkpoints())}), or owner/name of a repository on the hub.",
+    )

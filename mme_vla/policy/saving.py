@@ -322,7 +322,7 @@ def load_policy[P: "Policy"](
     recompute_buffers(policy)
     policy.processor = load_processor(folder, tokenizer)
     check_processor(policy, str(source))
-    policy.has_self_check = (folder / SELF_CHECK).is_file()
+    policy._renews_self_check = (folder / SELF_CHECK).is_file()
     if kind == torch.bfloat16:
         policy.requires_grad_(False)
     return policy.to(device).eval()

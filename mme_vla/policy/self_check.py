@@ -225,7 +225,7 @@ def renew_self_check(policy: "Policy", dtype: str) -> SelfCheck | None:
     Args:
         dtype: that the weights will be stored in.
     """
-    if not policy.has_self_check:
+    if not policy._renews_self_check:
         return None
     check, reason = try_self_check(policy)
     if check is None:

@@ -88,7 +88,7 @@ class MMEVLAModelServer(PredictModelServer):
         require(
             not robot.readings,
             f"This policy reads {', '.join(robot.readings)}, which the harness does not send: it"
-            " cannot be served to it. Evaluate it with python -m mme_vla.evaluate.",
+            " cannot be served to it. Evaluate it with mme-vla evaluate.",
         )
         require(
             not robot.action.of_pose,

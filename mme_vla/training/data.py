@@ -85,8 +85,9 @@ def prepare_data(
     val = None
     if held_out:
         val = _samples(policy, data, sources, caches, split.val, seed, held_out=True)
+    names = ", ".join(source.name for source in sources)
     say(
-        f"data {data.name}: {len(train)} training steps in {sum(map(len, split.train))} episodes,"
+        f"data {names}: {len(train)} training steps in {sum(map(len, split.train))} episodes,"
         f" {0 if val is None else len(val)} held-out steps in {held_out}"
     )
     return SplitData(train, val, [source.fingerprint for source in sources])

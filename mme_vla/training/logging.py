@@ -96,7 +96,7 @@ class Window:
             not broken,
             f"{' and '.join(broken)} stopped being a number before step {step}; nothing of it was"
             " saved. Resume from the last checkpoint with a lower train.lr in a new run"
-            " (init_from=…), or look for broken values in the data (python -m mme_vla.inspect"
+            " (init_from=…), or look for broken values in the data (mme-vla inspect"
             " dataset=…).",
         )
         self.restart()

@@ -17,6 +17,7 @@ from mme_vla.config.sections import (
     read_section,
 )
 from mme_vla.errors import require
+from mme_vla.memory.sizes import check_budget
 
 if TYPE_CHECKING:
     import torch
@@ -236,6 +237,7 @@ class TrainRun:
             config: plain and resolved.
         """
         settings = TrainSettings.from_dict(config["train"], config["seed"])
+        check_budget(config.get("memory"))
         run = read_section(
             cls, config, others=True, name=str(config["name"]), train=settings, config={}
         )

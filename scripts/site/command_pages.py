@@ -40,8 +40,8 @@ GUIDES = {
 }
 """Command → the page that shows it at work."""
 EXAMPLES = {
-    "results": "python -m mme_vla.results --demo --html report.html",
-    "analyse": "python -m mme_vla.analyse selection --output selection.mp4",
+    "results": "mme-vla results --demo --html report.html",
+    "analyse": "mme-vla analyse selection --output selection.mp4",
     "harness": "mme-vla harness --port 8000 --args.checkpoint=outputs/framesamp_modul/latest",
     "weights": (
         "mme-vla weights Yinpei/mme_vla_suite/perceptual-framesamp-modul"

@@ -11,7 +11,7 @@ from mme_vla.config.trees import library_files, library_trees
 REPOSITORY = Path(__file__).resolve().parents[2]
 INTRODUCTION = """# Configuration
 
-Every command takes `key=value` and `group=file` words: `python -m mme_vla.train model=framesamp_modul train.lr=1e-3`.
+Every command takes `key=value` and `group=file` words: `mme-vla train model=framesamp_modul train.lr=1e-3`.
 The keys of a command are on its page under *Commands*, the files of a group below. In Python the same words are keyword
 arguments: `build_policy("framesamp_modul", backbone="pi05", memory={"budget": 256})`.
 

@@ -56,8 +56,9 @@ LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", "
 
 def on_config(config: "MkDocsConfig") -> "MkDocsConfig":
     """Take version and address of the project from `pyproject.toml`. The placeholder of an address
-    is no link.
+    is no link. Pages that are opened as files need none for an unknown address.
     """
+    config.theme.static_templates.discard("404.html")
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     version = pyproject["project"]["version"]
     address = pyproject["tool"]["hatch"]["metadata"]["hooks"]["custom"]["repository"]

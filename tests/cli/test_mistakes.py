@@ -51,6 +51,14 @@ def reply(
         ("results verify", "A value is needed for receipt (receipt: receipt.json, or a folder"),
         ("docs --biuld", "There is no option '--biuld'. Did you mean '--build'?"),
         ("docs --output", "--output needs one value."),
+        ("evaluate with=[drop:all]", "'with' is a key of mme-vla probe."),
+        ("evaluate checkpoint=missing", "No checkpoint at missing: there is no such folder."),
+        ("evaluate checkpoint=outputs/missing", "No checkpoint at outputs/missing: there is no"),
+        ("probe checkpoint=nano with=[dropall] recordings=sample", "Did you mean 'drop'?"),
+        (
+            "probe checkpoint=nano with=[drop:many] recordings=sample",
+            "a name and a number, drop:2.",
+        ),
     ],
 )
 def test_a_reply_says_what_to_type(
@@ -132,6 +140,9 @@ def test_the_version_is_printed(
         ("evaluate checkpoint=nano video=yes", "video='yes'. Known: all, failure, none"),
         ("serve checkpoint=nano port=80000", "port=80000 must be a whole number from 0 to 65535"),
         ("nano task=VideoUnmask model=nope", "Unknown model 'nope'."),
+        ("train model=framesamp_modul memory.budget=100", "choose a multiple of 16, such as 96."),
+        ("evaluate checkpoint=missing", "No checkpoint at missing: there is no such folder."),
+        ("probe checkpoint=nano recordings=sample with=[dropall]", "Did you mean 'drop'?"),
     ],
 )
 def test_values_are_checked_without_pytorch(line: str, message: str, tmp_path: Path) -> None:

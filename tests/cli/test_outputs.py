@@ -164,7 +164,11 @@ def test_a_gallery_replaces_no_readme_but_its_own(
     with pytest.raises(UserError, match=r"README\.md exists"):
         gallery.main(cfg)
     assert page.read_text() == "# My project\n"
-    page.write_text(gallery.render("gallery.md", entries=[("StopCube", "press", "StopCube.jpg")]))
+    page.write_text(
+        gallery.render(
+            "gallery.md", title="StopCube", entries=[("StopCube", "press", "StopCube.jpg")]
+        )
+    )
     with pytest.raises(RuntimeError, match="reached"):
         gallery.main(cfg)
 

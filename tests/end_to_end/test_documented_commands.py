@@ -184,11 +184,9 @@ def test_the_words_of_other_documented_commands_are_valid(page: str, command: st
         assert arguments[0] in cli.commands()
         command_name, arguments = arguments[0], arguments[1:]
         entry = f"mme-vla {command_name}"
-        if command_name in ("train", "evaluate"):  # typed in both ways, without words of their own
-            entry = f"python -m mme_vla.{command_name}"
     else:
         assert find_spec(program) is not None
-        entry = f"python -m {program}"
+        entry = f"mme-vla {program.removeprefix('mme_vla.')}"
     name = {documented: name for name, documented in configured_commands().items()}.get(entry)
     if name is None:  # it takes options instead of a configuration
         return

@@ -114,6 +114,8 @@ evaluate checkpoint=nanno
 evaluate checkpoint=missing
 evaluate checkpoint=empty
 evaluate checkpoint=missing/latest
+evaluate checkpoint=outputs/missing
+evaluate checkpoint=nano with=[drop:all]
 evaluate checkpoint=nano tasks=VideoUmask
 evaluate checkpoint=nano task=[VideoUnmask,StopCub]
 evaluate checkpoint=nano task=VideoUnmask tasks=StopCube
@@ -145,6 +147,8 @@ probe checkpoint=nano
 probe checkpoint=nano recordings=missing
 probe checkpoint=nano recordings=not_a_dataset
 probe checkpoint=nano with=[dropall]
+probe checkpoint=nano with=[dropall] recordings=sample
+probe checkpoint=outputs/missing recordings=sample
 probe checkpoint=nano with=[drop:many] recordings=not_a_dataset
 probe checkpoint=nano offline=false
 probe checkpoint=nano offline=false online=true task=VideoUmask
@@ -154,6 +158,7 @@ probe compare=[missing]
 probe card=yes checkpoint=nano
 inspect
 inspect checkpoint=missing
+inspect checkpoint=nano dataset=sample
 inspect checkpoint=cut
 inspect checkpoint=changed
 inspect dataset=missing

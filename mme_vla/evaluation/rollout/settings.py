@@ -3,11 +3,13 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Self, TypedDict
 
 from mme_vla.config.sections import NonNegativeInt, Positive, PositiveInt, read_section
 from mme_vla.envs.base import environment
 from mme_vla.evaluation.rollout.events import read_events
+from mme_vla.policy.run_folders import check_on_machine, find_run
 
 
 @dataclass(frozen=True)
@@ -103,10 +105,12 @@ class RolloutKeywords(TypedDict, total=False):
 
 
 def check_config(config: Mapping[str, Any]) -> None:
-    """Check what a command's configuration says of rollouts and of the tasks, without PyTorch.
+    """Check what a command's configuration says of rollouts, tasks and checkpoint, without PyTorch.
 
     Args:
         config: plain and resolved, of a command that has the keys of configs/evaluate.yaml.
     """
     # Each event is a run of its own, which the command checks.
     RolloutSettings.from_config({**config, "event": None})
+    if config["checkpoint"] is not None:
+        check_on_machine(find_run(Path(str(config["checkpoint"])).expanduser()))

@@ -195,8 +195,11 @@ def _seconds_a_scene(
 
 
 def _write(card: Card, conclusion: Conclusion, folder: Path, policy: Policy) -> None:
-    server = policy.conditions().get("server")
-    content = {"conclusion": asdict(conclusion), "card": asdict(card), "server": server}
+    content = {
+        "conclusion": asdict(conclusion),
+        "card": asdict(card),
+        "server": policy.info.server,
+    }
     write_json(folder / FIGURES, to_json(content))
     verdict, *reasons = conclusion.sentences
     detail = ""

@@ -8,7 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import log_to_terminal
-from mme_vla.cli.loading import PolicyChoice, load_policy
+from mme_vla.cli.loading import PolicyChoice, load_policy, release
 from mme_vla.config.devices import process_device
 from mme_vla.config.sections import read_section
 from mme_vla.data.sources import open_sources
@@ -64,7 +64,7 @@ def main(cfg: DictConfig) -> None:
             values["references"],
         )
     finally:
-        policy.close()
+        release(policy)
     verdict, *reasons = result.conclusion.sentences
     print(card_text(result.card, verdict))
     print("\n".join(reasons))

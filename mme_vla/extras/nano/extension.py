@@ -12,8 +12,7 @@ EXTENSION = Extension(
         "nano": Command(
             "mme_vla.extras.nano.cli.nano",
             "small policies from nothing to results on two cores; `nano board` ranks them",
-            "nano",
-            "python -m mme_vla.nano",
+            config="nano",
             reads_words=True,
         ),
         "vision-pretrain": Command(

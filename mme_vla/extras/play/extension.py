@@ -15,8 +15,7 @@ EXTENSION = Extension(
         "play": Command(
             "mme_vla.extras.play.cli",
             "play the tasks yourself, or let a model play",
-            "play",
-            "python -m mme_vla.play",
+            config="play",
         )
     },
     configs=Path(__file__).parent / "configs",

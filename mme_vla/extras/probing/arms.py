@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import UserError, require
 from mme_vla.extras.probing.channels import Channel, Remembered
 from mme_vla.extras.probing.feed import Feed
 from mme_vla.extras.probing.interventions import NEEDS, Moment, perturb_store
+from mme_vla.extras.probing.settings import listed_arms, words_of_arm
 from mme_vla.memory.perturbation import (
     PROBE,
     Pause,
@@ -19,7 +20,6 @@ from mme_vla.memory.perturbation import (
     build_perturbation,
     build_word,
     overrides,
-    split_word,
 )
 from mme_vla.policy.base import Policy
 from mme_vla.policy.sections import PolicySections
@@ -156,24 +156,13 @@ def read_arm(spec: Any) -> Arm:
         if options:
             name += f"({options})"
         return Arm(name, (build_perturbation(spec, PROBE, "with"),))
-    if not isinstance(spec, str) or not spec:
-        raise UserError(
-            f"with={brief(spec)}: write words such as drop:2 or nodemo+shuffle, or {{name: drop,"
-            " …}."
-        )
-    parts = []
-    for text in spec.split("+"):
-        word = split_word(text)
-        if word is None or word.unit is not None:
-            raise UserError(f"with={text}: write a name, as drop, or a name and a number, drop:2.")
-        parts.append(build_word(word, PROBE, f"with={text}"))
+    parts = [build_word(word, PROBE, f"with={text}") for text, word in words_of_arm(spec)]
     return Arm(spec, tuple(parts))
 
 
 def read_arms(specs: Any) -> list[Arm]:
     """Arms of `with`, each once."""
-    words = [specs] if isinstance(specs, str | Mapping) else list(specs)
-    arms = [read_arm(word) for word in words]
+    arms = [read_arm(spec) for spec in listed_arms(specs)]
     names = [arm.name for arm in arms]
     if twice := [name for i, name in enumerate(names) if name in names[:i]]:
         raise UserError(f"with= names {twice[0]} twice.")

@@ -42,15 +42,13 @@ EXTENSION = Extension(
         "analyse": Command(
             "mme_vla.extras.probing.cli.analyse",
             "what a memory attends to, selects, modulates and costs",
-            usage="python -m mme_vla.analyse",
             processes="any",
         ),
         "probe": Command(
             "mme_vla.extras.probing.cli.probe",
             "what a policy takes from its memory, on recorded episodes and in closed loop",
-            "probe",
-            "python -m mme_vla.probe",
-            "shared",
+            config="probe",
+            processes="shared",
             reads_words=True,
         ),
     },

@@ -330,6 +330,7 @@ class ProbedPolicy(Policy):
             max_actions=inner.info.max_actions,
             max_running=inner.info.max_running,
             identity=inner.info.identity,
+            server=inner.info.server,
             history_dtype=inner.info.history_dtype,
         )
         if arm.parts:
@@ -337,9 +338,6 @@ class ProbedPolicy(Policy):
 
     def start_episode(self, goal: str, seed: int = 0) -> ProbedEpisode:
         return ProbedEpisode(self, goal, seed)
-
-    def conditions(self) -> dict[str, Any]:
-        return self.inner.conditions()
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
         return self.inner.sampling_noise(generator)

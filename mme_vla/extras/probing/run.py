@@ -5,7 +5,7 @@ resumes.
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,20 +42,11 @@ from mme_vla.extras.probing.offline import OfflineSettings, probe_offline
 from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.extras.probing.recordings import Recording, all_recordings
 from mme_vla.extras.probing.report import Notes, check_outputs, write_images, write_page
+from mme_vla.extras.probing.settings import IN_CLOSED_LOOP, NO_DATA
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
 
 OFFLINE, ONLINE = "offline", "online"  # Folders of the lines and of the closed loop
-NO_DATA = (
-    "A probe on recorded episodes needs some: recordings=<dataset>. Those of the benchmark are made"
-    " by `mme-vla record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false"
-    " online=true probes in closed loop alone."
-)
-
-
-IN_CLOSED_LOOP = (
-    "event=…: events act in closed loop: add online=true to the command, or tasks=… in Python."
-)
 
 
 @dataclass(frozen=True)
@@ -243,8 +234,6 @@ def probe(
     tasks: str | Sequence[str] | None = None,
     episodes: int | Sequence[int] | None = None,
     seed: int = 42,
-    draws: int = 8,
-    moments: int | None = 8,
     subgoal: str | SubgoalPredictor | None = None,
     name: str | None = None,
     base: Callable[..., Any] = make_env,
@@ -263,20 +252,25 @@ def probe(
         output: the probe's folder, for its lines and its page.
         tasks, episodes: of the closed loop, as for `evaluate`; None leaves it out.
         seed: of noise and of random choices.
-        draws: chunks sampled at each step. moments: most steps of an episode.
         subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
         name: what lines and records call the policy. base: makes an environment with the
             benchmark's interface.
         show_progress: whether a progress bar is shown. event: further arms of the closed loop, as
             for `evaluate`.
-        settings: of `RolloutSettings`, such as `workers=2`.
+        settings: of `OfflineSettings`, such as `draws=8` chunks a step, and of `RolloutSettings`,
+            such as `workers=2`.
 
     Returns:
         Its findings, the paired comparisons of the closed loop, notes, and the path of the page.
 
     >>> probe("outputs/mine/latest", "outputs/val", output="outputs/probe").page  # doctest: +SKIP
     """
-    run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
+    settings["seed"] = seed
+    offline = read_section(OfflineSettings, settings, others=True)
+    of_rollouts = {spec.name for spec in fields(RolloutSettings)}
+    of_offline = {spec.name for spec in fields(OfflineSettings)} - of_rollouts
+    rollout = {key: value for key, value in settings.items() if key not in of_offline}
+    run_settings = read_section(RolloutSettings, rollout)
     if recordings is None and tasks is None:
         raise UserError(f"probe() needs recordings=…, tasks=…, or both. {NO_DATA}")
     arms_of_events = event_arms(event)
@@ -294,7 +288,6 @@ def probe(
     facts = facts_of(
         loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None
     )
-    offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
     plan = ProbePlan(arms, recorded, recorded, jobs, offline, arms_of_events)
     folder = Path(output).expanduser()
     options = RunOptions(predictor, source=source, base=base, show_progress=show_progress)

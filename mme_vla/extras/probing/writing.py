@@ -5,7 +5,7 @@ Nothing is trained and no policy acts: the memory selects along demonstrated epi
 (`evidence.py`).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import comb
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from mme_vla.data.statistics import normalised_states
+from mme_vla.envs.facts import Fact
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.evidence import EvidenceEpisode
 from mme_vla.memory.base import MemoryModule, stack_history
@@ -119,20 +120,100 @@ def score_episode(
     return EpisodeWriting(precision, recall, chance_precision, chance_recall, lags, len(facts))
 
 
+@dataclass(frozen=True)
+class Operations:
+    """What a memory did with the facts of one episode, at the decisions that depend on them.
+
+    stored: of each fact that a decision depends on, whether the memory keeps a frame of it there.
+    updated: of each fact that another one replaced before the decision, whether as many frames of
+    the new one are kept there as of the old one, and at least one. kept: facts kept at each
+    decision.
+    """
+
+    stored: Sequence[bool]
+    updated: Sequence[bool]
+    kept: Sequence[int]
+
+
+def operations_of(selection: Selection, facts: Sequence[Fact]) -> Operations:
+    """Storage and update of one episode.
+
+    Args:
+        selection: the frames selected at a step. facts: with the decisions that need them.
+    """
+    stored: list[bool] = []
+    updated: list[bool] = []
+    kept: list[int] = []
+    decisions: set[int] = set()
+    for fact in facts:
+        decisions.update(fact.needed)
+    for decision in sorted(decisions):
+        frames = selection(decision)
+        needed = [fact for fact in facts if decision in fact.needed]
+        counts = [_frames_of(fact, frames) for fact in needed]
+        stored += [count > 0 for count in counts]
+        kept.append(sum(count > 0 for count in counts))
+        for fact, count in zip(needed, counts, strict=True):
+            if fact.changed is None or fact.changed > decision:
+                continue
+            for other, new in zip(needed, counts, strict=True):
+                if other.frames[0] == fact.changed:
+                    updated.append(new >= max(count, 1))
+    return Operations(stored, updated, kept)
+
+
+def _frames_of(fact: Fact, frames: np.ndarray) -> int:
+    """How many of these frames show a fact."""
+    first, last = fact.frames
+    return int(((frames >= first) & (frames <= last)).sum())
+
+
 @dataclass
 class Writing:
-    """The scores of one memory: task → its episodes."""
+    """The scores of one memory: task → its episodes.
+
+    operations: task → those of its episodes. budget: tokens of the memory; None where the frames
+    are no memory's.
+    """
 
     tasks: dict[str, list[EpisodeWriting]] = field(default_factory=dict)
+    operations: dict[str, list[Operations]] = field(default_factory=dict)
+    budget: int | None = None
+
+    def operations_row(self, tasks: Iterable[str]) -> dict[str, float | None]:
+        """`storage`, `update` and `compression` over the episodes of these tasks.
+
+        storage, update: shares of `Operations.stored` and `updated`; None where there is none.
+        compression: facts kept at a decision for each token of the memory's budget.
+        """
+        stored: list[bool] = []
+        updated: list[bool] = []
+        kept: list[int] = []
+        for task in tasks:
+            for operations in self.operations.get(task, ()):
+                stored += operations.stored
+                updated += operations.updated
+                kept += operations.kept
+        row: dict[str, float | None] = {"storage": None, "update": None, "compression": None}
+        if stored:
+            row["storage"] = float(np.mean(stored))
+        if updated:
+            row["update"] = float(np.mean(updated))
+        if kept and self.budget:
+            row["compression"] = float(np.mean(kept)) / self.budget
+        return row
 
     def to_dict(self) -> dict[str, Any]:
         """`tasks` and `mean`: rows of `precision`, `recall`, `score`, `chance`, `lag`, `held`,
-        `facts` and `episodes`.
+        `facts`, `episodes`, `storage`, `update` and `compression`.
 
         lag: mean, in frames; None where no fact was kept. held: share of the facts that were kept
         at some step.
         """
-        rows = {task: _row(episodes) for task, episodes in self.tasks.items()}
+        rows = {
+            task: _row(episodes) | self.operations_row([task])
+            for task, episodes in self.tasks.items()
+        }
         mean: dict[str, Any] = {}
         for name in next(iter(rows.values()), {}):
             values = [row[name] for row in rows.values() if row[name] is not None]
@@ -313,6 +394,8 @@ def score_writing(
         stats = policy.require_processor().require_stats().state
         normalised = normalize(torch.from_numpy(raw), stats)
     states = normalised.split([episode.length for episode in episodes])
+    if isinstance(selector, MemoryModule):
+        writing.budget = selector.budget
     tower = policy if isinstance(selector, MemoryModule) and reads_tokens(selector) else None
     for episode, motion in zip(episodes, states, strict=True):
         if isinstance(selector, str):
@@ -324,6 +407,8 @@ def score_writing(
         )
         if score is not None:
             writing.tasks.setdefault(episode.task, []).append(score)
+            operations = operations_of(selection, episode.facts)
+            writing.operations.setdefault(episode.task, []).append(operations)
     return writing
 
 
@@ -335,15 +420,19 @@ def writing_table(results: Mapping[str, Writing]) -> str:
     """
     rows = {name: writing.to_dict() for name, writing in results.items() if writing.tasks}
     lines = [
-        "| memory | score | chance | precision | recall | lag | held |",
-        "|---|---:|---:|---:|---:|---:|---:|",
+        "| memory | score | chance | precision | recall | lag | held | storage | update |"
+        " facts a 100 tokens |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for name, row in rows.items():
         mean = row["mean"]
         keys = ("score", "chance", "precision", "recall")
         shares = " | ".join(f"{mean[key]:.2f}" for key in keys)
         lag = "" if mean["lag"] is None else f"{mean['lag']:.0f}"
-        lines.append(f"| `{name}` | {shares} | {lag} | {mean['held']:.2f} |")
+        rates = []
+        for key, factor in (("storage", 1), ("update", 1), ("compression", 100)):
+            rates.append("" if mean[key] is None else f"{factor * mean[key]:.2f}")
+        lines.append(f"| `{name}` | {shares} | {lag} | {mean['held']:.2f} | {' | '.join(rates)} |")
     names = [f"`{name}`" for name in rows]
     lines += ["", f"| task | {' | '.join(names)} |", "|---|" + "---:|" * len(rows)]
     tasks: dict[str, None] = {}

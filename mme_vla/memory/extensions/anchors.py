@@ -11,9 +11,9 @@ import numpy as np
 from mme_vla.errors import check_sizes
 from mme_vla.memory.base import PerceptualMemory
 from mme_vla.memory.extensions.attending import FrameMemory
-from mme_vla.memory.framesamp import budget_frames
 from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import check_every, recurrent_frames
+from mme_vla.memory.sizes import LEAST_FRAMES, budget_frames
 from mme_vla.registry import MEMORIES
 
 
@@ -43,7 +43,7 @@ class Anchors(FrameMemory, PerceptualMemory):
         """
         check_sizes("memory", spacing=spacing)
         check_every(every, spacing, "spacing")
-        frames = budget_frames(budget, grid, at_least=2)
+        frames = budget_frames(budget, grid, LEAST_FRAMES["anchors"])
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling), **encoder)
         self.recent = frames - 1
         self.spacing = spacing

@@ -25,8 +25,8 @@ from torch import Tensor
 
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, all_patches
-from mme_vla.memory.framesamp import budget_frames
 from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.sizes import LEAST_FRAMES, budget_frames
 from mme_vla.memory.tokendrop import ChangeScorer
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens
@@ -62,7 +62,7 @@ class Events(PerceptualMemory):
         """
         check_sizes("memory", stride=stride)
         require(gripper > 0, f"memory.gripper={gripper}: must be greater than 0.")
-        frames = budget_frames(budget, grid, at_least=2)
+        frames = budget_frames(budget, grid, LEAST_FRAMES["events"])
         storage = StorageSpec(grid, pooling, stride, ChangeScorer(grid, stride).key)
         super().__init__(d_vision, width, budget, storage, **encoder)
         self.frames = frames

@@ -20,9 +20,10 @@ from torch.nn import functional
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
 from mme_vla.memory.extensions.attending import by_frame, rows_at
-from mme_vla.memory.framesamp import budget_frames, evenly_spaced_stored_frames
+from mme_vla.memory.framesamp import evenly_spaced_stored_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.recurrent import default_hidden, full_precision, linear
+from mme_vla.memory.sizes import LEAST_FRAMES, budget_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens, ReadsLabels
 
@@ -60,7 +61,7 @@ class Keyframes(PerceptualMemory, ReadsLabels):
             hidden: width of the head; None is a quarter of `d_vision`, at least 64.
         """
         check_sizes("memory", every=every, pool=pool)
-        frames = budget_frames(budget, grid, at_least=3)
+        frames = budget_frames(budget, grid, LEAST_FRAMES["keyframes"])
         require(
             frames <= pool,
             f"memory.pool={pool}: the frames of memory.budget={budget} are {frames}, so at least"

@@ -21,8 +21,9 @@ from torch import Tensor
 
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, all_patches
-from mme_vla.memory.framesamp import budget_frames, evenly_spaced_frames
+from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.sizes import LEAST_FRAMES, budget_frames
 from mme_vla.registry import MEMORIES
 
 
@@ -54,7 +55,7 @@ class Retrieval(PerceptualMemory):
                 never cuts.
             longest: most stored frames of a chunk.
         """
-        frames = budget_frames(budget, grid)
+        frames = budget_frames(budget, grid, LEAST_FRAMES["retrieval"])
         require(
             -1 <= cut <= 1,
             f"memory.cut={cut} is a cosine: it lies between -1 (never cut) and 1 (cut everywhere).",

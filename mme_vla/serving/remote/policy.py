@@ -250,6 +250,11 @@ class RemotePolicy(Policy):
         if running is None and name == "mme_vla" and isinstance(most, int):
             running = max(1, most)
         identity = _identity(choice, name, self.metadata)
+        self._server: dict[str, Any] = {
+            "address": choice.server,
+            "protocol": name,
+            "metadata": json_value(self.metadata),
+        }
         max_actions = self.metadata.get("max_actions")
         sample_steps = self.metadata.get("sample_steps")
         self.info = PolicyInfo(
@@ -258,6 +263,7 @@ class RemotePolicy(Policy):
             resamples=False,
             max_running=running,
             identity=identity,
+            server=self._server,
         )
         self.config = {
             "name": identity.model,
@@ -315,17 +321,6 @@ class RemotePolicy(Policy):
             if chunk is not None:
                 row[:] = torch.from_numpy(chunk)
         return rows
-
-    def conditions(self) -> dict[str, Any]:
-        """The server, for a receipt: its address, its protocol, and its metadata."""
-        server = {
-            "address": self.protocol.choice.server,
-            "protocol": self.protocol.name,
-            "metadata": json_value(self.metadata),
-        }
-        if self.traffic.seconds:
-            server["times"] = self.traffic.summary()
-        return {"server": server}
 
     def close(self) -> None:
         """Close all connections."""
@@ -386,6 +381,7 @@ class RemotePolicy(Policy):
             reply = self._act(episode, frames)
         with self._lock:
             self.traffic.add(time.perf_counter() - begun, reply)
+            self._server["times"] = self.traffic.summary()
         return reply
 
     def _act(self, episode: RemoteEpisode, frames: NewFrames) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import torch
 
 from helpers.probe_fakes import made_up, probed, reader
 from helpers.rollout_fakes import quick_policy
+from mme_vla import probe
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.extras.probing.channels import channel_of
@@ -20,6 +21,7 @@ from mme_vla.extras.probing.lines import EntryLine, MomentLine, append, read
 from mme_vla.extras.probing.offline import compare_chunks
 from mme_vla.extras.probing.probed import ProbedPolicy
 from mme_vla.memory.perturbation import Pause, Perturbation
+from mme_vla.testing.small import small_policy
 
 NEURAL_ARMS = [
     "drop:all",
@@ -238,3 +240,14 @@ def test_a_change_is_measured_against_the_noise_of_the_same_policy() -> None:
     assert compare_chunks(before, before[[1, 2, 3, 4, 5, 0]]).distance == pytest.approx(
         0, abs=1e-12
     )
+
+
+def test_settings_of_recordings_and_rollouts_are_keywords(tmp_path: Path) -> None:
+    policy = small_policy("framesamp_modul")
+    options: dict[str, Any] = {"draws": 2, "moments": 1, "scan": False, "workers": 1}
+    page = probe(
+        policy, "sample", ["shuffle"], output=tmp_path, show_progress=False, **options
+    ).page
+    assert "shuffle" in page.read_text()
+    with pytest.raises(UserError, match="Unknown key moment"):
+        probe(policy, "sample", ["shuffle"], output=tmp_path, moment=1)

@@ -19,6 +19,7 @@ from mme_vla.extras.probing.evidence import EvidenceEpisode, record_evidence
 from mme_vla.extras.probing.writing import (
     FRAMES,
     LONGEST,
+    operations_of,
     required_frames,
     score_episode,
     score_writing,
@@ -75,6 +76,36 @@ def test_precision_recall_and_lag_of_a_known_selection(selection, precision, rec
     assert score is not None and score.facts == 2
     assert (score.precision, score.recall) == pytest.approx((precision, recall))
     assert list(score.lags) == lags
+
+
+def test_storage_and_update_are_counted_at_the_decisions() -> None:
+    old = Fact("visit 0", "1", (0, 9), needed=(40, 60), changed=20)
+    new = Fact("visit 1", "2", (20, 29), needed=(40, 60))
+    unused = Fact("light", "red", (30, 35))
+    facts = [old, new, unused]
+    both = operations_of(lambda step: np.array([3, 22, 25, 33]), facts)
+    assert (both.stored, both.updated, both.kept) == ([True] * 4, [True] * 2, [2, 2])
+    stale = operations_of(lambda step: np.array([1, 3, 22]), facts)
+    assert (stale.stored, stale.updated) == ([True] * 4, [False] * 2)
+    lost = operations_of(lambda step: np.array([22] if step < 50 else [step]), facts)
+    assert lost.stored == [False, True, False, False]
+    assert (lost.updated, lost.kept) == ([True, False], [1, 0])
+    later = operations_of(lambda step: np.array([3]), [Fact("a", "1", (0, 9), (15,), changed=20)])
+    assert (later.stored, later.updated) == ([True], [])
+
+
+def test_operations_stand_beside_the_score() -> None:
+    episode = synthetic()
+    facts = [replace(fact, needed=(200,)) for fact in episode.facts]
+    facts[0] = replace(facts[0], changed=50)
+    episodes = [replace(episode, facts=facts)]
+    memory = FrameSamp(32, 16, budget=512, grid=4)
+    mean = score_writing(memory, episodes).to_dict()["mean"]
+    assert (mean["storage"], mean["compression"]) == (1, 4 / 512)
+    assert mean["update"] == 0, "of a longer reveal more frames are kept than of what replaced it"
+    oracle = score_writing("oracle", episodes).to_dict()["mean"]
+    assert (oracle["storage"], oracle["update"], oracle["compression"]) == (1, 1, None)
+    assert score_writing("oracle", [synthetic()]).to_dict()["mean"]["storage"] is None
 
 
 def test_chance_is_the_expectation_for_as_many_frames_at_random() -> None:

@@ -5,11 +5,14 @@ same with that peg.
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from functools import partial
+from typing import Any
 
 import numpy as np
 import sapien
 
+from mme_vla.envs.facts import Candidates
 from mme_vla.envs.robomme.robot.control import PlanningError
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator, PegEnd
 from mme_vla.envs.robomme.robot.robots import ROBOT_BASE
@@ -28,7 +31,7 @@ from mme_vla.envs.robomme.scene.things import Thing, distance_xy
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import end_video
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
-from mme_vla.envs.task import Task
+from mme_vla.envs.task import Task, candidates_among
 
 PEGS, PEG_LENGTH, PEG_RADIUS = 3, 0.05, 0.01
 FROM_BOX, FROM_PEG = 0.06, 0.075
@@ -132,6 +135,22 @@ class InsertPeg(Task):
             if clear and math.dist(place, box) > FROM_BOX:
                 return place
         raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
+
+    def flip_fact(self) -> dict[str, Any] | None:
+        """The first two pegs, of which the video takes one, change places."""
+        if len(self.pegs) < 2:
+            return None
+        values = deepcopy(self.values.spec)
+        pegs = values["initializations"][-1]["pegs"]
+        pegs[0], pegs[1] = pegs[1], pegs[0]
+        return values
+
+    def candidates(self) -> Candidates | None:
+        """The pegs, before one is grasped."""
+        subtask = self.progress.current
+        if subtask is None or subtask.video or subtask.operation != "which":
+            return None
+        return candidates_among(self.pegs, [self.peg])
 
     def cues(self) -> list[Cue]:
         return [Cue("white", lambda: on_table(self.ends(self.end)[0].position))]

@@ -4,10 +4,13 @@ same manner.
 
 import math
 from collections.abc import Sequence
+from copy import deepcopy
+from typing import Any
 
 import numpy as np
 import sapien
 
+from mme_vla.envs.facts import Candidates
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.articulated import PEG_COLOUR, build_peg
 from mme_vla.envs.robomme.scene.objects import H, at, build_cube, build_disc, cube_pose
@@ -28,7 +31,7 @@ from mme_vla.envs.robomme.scene.predicates import (
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import delay, end_video, pick, place, wait
 from mme_vla.envs.subtasks import Choice, SubTask
-from mme_vla.envs.task import Task
+from mme_vla.envs.task import Task, candidates_among
 
 MANNERS = ("hook", "push", "grasp")
 MANNER_TEXTS = {
@@ -132,6 +135,21 @@ class MoveCube(Task):
         if self.reset_in_progress:
             for thing, pose in self._execution_poses.items():
                 thing.displace(pose)
+
+    def flip_fact(self) -> dict[str, Any]:
+        """The video takes the peg instead of the cube, or the cube instead of the peg."""
+        values = deepcopy(self.values.spec)
+        manner = "grasp" if self.manner == "hook" else "hook"
+        values["initializations"][-1]["way_idx"] = MANNERS.index(manner)
+        return values
+
+    def candidates(self) -> Candidates | None:
+        """The peg and the cube: what the manner of the video begins with."""
+        subtask = self.progress.current
+        if subtask is None or subtask.video or subtask.operation != "how":
+            return None
+        first = self.peg.tail if self.manner == "hook" else self.cube
+        return candidates_among([self.peg.tail, self.cube], [first])
 
     def subtasks(self) -> list[SubTask]:
         moves = {"hook": self._hook, "push": self._push, "grasp": self._grasp}[self.manner]

@@ -5,10 +5,13 @@ again.
 import itertools
 import math
 from collections.abc import Sequence
+from copy import deepcopy
 from functools import partial
+from typing import Any
 
 import numpy as np
 
+from mme_vla.envs.facts import Candidates
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Mark, Trace, build_mark
 from mme_vla.envs.robomme.scene.objects import Disc, build_disc
@@ -18,7 +21,7 @@ from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import end_stick_video
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
-from mme_vla.envs.task import Task
+from mme_vla.envs.task import Task, candidates_among
 
 GRID = {"easy": 3, "medium": 4, "hard": 5}
 PATH_LENGTH = {"easy": (2, 4), "medium": (3, 5), "hard": (4, 8)}
@@ -81,6 +84,36 @@ class PatternLock(Task):
         raise SceneError(
             f"PatternLock, seed {self.seed}: no path of {low} to {high} discs in {TRIES} tries."
         )
+
+    def flip_fact(self) -> dict[str, Any] | None:
+        """Another path of the same length from the same disc, with another first move; None where
+        none is found.
+        """
+        n = GRID[self.difficulty]
+        nodes = [self.discs.index(disc) for disc in self.path]
+        draws = Draws(self.seed)
+        for _ in range(TRIES):
+            goal = draws.integer(0, n * n)
+            other = search(draws, n, nodes[0], goal, {nodes[0]}) or []
+            if len(other) == len(nodes) and other[1] != nodes[1]:
+                values = deepcopy(self.values.spec)
+                values["actions"]["path_nodes"] = other
+                return values
+        return None
+
+    def candidates(self) -> Candidates | None:
+        """The neighbours of the disc that the next move starts from."""
+        subtask = self.progress.current
+        if subtask is None or subtask.video:
+            return None
+        remaining = len(self.progress.to_come)
+        here, goal = self.path[-remaining - 1], self.path[-remaining]
+        nearest = SPACING * math.sqrt(2) + 1e-6
+        neighbours = []
+        for disc in self.discs:
+            if disc is not here and distance_xy(disc.position, here.position) < nearest:
+                neighbours.append(disc)
+        return candidates_among(neighbours, [goal])
 
     def start_episode(self, draws: Draws) -> None:
         self.marks = [

@@ -3,8 +3,10 @@ pick up just those.
 """
 
 from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any
 
-from mme_vla.envs.facts import VisibleFact
+from mme_vla.envs.facts import Candidates, VisibleFact
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
 from mme_vla.envs.robomme.scene.motions import Cue, Highlight, active_motions, under
 from mme_vla.envs.robomme.scene.objects import COLOURS, RGB, Cube, H, build_highlight
@@ -22,7 +24,7 @@ from mme_vla.envs.robomme.tasks.families.stages import (
     put_down_choice,
 )
 from mme_vla.envs.subtasks import Choice, SubTask, ordinal
-from mme_vla.envs.task import Task
+from mme_vla.envs.task import Task, candidates_among
 
 CUBES = {"easy": 3, "medium": 4, "hard": 6}
 GOALS = {"easy": 1, "medium": 2, "hard": 3}
@@ -81,6 +83,24 @@ class PickHighlight(Task):
         return self.values.word(
             f"objects.colors.{i}", lambda: SAMPLED_COLOURS[draws.integer(0, 3)], COLOURS
         )
+
+    def flip_fact(self) -> dict[str, Any] | None:
+        """As many of the other cubes are highlighted instead; None where there are fewer."""
+        count = len(self.goal_cubes)
+        others = [i for i, cube in enumerate(self.cubes) if cube in self.other_cubes]
+        if len(others) < count:
+            return None
+        values = deepcopy(self.values.spec)
+        values["objects"]["highlight_ids"] = others[:count]
+        return values
+
+    def candidates(self) -> Candidates | None:
+        """Any highlighted cube that has not been picked up is correct."""
+        options = super().candidates()
+        if options is None:
+            return None
+        remaining = [cube for cube in self.goal_cubes if cube not in self.picked]
+        return candidates_among(self.cubes, remaining)
 
     def cues(self) -> list[Cue]:
         return [under(cube) for cube in self.goal_cubes]

@@ -4,11 +4,13 @@ route.
 
 import itertools
 import math
+from copy import deepcopy
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from mme_vla.envs.facts import Candidates
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator, arc
 from mme_vla.envs.robomme.scene.motions import Cue, Mark, Place, Trace, build_mark, on_table
 from mme_vla.envs.robomme.scene.objects import Disc, build_disc, build_obstacle
@@ -18,7 +20,7 @@ from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.robomme.tasks import register_task
 from mme_vla.envs.robomme.tasks.families.stages import end_stick_video
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
-from mme_vla.envs.task import Task
+from mme_vla.envs.task import Task, candidates_among
 
 PLACES, SPACING, CENTRE_X = 9, 0.07, -0.1
 MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}
@@ -100,6 +102,28 @@ class RouteStick(Task):
                 nearby.remove(route[-2])
             route.append(nearby[draws.integer(0, len(nearby))])
         return route
+
+    def flip_fact(self) -> dict[str, Any] | None:
+        """The route mirrored at its first disc, with the same turns; None where it leaves the
+        discs.
+        """
+        route = [self.discs.index(disc) for disc in self.route]
+        mirrored = [2 * route[0] - i for i in route]
+        if not all(0 <= i < len(self.discs) for i in mirrored):
+            return None
+        values = deepcopy(self.values.spec)
+        values["actions"]["route"] = mirrored
+        return values
+
+    def candidates(self) -> Candidates | None:
+        """The discs beside the one that the next move starts from."""
+        subtask = self.progress.current
+        if subtask is None or subtask.video:
+            return None
+        remaining = len(self.progress.to_come)
+        here = self.discs.index(self.route[-remaining - 1])
+        beside = self.discs[max(here - 1, 0) : here] + self.discs[here + 1 : here + 2]
+        return candidates_among(beside, [self.route[-remaining]])
 
     def cues(self) -> list[Cue]:
         """Of the next move: a disc under its target, and smaller ones along its arc."""

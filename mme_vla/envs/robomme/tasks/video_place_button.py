@@ -2,7 +2,8 @@
 was pressed.
 """
 
-from typing import ClassVar
+from copy import deepcopy
+from typing import Any, ClassVar
 
 from mme_vla.envs.robomme.scene.objects import Disc
 from mme_vla.envs.robomme.scene.placement import Draws
@@ -41,6 +42,19 @@ class VideoPlaceButton(VideoPlace):
         if self.before:
             return self.targets[self._visited_before[-1]]
         return self.targets[self._visited_after[0]]
+
+    def flip_fact(self) -> dict[str, Any]:
+        """The two visited targets change places, and with them the order of the visits.
+
+        Where two targets change places later, it is the same two places.
+        """
+        values = deepcopy(self.values.spec)
+        places = values["layout"]["targets"]
+        places[0], places[1] = places[1], places[0]
+        other = {0: 1, 1: 0}
+        swapped = values["objects"].get("swap_pair_ids") or []
+        values["objects"]["swap_pair_ids"] = [other.get(i, i) for i in swapped]
+        return values
 
     def visits(self) -> list[SubTask]:
         steps: list[SubTask] = []

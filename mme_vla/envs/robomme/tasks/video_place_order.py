@@ -2,7 +2,8 @@
 video.
 """
 
-from typing import ClassVar
+from copy import deepcopy
+from typing import Any, ClassVar
 
 from mme_vla.envs.robomme.scene.objects import Cube, Disc
 from mme_vla.envs.robomme.scene.placement import Draws
@@ -53,6 +54,21 @@ class VideoPlaceOrder(VideoPlace):
     @property
     def goal_target(self) -> Disc:
         return self.visited[self.rank - 1]
+
+    def flip_fact(self) -> dict[str, Any] | None:
+        """The target that counts is visited when the next one was, and that one in its place."""
+        count = len(self.visited)
+        if count < 2:
+            return None
+        values = deepcopy(self.values.spec)
+        for cube, targets in zip(
+            self.demonstrated, values["objects"]["visit_ids_by_object"], strict=True
+        ):
+            if self.cubes[cube] is self.cube:
+                first = self.rank - 1
+                second = self.rank % count
+                targets[first], targets[second] = targets[second], targets[first]
+        return values
 
     def visits(self) -> list[SubTask]:
         steps: list[SubTask] = []

@@ -3,6 +3,8 @@ now.
 """
 
 from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any
 
 from mme_vla.envs.facts import VisibleFact
 from mme_vla.envs.robomme.robot.demonstrator import Demonstrator
@@ -147,6 +149,15 @@ class VideoRepick(Task):
                 self.swaps = sequential_swaps(self.initiators, self.cubes, start=k)
             self.motions = [*self.swaps]
         super().before_physics(k)
+
+    def flip_fact(self) -> dict[str, Any] | None:
+        """The video picks up the next cube instead."""
+        count = len(self.cubes)
+        if count < 2:
+            return None
+        values = deepcopy(self.values.spec)
+        values["objects"]["target"] = (self.cubes.index(self.cube) + 1) % count
+        return values
 
     def cues(self) -> list[Cue]:
         def left() -> int:

@@ -1,4 +1,4 @@
-"""`python -m mme_vla.analyse WHAT`: the paper's analyses of what a memory does.
+"""`mme-vla analyse WHAT`: the paper's analyses of what a memory does.
 
     attention    mass on memory, observation and language, mean and maximum over layers
     modulation   mean and deviation of the predicted scales and biases
@@ -416,7 +416,7 @@ def _tera(flops: int) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argument_parser("python -m mme_vla.analyse", __doc__, EXAMPLES)
+    parser = argument_parser("mme-vla analyse", __doc__, EXAMPLES)
     commands = parser.add_subparsers(required=True, metavar="WHAT")
 
     def command(run: Callable[[argparse.Namespace], None], output: str) -> argparse.ArgumentParser:

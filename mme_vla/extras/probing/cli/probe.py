@@ -1,4 +1,4 @@
-"""`python -m mme_vla.probe checkpoint=…`: what a policy takes from its memory
+"""`mme-vla probe checkpoint=…`: what a policy takes from its memory
 (configs/probe.yaml).
 """
 
@@ -11,23 +11,21 @@ from omegaconf import DictConfig
 from mme_vla.cli.command import log_to_terminal, run_configured
 from mme_vla.config.devices import process_device
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, require
-from mme_vla.policy.build import policy_config
 
 logger = logging.getLogger("mme_vla.probe")
 
 
 def main() -> None:
-    """Run the command; the first word `card` means `card=true`."""
-    if sys.argv[1:2] == ["card"]:
-        sys.argv[1] = "card=true"
-    run_configured("probe", probe)
+    """Run the command; a first word `card` or `twins` means `card=true` or `twins=true`."""
+    if sys.argv[1:2] in (["card"], ["twins"]):
+        sys.argv[1] += "=true"
+    run_configured("probe", probe, check="mme_vla.extras.probing.settings:check_probe")
 
 
 def probe(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
     from mme_vla.cli.evaluate import choose_subgoals, report_usage
-    from mme_vla.cli.loading import PolicyChoice, load_policy
+    from mme_vla.cli.loading import PolicyChoice, load_policy, release
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import choose_numbers, named_tasks
@@ -44,12 +42,12 @@ def probe(cfg: DictConfig) -> None:
     from mme_vla.extras.probing.recordings import all_recordings
     from mme_vla.extras.probing.report import table_of
     from mme_vla.extras.probing.run import (
-        IN_CLOSED_LOOP,
-        NO_DATA,
         ProbePlan,
         probed_folder,
         run_probe,
     )
+    from mme_vla.extras.probing.twins import FIGURES, measure_twins
+    from mme_vla.policy.build import policy_config
     from mme_vla.utils import safe_name
 
     values = policy_config(cfg)
@@ -58,25 +56,18 @@ def probe(cfg: DictConfig) -> None:
         print(table_of({folder: probed_folder(Path(folder)) for folder in listed}))
         return
     card = values["card"]
-    if not (values["offline"] or values["online"] or card):
-        raise UserError(
-            "offline=false online=false leaves nothing to probe: set one of them to true."
-        )
+    twins = values["twins"]
+    if twins:
+        # It makes its own scenes.
+        values["offline"] = False
     if values["server"] is not None:
         # A server chooses a chunk once: recordings are what contents are taken from.
         values["offline"] = False
-        require(
-            values["online"] or card,
-            "server=…: a served policy is probed in closed loop alone: add online=true.",
-        )
-    if values["offline"] and values["recordings"] is None and not card:
-        raise UserError(NO_DATA)
     events = event_arms(values["event"])
-    require(values["online"] or not events, IN_CLOSED_LOOP)
     settings = RolloutSettings.from_config({**values, "event": None})
     offline = read_section(OfflineSettings, values, others=True)
     jobs = []
-    if values["online"] or card:
+    if values["online"] or card or twins:
         jobs = choose_episodes(
             named_tasks(values), values["episodes"], settings.split, settings.env
         )
@@ -92,15 +83,17 @@ def probe(cfg: DictConfig) -> None:
         choose_numbers(values["recorded"], len(recordings), "the data") if values["offline"] else []
     )
     probed = [recordings[i] for i in numbers]
-    subgoals = (
-        choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
-        if jobs
-        else None
-    )
+    subgoals = None
+    if jobs and not twins:
+        subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
     predictor = None if subgoals is None else str(values["subgoal"]["name"])
     facts = facts_of(policy, name, source, settings, predictor)
     # A shipped policy has a folder of its name; one that an earlier version began continues.
-    kind = "card" if card else "probe"
+    kind = "probe"
+    if card:
+        kind = "card"
+    if twins:
+        kind = "twins"
     model = safe_name(name, "the policy's name")
     folder = Path("outputs", kind, model, str(facts.checkpoint))
     if facts.run.is_shipped and not folder.exists():
@@ -110,7 +103,10 @@ def probe(cfg: DictConfig) -> None:
     plan = ProbePlan(values["with"], probed, recordings, jobs, offline, events)
     options = RunOptions(subgoals, shard, source)
     try:
-        if card:
+        if twins:
+            text = measure_twins(policy.eval(), jobs, folder, facts, settings, options)
+            page = folder / FIGURES
+        elif card:
             graded = run_card(
                 policy.eval(), plan, folder, facts, settings, options, values["references"]
             )
@@ -119,7 +115,7 @@ def probe(cfg: DictConfig) -> None:
             page = run_probe(policy.eval(), plan, folder, facts, settings, options).page
             text = (folder / "table.md").read_text(encoding="utf-8")
     finally:
-        policy.close()
+        release(policy)
         if subgoals is not None:
             report_usage(subgoals.usage)
             subgoals.close()

@@ -3,7 +3,8 @@ them down.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from copy import deepcopy
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -277,6 +278,13 @@ class Unmask(ContainerTask):
     def visible_facts(self, ended: Mapping[int, SubTask]) -> dict[str, VisibleFact]:
         return active_motions([self.cover])
 
+    def flip_fact(self) -> dict[str, Any]:
+        """The first two containers change places, and their cubes with them."""
+        values = deepcopy(self.values.spec)
+        places = values["layout"]["bins"]
+        places[0], places[1] = places[1], places[0]
+        return values
+
     def start_episode(self, draws: Draws) -> None:
         self.cover = Cover(self.containers, self.parking_group("inner"), self.contents)
         outer = Cover(self.outer.containers, self.parking_group("outer"))
@@ -376,6 +384,13 @@ class UnmaskSwap(ContainerTask):
         for _ in range(self.turned("swaps")):
             initiators.append(draws.integer(0, count))
         return initiators
+
+    def flip_fact(self) -> dict[str, Any]:
+        """The first two cubes change places: each is under the other's container."""
+        values = deepcopy(self.values.spec)
+        over = values["objects"]["selected"]
+        over[0], over[1] = over[1], over[0]
+        return values
 
     @property
     def swapped_after(self) -> int:

@@ -1,0 +1,255 @@
+"""Twin accuracy: policies whose answer is known, in an environment of one's own and in RoboMME."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mme_vla.config.plugins import import_plugins
+from mme_vla.embodiment.robomme import choice_row
+from mme_vla.envs.base import environment
+from mme_vla.envs.facts import Candidates
+from mme_vla.envs.make import make_env
+from mme_vla.envs.oracle import oracle_of
+from mme_vla.envs.vector.pool import Job
+from mme_vla.evaluation.rollout.evaluation import RunOptions
+from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.extras.probing.arms import UNPROBED
+from mme_vla.extras.probing.twins import (
+    FIGURES,
+    LINES,
+    MEMORY_OFF,
+    Decision,
+    NoPairError,
+    TwinLine,
+    Twins,
+    aggregate_twins,
+    approached,
+    check_pair,
+    read_twins,
+    run_twins,
+    share_correct,
+    twin_tables,
+)
+from mme_vla.policy.base import Policy
+from mme_vla.testing.small import small_policy
+
+REPOSITORY = Path(__file__).parents[3]
+SILENT = RunOptions(show_progress=False)
+FACTS = RunFacts("planted", "none", 7)
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+
+
+# Definitions --------------------------------------------------------------------------------------
+
+
+def test_the_reached_candidate_counts_and_else_the_one_whose_distance_fell_most() -> None:
+    start = np.array([-1.0, -1.0])
+    assert approached(SQUARE, start, np.array([0.9, 1.1])).tolist() == [3]
+    assert approached(SQUARE, start, np.array([-0.9, -1.0])).tolist() == [1]
+    # On the way past the first corner the tool has reached the last one, which lies in line.
+    assert approached(SQUARE, start, np.array([1.2, 1.2])).tolist() == [3]
+
+
+def test_a_tie_counts_by_the_share_that_is_correct() -> None:
+    candidates = Candidates(SQUARE.tolist(), [3])
+    middle, ahead = [0.5, -1.0], [0.5, -0.6]
+    assert approached(SQUARE, np.array(middle), np.array(ahead)).tolist() == [2, 3]
+    assert share_correct(candidates, middle, ahead) == 0.5
+    assert share_correct(candidates, middle, middle) == 0.25, "a tool that does not move"
+
+
+def test_a_pair_differs_in_what_is_correct_alone() -> None:
+    first = Decision("go", Candidates(SQUARE.tolist(), [0]), {}, [])
+    other = replace(first, candidates=Candidates(SQUARE[::-1].tolist(), [0]))
+    check_pair(first, other)
+    wrong = {
+        "goal": replace(other, goal="stay"),
+        "same candidate": replace(first, candidates=Candidates(SQUARE[::-1].tolist(), [3])),
+        "number": replace(first, candidates=Candidates(SQUARE[:3].tolist(), [1])),
+        "elsewhere": replace(first, candidates=Candidates((SQUARE + 9).tolist(), [1])),
+    }
+    for reason, twin in wrong.items():
+        with pytest.raises(NoPairError, match=reason):
+            check_pair(first, twin)
+
+
+def test_tasks_weigh_the_same_and_left_out_pairs_are_named() -> None:
+    def line(task: str, episode: int, share: float) -> TwinLine:
+        return TwinLine(task, episode, 4, 1 / 16, {"unprobed": share})
+
+    lines = [line("VideoUnmask", i, 1.0) for i in range(3)]
+    lines += [line("PickHighlight", 0, 0.0), TwinLine("RouteStick", 5, left_out="it has no twin")]
+    twins = aggregate_twins(lines, {})
+    assert twins.total["unprobed"].accuracy == 0.5 and twins.total["unprobed"].pairs == 4
+    assert twins.suites["Permanence"]["unprobed"].accuracy == 1
+    assert twins.tasks["VideoUnmask"]["unprobed"].low > 0.4
+    assert twins.total["unprobed"].chance == 1 / 16
+    assert twins.notes == ["Left out: RouteStick: it has no twin (episodes 5)."]
+    (table,) = twin_tables(twins)
+    assert [row[0] for row in table.rows] == [
+        "VideoUnmask", "PickHighlight", "Permanence", "Reference", "all",
+    ]  # fmt: skip
+
+
+# An environment of one's own ----------------------------------------------------------------------
+
+
+SCENES = [Job("Blink", "test", episode) for episode in range(40)]
+
+
+@pytest.fixture
+def blink(monkeypatch: pytest.MonkeyPatch) -> str:
+    """examples/blink with twins."""
+    monkeypatch.syspath_prepend(REPOSITORY / "examples" / "blink")
+    import_plugins(["blink_twins"])
+    return "blink_twins"
+
+
+class PlantedEpisode:
+    """Keeps every image that it observes, and the noise that the policy would have."""
+
+    failure = None
+    subgoal = None
+    goal = ""
+    options: Sequence[Any] = ()
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.images: list[np.ndarray] = []
+        self.n_observed_frames = 0
+
+    def observe(self, frames: Mapping[str, np.ndarray], *_: Any, **__: Any) -> None:
+        (images,) = frames.values()
+        self.images += list(images)
+        self.n_observed_frames += len(images)
+
+    def begun(self, frames: Sequence[int], exec_start: int) -> None:
+        pass
+
+
+Rule = Callable[[PlantedEpisode], np.ndarray]
+"""The chunk that is chosen in an episode."""
+
+
+class Planted(Policy):
+    """A policy that acts by a rule, with the robot of another."""
+
+    memory = None
+
+    def __init__(self, inner: Policy, rule: Rule) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+        self.processor = inner.processor
+        self.config = inner.config
+        self.rule = rule
+
+    def start_episode(self, goal: str, seed: int = 0) -> Any:
+        return PlantedEpisode(seed)
+
+    def act(self, episodes: Any, steps: int | None = None) -> np.ndarray:
+        return np.stack([self.rule(episode) for episode in episodes])
+
+
+def move(side: float) -> np.ndarray:
+    return np.full((4, 1), side, np.float32)
+
+
+def remembered(episode: PlantedEpisode) -> np.ndarray:
+    """Towards the light of the first frame."""
+    columns = np.flatnonzero((episode.images[0] == (255, 220, 0)).all(-1).any(0))
+    return move(1.0 if columns.mean() > 32 else -1.0)
+
+
+def measure(rule: Rule, env: str, folder: Path) -> Twins:
+    settings = RolloutSettings(env=env, seed=7)
+    policy = Planted(small_policy("pi05", env=env), rule)
+    return run_twins(policy, SCENES, folder, FACTS, settings, SILENT)
+
+
+def test_planted_policies_have_their_accuracy(blink: str, tmp_path: Path) -> None:
+    own_noise = np.random.default_rng(0)
+    rules: dict[str, tuple[Rule, float, float]] = {
+        "remembers": (remembered, 1, 1),
+        "forgets what it saw": (lambda episode: move(1.0), 0, 0),
+        "guesses by its noise": (lambda episode: move(episode.rng.choice([-1, 1])), 0, 0),
+        "does not move": (lambda episode: move(0.0), 1 / 4, 1 / 4),
+        "guesses anew": (lambda episode: move(own_noise.choice([-1, 1])), 0.1, 0.4),
+    }
+    for name, (rule, least, most) in rules.items():
+        twins = measure(rule, blink, tmp_path / name)
+        accuracy = twins.total[UNPROBED.name]
+        assert accuracy.pairs == 40 and accuracy.chance == 1 / 4
+        assert least <= accuracy.accuracy <= most, name
+        assert accuracy.low <= accuracy.accuracy <= accuracy.high
+        assert list(twins.suites) == ["Recall"]
+
+
+def test_a_policy_without_its_memory_is_never_right_in_both(blink: str, tmp_path: Path) -> None:
+    policy = small_policy("framesamp_modul", env=blink).eval()
+    settings = RolloutSettings(env=blink, seed=7, flow_steps=2)
+    twins = run_twins(policy, SCENES[:4], tmp_path, FACTS, settings, SILENT)
+    assert twins.total[MEMORY_OFF].accuracy == 0 and twins.total[MEMORY_OFF].pairs == 4
+
+
+def test_a_stopped_measurement_continues(blink: str, tmp_path: Path) -> None:
+    measure(remembered, blink, tmp_path)
+    lines = (tmp_path / LINES).read_bytes().splitlines(keepends=True)
+    (tmp_path / LINES).write_bytes(b"".join(lines[:3]) + lines[3][:9])
+    with pytest.warns(UserWarning, match="half-written"):
+        twins = measure(lambda episode: move(1.0), blink, tmp_path)
+    assert [line.arms[UNPROBED.name] for line in read_twins(tmp_path)] == [1] * 3 + [0] * 37
+    assert twins.tasks["Blink"][UNPROBED.name].accuracy == 3 / 40
+    assert (tmp_path / FIGURES).is_file()
+
+
+# RoboMME ------------------------------------------------------------------------------------------
+
+TWIN_TASKS = (
+    "VideoUnmask", "ButtonUnmask", "VideoUnmaskSwap", "ButtonUnmaskSwap", "VideoRepick",
+    "VideoPlaceButton", "VideoPlaceOrder", "PickHighlight", "InsertPeg", "MoveCube", "PatternLock",
+    "RouteStick",
+)  # fmt: skip
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("task", TWIN_TASKS)
+def test_the_script_is_right_in_both_scenes_of_robomme(task: str, tmp_path: Path) -> None:
+    check_script(task, tmp_path)
+
+
+def test_the_script_is_right_in_both_scenes_of_a_task(tmp_path: Path) -> None:
+    check_script("ButtonUnmask", tmp_path)
+
+
+def check_script(task: str, folder: Path) -> None:
+    """The script's own choice has all pairs of a task."""
+    made: list[Any] = []
+
+    def base(**scene: Any) -> Any:
+        made.append(make_env(action_space="multi_choice", render=False, **scene))
+        return made[-1]
+
+    def scripted(_: PlantedEpisode) -> np.ndarray:
+        choice = oracle_of(made[-1])
+        assert choice is not None
+        return choice_row(str(choice["choice"]).lower(), choice.get("point") or ())[None]
+
+    policy = Planted(small_policy("pi05", embodiment="robomme_choice_front"), scripted)
+    jobs = [Job(task, "test", episode) for episode in range(2)]
+    settings = RolloutSettings(seed=7, draw="all")
+    options = replace(SILENT, base=base)
+    twins = run_twins(policy, jobs, folder, FACTS, settings, options)
+    assert twins.total[UNPROBED.name].accuracy == 1, twins.notes
+    assert twins.total[UNPROBED.name].pairs >= 1
+
+
+@pytest.mark.parametrize("task", ["PickXtimes", "SwingXtimes", "BinFill", "StopCube"])
+def test_a_count_of_what_the_robot_does_has_no_twin(task: str) -> None:
+    source = environment("mme_vla")
+    assert source.twin(source.episode(task, "test", 0)) is None
