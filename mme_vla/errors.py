@@ -112,23 +112,23 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
     return f"{hint}Known: {', '.join(known) or 'none'}."
 
 
-def missing_extra(what: str, extra: str) -> UserError:
+def missing_extra(what: str, extra: str, pip: tuple[str, str] | None = None) -> UserError:
     """The error to raise where the packages of an extra are not installed: what needs them, and
     what installs them.
 
     Only a clone has `constraints.txt` beside the package. `--inexact` keeps the extras that are
-    there already; a plain `uv sync` would take them away.
+    there already; a plain `uv sync` would take them away. `pip` is for an extra with a package that
+    pip and `uv pip` refuse: the extra to install in its place, and what follows on the command.
     """
+    of_pip, further = pip or (extra, "")
     if not CONSTRAINTS.is_file():
-        package = f"'mme-vla[{extra}]'"
+        package = f"'mme-vla[{of_pip}]'"
+        with_uv = "" if pip else f" (with uv: uv pip install {package})"
         return UserError(
-            f"{what} needs the extra `{extra}`. With pip: pip install {package} (with uv: uv pip"
-            f" install {package})."
+            f"{what} needs the extra `{extra}`. With pip: pip install {package}{further}{with_uv}."
         )
-    with_uv, with_pip = (
-        f"uv sync --inexact --extra {extra}",
-        f"pip install -c constraints.txt -e '.[{extra}]'",
-    )
+    with_uv = f"uv sync --inexact --extra {extra}"
+    with_pip = f"pip install -c constraints.txt -e '.[{of_pip}]'{further}"
     return UserError(
         f"{what} needs the extra `{extra}`. In the clone: {with_uv} (without uv: {with_pip})."
     )

@@ -45,7 +45,7 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.rmt import RMT
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.memory.ttt import TTT
-from mme_vla.utils.style import COLOURS, EXECUTION, FAINT, LINE, VIDEO, look, rgb, svg
+from mme_vla.utils.style import COLOURS, EXECUTION, FAINT, LINE, VIDEO, log_scale, look, rgb, svg
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "concepts" / "figures"
@@ -207,9 +207,7 @@ def budget(source: EpisodeSource) -> Figure:
         ("tokendrop_modul_success", "TokenDrop"),
     ):
         right.plot(budgets, [float(row[column]) for row in rows], "o-", ms=5, label=label)
-    right.set_xscale("log", base=2)
-    right.set_xticks(budgets, [f"{tokens:,}" for tokens in budgets])
-    right.minorticks_off()
+    log_scale(right.xaxis, budgets)
     right.set(
         xlabel="memory tokens",
         ylabel="success (%)",

@@ -1,6 +1,11 @@
 """Messages of `UserError`."""
 
-from mme_vla.errors import UserError
+from pathlib import Path
+
+import pytest
+
+from mme_vla import errors
+from mme_vla.errors import UserError, missing_extra
 
 
 def test_the_middle_of_an_overlong_message_is_left_out() -> None:
@@ -11,3 +16,24 @@ def test_the_middle_of_an_overlong_message_is_left_out() -> None:
 
 def test_a_message_of_usual_length_stays_as_it_is() -> None:
     assert str(UserError("budget=0 must be at least 1.")) == "budget=0 must be at least 1."
+
+
+def test_a_missing_extra_is_installed_with_the_commands_of_the_clone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(errors, "CONSTRAINTS", tmp_path / "constraints.txt")
+    errors.CONSTRAINTS.touch()
+    message = str(missing_extra("The simulator", "sim"))
+    assert message.startswith("The simulator needs the extra `sim`. In the clone: uv sync")
+    assert "--inexact --extra sim " in message
+    assert "pip install -c constraints.txt -e '.[sim]'" in message
+
+
+def test_a_missing_extra_of_the_installed_wheel_is_installed_by_the_name_of_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(errors, "CONSTRAINTS", tmp_path / "constraints.txt")
+    assert str(missing_extra("The simulator", "sim")) == (
+        "The simulator needs the extra `sim`. With pip: pip install 'mme-vla[sim]'"
+        " (with uv: uv pip install 'mme-vla[sim]')."
+    )

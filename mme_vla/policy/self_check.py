@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -358,13 +358,12 @@ def predict_chunk(
     Args:
         stored: return the actions that the stored chunk becomes.
     """
-    from mme_vla.policy.base import choose_actions
-
+    processor = policy.require_processor()
     devices = [policy.device] if policy.device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices), _inference(policy):
         torch.manual_seed(_SEED)  # of what is sampled beside the noise
         episode = policy.start_episode(check.goal, _SEED)
-        if policy.require_processor().prompt_spec.reads_subgoal:
+        if processor.prompt_spec.reads_subgoal:
             episode.subgoal = check.goal
         episode.options = tuple(
             Option(chr(ord("a") + number), text, needs_point=True)
@@ -374,17 +373,18 @@ def predict_chunk(
         if policy.embodiment.action.frames is not None:
             past_actions = check.past_actions
         episode.observe(check.views, check.states, check.is_demo, past_actions)
-        predicted: list[Tensor] = []
-
-        def predict(batch: Any, noise: Mapping[str, Tensor]) -> Tensor:
-            chunk = policy.predict_chunk(batch, [episode], stack_noise([check.noise]))
-            predicted.append(chunk[0].float().cpu())
-            if stored and chunk[0].shape == check.chunk.shape:
-                return torch.from_numpy(check.chunk)[None]
-            return chunk
-
-        actions = choose_actions(policy, [episode], predict=predict).actions[0]
-    return predicted[0].numpy(), np.asarray(actions, np.float32)
+        batch = policy.observation([episode])
+        noise = stack_noise([check.noise])
+        chunk = policy.predict_chunk(batch, [episode], noise)[:1].float().cpu()
+        becomes_actions = chunk
+        if stored and chunk[0].shape == check.chunk.shape:
+            becomes_actions = torch.from_numpy(check.chunk)[None]
+        # As `choose_actions` makes a chunk the robot's.
+        absolute = processor.absolute_actions(becomes_actions, episode.state[None])
+        rows = policy.embodiment.action.decide(absolute[0], episode.options)
+        n_past = processor.samples.window - 1
+        actions = np.asarray(rows.numpy()[n_past:], np.float32)
+    return chunk[0].numpy(), actions
 
 
 @contextmanager

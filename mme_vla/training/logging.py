@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
-from mme_vla.errors import UserError, missing_extra, require
+from mme_vla.errors import CONSTRAINTS, UserError, missing_extra, require
 from mme_vla.registry import Registry
 from mme_vla.training.runs import METRICS
 from mme_vla.utils import read_lines, write_atomically
@@ -312,9 +312,8 @@ def check_logger(config: Mapping[str, Any]) -> None:
         return
     if name == "wandb":
         raise missing_extra("logger=wandb", "wandb")
-    raise UserError(
-        f"logger={name} needs the package {name}: pip install -c constraints.txt {name}"
-    )
+    pins = "-c constraints.txt " if CONSTRAINTS.is_file() else ""
+    raise UserError(f"logger={name} needs the package {name}: pip install {pins}{name}")
 
 
 def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Loggers:

@@ -144,7 +144,8 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
     """Return the path of `name` in `folder`, symbolic links followed.
 
     A snapshot in the hub's cache is made of links to the files of its repository's folder,
-    `../../blobs/…`: these count as its own.
+    `../../blobs/…`: these count as its own. So do the files of the installed library, which some
+    installers link to a cache (`uv pip install --link-mode symlink`).
     """
     place = folder / name
     root = folder.resolve()
@@ -153,7 +154,10 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
     except (OSError, ValueError, RuntimeError):  # a null character, a loop of links
         target = Path("/")
     allowed = target.is_relative_to(root) and target != root
-    if not allowed and ".." not in Path(name).parts:
+    climbs = ".." in Path(name).parts
+    if root.is_relative_to(_PACKAGE) and not climbs:
+        allowed = allowed or target.is_file()
+    if not allowed and not climbs:
         # the hub's cache: <repository>/snapshots/<revision>, of which `root` is one or lies in one
         for snapshot in (root, *root.parents):
             repository = snapshot.parent.parent
@@ -207,6 +211,7 @@ def require_earlier(path: Path, *marks: str) -> Path:
     return path
 
 
+_PACKAGE = Path(__file__).parents[1].resolve()  # of the folder: the file itself may be a link
 _HUB_REPOSITORY = re.compile(r"(models|datasets|spaces)--")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]{0,99}")
 

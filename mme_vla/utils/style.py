@@ -6,12 +6,13 @@ style sheet, or a viewer that prefers dark, shows the same drawing on a dark gro
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure as Canvas
 
 PALETTE = {
@@ -138,6 +139,26 @@ def css(selector: str = ":root") -> str:
     """Return the rule that gives an element the palette, light or dark as its viewer prefers."""
     values = [f"--{name}: light-dark({light}, {dark});" for name, (light, dark) in PALETTE.items()]
     return "\n".join([f"{selector} {{", "color-scheme: light dark;", *values, "}\n"])
+
+
+def log_scale(axis: "Axis", ticks: Collection[float] = ()) -> None:
+    """Make an axis logarithmic, labelled with numbers.
+
+    The labels that matplotlib gives a logarithmic axis are math text, which the look turns off.
+
+    Args:
+        ticks: what is labelled, in data units; empty for 1, 2 and 5 of each decade.
+    """
+    from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
+
+    axes = axis.axes
+    if axis is axes.xaxis:
+        axes.set_xscale("log")
+    else:
+        axes.set_yscale("log")
+    axis.set_major_locator(FixedLocator(sorted(ticks)) if ticks else LogLocator(subs=(1, 2, 5)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter("{x:,.6g}")
 
 
 def legend(canvas: "Canvas", axes: "Axes", columns: int) -> None:

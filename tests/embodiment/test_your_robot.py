@@ -124,17 +124,17 @@ def test_the_page_from_the_dataset_to_a_served_policy(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     inspecting, cached, training = (shlex.split(line) for line in blocks("bash")[0].splitlines())
-    assert inspecting[:5] == ["python", "-m", "mme_vla.inspect", "--config-dir", "configs"]
+    assert inspecting[:4] == ["mme-vla", "inspect", "--config-dir", "configs"]
     assert cached[:4] == ["mme-vla", "cache", "--config-dir", "configs"]
-    assert training[:5] == ["python", "-m", "mme_vla.train", "--config-dir", "configs"]
+    assert training[:4] == ["mme-vla", "train", "--config-dir", "configs"]
     folders = [place / "configs"]
-    inspect_main(compose("inspect", inspecting[5:], extra_dirs=folders))
+    inspect_main(compose("inspect", inspecting[4:], extra_dirs=folders))
     inspected = capsys.readouterr().out
     assert "25" in inspected, "frames of both episodes"
     assert "left_0" in inspected and "number 1" not in inspected
     cache_main(compose("cache", [*cached[4:], *SMALL, "device=cpu"], extra_dirs=folders))
     assert "2 episodes encoded" in capsys.readouterr().out
-    cfg = compose("train", [*training[5:], *SMALL, *BRIEF], extra_dirs=folders)
+    cfg = compose("train", [*training[4:], *SMALL, *BRIEF], extra_dirs=folders)
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     run = TrainRun.from_config(config)
     checkpoint = train(run, Path(run.output), begun=time.perf_counter())
@@ -143,9 +143,9 @@ def test_the_page_from_the_dataset_to_a_served_policy(
     assert summary["open_loop"]["names"][0] == "left_0"
 
     checking = shlex.split(blocks("bash")[1])
-    assert checking[:3] == ["python", "-m", "mme_vla.inspect"]
+    assert checking[:2] == ["mme-vla", "inspect"]
     capsys.readouterr()
-    inspect_main(compose("inspect", checking[3:]))
+    inspect_main(compose("inspect", checking[2:]))
     checked = capsys.readouterr().out
     assert "episode 1 of demonstrations" in checked and "right_6" in checked
     assert "baseline" in checked.splitlines()[-3]

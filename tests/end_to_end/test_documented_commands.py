@@ -56,7 +56,7 @@ NOT_RUN = {
         "needs a policy that was trained before"
     ),
     r"--checkpoint outputs/": "needs a policy that was trained before",
-    r"mme_vla\.results outputs/(?!published)|mme-vla results verify": (
+    r"mme(_vla\.|-vla )results (outputs/(?!published)|verify)": (
         "needs the records of an evaluation"
     ),
     r"mme-vla probe card": "needs recorded episodes",
@@ -67,15 +67,17 @@ NOT_RUN = {
     r"python (dagger|grpo|reward_weighted)\.py": (
         "tests/extras/trajectories/test_rollouts.py or test_dagger_example.py runs it"
     ),
-    r"mme_vla\.serve ": "serves until it is stopped",
+    r"mme(_vla\.|-vla )serve ": "serves until it is stopped",
     r"mme-vla harness ": "serves until it is stopped",
     r"mme-vla docs$": "opens a browser; tests/docs builds the site",
-    r"mme_vla\.play ": "waits for a player, or plays hundreds of episodes",
+    r"mme(_vla\.|-vla )play ": "waits for a player, or plays hundreds of episodes",
     r"mme-vla record ": "records for minutes or hours",
     r"mme(_vla\.|-vla )evaluate .*checkpoint=nano|tasks=\[PickXtimes,VideoUnmask\]": (
         "evaluates for minutes"
     ),
-    r"mme_vla\.probe (checkpoint=nano|compare=)": "needs recorded episodes or finished probes",
+    r"mme(_vla\.|-vla )probe (twins |checkpoint=nano|compare=)": (
+        "needs recorded episodes or finished probes, or evaluates for minutes"
+    ),
     r"mme-vla (convert|cache) |subgoal-build input=(path|datasets)": "needs a full dataset",
     r"--config-dir configs embodiment=two_arms": "needs a robot's dataset",
     r"mme-vla weights ": "needs released weights",
@@ -98,7 +100,7 @@ def documented() -> list[tuple[str, str]]:
 def commands_of(text: str) -> Iterator[str]:
     for language, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
         for line in block.replace("\\\n", " ").splitlines():
-            if language == "bash" or (not language and line.startswith("python ")):
+            if language == "bash" or (not language and line.startswith(("python ", "mme-vla "))):
                 yield re.sub(r"  +# .*", "", line).strip()
 
 
@@ -143,13 +145,10 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_documented_command_runs_as_printed(
     page: str, command: str, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if (words := shlex.split(command))[:3] == [
-        "python",
-        "-m",
-        "mme_vla.results",
-    ]:  # in this process: it only reads
+    words = shlex.split(command)
+    if words[:2] == ["mme-vla", "results"]:  # in this process: it only reads
         monkeypatch.chdir(folder_of(page, root))
-        results(words[3:])
+        results(words[2:])
         return
     if re.search(r"mme(_vla\.|-vla )evaluate|mme-vla gallery", command):
         pytest.importorskip(
@@ -190,6 +189,12 @@ def test_the_words_of_other_documented_commands_are_valid(page: str, command: st
     name = {documented: name for name, documented in configured_commands().items()}.get(entry)
     if name is None:  # it takes options instead of a configuration
         return
+    if arguments[:1] == ["board"]:  # a command of its own, with options
+        return
+    if arguments[:1] in (["card"], ["twins"]):
+        arguments[0] += "=true"
+    # Words that a line above the command defines
+    arguments = [word for word in arguments if not word.startswith("$")]
     arguments = trust_as_override(arguments)
     args = get_args_parser().parse_intermixed_args(
         with_settings(arguments) if name == "nano" else arguments

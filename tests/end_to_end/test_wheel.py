@@ -72,6 +72,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             "--offline",
             "--link-mode",
             "symlink",
+            "--no-compile-bytecode",
             "--python",
             str(python),
             "-c",
@@ -123,6 +124,8 @@ def test_the_source_archive_holds_what_the_wheel_is_made_of(tmp_path: Path) -> N
         "LICENSE",
         "constraints.txt",
         "tests/end_to_end/test_wheel.py",
+        ".ci/run",
+        ".github/workflows/tests.yml",
     } <= packed
 
 

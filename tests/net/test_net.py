@@ -22,6 +22,29 @@ from net.archives import command, unpack
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 NET = REPOSITORY / "tests" / "data" / "net"
 TOLERANCE = 1e-5
+NEEDS = {
+    "diffusion_policy": ("diffusers", "baselines"),
+    "memoryvla": ("transformers", "baselines"),
+    "openvla": ("transformers", "baselines"),
+    "sam2act_plus": ("transformers", "baselines"),
+    "simplememvla": ("transformers", "vlm"),
+    "lora": ("peft", "vlm"),
+    "serve": ("uvicorn", "serve"),
+    "harness": ("vla_eval", "harness"),
+    "released": ("tensorstore", "orbax"),
+    "simulator": ("mani_skill", "sim"),
+}
+"""Beginning of the name of a model, run, command or format → a module that it needs, and the extra
+that brings it.
+"""
+
+
+def skip_without_extra(name: str) -> None:
+    """Skip a test whose extra the environment lacks."""
+    for start, (module, extra) in NEEDS.items():
+        if name.startswith(start):
+            reason = f"{name} needs the extra {extra}: pip install 'mme-vla[{extra}]'"
+            pytest.importorskip(module, reason=reason)
 
 
 def read(name: str) -> Any:
@@ -45,6 +68,7 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_saved_policy_gives_the_same_loss_and_actions(
     model: str, checkpoints: Path, tmp_path: Path
 ) -> None:
+    skip_without_extra(model)
     folder = shutil.copytree(checkpoints / model, tmp_path / model)
     models.restore(folder)
     figures = models.figures(mme_vla.Policy.from_pretrained(folder))
@@ -71,8 +95,7 @@ def mistaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("line", REPLIES)
 def test_reply_to_a_mistake_says_no_less(line: str, mistaken: Path) -> None:
-    if line.startswith("harness"):
-        pytest.importorskip("vla_eval", reason="needs the extra harness")
+    skip_without_extra(line)
     current = replies.reply(line, mistaken)
     changes = replies.difference(REPLIES[line]["text"], current["text"])
     assert current["code"] == REPLIES[line]["code"], changes
@@ -110,6 +133,7 @@ def assert_close(actual: Any, expected: Any, place: str = "") -> None:
 
 @pytest.mark.parametrize("run", runs.RUNS)
 def test_policy_of_a_run_acts_as_before(run: str, at_runs: Path) -> None:
+    skip_without_extra(run)
     figures = models.figures(mme_vla.Policy.from_pretrained(Path("training", run)))
     assert_close(figures["actions"], RUNS["actions"][run])
 
@@ -132,6 +156,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
 def test_run_resumes_with_the_same_losses_and_keeps_the_vision_cache(
     run: str, at_runs: Path
 ) -> None:
+    skip_without_extra(run)
     before = contents(Path("cache"))
     assert_close(runs.resume(run), RUNS["resumed"][run])
     assert contents(Path("cache")) == before
@@ -141,6 +166,7 @@ def test_run_resumes_with_the_same_losses_and_keeps_the_vision_cache(
 def test_saved_policy_has_the_same_loss_on_the_dataset(
     model: str, at_runs: Path, checkpoints: Path
 ) -> None:
+    skip_without_extra(model)
     shutil.copytree(checkpoints / model, "saved")
     models.restore(Path("saved"))
     assert_close(runs.first_loss(model, Path("saved")), RUNS["first_loss"][model])
@@ -151,7 +177,7 @@ def test_results_have_the_same_figures(at_runs: Path) -> None:
 
 
 def test_finished_evaluation_is_recognised(at_runs: Path) -> None:
-    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    skip_without_extra("simulator")
     before = contents(Path("evaluation"))
     command("evaluate", *runs.EVALUATE)
     assert contents(Path("evaluation")) == before
@@ -159,6 +185,7 @@ def test_finished_evaluation_is_recognised(at_runs: Path) -> None:
 
 @pytest.mark.parametrize("run", runs.RUNS)
 def test_run_is_inspected(run: str, at_runs: Path) -> None:
+    skip_without_extra(run)
     assert "step_000002" in command("inspect", f"checkpoint=training/{run}")
 
 
@@ -184,7 +211,7 @@ def at_earlier(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_shards_with_claims_are_recognised_and_joined(at_earlier: None) -> None:
-    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    skip_without_extra("simulator")
     before = contents(runs.SHARDS)
     command("evaluate", *runs.SHARD)
     after = contents(runs.SHARDS)
@@ -202,7 +229,7 @@ def test_finished_run_is_recognised_from_python(at_earlier: None) -> None:
 
 
 def test_report_card_is_the_same(at_runs: Path) -> None:
-    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    skip_without_extra("simulator")
     assert_close(runs.card(), RUNS["card"])
 
 
@@ -221,8 +248,7 @@ def at_formats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("target", formats.FORMATS)
 def test_export_converts_back_to_the_same_weights(target: str, at_formats: None) -> None:
-    if target == "released":
-        pytest.importorskip("tensorstore", reason="needs the extra orbax")
+    skip_without_extra(target)
     assert not formats.converted_back(target)
 
 

@@ -397,7 +397,7 @@ def test_a_key_with_a_line_break_is_refused_and_not_repeated() -> None:
 
 
 class Peer:
-    """A server that writes prepared bytes to whoever connects, and holds the connection."""
+    """A server that writes prepared bytes to its client, and holds the connection."""
 
     def __init__(self, *parts: bytes, pause_s: float = 0, read: bool = True) -> None:
         self.parts = parts

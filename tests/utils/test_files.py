@@ -20,6 +20,7 @@ from mme_vla.utils import (
     FolderLock,
     check_sums,
     inside,
+    io,
     read_bytes,
     read_json,
     read_lines,
@@ -130,6 +131,22 @@ def test_a_name_that_leads_out_of_its_folder_is_refused(tmp_path: Path) -> None:
     assert inside(folder, "sub/../model").is_file()
     assert inside(folder, "near").is_file()
     for name in ("../secret", "/etc/passwd", "link", "", ".", "sub/../../secret", "nu\0l"):
+        with pytest.raises(UserError, match="outside"):
+            inside(folder, name)
+
+
+def test_a_shipped_file_may_be_a_link_to_the_cache_of_an_installer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "site-packages" / "mme_vla" / "assets" / "nano"
+    folder.mkdir(parents=True)
+    (tmp_path / "cached").write_text("{}")
+    (folder / "config.json").symlink_to(tmp_path / "cached")
+    with pytest.raises(UserError, match="outside"):
+        inside(folder, "config.json")
+    monkeypatch.setattr(io, "_PACKAGE", tmp_path / "site-packages" / "mme_vla")
+    assert inside(folder, "config.json").read_text() == "{}"
+    for name in ("../../../../cached", str(tmp_path / "cached"), ""):
         with pytest.raises(UserError, match="outside"):
             inside(folder, name)
 

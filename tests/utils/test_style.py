@@ -6,7 +6,7 @@ import subprocess
 import pytest
 
 from helpers import REPOSITORY
-from mme_vla.utils.style import PALETTE, css, figure, svg, themed
+from mme_vla.utils.style import PALETTE, css, figure, log_scale, svg, themed
 
 HEX = re.compile(r"(?<!\w)#[0-9a-f]{6}\b", re.IGNORECASE)
 SUFFIXES = ("*.py", "*.css", "*.html", "*.js", "*.svg")
@@ -69,6 +69,37 @@ def test_drawings_follow_light_and_dark() -> None:
     assert f"var(--ink, {PALETTE['ink'][0]})" in drawing
     assert css("svg:root") in drawing  # as a file it has the colours with it
     assert "#ffffff" not in re.sub(r"<style>.*?</style>", "", drawing, flags=re.DOTALL)
+
+
+def labels_of(drawing: str) -> list[str]:
+    return re.findall(r"<text[^>]*>([^<]*)</text>", drawing)
+
+
+def test_logarithmic_axes_are_labelled_with_numbers() -> None:
+    with figure((7, 3), 2, columns=2) as (canvas, (curve, budgets)):
+        curve.plot([1, 2, 3], [0.05, 0.5, 2000])
+        log_scale(curve.yaxis)
+        budgets.plot([16, 64, 1024], [1, 2, 3])
+        log_scale(budgets.xaxis, {1024, 16, 64})
+        labels = labels_of(svg(canvas))
+    assert {"0.05", "0.5", "100", "2,000"} <= set(labels)
+    assert [label for label in labels if label in ("16", "64", "1,024", "32", "128")] == [
+        "16", "64", "1,024",
+    ]  # fmt: skip
+    assert not [label for label in labels if "$" in label]
+
+
+def test_no_other_file_makes_an_axis_logarithmic() -> None:
+    listed = subprocess.run(
+        ["git", "ls-files", "*.py"], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
+    own = re.compile(r"""set_[xy]scale\(|[xy]scale=|\.(loglog|semilog[xy])\(""")
+    found = [
+        name
+        for name in set(listed.stdout.split()) - EXCEPT
+        if own.search((REPOSITORY / name).read_text(encoding="utf-8"))
+    ]
+    assert found == []
 
 
 def test_only_colours_of_the_palette_are_named() -> None:

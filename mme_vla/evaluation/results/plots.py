@@ -16,6 +16,7 @@ from mme_vla.utils.style import (
     ON_LIGHT,
     figure,
     legend,
+    log_scale,
     svg,
 )
 
@@ -246,12 +247,10 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
                 capsize=3,
                 label=model,
             )
-        axes.set_xscale("log", base=2)
         ticks = {*budgets}
         for model_points in points.values():
             ticks.update(budget for budget, _ in model_points)
-        axes.set_xticks(sorted(ticks), [f"{budget:,}" for budget in sorted(ticks)])
-        axes.minorticks_off()
+        log_scale(axes.xaxis, ticks)
         axes.set_xlabel("memory tokens")
         axes.set_ylabel("average success (%)")
         axes.set_ylim(bottom=0)

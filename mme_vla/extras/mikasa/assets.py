@@ -4,10 +4,11 @@ import os
 from importlib.util import find_spec
 from pathlib import Path
 
-from mme_vla.errors import require
+from mme_vla.errors import missing_extra, require
 from mme_vla.extras.mikasa.catalog import BULB, FAMILY_OF, YCB
 
 PACKAGE = "mikasa_robo_suite"
+_PIP = " colorama, then pip install --no-deps --ignore-requires-python mikasa-robo-suite==1.0.0"
 _BULB = Path("vla", "utils", "objects", "low_poly_light_bulb.glb")
 _YCB = Path("data", "assets", "mani_skill2_ycb", "info_pick_v0.json")
 
@@ -15,12 +16,8 @@ _YCB = Path("data", "assets", "mani_skill2_ycb", "info_pick_v0.json")
 def check_package() -> None:
     """Refuse to continue without the benchmark's package and the simulator."""
     for package in (PACKAGE, "mani_skill"):
-        require(
-            find_spec(package) is not None,
-            "MIKASA-Robo-VLA needs the extra `mikasa`. In the clone: uv sync --inexact --extra"
-            " mikasa (without uv: pip install -c constraints.txt -e '.[sim]' colorama, then pip"
-            " install --no-deps --ignore-requires-python mikasa-robo-suite==1.0.0).",
-        )
+        if find_spec(package) is None:
+            raise missing_extra("MIKASA-Robo-VLA", "mikasa", pip=("sim", _PIP))
 
 
 def bulb_file() -> Path:

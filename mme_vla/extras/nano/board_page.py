@@ -13,7 +13,7 @@ from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, comparison_table, show, span
 from mme_vla.extras.nano.board import Board, Row, Separation, published_success
 from mme_vla.extras.nano.rows import CHOICES
-from mme_vla.utils.style import COLOURS, FAINT, INK, LINE, figure, legend, svg
+from mme_vla.utils.style import COLOURS, FAINT, INK, LINE, figure, legend, log_scale, svg
 
 PAINT = {"policy": COLOURS[0], "floor": FAINT, "ceiling": COLOURS[2]}
 LOCAL = COLOURS[1]
@@ -262,6 +262,7 @@ def success_figure(board: Board) -> str:
             of_trainings = row.mean(board.protocol.tasks)
             axes.plot(of_trainings, np.full(len(of_trainings), at), "|", color=INK, ms=7)
         axes.set_yticks(range(len(rows)), [row.name for row in rows])
+        axes.set_ylim(-0.6, len(rows) - 0.4)
         axes.set_xlim(0, 100)
         axes.set_xlabel("success over all tasks (%); strokes: trainings")
         axes.grid(True, axis="x", color=LINE)
@@ -294,7 +295,7 @@ def budget_figure(board: Board) -> str:
                 color=COLOURS[number % len(COLOURS)],
                 label=model,
             )
-        axes.set_xscale("log", base=2)
+        log_scale(axes.xaxis, {row.facts.budget or 0 for rows in several.values() for row in rows})
         axes.set_xlabel("memory tokens")
         axes.set_ylabel("success (%)")
         axes.set_ylim(bottom=0)

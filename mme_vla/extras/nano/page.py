@@ -28,7 +28,7 @@ from mme_vla.extras.nano.rows import TRAINED
 from mme_vla.extras.nano.settings import NanoRun
 from mme_vla.utils import read_json, write_atomically
 from mme_vla.utils.pages import render
-from mme_vla.utils.style import figure, legend
+from mme_vla.utils.style import figure, legend, log_scale
 
 PAGE, CURVES = "page.md", "learning.png"
 FEW_POINTS = 12  # of a curve, below which each has a marker
@@ -208,7 +208,7 @@ def plot_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path)
     Returns:
         Whether there was a loss to draw.
     """
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+    from matplotlib.ticker import MaxNLocator
 
     measured: dict[str, list[tuple[float, float]]] = {}
     for model, curve in curves.items():
@@ -224,12 +224,10 @@ def plot_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path)
             marker = "o" if len(points) <= FEW_POINTS else None
             axes.plot(*zip(*points, strict=True), marker=marker, ms=4, label=model)
         if min(losses) > 0 and max(losses) > 10 * min(losses):
-            axes.set_yscale("log")
-            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axes.yaxis.set_minor_formatter(NullFormatter())
+            log_scale(axes.yaxis)
         else:
             axes.set_ylim(bottom=0)
-        axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_major_formatter("{x:g}")
         steps = sorted({step for points in measured.values() for step, _ in points})
         if len(steps) <= FEW_POINTS // 2:
             axes.set_xticks(steps)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from mme_vla import errors
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes
 from mme_vla.errors import UserError
@@ -78,3 +79,15 @@ def test_without_the_package_both_ways_to_install_it_are_named(
     monkeypatch.setattr(assets, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"uv sync --inexact --extra mikasa .*--no-deps"):
         environment("mikasa").check_installed()
+
+
+def test_users_of_the_wheel_are_told_what_pip_accepts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(assets, "find_spec", lambda name: None)
+    monkeypatch.setattr(errors, "CONSTRAINTS", tmp_path / "constraints.txt")
+    with pytest.raises(UserError) as refusal:
+        environment("mikasa").check_installed()
+    message = str(refusal.value)
+    assert "pip install 'mme-vla[sim]' colorama, then pip install --no-deps" in message
+    assert "uv" not in message and "clone" not in message
