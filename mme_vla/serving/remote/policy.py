@@ -374,7 +374,8 @@ class RemotePolicy(Policy):
         try:
             reply = self._act(episode, frames)
         except ConnectionError:
-            if not self.protocol.stateless:
+            was_closed_here = episode.connection is None  # at an interrupt
+            if was_closed_here or not self.protocol.stateless:
                 raise
             # A server without a memory can be asked the same once more.
             self._begin(episode, frames)
