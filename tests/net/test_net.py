@@ -32,6 +32,8 @@ NEEDS = {
     "serve": ("uvicorn", "serve"),
     "harness": ("vla_eval", "harness"),
     "released": ("tensorstore", "orbax"),
+    "evaluate": ("mani_skill", "sim"),
+    "probe": ("mani_skill", "sim"),
     "simulator": ("mani_skill", "sim"),
 }
 """Beginning of the name of a model, run, command or format → a module that it needs, and the extra
