@@ -7,7 +7,7 @@ mme-vla audit env=cues plugins=[cues] tasks=Cues server=ws://127.0.0.1:8000 reco
 import argparse
 
 import numpy as np
-from stub_servers import Seen, Stub, make_server
+from stub_servers import Stream, Stub, make_server
 
 
 def light(frame: np.ndarray) -> int:
@@ -22,37 +22,37 @@ def towards(side: int) -> np.ndarray:
     return np.full((4, 1), side or 1, np.float32)
 
 
-def video(seen: Seen) -> np.ndarray:
+def video(stream: Stream) -> np.ndarray:
     """Remembers where the light was in the video."""
-    sides = [light(frame) for frame in seen.frames[: seen.n_video]]
+    sides = [light(frame) for frame in stream.frames[: stream.n_video]]
     return towards(next((side for side in sides if side), 0))
 
 
-def clock(seen: Seen) -> np.ndarray:
+def clock(stream: Stream) -> np.ndarray:
     """Counts frames, and never looks at one."""
-    return towards(-1 if len(seen.frames) < 30 else 1)
+    return towards(-1 if len(stream.frames) < 30 else 1)
 
 
-def memoryless(seen: Seen) -> np.ndarray:
+def memoryless(stream: Stream) -> np.ndarray:
     """Sees the current frame alone."""
-    return towards(light(seen.frames[-1]))
+    return towards(light(stream.frames[-1]))
 
 
-def own_actions(seen: Seen) -> np.ndarray:
+def own_actions(stream: Stream) -> np.ndarray:
     """Repeats its own last chunk; the first follows the current frame."""
-    if seen.chunks:
-        return towards(int(np.sign(seen.chunks[-1][0, 0])))
-    return memoryless(seen)
+    if stream.chunks:
+        return towards(int(np.sign(stream.chunks[-1][0, 0])))
+    return memoryless(stream)
 
 
-def last_frame(seen: Seen) -> np.ndarray:
+def last_frame(stream: Stream) -> np.ndarray:
     """Remembers the frame before the current one, and no other."""
-    return towards(light(seen.frames[-1]) or light(seen.frames[-2:][0]))
+    return towards(light(stream.frames[-1]) or light(stream.frames[-2:][0]))
 
 
-def goal(seen: Seen) -> np.ndarray:
+def goal(stream: Stream) -> np.ndarray:
     """Reads the goal alone."""
-    return towards(-1 if "left" in seen.goal else 1)
+    return towards(-1 if "left" in stream.goal else 1)
 
 
 FAKES = {fake.__name__: fake for fake in (video, clock, memoryless, own_actions, last_frame, goal)}

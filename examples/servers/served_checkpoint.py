@@ -10,7 +10,7 @@ of `openpi` the current frame at each chunk.
 import argparse
 
 import numpy as np
-from stub_servers import Policy, Seen, Stub, make_server
+from stub_servers import Policy, Stream, Stub, make_server
 
 from mme_vla import Policy as LoadedPolicy
 
@@ -19,11 +19,11 @@ def behind(policy: LoadedPolicy) -> Policy:
     """The policy as a stub's. It sees an episode's frames anew at each chunk."""
     robot = policy.embodiment
 
-    def choose(seen: Seen) -> np.ndarray:
-        episode = policy.start_episode(seen.goal)
-        images = np.stack(seen.frames)
-        is_demo = np.arange(len(images)) < seen.n_video
-        episode.observe({robot.memory_camera: images}, np.stack(seen.states), is_demo)
+    def choose(stream: Stream) -> np.ndarray:
+        episode = policy.start_episode(stream.goal)
+        images = np.stack(stream.frames)
+        is_demo = np.arange(len(images)) < stream.n_video
+        episode.observe({robot.memory_camera: images}, np.stack(stream.states), is_demo)
         return policy.act(episode)
 
     return choose

@@ -4,7 +4,7 @@
     python stub_servers.py robomme --port 8001 --fault nan --after 3
 
 Each is written from the protocol's description and needs msgpack, numpy and websockets alone. The
-policy behind it is a function of what the server was sent (`Seen`). `--fault` spoils the replies.
+policy behind it is a function of what the server got (`Stream`). `--fault` spoils the replies.
 """
 
 import argparse
@@ -28,7 +28,7 @@ FAULTS = ("none", "error", "garbage", "text", "list", "no_actions", "shape", "na
 
 
 @dataclass
-class Seen:
+class Stream:
     """What a server was sent of one episode, and what it returned.
 
     frames: images of the first camera, the conditioning video first. n_video: frames of that video.
@@ -41,13 +41,13 @@ class Seen:
     chunks: list[np.ndarray] = field(default_factory=list)
 
 
-Policy = Callable[[Seen], np.ndarray]
-"""From what was seen to a chunk [h, w]."""
+Policy = Callable[[Stream], np.ndarray]
+"""From an episode's stream to a chunk [h, w]."""
 
 
-def hold_still(seen: Seen) -> np.ndarray:
+def hold_still(stream: Stream) -> np.ndarray:
     """Sixteen actions that keep the robot where it is."""
-    return np.repeat(seen.states[-1][None], 16, axis=0).astype(np.float32)
+    return np.repeat(stream.states[-1][None], 16, axis=0).astype(np.float32)
 
 
 @dataclass
@@ -67,11 +67,11 @@ class Stub:
     requests: list[Any] = field(default_factory=list)
     replies: int = 0
     lock: Any = field(default_factory=threading.Lock)
-    shared: Seen = field(default_factory=Seen)
+    shared: Stream = field(default_factory=Stream)
 
-    def chunk(self, seen: Seen) -> np.ndarray:
-        actions = np.asarray(self.policy(seen), np.float32)
-        seen.chunks.append(actions)
+    def chunk(self, stream: Stream) -> np.ndarray:
+        actions = np.asarray(self.policy(stream), np.float32)
+        stream.chunks.append(actions)
         return actions
 
     def next_fault(self) -> str:
@@ -135,62 +135,62 @@ def unpack(data: bytes) -> Any:
     return msgpack.unpackb(data, object_hook=decode)
 
 
-# The protocols. Each takes a request and what was seen so far, and returns a reply.
+# The protocols. Each takes a request and the episode's stream so far, and returns a reply.
 
 
-def observe_openpi(stub: Stub, request: dict[str, Any], seen: Seen) -> dict[str, Any]:
+def observe_openpi(stub: Stub, request: dict[str, Any], stream: Stream) -> dict[str, Any]:
     """One frame a request. A key that is missing is an error, as in the transforms of openpi."""
     images = [value for value in request.values() if np.ndim(value) == 3]
-    seen.frames.append(images[0])
-    seen.states.append(request["observation/state"])
-    seen.goal = request["prompt"]
+    stream.frames.append(images[0])
+    stream.states.append(request["observation/state"])
+    stream.goal = request["prompt"]
     begun = time.monotonic()
-    actions = stub.chunk(seen)
+    actions = stub.chunk(stream)
     return {"actions": actions, "server_timing": {"infer_ms": 1e3 * (time.monotonic() - begun)}}
 
 
-def observe_robomme(stub: Stub, request: dict[str, Any], seen: Seen) -> dict[str, Any]:
+def observe_robomme(stub: Stub, request: dict[str, Any], stream: Stream) -> dict[str, Any]:
     """Past frames come by `add_buffer`; the memory is one for all connections."""
-    seen = stub.shared
+    stream = stub.shared
     if request.get("reset", False):
-        stub.shared = Seen()
+        stub.shared = Stream()
         return {"reset_finished": True, "reset_time_ms": 0.1}
     if request.get("add_buffer", False):
-        seen.frames += list(request["images"][:, 0])
-        seen.states += list(request["state"])
+        stream.frames += list(request["images"][:, 0])
+        stream.states += list(request["state"])
         if request["exec_start_idx"] > 0:
-            seen.n_video = request["exec_start_idx"]
+            stream.n_video = request["exec_start_idx"]
         return {"add_buffer_finished": True, "add_buffer_time_ms": 0.1}
-    if not seen.frames:
+    if not stream.frames:
         raise AssertionError("a policy with a memory needs a buffer")
-    seen.goal = request["prompt"]
-    return {"actions": stub.chunk(seen), "infer_time_ms": 0.1}
+    stream.goal = request["prompt"]
+    return {"actions": stub.chunk(stream), "infer_time_ms": 0.1}
 
 
-def observe_challenge(stub: Stub, request: dict[str, Any], seen: Seen) -> dict[str, Any]:
+def observe_challenge(stub: Stub, request: dict[str, Any], stream: Stream) -> dict[str, Any]:
     """All frames since the last request, in lists; the memory is one for all connections."""
     if request.get("reset", False):
-        stub.shared = Seen()
+        stub.shared = Stream()
         return {"reset_finished": True}
-    seen = stub.shared
+    stream = stub.shared
     if request["is_first_step"]:
-        seen.n_video = len(request["front_rgb_list"]) - 1
-    seen.goal = request["task_goal"][0]
-    seen.frames += request["front_rgb_list"]
+        stream.n_video = len(request["front_rgb_list"]) - 1
+    stream.goal = request["task_goal"][0]
+    stream.frames += request["front_rgb_list"]
     joints = zip(request["joint_state_list"], request["gripper_state_list"], strict=True)
-    seen.states += [np.concatenate([arm, fingers[:1]]) for arm, fingers in joints]
-    return {"actions": stub.chunk(seen)}
+    stream.states += [np.concatenate([arm, fingers[:1]]) for arm, fingers in joints]
+    return {"actions": stub.chunk(stream)}
 
 
-def talk(stub: Stub, observe: Callable[[Stub, Any, Seen], dict[str, Any]], peer: Any) -> None:
+def talk(stub: Stub, observe: Callable[[Stub, Any, Stream], dict[str, Any]], peer: Any) -> None:
     """Metadata first, then a reply to each request; an error is a text, and ends the connection."""
     peer.send(pack({"policy": "stub"}))
-    seen = Seen()
+    stream = Stream()
     for data in peer:
         request = unpack(data)
         stub.requests.append(request)
         try:
-            reply = observe(stub, request, seen)
+            reply = observe(stub, request, stream)
         except Exception as error:
             peer.send(f"Traceback (most recent call last): {type(error).__name__}: {error}")
             peer.close(1011, "error")
@@ -207,32 +207,32 @@ def talk(stub: Stub, observe: Callable[[Stub, Any, Seen], dict[str, Any]], peer:
 
 def talk_harness(stub: Stub, peer: Any) -> None:
     """Typed messages; the client greets first. One action for each observation."""
-    seen = Seen()
+    stream = Stream()
     for data in peer:
         message = unpack(data)
         stub.requests.append(message)
         kind, payload = message["type"], message["payload"]
         reply: dict[str, Any] = {}
-        answer = "action"
+        reply_kind = "action"
         if kind == "hello":
-            answer = "hello"
-            wanted = {"send_state": True, "send_video_history": True}
+            reply_kind = "hello"
+            params = {"send_state": True, "send_video_history": True}
             reply = {"harness_version": "0.8.0", "protocol_version": 1,
-                     "observation_params": wanted}  # fmt: skip
+                     "observation_params": params}  # fmt: skip
         elif kind == "episode_start":
-            seen = Seen()
+            stream = Stream()
         elif kind == "observation":
             video = payload.get("video_history", [])
-            seen.n_video += len(video)
-            seen.frames += [*video, next(iter(payload["images"].values()))]
-            seen.states.append(payload["states"])
-            seen.goal = payload["task_description"]
-            reply = {"actions": stub.chunk(seen)[0]}
+            stream.n_video += len(video)
+            stream.frames += [*video, next(iter(payload["images"].values()))]
+            stream.states.append(payload["states"])
+            stream.goal = payload["task_description"]
+            reply = {"actions": stub.chunk(stream)[0]}
         if not reply:
             continue
 
-        def packed(content: Any, answer: str = answer, number: int = message["seq"]) -> bytes:
-            kind = "error" if content == "error" else answer
+        def packed(content: Any, name: str = reply_kind, number: int = message["seq"]) -> bytes:
+            kind = "error" if content == "error" else name
             return pack({"type": kind, "payload": content, "seq": number, "timestamp": 0.0}, True)
 
         fault = stub.next_fault() if kind == "observation" else "none"

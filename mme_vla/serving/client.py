@@ -120,7 +120,7 @@ class Client:
         """Send one message and return the answer.
 
         Raises:
-            UserError: the server refuses the message, and says why. The episode goes on where
+            UserError: the server refuses the message, and says why. The episode continues where
                 nothing was changed; else the next request raises `ConnectionError`.
             ConnectionError: the connection is lost. TimeoutError: no answer within `timeout`; the
                 connection is closed.

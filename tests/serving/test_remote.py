@@ -32,8 +32,8 @@ from mme_vla.policy.mme import MMEPolicy
 from mme_vla.serving.client import Client
 from mme_vla.serving.codec import pack
 from mme_vla.serving.remote.connections import HarnessConnection, HttpConnection, _encode
-from mme_vla.serving.remote.policy import RemotePolicy, _identity, _RefusedError, plain
-from mme_vla.serving.remote.protocols import HarnessProtocol, NewFrames, OwnProtocol
+from mme_vla.serving.remote.policy import RemotePolicy, _identity, _RefusedError, json_value
+from mme_vla.serving.remote.protocols import HarnessProtocol, LibraryProtocol, NewFrames
 from mme_vla.serving.remote.settings import ConnectionSettings, ServerChoice
 
 BRIEF = ConnectionSettings(timeout_s=1, open_s=2)
@@ -217,11 +217,11 @@ def test_a_run_whose_server_dies_is_continued_and_nothing_is_counted_twice(
 
     stub = stubs.Stub()
 
-    def dies_in_the_second_episode(seen: Any) -> np.ndarray:
+    def dies_in_the_second_episode(stream: Any) -> np.ndarray:
         if len(stub.requests) == 7:
             server.shutdown()
             raise stubs.FaultError
-        return stubs.hold_still(seen)
+        return stubs.hold_still(stream)
 
     stub.policy = dies_in_the_second_episode
     server = stubs.make_server("challenge", stub)
@@ -357,8 +357,8 @@ def test_what_cannot_be_served_is_refused_before_the_first_episode(
 
 
 def test_the_challenge_executes_whole_chunks(stubs: Any, inline: None, tmp_path: Path) -> None:
-    def long(seen: Any) -> np.ndarray:
-        return np.repeat(seen.states[-1][None], 20, axis=0)
+    def long(stream: Any) -> np.ndarray:
+        return np.repeat(stream.states[-1][None], 20, axis=0)
 
     with stubs.serving("challenge", stubs.Stub(policy=long)) as url:
         policy = connect(url, "challenge")
@@ -568,7 +568,7 @@ def test_metadata_of_another_kind_are_refused_or_left_out() -> None:
     with pytest.raises(UserError, match="none of simple_subgoal, grounded_subgoal"):
         harness.describe({"observation_params": params})
     with pytest.raises(UserError, match="is no server of this library"):
-        OwnProtocol(choice, ROBOMME_JOINT).describe({"server": ARRAY})
+        LibraryProtocol(choice, ROBOMME_JOINT).describe({"server": ARRAY})
 
 
 def test_lists_of_several_lengths_are_a_malformed_action() -> None:
@@ -603,7 +603,7 @@ def test_a_servers_names_lead_out_of_no_folder(key: str, name: str) -> None:
 
 def test_a_receipt_holds_no_more_than_a_part_of_large_metadata() -> None:
     metadata = {str(n): "x" * 10_000 for n in range(1000)}
-    part = plain(metadata)
+    part = json_value(metadata)
     assert len(part) == 64 and all(len(text) <= 400 for text in part.values())
 
 
@@ -615,10 +615,10 @@ def test_an_interrupt_ends_requests_that_wait_for_a_reply(
     release = threading.Event()
     late: list[bool] = []
 
-    def wait_for_the_test(seen: Any) -> np.ndarray:
+    def wait_for_the_test(stream: Any) -> np.ndarray:
         requested.set()
         late.append(not release.wait(20))
-        return stubs.hold_still(seen)
+        return stubs.hold_still(stream)
 
     def interrupt(futures: Any) -> None:
         requested.wait(5)

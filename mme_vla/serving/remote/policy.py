@@ -253,7 +253,7 @@ class RemotePolicy(Policy):
         self._server: dict[str, Any] = {
             "address": choice.server,
             "protocol": name,
-            "metadata": plain(self.metadata),
+            "metadata": json_value(self.metadata),
         }
         max_actions = self.metadata.get("max_actions")
         sample_steps = self.metadata.get("sample_steps")
@@ -374,8 +374,8 @@ class RemotePolicy(Policy):
         try:
             reply = self._act(episode, frames)
         except ConnectionError:
-            # Without a connection the episode was closed, by an interrupt.
-            if not self.protocol.stateless or episode.connection is None:
+            was_closed_here = episode.connection is None  # at an interrupt
+            if was_closed_here or not self.protocol.stateless:
                 raise
             # A server without a memory can be asked the same once more.
             self._begin(episode, frames)
@@ -478,7 +478,7 @@ def _identity(choice: ServerChoice, protocol: str, metadata: Mapping[str, Any]) 
     return PolicyIdentity(connection.name or protocol, connection.checkpoint or "served")
 
 
-def plain(value: Any, depth: int = 4) -> Any:
+def json_value(value: Any, depth: int = 4) -> Any:
     """A server's metadata as JSON has it: texts, numbers, lists and maps; of others their text."""
     if value is None or isinstance(value, bool | int):
         return value
@@ -488,7 +488,9 @@ def plain(value: Any, depth: int = 4) -> Any:
         return value if np.isfinite(value) else str(value)
     if depth and isinstance(value, Mapping):
         entries = islice(value.items(), _MOST_ENTRIES)
-        return {brief(str(key), 80, quote=False): plain(one, depth - 1) for key, one in entries}
+        return {
+            brief(str(key), 80, quote=False): json_value(one, depth - 1) for key, one in entries
+        }
     if depth and isinstance(value, list | tuple):
-        return [plain(one, depth - 1) for one in value[:_MOST_ENTRIES]]
+        return [json_value(one, depth - 1) for one in value[:_MOST_ENTRIES]]
     return brief(value, 200)

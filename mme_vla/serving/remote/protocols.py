@@ -29,7 +29,7 @@ from mme_vla.serving.remote.connections import (
 from mme_vla.serving.remote.settings import ServerChoice, Subgoals
 from mme_vla.serving.requests import IMAGE_KEYS
 
-OWN = "mme_vla"  # what this library's server calls itself
+SERVER_NAME = "mme_vla"  # what this library's server calls itself
 
 
 @dataclass
@@ -123,15 +123,15 @@ class ServerProtocol:
             message[keys.get(name, key)] = np.ascontiguousarray(frames.views[name][-1])
         message[keys.get("state", "observation/state")] = frames.states[-1]
         message[keys.get("prompt", "prompt")] = frames.goal
-        return message | self._said(frames)
+        return message | self._subgoal_field(frames)
 
-    def _said(self, frames: NewFrames) -> dict[str, Any]:
+    def _subgoal_field(self, frames: NewFrames) -> dict[str, Any]:
         if self.subgoal is None or frames.subgoal is None:
             return {}
         return {self.subgoal: frames.subgoal}
 
 
-class OwnProtocol(ServerProtocol):
+class LibraryProtocol(ServerProtocol):
     """This library's server, with its extensions of the challenge's lists: any robot, a seed, the
     executed actions.
     """
@@ -143,7 +143,7 @@ class OwnProtocol(ServerProtocol):
 
     def describe(self, metadata: Mapping[str, Any]) -> None:
         require(
-            str(metadata.get("server")) == OWN,
+            str(metadata.get("server")) == SERVER_NAME,
             f"protocol=mme_vla: {self.choice.server} is no server of this library; set"
             " protocol=auto.",
         )
@@ -153,8 +153,8 @@ class OwnProtocol(ServerProtocol):
             " describes no robot: update it, or set protocol=challenge.",
         )
         robot = Embodiment.from_dict(metadata["robot"])
-        robot = robot.with_horizon(_whole(metadata, "horizon"))
-        action = replace(robot.action, execute=_whole(metadata, "execute"))
+        robot = robot.with_horizon(_count(metadata, "horizon"))
+        action = replace(robot.action, execute=_count(metadata, "execute"))
         self.robot = replace(robot, action=action)
         kind = metadata.get("subgoal")
         self.subgoal = self.subgoal if kind is None else _subgoal_kind(str(kind))
@@ -168,7 +168,7 @@ class OwnProtocol(ServerProtocol):
             "is_first_step": frames.first,
             "state_list": frames.states,
             **_lists(self.robot, frames),
-            **self._said(frames),
+            **self._subgoal_field(frames),
         }
         if frames.first:
             message["exec_start_idx"] = frames.n_video
@@ -209,7 +209,7 @@ class ChallengeProtocol(ServerProtocol):
             **_lists(self.robot, frames),
             "joint_state_list": list(frames.states[:, :ARM_JOINTS]),
             "gripper_state_list": list(grippers),
-            **self._said(frames),
+            **self._subgoal_field(frames),
         })  # fmt: skip
 
 
@@ -308,7 +308,13 @@ class HarnessProtocol(ServerProtocol):
 
 PROTOCOLS: Mapping[str, type[ServerProtocol]] = {
     kind.name: kind
-    for kind in (OwnProtocol, RobommeProtocol, OpenpiProtocol, ChallengeProtocol, HarnessProtocol)
+    for kind in (
+        LibraryProtocol,
+        RobommeProtocol,
+        OpenpiProtocol,
+        ChallengeProtocol,
+        HarnessProtocol,
+    )
 }
 
 
@@ -342,7 +348,7 @@ def detect(choice: ServerChoice) -> Detection:
         harness.close()
         return Detection("harness", "it waits for a greeting and returns one")
     try:
-        if str(client.metadata.get("server")) == OWN:
+        if str(client.metadata.get("server")) == SERVER_NAME:
             return Detection("mme_vla", "its metadata say so")
         try:
             reply = client.request({"reset": True})
@@ -388,7 +394,7 @@ def _subgoal_kind(text: str) -> str:
     return text
 
 
-def _whole(metadata: Mapping[str, Any], key: str) -> int:
+def _count(metadata: Mapping[str, Any], key: str) -> int:
     value = metadata.get(key)
     require(
         isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 4096,
