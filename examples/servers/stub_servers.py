@@ -289,6 +289,10 @@ def make_server(protocol: str, stub: Stub, port: int = 0) -> Server | ThreadingH
                  "challenge": observe_challenge}  # fmt: skip
 
     def handle(peer: Any) -> None:
+        key = peer.request.headers.get("Authorization")
+        if stub.key is not None and key != f"Api-Key {stub.key}":
+            peer.close(1008, "the key is wrong")
+            return
         try:
             if protocol == "harness":
                 talk_harness(stub, peer)

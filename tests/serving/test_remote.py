@@ -312,14 +312,19 @@ def test_the_receipt_names_the_server_and_its_times(
     assert part["server"]["times"]["round_trip_ms"]["p50"] > 0
 
 
-def test_keys_of_a_server_go_with_every_connection(
-    stubs: Any, inline: None, tmp_path: Path
+@pytest.mark.parametrize("protocol", ["openpi", "challenge", "challenge-http", "harness"])
+def test_the_key_of_a_server_goes_with_every_connection(
+    protocol: str, stubs: Any, inline: None, tmp_path: Path
 ) -> None:
-    with stubs.serving("challenge-http", stubs.Stub(key="sesame")) as url:
-        policy = connect(url, api_key="sesame")
-        (record,) = run(policy, tmp_path / "right", PICK[:1])
+    with stubs.serving(protocol, stubs.Stub(key="sesame")) as url:
+        policy = connect(url, protocol.removesuffix("-http"), api_key="sesame")
+        (record,) = run(policy, tmp_path, PICK[:1], retries=0)
         policy.close()
-        assert record.outcome == "timeout"
+    assert record.outcome == "timeout"
+
+
+def test_a_wrong_key_is_reported(stubs: Any, inline: None, tmp_path: Path) -> None:
+    with stubs.serving("challenge-http", stubs.Stub(key="sesame")) as url:
         policy = connect(url, api_key="wrong")
         (record,) = run(policy, tmp_path / "wrong", PICK[:1], retries=0)
         policy.close()

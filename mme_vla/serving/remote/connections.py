@@ -159,17 +159,26 @@ class HarnessConnection:
     """The protocol of vla-evaluation-harness 0.8: typed messages with a number, the client's first.
 
     Args:
-        url: `ws://host:port`. timeout: seconds to wait for a reply. open_timeout: for the
-            connection and the first reply.
+        url: `ws://host:port`. api_key: of the server, if it has one. timeout: seconds to wait for a
+            reply. open_timeout: for the connection and the first reply.
     """
 
     VERSION = 1  # of its protocol
 
-    def __init__(self, url: str, timeout: float = 600, open_timeout: float = 60) -> None:
+    def __init__(
+        self,
+        url: str,
+        api_key: str | None = None,
+        timeout: float = 600,
+        open_timeout: float = 60,
+    ) -> None:
         self.url = url
         self._timeout = open_timeout
         self._sequence = 0
-        self._socket = open_socket(url, {}, open_timeout, timeout)
+        headers = {}
+        if api_key is not None:
+            headers["Authorization"] = f"Api-Key {api_key}"
+        self._socket = open_socket(url, headers, open_timeout, timeout)
         hello = {"harness_version": "0.8.0", "protocol_version": self.VERSION}
         try:
             self.metadata = self._reply("hello", self.send("hello", hello))

@@ -197,6 +197,14 @@ class Traffic:
         return summary
 
 
+def _count(metadata: Mapping[str, Any], key: str) -> int | None:
+    """A whole number from 1 on of a server's metadata; None where it gives none."""
+    value = metadata.get(key)
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 1:
+        return value
+    return None
+
+
 class RemotePolicy(Policy):
     """A policy behind a server."""
 
@@ -246,20 +254,17 @@ class RemotePolicy(Policy):
         running = choice.connection.episodes
         if running is None and self.protocol.shares_memory:
             running = 1
-        most = self.metadata.get("max_clients")
-        if running is None and name == "mme_vla" and isinstance(most, int):
-            running = max(1, most)
+        if running is None and name == "mme_vla":
+            running = _count(self.metadata, "max_clients")
         identity = _identity(choice, name, self.metadata)
         self._server: dict[str, Any] = {
             "address": choice.server,
             "protocol": name,
             "metadata": json_value(self.metadata),
         }
-        max_actions = self.metadata.get("max_actions")
-        sample_steps = self.metadata.get("sample_steps")
         self.info = PolicyInfo(
-            sample_steps=sample_steps if isinstance(sample_steps, int) else 1,
-            max_actions=max_actions if isinstance(max_actions, int) else None,
+            sample_steps=_count(self.metadata, "sample_steps") or 1,
+            max_actions=_count(self.metadata, "max_actions"),
             resamples=False,
             max_running=running,
             identity=identity,

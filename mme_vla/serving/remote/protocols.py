@@ -257,7 +257,9 @@ class HarnessProtocol(ServerProtocol):
 
     def open(self) -> HarnessConnection:
         connection = self.choice.connection
-        return HarnessConnection(self.choice.server, connection.timeout_s, connection.open_s)
+        return HarnessConnection(
+            self.choice.server, connection.api_key, connection.timeout_s, connection.open_s
+        )
 
     def describe(self, metadata: Mapping[str, Any]) -> None:
         params = metadata.get("observation_params")
@@ -344,7 +346,9 @@ def detect(choice: ServerChoice) -> Detection:
     try:
         client = open_patiently(open_briefly, connection.open_s)
     except TimeoutError:
-        harness = HarnessConnection(choice.server, connection.timeout_s, connection.open_s)
+        harness = HarnessConnection(
+            choice.server, connection.api_key, connection.timeout_s, connection.open_s
+        )
         harness.close()
         return Detection("harness", "it waits for a greeting and returns one")
     try:
