@@ -22,9 +22,15 @@ MODEL = [
     "mme_vla.integration.modulator",
 ]
 """FrameSamp + Modulator, from image to loss."""
-NOT_READ = {"mme_vla", "mme_vla.errors", "mme_vla.registry", "mme_vla.speed"}
-"""Of no concern to the mathematics: messages, tables of names, and marks of what can be made
-faster.
+NOT_READ = {
+    "mme_vla",
+    "mme_vla.errors",
+    "mme_vla.memory.sizes",
+    "mme_vla.registry",
+    "mme_vla.speed",
+}
+"""Of no concern to the mathematics: messages, checks of settings, tables of names, and marks of
+what can be made faster.
 """
 SELECTION = ["memory/tokendrop.py", "memory/history.py"]
 HEAD = ["backbone/flow.py"]

@@ -110,8 +110,10 @@ class HttpConnection:
 
     def _exchange(self, method: str, path: str, body: bytes | None) -> dict[str, Any]:
         late = threading.Event()
+        is_open = False
         try:
             stream = self._open()
+            is_open = True
             # The socket's time-out is that of one read, and a byte now and then is within it.
             watch = threading.Timer(self._timeout, _shut, (stream, late))
             watch.daemon = True
@@ -126,7 +128,8 @@ class HttpConnection:
                 raise http.client.IncompleteRead(content, response.length)
         except (OSError, http.client.HTTPException) as error:
             self.close()
-            if late.is_set():
+            # The socket may notice before the watch does.
+            if late.is_set() or (is_open and isinstance(error, TimeoutError)):
                 raise TimeoutError(
                     f"No answer from {self.url}{path} within {self._timeout:g} s."
                 ) from None
