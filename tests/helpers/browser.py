@@ -114,9 +114,9 @@ class Browser:
         return reply["result"].get("value")
 
     def wait(self, script: str, seconds: float = 60) -> None:
-        """Wait until an expression is true."""
+        """Wait until an expression is true, which may lead to another page meanwhile."""
         end = time.monotonic() + seconds
-        while not self.run(script):
+        while not self._is_true(script):
             if time.monotonic() > end:
                 text = self.run("document.body.innerText")
                 raise TimeoutError(
@@ -124,6 +124,14 @@ class Browser:
                     f" says:\n{text}\n{self.problems}"
                 )
             time.sleep(0.05)
+
+    def _is_true(self, script: str) -> bool:
+        try:
+            return bool(self.run(script))
+        except RuntimeError as error:
+            if "navigated or closed" not in str(error):
+                raise
+            return False
 
     def text(self, selector: str) -> str:
         """What is to be read in an element, empty where it is hidden."""
