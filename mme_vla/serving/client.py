@@ -1,5 +1,6 @@
 """`Client`: talk to a policy server from Python, in either schema."""
 
+import re
 import socket
 import struct
 from collections.abc import Mapping, Sequence
@@ -63,9 +64,8 @@ class Client:
         self.url = url
         self.timeout = timeout
         self.open_timeout = open_timeout
-        self._headers = {}
-        if api_key is not None:
-            self._headers["Authorization"] = f"Api-Key {api_key}"
+        self._headers = key_header(api_key)
+        self._address = without_user(url)  # for messages
         self._socket: Any = None
         self._ends = ExitStack()
         self.metadata: dict[str, Any] = {}
@@ -149,12 +149,12 @@ class Client:
         except ConnectionClosed as error:
             self.close()
             raise ConnectionError(
-                f"The server at {self.url} closed the connection: {error}"
+                f"The server at {self._address} closed the connection: {error}"
             ) from None
         except TimeoutError:
             self.close()  # an answer that came later would be taken for that of the next request
             raise TimeoutError(
-                f"No answer from {self.url} within {timeout:g} s; call reconnect()."
+                f"No answer from {self._address} within {timeout:g} s; call reconnect()."
             ) from None
         if isinstance(response, str):
             reason = brief(response, 2000, quote=False)
@@ -164,6 +164,18 @@ class Client:
         except UserError:
             self.close()
             raise
+
+
+def key_header(api_key: str | None) -> dict[str, str]:
+    """The header that takes a server's key along; none without a key."""
+    if api_key is None:
+        return {}
+    return {"Authorization": f"Api-Key {api_key}"}
+
+
+def without_user(url: str) -> str:
+    """An address for messages, without the user and password before its `@`."""
+    return re.sub(r"^(\w+://)?.*@", r"\1…@", url, flags=re.DOTALL)
 
 
 def open_socket(
@@ -179,14 +191,20 @@ def open_socket(
         UserError: not an address, or the server refuses this client, or redirects it.
         ConnectionError: there is no server, or (`FullError`) no place for this client now.
     """
+    name = without_user(url)
     try:
         address = parse_uri(url)
-    except InvalidURI as error:
-        raise UserError(f"{url!r} is not an address such as ws://127.0.0.1:8001: {error}") from None
+    except (InvalidURI, ValueError) as error:
+        reason = "its host or port is malformed"  # a `ValueError` may quote the password
+        if isinstance(error, InvalidURI):
+            reason = error.msg
+        raise UserError(
+            f"{name!r} is not an address such as ws://127.0.0.1:8001: {reason}."
+        ) from None
     try:
         stream = socket.create_connection((address.host, address.port), open_timeout)
     except OSError as error:
-        raise ConnectionError(f"No policy server responds at {url}: {error}") from error
+        raise ConnectionError(f"No policy server responds at {name}: {error}") from error
     stream.settimeout(None)
     seconds = struct.pack("ll", int(pong_timeout), int(pong_timeout % 1 * 1e6))
     stream.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, seconds)
@@ -202,17 +220,17 @@ def open_socket(
             proxy=None,
         )
     except ValueError as error:  # a redirect, for a socket that is open
-        raise UserError(f"The server at {url} is elsewhere: {error}") from None
+        raise UserError(f"The server at {name} is elsewhere: {without_user(str(error))}") from None
     except InvalidHandshake as error:
         reply = getattr(getattr(error, "response", None), "body", b"") or b""
         message = bytes(reply).decode(errors="replace").strip() or str(error)
-        text = f"The server at {url} refuses the connection: {brief(message, 400, quote=False)}"
+        text = f"The server at {name} refuses the connection: {brief(message, 400, quote=False)}"
         is_full = isinstance(error, InvalidStatus) and error.response.status_code == 503
         if is_full:
             raise FullError(text) from None
         raise UserError(text) from None
     except (OSError, TimeoutError, EOFError) as error:
-        raise ConnectionError(f"No policy server responds at {url}: {error}") from error
+        raise ConnectionError(f"No policy server responds at {name}: {error}") from error
 
 
 def decoded_map(data: bytes) -> dict[str, Any]:

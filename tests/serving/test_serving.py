@@ -284,6 +284,31 @@ def test_a_key_is_requested(policy):
             by_challenge(client, course()[:1])
 
 
+def test_messages_name_an_address_without_its_user_and_password(policy, monkeypatch):
+    with Served(policy) as served:
+        port = served.server.port
+        with Client(f"ws://me:secret@127.0.0.1:{port}", timeout=5) as client:
+
+            def say_nothing(timeout):
+                raise TimeoutError
+
+            monkeypatch.setattr(client._socket, "recv", say_nothing)
+            with pytest.raises(TimeoutError, match=r"ws://…@127") as silent:
+                client.request({"reset": True})
+    messages = [str(silent.value)]
+    for url in (
+        f"ws://me:secret@127.0.0.1:{port}",  # it has stopped
+        "ws://me:se@cret@127.0.0.1:x",
+        "ws://me:cret/@127.0.0.1",
+        "me:secret@127.0.0.1",
+        "http://me:secret@127.0.0.1",
+    ):
+        with pytest.raises((UserError, ConnectionError)) as refused:
+            Client(url, open_timeout=5)
+        messages.append(str(refused.value))
+    assert not any("cret" in message or "me:" in message for message in messages), messages
+
+
 def test_a_full_server_says_so_and_has_capacity_again_later(policy):
     with Served(policy, encode_chunk=1, limits=Limits(connections=1)) as served, served.reading():
         busy = served.client()

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from mme_vla.errors import UserError, brief
-from mme_vla.serving.client import LARGEST_REPLY, Client, decoded_map, open_socket
+from mme_vla.serving.client import LARGEST_REPLY, Client, decoded_map, key_header, open_socket
 from mme_vla.serving.codec import MOST_TEXT, check_size, msgpack, pack, read_array
 
 PAUSE_S = 0.5  # between two attempts to open a connection
@@ -77,9 +77,8 @@ class HttpConnection:
             "Content-Type": "application/msgpack",
             "Accept": "application/msgpack",
             "X-Session": uuid.uuid4().hex,
+            **key_header(api_key),
         }
-        if api_key is not None:
-            self._headers["Authorization"] = f"Api-Key {api_key}"
         host = address.hostname or ""
         self._path = address.path.rstrip("/")
         self._http: http.client.HTTPConnection
@@ -178,10 +177,7 @@ class HarnessConnection:
         self.url = url
         self._timeout = open_timeout
         self._sequence = 0
-        headers = {}
-        if api_key is not None:
-            headers["Authorization"] = f"Api-Key {api_key}"
-        self._socket = open_socket(url, headers, open_timeout, timeout)
+        self._socket = open_socket(url, key_header(api_key), open_timeout, timeout)
         hello = {"harness_version": "0.8.0", "protocol_version": self.VERSION}
         try:
             self.metadata = self._reply("hello", self.send("hello", hello))
