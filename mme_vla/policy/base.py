@@ -268,6 +268,20 @@ class Policy(nn.Module):
         """
         raise NotImplementedError
 
+    def executable_actions(self, chunk: Tensor, episodes: Sequence[Episode]) -> np.ndarray:
+        """A normalised chunk [n, h, a] float32 as the embodiment executes it [n, h, w], without the
+        steps of a chunk that lie in the past.
+        """
+        processor = self.require_processor()
+        absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
+        space = self.embodiment.action
+        decided = []
+        for episode, rows in zip(episodes, absolute, strict=True):
+            decided.append(space.decide(rows, episode.options))
+        n_past = processor.samples.window - 1
+        actions: np.ndarray = torch.stack(decided).numpy()[:, n_past:]
+        return actions
+
     # Folders
 
     @classmethod
@@ -405,8 +419,7 @@ def choose_actions(
         predict: in place of `Policy.predict_chunk`, from the observation and its noise to the
             normalised chunk [n, h, a].
     """
-    processor = policy.require_processor()
-    processor.require_stats()  # before the noise or memory of an episode changes
+    policy.require_processor().require_stats()  # before the noise or memory of an episode changes
     batch = policy.observation(episodes)
     noise = stack_noise([episode.draw() for episode in episodes])
     was_training = policy.training
@@ -419,13 +432,7 @@ def choose_actions(
         chunk = chunk.float().cpu()
     finally:
         policy.train(was_training)
-    absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
-    space = policy.embodiment.action
-    decided = []
-    for episode, rows in zip(episodes, absolute, strict=True):
-        decided.append(space.decide(rows, episode.options))
-    n_past = processor.samples.window - 1
-    actions = torch.stack(decided).numpy()[:, n_past:]
+    actions = policy.executable_actions(chunk, episodes)
     for episode, executed in zip(episodes, actions, strict=True):
         episode.acted(executed)
     return SelectedActions(batch, chunk, actions)

@@ -358,12 +358,11 @@ def predict_chunk(
     Args:
         stored: return the actions that the stored chunk becomes.
     """
-    processor = policy.require_processor()
     devices = [policy.device] if policy.device.type == "cuda" else []
     with torch.random.fork_rng(devices=devices), _inference(policy):
         torch.manual_seed(_SEED)  # of what is sampled beside the noise
         episode = policy.start_episode(check.goal, _SEED)
-        if processor.prompt_spec.reads_subgoal:
+        if policy.require_processor().prompt_spec.reads_subgoal:
             episode.subgoal = check.goal
         episode.options = tuple(
             Option(chr(ord("a") + number), text, needs_point=True)
@@ -379,11 +378,7 @@ def predict_chunk(
         becomes_actions = chunk
         if stored and chunk[0].shape == check.chunk.shape:
             becomes_actions = torch.from_numpy(check.chunk)[None]
-        # As `choose_actions` makes a chunk the robot's.
-        absolute = processor.absolute_actions(becomes_actions, episode.state[None])
-        rows = policy.embodiment.action.decide(absolute[0], episode.options)
-        n_past = processor.samples.window - 1
-        actions = np.asarray(rows.numpy()[n_past:], np.float32)
+        actions = policy.executable_actions(becomes_actions, [episode])[0].astype(np.float32)
     return chunk[0].numpy(), actions
 
 
