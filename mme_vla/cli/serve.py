@@ -13,7 +13,7 @@ from mme_vla.cli.loading import PolicyChoice, load_policy, prepare_sampling
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import policy_config
 from mme_vla.policy.saving import local_folder
-from mme_vla.policy.self_check import NO_CHECK, compare
+from mme_vla.policy.self_check import NO_CHECK, IncomparableError, compare
 from mme_vla.serving.server import PolicyServer
 from mme_vla.serving.settings import ServeSettings, is_local
 
@@ -46,7 +46,11 @@ def main(cfg: DictConfig) -> None:
 
 def _report_self_check(policy: Policy, folder: Path) -> None:
     """Log in one line whether a policy predicts what it predicted where it was trained."""
-    result = compare(policy, folder)
+    try:
+        result = compare(policy, folder)
+    except IncomparableError as error:
+        logger.warning("%s", error)
+        return
     if result is None:
         logger.info("%s", NO_CHECK)
     elif result.passed:

@@ -64,6 +64,10 @@ _KINDS: dict[str, tuple[tuple[torch.dtype, int], ...]] = {
 """Dtypes and numbers of axes of the tensors, by the first part of their names."""
 
 
+class IncomparableError(UserError):
+    """The policy raised an error in place of a chunk: the self-check says nothing of it."""
+
+
 @dataclass(frozen=True)
 class _About:
     """Words in the header of the file's tensors."""
@@ -216,7 +220,7 @@ def try_self_check(policy: "Policy") -> tuple[SelfCheck | None, str | None]:
     try:
         return record_self_check(policy), None
     except Exception as error:
-        return None, brief(f"{type(error).__name__}: {error}", 300, quote=False)
+        return None, _reason(error)
 
 
 def renew_self_check(policy: "Policy", dtype: str) -> SelfCheck | None:
@@ -296,7 +300,8 @@ def compare(policy: "Policy", folder: Path) -> Comparison | None:
     """Compare a loaded policy with the self-check of its checkpoint; None if it has none.
 
     Raises:
-        UserError: the file is damaged, or does not fit the policy.
+        UserError: the file is damaged, or does not fit the policy. IncomparableError: the policy
+            raises an error of its own, such as one of a dtype that it cannot compute in.
     """
     check = read_self_check(folder)
     if check is None:
@@ -316,6 +321,11 @@ def compare(policy: "Policy", folder: Path) -> Comparison | None:
         chunk, actions = predict_chunk(policy, check, stored=True)
     except UserError as error:
         raise UserError(f"{folder / FILE} does not fit this policy: {error}") from error
+    except Exception as error:
+        raise IncomparableError(
+            f"self-check: not done, the policy predicts no chunk ({_precision_of(policy)},"
+            f" {policy.device.type}): {_reason(error)}"
+        ) from error
     for name, array, stored in (
         (_CHUNK, chunk, check.chunk),
         (_ACTIONS, actions, check.actions),
@@ -396,6 +406,12 @@ def _inference(policy: "Policy") -> "Iterator[None]":
     finally:
         policy.compute_dtype = dtype
         policy.train(was_training)
+
+
+def _reason(error: Exception) -> str:
+    """Kind and text of an error, in one line."""
+    text = " ".join(str(error).split())
+    return brief(f"{type(error).__name__}: {text}", 300, quote=False)
 
 
 def _precision_of(policy: "Policy") -> Literal["float32", "bfloat16"]:
