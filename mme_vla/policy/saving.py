@@ -253,15 +253,15 @@ def save_settings(
     """
     config = {**policy.config, **(facts or {})}
     (folder / CONFIG).write_text(json.dumps(config, indent=2, ensure_ascii=False) + "\n")
-    written = [CONFIG]
+    names = [CONFIG]
     if self_check is None:
         (folder / SELF_CHECK).unlink(missing_ok=True)  # of the weights that lay here before
     else:
-        written.append(self_check.write(folder))
+        names.append(self_check.write(folder))
     (folder / CARD_FILE).write_text(model_card(policy, config, self_check is not None))
     if policy.processor is not None:
-        written += policy.processor.save(folder)
-    return written
+        names += policy.processor.save(folder)
+    return names
 
 
 def load_policy[P: "Policy"](

@@ -28,13 +28,19 @@ from mme_vla.policy.identity import PolicyIdentity
 from mme_vla.processing.base import PolicyProcessor, PromptSpec
 from mme_vla.processing.normalise import NormStats
 from mme_vla.serving.remote.connections import Connection, open_patiently
-from mme_vla.serving.remote.protocols import PROTOCOLS, NewFrames, ServerProtocol, detect
+from mme_vla.serving.remote.protocols import (
+    LONGEST_CHUNK,
+    PROTOCOLS,
+    NewFrames,
+    ServerProtocol,
+    count_of,
+    detect,
+)
 from mme_vla.serving.remote.settings import ServerChoice
 from mme_vla.utils import safe_name
 
 LARGEST_ACTION = 1e4
 """Largest size of a number of an action: radians, metres and shares are far below."""
-LONGEST_CHUNK = 4096  # actions
 _MOST_ENTRIES = 64  # of a list or map of a server's metadata, in a receipt
 _MS_KEYS = ("infer_ms", "infer_time_ms")
 """Where servers say how long they computed: openpi's in `server_timing`, RoboMME's beside the
@@ -197,14 +203,6 @@ class Traffic:
         return summary
 
 
-def _count(metadata: Mapping[str, Any], key: str) -> int | None:
-    """A whole number from 1 on of a server's metadata; None where it gives none."""
-    value = metadata.get(key)
-    if isinstance(value, int) and not isinstance(value, bool) and value >= 1:
-        return value
-    return None
-
-
 class RemotePolicy(Policy):
     """A policy behind a server."""
 
@@ -255,7 +253,7 @@ class RemotePolicy(Policy):
         if running is None and self.protocol.shares_memory:
             running = 1
         if running is None and name == "mme_vla":
-            running = _count(self.metadata, "max_clients")
+            running = count_of(self.metadata, "max_clients")
         identity = _identity(choice, name, self.metadata)
         self._server: dict[str, Any] = {
             "address": choice.server,
@@ -263,8 +261,8 @@ class RemotePolicy(Policy):
             "metadata": json_value(self.metadata),
         }
         self.info = PolicyInfo(
-            sample_steps=_count(self.metadata, "sample_steps") or 1,
-            max_actions=_count(self.metadata, "max_actions"),
+            sample_steps=count_of(self.metadata, "sample_steps") or 1,
+            max_actions=count_of(self.metadata, "max_actions"),
             resamples=False,
             max_running=running,
             identity=identity,

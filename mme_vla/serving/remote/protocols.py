@@ -30,6 +30,7 @@ from mme_vla.serving.remote.settings import ServerChoice, Subgoals
 from mme_vla.serving.requests import IMAGE_KEYS
 
 SERVER_NAME = "mme_vla"  # what this library's server calls itself
+LONGEST_CHUNK = 4096  # actions
 
 
 @dataclass
@@ -153,8 +154,8 @@ class LibraryProtocol(ServerProtocol):
             " describes no robot: update it, or set protocol=challenge.",
         )
         robot = Embodiment.from_dict(metadata["robot"])
-        robot = robot.with_horizon(_count(metadata, "horizon"))
-        action = replace(robot.action, execute=_count(metadata, "execute"))
+        robot = robot.with_horizon(_actions_of(metadata, "horizon"))
+        action = replace(robot.action, execute=_actions_of(metadata, "execute"))
         self.robot = replace(robot, action=action)
         kind = metadata.get("subgoal")
         self.subgoal = self.subgoal if kind is None else _subgoal_kind(str(kind))
@@ -398,11 +399,21 @@ def _subgoal_kind(text: str) -> str:
     return text
 
 
-def _count(metadata: Mapping[str, Any], key: str) -> int:
+def count_of(metadata: Mapping[str, Any], key: str) -> int | None:
+    """A whole number from 1 on of a server's metadata; None where it gives none."""
     value = metadata.get(key)
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 1:
+        return value
+    return None
+
+
+def _actions_of(metadata: Mapping[str, Any], key: str) -> int:
+    """A number of actions, which the metadata must have."""
+    count = count_of(metadata, key)
     require(
-        isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 4096,
-        f"The server's metadata are malformed: {key}={brief(value)} must be a whole number.",
+        count is not None and count <= LONGEST_CHUNK,
+        f"The server's metadata are malformed: {key}={brief(metadata.get(key))} must be a whole"
+        f" number from 1 to {LONGEST_CHUNK}.",
     )
-    assert isinstance(value, int)
-    return value
+    assert count is not None
+    return count
