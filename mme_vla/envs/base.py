@@ -23,7 +23,7 @@ from mme_vla.envs.facts import Candidates, Fact
 from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
-from mme_vla.errors import check_known, listed, require
+from mme_vla.errors import UserError, check_known, listed, require
 from mme_vla.registry import ENVS
 
 Actions = Sequence[Any]
@@ -135,11 +135,9 @@ class Environment(ABC):
         Raises:
             UserError: the environment does not say.
         """
-        require(
-            False,
-            f"{type(self).__name__} has candidates and no place of the tool: implement tool(env).",
+        raise UserError(
+            f"{type(self).__name__} has candidates and no place of the tool: implement tool(env)."
         )
-        return ()
 
     def scene_values(self, env: Any) -> Mapping[str, Any] | None:
         """What makes the scene of `env`, right after its reset: plain values, the same on every
