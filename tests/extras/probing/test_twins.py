@@ -11,11 +11,13 @@ import torch
 
 from mme_vla.config.plugins import import_plugins
 from mme_vla.embodiment.robomme import choice_row
+from mme_vla.envs import make
 from mme_vla.envs.base import environment
 from mme_vla.envs.facts import Candidates
 from mme_vla.envs.make import make_env
 from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import SceneError
 from mme_vla.evaluation.rollout.evaluation import RunOptions
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -29,8 +31,8 @@ from mme_vla.extras.probing.twins import (
     TwinLine,
     Twins,
     aggregate_twins,
-    approached,
     check_pair,
+    nearest_candidates,
     read_twins,
     run_twins,
     share_correct,
@@ -50,16 +52,16 @@ SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 
 def test_the_reached_candidate_counts_and_else_the_one_whose_distance_fell_most() -> None:
     start = np.array([-1.0, -1.0])
-    assert approached(SQUARE, start, np.array([0.9, 1.1])).tolist() == [3]
-    assert approached(SQUARE, start, np.array([-0.9, -1.0])).tolist() == [1]
+    assert nearest_candidates(SQUARE, start, np.array([0.9, 1.1])).tolist() == [3]
+    assert nearest_candidates(SQUARE, start, np.array([-0.9, -1.0])).tolist() == [1]
     # On the way past the first corner the tool has reached the last one, which lies in line.
-    assert approached(SQUARE, start, np.array([1.2, 1.2])).tolist() == [3]
+    assert nearest_candidates(SQUARE, start, np.array([1.2, 1.2])).tolist() == [3]
 
 
 def test_a_tie_counts_by_the_share_that_is_correct() -> None:
     candidates = Candidates(SQUARE.tolist(), [3])
     middle, ahead = [0.5, -1.0], [0.5, -0.6]
-    assert approached(SQUARE, np.array(middle), np.array(ahead)).tolist() == [2, 3]
+    assert nearest_candidates(SQUARE, np.array(middle), np.array(ahead)).tolist() == [2, 3]
     assert share_correct(candidates, middle, ahead) == 0.5
     assert share_correct(candidates, middle, middle) == 0.25, "a tool that does not move"
 
@@ -247,6 +249,19 @@ def check_script(task: str, folder: Path) -> None:
     twins = run_twins(policy, jobs, folder, FACTS, settings, options)
     assert twins.total[UNPROBED.name].accuracy == 1, twins.notes
     assert twins.total[UNPROBED.name].pairs >= 1
+
+
+def test_a_scene_that_cannot_be_built_is_left_out_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def no_place(*_: Any, **__: Any) -> None:
+        raise SceneError("a cube finds no place")
+
+    monkeypatch.setattr(make, "make_task", no_place)
+    policy = Planted(small_policy("pi05", embodiment="robomme_choice_front"), lambda _: move(0.0))
+    jobs = [Job("ButtonUnmask", "test", 0)]
+    twins = run_twins(policy, jobs, tmp_path, FACTS, RolloutSettings(seed=7), SILENT)
+    assert twins.notes[-1] == "Left out: ButtonUnmask: a cube finds no place (episodes 0)."
 
 
 @pytest.mark.parametrize("task", ["PickXtimes", "SwingXtimes", "BinFill", "StopCube"])

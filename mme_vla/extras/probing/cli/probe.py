@@ -46,7 +46,7 @@ def probe(cfg: DictConfig) -> None:
         probed_folder,
         run_probe,
     )
-    from mme_vla.extras.probing.twins import FIGURES, measure_twins
+    from mme_vla.extras.probing.twins import FIGURES, run_twins, twins_text
     from mme_vla.policy.build import policy_config
     from mme_vla.utils import safe_name
 
@@ -104,8 +104,8 @@ def probe(cfg: DictConfig) -> None:
     options = RunOptions(subgoals, shard, source)
     try:
         if twins:
-            text = measure_twins(policy.eval(), jobs, folder, facts, settings, options)
-            page = folder / FIGURES
+            twin_figures = run_twins(policy.eval(), jobs, folder, facts, settings, options)
+            text, page = twins_text(twin_figures), folder / FIGURES
         elif card:
             graded = run_card(
                 policy.eval(), plan, folder, facts, settings, options, values["references"]
