@@ -17,11 +17,12 @@ from mme_vla.envs.facts import Candidates
 from mme_vla.envs.make import make_env
 from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import SceneError
+from mme_vla.errors import SceneError, UserError
 from mme_vla.evaluation.rollout.evaluation import RunOptions
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.arms import UNPROBED
+from mme_vla.extras.probing.settings import ProbeChoice
 from mme_vla.extras.probing.twins import (
     FIGURES,
     LINES,
@@ -97,6 +98,20 @@ def test_tasks_weigh_the_same_and_left_out_pairs_are_named() -> None:
     assert [row[0] for row in table.rows] == [
         "VideoUnmask", "PickHighlight", "Permanence", "Reference", "all",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("with", ["shuffle"]), ("recordings", "data"), ("online", True)]
+)
+def test_what_has_no_effect_on_twins_is_refused(key: str, value: Any) -> None:
+    config: dict[str, Any] = {
+        "compare": None, "card": False, "twins": True, "offline": True, "online": False,
+        "recordings": None, "event": None, "server": None, "references": {}, "with": None,
+    }  # fmt: skip
+    assert not ProbeChoice.from_config(config).on_recordings
+    ProbeChoice.from_config(config).check()
+    with pytest.raises(UserError, match=f"leave out {key}="):
+        ProbeChoice.from_config({**config, key: value}).check()
 
 
 # An environment of one's own ----------------------------------------------------------------------
