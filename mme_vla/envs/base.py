@@ -11,7 +11,7 @@ which become the conditioning video), `frozen` (on reset: steps in which no acti
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -247,6 +247,15 @@ class Environment(ABC):
     def suite_of(self, task: str) -> str | None:
         """The suite of a task."""
         return _group_of(task, self.suites)
+
+    def suites_of(self, tasks: Iterable[str]) -> dict[str, str]:
+        """Task → suite, of the tasks that belong to one."""
+        suites = {}
+        for task in tasks:
+            suite = self.suite_of(task)
+            if suite is not None:
+                suites[task] = suite
+        return suites
 
     def groups_of(self, task: str) -> dict[str, str]:
         """The group of a task in each further grouping: title → name."""

@@ -245,8 +245,7 @@ def measure_card(
             success_of_references[name] = _mean(_success(records, beside.keys))
     matched, repeated = (_success(side, same.keys) for side in (unprobed, equal))
     outcomes = {label: _success(side, same.keys) for label, side in probed.items()}
-    suite_of = environment(settings.env).suite_of
-    suites = {job.task: suite for job in plan.jobs if (suite := suite_of(job.task))}
+    suites = environment(settings.env).suites_of(job.task for job in plan.jobs)
     return replace(
         grade(matched, outcomes, repeated),
         model=facts.model,

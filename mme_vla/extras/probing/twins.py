@@ -417,11 +417,7 @@ def run_twins(
     # The figures, over the pairs of every shard.
     selected = {(job.task, job.episode) for job in jobs}
     lines = [line for line in read_twins(folder) if (line.task, line.episode) in selected]
-    suites = {}
-    for job in jobs:
-        suite = environment(settings.env).suite_of(job.task)
-        if suite is not None:
-            suites[job.task] = suite
+    suites = environment(settings.env).suites_of(job.task for job in jobs)
     twins = aggregate_twins(lines, suites)
     twins = replace(
         twins, model=facts.model, checkpoint=facts.checkpoint, notes=[*notes, *twins.notes]
