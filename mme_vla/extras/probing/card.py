@@ -52,7 +52,7 @@ NEGLIGIBLE = 0.01
 of 0.
 """
 AGAIN, PAGE, FIGURES = "again", "card.html", "card.json"
-MARK = "Report card of"  # stands in the heading of each page
+MARK = "Report card of"  # in the heading of each page
 _SAMPLES = 10_000  # of the bootstrap
 LOSS = (
     "A loss is the matched success minus the arm's, with a 95 % interval (paired bootstrap over"
