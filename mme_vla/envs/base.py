@@ -11,7 +11,7 @@ which become the conditioning video), `frozen` (on reset: steps in which no acti
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -23,7 +23,7 @@ from mme_vla.envs.facts import Candidates, Fact
 from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
-from mme_vla.errors import check_known, listed, require
+from mme_vla.errors import UserError, check_known, listed, require
 from mme_vla.registry import ENVS
 
 Actions = Sequence[Any]
@@ -135,11 +135,9 @@ class Environment(ABC):
         Raises:
             UserError: the environment does not say.
         """
-        require(
-            False,
-            f"{type(self).__name__} has candidates and no place of the tool: implement tool(env).",
+        raise UserError(
+            f"{type(self).__name__} has candidates and no place of the tool: implement tool(env)."
         )
-        return ()
 
     def scene_values(self, env: Any) -> Mapping[str, Any] | None:
         """What makes the scene of `env`, right after its reset: plain values, the same on every
@@ -249,6 +247,15 @@ class Environment(ABC):
     def suite_of(self, task: str) -> str | None:
         """The suite of a task."""
         return _group_of(task, self.suites)
+
+    def suites_of(self, tasks: Iterable[str]) -> dict[str, str]:
+        """Task → suite, of the tasks that belong to one."""
+        suites = {}
+        for task in tasks:
+            suite = self.suite_of(task)
+            if suite is not None:
+                suites[task] = suite
+        return suites
 
     def groups_of(self, task: str) -> dict[str, str]:
         """The group of a task in each further grouping: title → name."""

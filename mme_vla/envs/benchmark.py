@@ -1,6 +1,7 @@
 """RoboMME as the entry `mme_vla` of the registry of environments."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from mme_vla.embodiment import Embodiment
@@ -10,6 +11,7 @@ from mme_vla.envs.base import Environment
 from mme_vla.envs.facts import Candidates, Fact
 from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
 from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
+from mme_vla.errors import SceneError
 from mme_vla.registry import ENVS
 
 
@@ -61,22 +63,17 @@ class RoboMME(Environment):
         return facts
 
     def twin(self, spec: EpisodeSpec) -> Mapping[str, Any] | None:
-        """The row of the scene in which the task's `flip_fact` changed one fact."""
-        from mme_vla.envs.robomme.scene.placement import SceneError
+        """The row of the scene in which the task's `flip_fact` changed one fact.
 
-        self.check_installed()
-        try:
-            task = make.make_task(spec.task, render=False, **spec.options)
-        except SceneError:
-            return None
-        try:
-            task.reset()
+        Raises:
+            SceneError: there is no scene of `spec`.
+        """
+        with _scene_of(spec) as task:
             values = task.flip_fact()
-            return None if values is None else task.scene_values() | {"spec": values}
-        except SceneError:
-            return None
-        finally:
-            task.close()
+            if values is None:
+                return None
+            row: dict[str, Any] = task.scene_values()
+            return row | {"spec": values}
 
     def candidates(self, env: Any) -> Candidates | None:
         """What the current sub-task can be carried out on."""
@@ -90,20 +87,11 @@ class RoboMME(Environment):
 
     def scene_digest(self, spec: EpisodeSpec) -> str:
         """Without the conditioning video, which does not belong to the scene."""
-        from mme_vla.envs.robomme.scene.placement import SceneError
-
-        self.check_installed()
         try:
-            task = make.make_task(spec.task, render=False, **spec.options)
+            with _scene_of(spec) as task:
+                return scene_digest(task.placed_values())
         except SceneError:
             return NOT_BUILT
-        try:
-            task.reset()
-            return scene_digest(task.placed_values())
-        except SceneError:
-            return NOT_BUILT
-        finally:
-            task.close()
 
     def open(
         self,
@@ -120,3 +108,18 @@ class RoboMME(Environment):
         return make.make_env(
             task, split, episode, action_space, max_steps=max_steps, render=render, row=row
         )
+
+
+@contextmanager
+def _scene_of(spec: EpisodeSpec) -> Iterator[Any]:
+    """The task of an episode right after its reset, without images.
+
+    Raises:
+        SceneError: it cannot be built.
+    """
+    task = make.make_task(spec.task, render=False, **spec.options)
+    try:
+        task.reset()
+        yield task
+    finally:
+        task.close()

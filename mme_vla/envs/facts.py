@@ -55,8 +55,9 @@ class Fact:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Fact":
-        """What `to_dict` returned."""
-        first, last = values["frames"]
+        """What `to_dict` returned, also that of an earlier version, which wrote `shown`."""
+        key = "shown" if "shown" in values else "frames"
+        first, last = values[key]
         needed = tuple(values["needed"])
         return cls(values["name"], values["value"], (first, last), needed, values["changed"])
 

@@ -24,6 +24,12 @@ from mme_vla.envs.subtasks import Choice, Progress, SubTask
 from mme_vla.errors import check_known, require
 
 RECOVERY_MODES = ("z", "xy")
+_FORMER_NAMES = {
+    "evidence": "visible_facts",
+    "shown_facts": "visible_facts",
+    "evidence_choices": "fact_choices",
+}
+"""What tasks of earlier versions define → what replaced it."""
 
 
 def key_pose(subtask: SubTask) -> VisibleFact:
@@ -77,7 +83,7 @@ class Task(Stage):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for former, name in (("evidence", "visible_facts"), ("evidence_choices", "fact_choices")):
+        for former, name in _FORMER_NAMES.items():
             require(
                 former not in vars(cls),
                 f"{cls.__name__}.{former} is not read any more: define {name} instead.",

@@ -164,14 +164,20 @@ def _affordable_scenes(
         n_scenes = int(read_json(path, "an audit's plan")["scenes_a_task"])
     else:
         # A few scenes of the matched run tell how long one takes; they count.
-        pilot = ProbePlan(
-            arms=(), jobs=[job for of_task in by_task.values() for job in of_task[:PILOT]]
-        )
+        pilot = ProbePlan(arms=(), jobs=_first_scenes(by_task, PILOT))
         seconds = _seconds_a_scene(pilot, folder / ONLINE / slug(UNPROBED.name), run_matched)
         affordable = int(60 * minutes / (seconds * N_RUNS * len(by_task)))
         n_scenes = min(max(PILOT, affordable), max(map(len, by_task.values())))
         write_json(path, {"scenes_a_task": n_scenes, "seconds_a_scene": round(seconds, 3)})
-    return [job for of_task in by_task.values() for job in of_task[:n_scenes]]
+    return _first_scenes(by_task, n_scenes)
+
+
+def _first_scenes(by_task: Mapping[str, Sequence[Job]], count: int) -> list[Job]:
+    """So many scenes of each task."""
+    scenes: list[Job] = []
+    for of_task in by_task.values():
+        scenes += of_task[:count]
+    return scenes
 
 
 def _seconds_a_scene(
@@ -191,8 +197,10 @@ def _seconds_a_scene(
     if n_measured:
         return seconds / n_measured
     # An interrupted audit left all records: each has its time, which counts waiting for others.
-    ended = ended_scenes(records, pilot).values()
-    return float(np.mean([record.seconds.total for of_scene in ended for record in of_scene]))
+    totals: list[float] = []
+    for of_scene in ended_scenes(records, pilot).values():
+        totals += [record.seconds.total for record in of_scene]
+    return float(np.mean(totals))
 
 
 def _write(card: Card, conclusion: Conclusion, folder: Path, policy: Policy) -> None:

@@ -52,7 +52,7 @@ NEGLIGIBLE = 0.01
 of 0.
 """
 AGAIN, PAGE, FIGURES = "again", "card.html", "card.json"
-MARK = "Report card of"  # stands in the heading of each page
+MARK = "Report card of"  # in the heading of each page
 _SAMPLES = 10_000  # of the bootstrap
 LOSS = (
     "A loss is the matched success minus the arm's, with a 95 % interval (paired bootstrap over"
@@ -245,8 +245,7 @@ def measure_card(
             success_of_references[name] = _mean(_success(records, beside.keys))
     matched, repeated = (_success(side, same.keys) for side in (unprobed, equal))
     outcomes = {label: _success(side, same.keys) for label, side in probed.items()}
-    suite_of = environment(settings.env).suite_of
-    suites = {job.task: suite for job in plan.jobs if (suite := suite_of(job.task))}
+    suites = environment(settings.env).suites_of(job.task for job in plan.jobs)
     return replace(
         grade(matched, outcomes, repeated),
         model=facts.model,

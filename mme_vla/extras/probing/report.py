@@ -375,7 +375,7 @@ def remembered_image(lines: Sequence[EntryLine], recording: Recording, columns: 
     return contact_sheet(tiles, columns, title)
 
 
-MARK = "takes from its memory"  # stands in the heading of each page and table
+MARK = "takes from its memory"  # in the heading of each page and table
 
 
 def check_outputs(folder: Path, claimed: bool) -> None:

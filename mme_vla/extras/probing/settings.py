@@ -1,8 +1,10 @@
 """What a probe may be told (`configs/probe.yaml`), checked before PyTorch is imported."""
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
+from mme_vla.config.sections import PathText, read_section
 from mme_vla.errors import UserError, brief, check_choice, require
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.settings import check_config
@@ -19,40 +21,95 @@ IN_CLOSED_LOOP = (
 )
 
 
+@dataclass(frozen=True)
+class ProbeChoice:
+    """What a probe is to do; the keys and their meaning are those of `configs/probe.yaml`.
+
+    arms: of `with`. compare: alone or a list.
+    """
+
+    compare: PathText | tuple[PathText, ...] | None
+    card: bool
+    twins: bool
+    offline: bool
+    online: bool
+    recordings: Any
+    event: Any
+    server: Any
+    references: Mapping[str, PathText] | None
+    arms: Any
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Read a composed configuration, plain and resolved."""
+        return read_section(cls, config, others=True, arms=config["with"])
+
+    @property
+    def on_recordings(self) -> bool:
+        """Whether recorded episodes are probed.
+
+        A server chooses a chunk once, so recordings are only what contents are taken from. Twins
+        make their own scenes.
+        """
+        return self.offline and not self.twins and self.server is None
+
+    @property
+    def in_closed_loop(self) -> bool:
+        """Whether episodes of the closed loop are probed."""
+        return self.online or self.card
+
+    def check(self) -> None:
+        """Make sure that there is something to probe, that it has what it needs, and that names in
+        `with` exist.
+        """
+        if self.twins:
+            self._check_twins()
+            return
+        require(
+            self.offline or self.in_closed_loop,
+            "offline=false online=false leaves nothing to probe: set one of them to true.",
+        )
+        require(
+            self.in_closed_loop or self.server is None,
+            "server=…: a served policy is probed in closed loop alone: add online=true.",
+        )
+        needs_data = self.on_recordings and not self.card
+        require(not needs_data or self.recordings is not None, NO_DATA)
+        require(self.online or not event_arms(self.event), IN_CLOSED_LOOP)
+        if self.arms is None:
+            return
+        for spec in listed_arms(self.arms):
+            if not isinstance(spec, Mapping):
+                words_of_arm(spec)
+
+    def _check_twins(self) -> None:
+        """Refuse what has no effect on twins."""
+        without_effect = {
+            "card": self.card,
+            "online": self.online,
+            "recordings": self.recordings,
+            "with": self.arms,
+            "event": self.event,
+            "server": self.server,
+            "references": self.references,
+        }
+        for key, value in without_effect.items():
+            require(
+                not value,
+                f"twins=true measures the policy as it is and without memory: leave out {key}=….",
+            )
+
+
 def check_probe(config: Mapping[str, Any]) -> None:
-    """Check rollouts, tasks and checkpoint of a probe, what it is to do, and the names in `with`.
+    """Check rollouts, tasks and checkpoint of a probe, and what it is to do.
 
     Args:
         config: plain and resolved.
     """
-    if config["compare"] is not None:
-        return
-    check_config(config)
-    if config["twins"]:
-        for key in ("card", "online", "recordings", "with", "event", "server", "references"):
-            require(
-                not config[key],
-                f"twins=true measures the policy as it is and without memory: leave out {key}=….",
-            )
-        return
-    in_closed_loop = config["online"] or config["card"]
-    is_served = config["server"] is not None
-    require(
-        config["offline"] or in_closed_loop,
-        "offline=false online=false leaves nothing to probe: set one of them to true.",
-    )
-    require(
-        in_closed_loop or not is_served,
-        "server=…: a served policy is probed in closed loop alone: add online=true.",
-    )
-    needs_data = config["offline"] and not config["card"] and not is_served
-    require(not needs_data or config["recordings"] is not None, NO_DATA)
-    require(config["online"] or not event_arms(config["event"]), IN_CLOSED_LOOP)
-    if config["with"] is None:
-        return
-    for spec in listed_arms(config["with"]):
-        if not isinstance(spec, Mapping):
-            words_of_arm(spec)
+    choice = ProbeChoice.from_config(config)
+    if choice.compare is None:
+        check_config(config)
+        choice.check()
 
 
 def listed_arms(specs: Any) -> list[Any]:

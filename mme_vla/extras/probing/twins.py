@@ -8,6 +8,7 @@ the fact sees two equal scenes, and is correct in at most one of them.
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -53,7 +54,7 @@ from mme_vla.utils.io import to_line
 LINES, FIGURES = "twins.jsonl", "twins.json"
 MEMORY_OFF = "drop:all"
 """The arm without memory: everything remembered is removed."""
-MOST_ACTIONS = 400
+MAX_ACTIONS = 400
 """Of the demonstrator before the decision."""
 NOTHING = RenderRequest({}, now=(), grounded=False)
 
@@ -96,7 +97,7 @@ class Decision:
     actions: Sequence[np.ndarray]
 
 
-def approached(places: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def nearest_candidates(places: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Indices of the candidates that a motion of the tool approaches; several if they tie.
 
     It is the candidate that the tool has reached, nearer than half the smallest distance between
@@ -110,8 +111,8 @@ def approached(places: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.nda
     nearest = int(after.argmin())
     if after[nearest] < _half_gap(places) and after[nearest] < before[nearest]:
         return np.array([nearest])
-    fallen = before - after
-    return np.flatnonzero(fallen >= fallen.max() - 1e-6)
+    approach = before - after
+    return np.flatnonzero(approach >= approach.max() - 1e-6)
 
 
 def _half_gap(places: np.ndarray) -> float:
@@ -126,7 +127,7 @@ def share_correct(candidates: Candidates, start: Sequence[float], end: Sequence[
     two.
     """
     places = np.asarray(candidates.places, np.float64)
-    tied = approached(places, np.asarray(start, np.float64), np.asarray(end, np.float64))
+    tied = nearest_candidates(places, np.asarray(start, np.float64), np.asarray(end, np.float64))
     return float(np.isin(tied, candidates.correct).mean())
 
 
@@ -164,8 +165,8 @@ class TwinScenes:
     Args:
         policies: arm → policy; the same robot. The first one's reads decide what is rendered.
         settings: noise, split, environment, actions of a chunk that are executed.
-        base: makes an environment from `task`, `split`, `episode`, `max_steps` and, of a twin,
-            `row`; None for that of the settings.
+        base: makes an environment from `task`, `split`, `episode`, `max_steps` and `row`; None for
+            that of the settings.
     """
 
     def __init__(
@@ -176,23 +177,24 @@ class TwinScenes:
     ) -> None:
         self._policies = policies
         self._settings = settings
-        self._policy = next(iter(policies.values()))
-        self._robot = self._policy.embodiment
-        self._plan = RenderPlan(self._policy, None, settings)
-        self._seen = base
-        self._unseen = base
+        policy = next(iter(policies.values()))
+        self._robot = policy.embodiment
+        self._plan = RenderPlan(policy, None, settings)
         if base is None:
             make = partial(
                 base_env, settings.env, self._robot, only_possible=settings.only_possible
             )
-            self._seen = make(render=settings.render)
-            self._unseen = make(render=False)
+            self._with_images = make(render=settings.render)
+            self._without_images = make(render=False)
+        else:
+            self._with_images = self._without_images = base
 
     def run(self, job: Job) -> TwinLine:
         """Both scenes of an episode, under every arm."""
-        spec = environment(self._settings.env).episode(job.task, job.split, job.episode)
+        source = environment(self._settings.env)
+        spec = source.episode(job.task, job.split, job.episode)
         try:
-            row = environment(self._settings.env).twin(spec)
+            row = source.twin(spec)
             if row is None:
                 raise NoPairError("it has no twin")
             twin = replace(spec, row=row)
@@ -201,7 +203,7 @@ class TwinScenes:
             shares = dict.fromkeys(self._policies, 1.0)
             for scene, decision in zip((spec, twin), pair, strict=True):
                 for arm, chunk in decision.chunks.items():
-                    shares[arm] *= self._approach(scene, decision, chunk)
+                    shares[arm] *= self._score(scene, decision, chunk)
         except (NoPairError, SceneError) as error:
             return TwinLine(job.task, job.episode, left_out=text_of(error))
         chance = chance_of(pair[0].candidates) * chance_of(pair[1].candidates)
@@ -209,8 +211,9 @@ class TwinScenes:
 
     def _decide(self, spec: EpisodeSpec, job: Job) -> Decision:
         """Have the demonstrator act until the decision, and every policy choose its chunk there."""
-        base, env = self._open(self._seen, spec)
+        base, env = self._open(self._with_images, spec)
         try:
+            # The video and the current frame, which every policy observes.
             frames, report = env.reset(self._plan.before_video())
             missing = self._plan.missing(frames)
             if missing is not None:
@@ -221,15 +224,18 @@ class TwinScenes:
                 running[arm].take_report(report)
                 running[arm].begin(frames)
                 _read(running[arm])
+
+            # The demonstrator's actions, one by one, until a decision depends on the fact.
             actions: list[np.ndarray] = []
+            first = next(iter(running.values()))
             script = _script(base, spec, self._robot)
             candidates: Candidates | None = base.candidates
             while candidates is None:
                 action = next(script, None)
-                if action is None or len(actions) == MOST_ACTIONS:
+                if action is None or len(actions) == MAX_ACTIONS:
                     raise NoPairError("the demonstrator reaches no decision that depends on a fact")
                 actions.append(action)
-                draw = self._plan.of_chunk(running[next(iter(running))], 1)
+                draw = self._plan.of_chunk(first, 1)
                 frames, _, terminated, truncated, report = env.step(
                     Command(action[None], draw=draw)
                 )
@@ -241,6 +247,8 @@ class TwinScenes:
                     episode.resume(frames)
                     _read(episode)
                 candidates = base.candidates
+
+            # What each policy would do now.
             chunks = {}
             execute = self._settings.execute or self._robot.action.execute
             for arm, policy in self._policies.items():
@@ -253,11 +261,11 @@ class TwinScenes:
         finally:
             env.close()
 
-    def _approach(self, spec: EpisodeSpec, decision: Decision, chunk: np.ndarray) -> float:
+    def _score(self, spec: EpisodeSpec, decision: Decision, chunk: np.ndarray) -> float:
         """Execute a chunk at the decision of a scene; the share of what it approaches that is
         correct.
         """
-        base, env = self._open(self._unseen, spec)
+        base, env = self._open(self._without_images, spec)
         try:
             env.reset(NOTHING)
             for action in decision.actions:
@@ -268,15 +276,11 @@ class TwinScenes:
         finally:
             env.close()
 
-    def _open(self, base: Callable[..., Any] | None, spec: EpisodeSpec) -> tuple[Any, ChunkEnv]:
+    def _open(self, base: Callable[..., Any], spec: EpisodeSpec) -> tuple[Any, ChunkEnv]:
         """The environment of a scene, and the same one as it takes chunks."""
-        assert base is not None
-        scene: dict[str, Any] = {}
-        if spec.row is not None:
-            scene["row"] = spec.row
         limit = self._settings.limit_of(spec.task)
         made = base(
-            task=spec.task, split=spec.split, episode=spec.episode, max_steps=limit, **scene
+            task=spec.task, split=spec.split, episode=spec.episode, max_steps=limit, row=spec.row
         )
         env = make_rollout_env(
             spec.task,
@@ -367,14 +371,10 @@ def run_twins(
     facts: RunFacts,
     settings: RolloutSettings,
     options: RunOptions,
-    advance: Callable[[int], object] = lambda _: None,
 ) -> Twins:
     """Run the pairs of these episodes that the folder lacks, and write `twins.json`.
 
     The policy acts as it is, and without memory where it has one whose entries can be removed.
-
-    Args:
-        advance: called with 1 after each pair.
 
     Raises:
         UserError: the policy reads subgoals, which would tell it the fact.
@@ -393,48 +393,37 @@ def run_twins(
     else:
         notes.append(f"{MEMORY_OFF} was left out: it needs {why}.")
     claim_run(folder, run_settings(policy, facts, settings, None, options.source))
-    base = None
-    if options.base is not make_env:
-        base = options.base
-    scenes = TwinScenes(policies, settings, base)
+
+    # The pairs of this shard that the folder lacks.
     shard = options.shard
     path = folder / LINES
     if shard.count > 1:
         path = folder / f"twins-{shard.index}of{shard.count}.jsonl"
-    done = {(line.task, line.episode) for line in read_twins(folder)}
-    for job in list(jobs)[shard.index :: shard.count]:
-        if (job.task, job.episode) not in done:
+    local = list(jobs)[shard.index :: shard.count]
+    known = {(line.task, line.episode) for line in read_twins(folder)}
+    missing = [job for job in local if (job.task, job.episode) not in known]
+    base = None
+    if options.base is not make_env:
+        base = options.base
+    scenes = TwinScenes(policies, settings, base)
+    bar: AbstractContextManager[Callable[[int], object]] = nullcontext(lambda _: None)
+    if options.show_progress:
+        bar = progress("twins", len(local), len(local) - len(missing), unit="pairs")
+    with bar as advance:
+        for job in missing:
             _append(path, scenes.run(job))
-        advance(1)
+            advance(1)
+
+    # The figures, over the pairs of every shard.
     selected = {(job.task, job.episode) for job in jobs}
     lines = [line for line in read_twins(folder) if (line.task, line.episode) in selected]
-    suites = {}
-    for job in jobs:
-        suite = environment(settings.env).suite_of(job.task)
-        if suite is not None:
-            suites[job.task] = suite
+    suites = environment(settings.env).suites_of(job.task for job in jobs)
     twins = aggregate_twins(lines, suites)
     twins = replace(
         twins, model=facts.model, checkpoint=facts.checkpoint, notes=[*notes, *twins.notes]
     )
     write_json(folder / FIGURES, asdict(twins))
     return twins
-
-
-def measure_twins(
-    policy: Policy,
-    jobs: Sequence[Job],
-    folder: Path,
-    facts: RunFacts,
-    settings: RolloutSettings,
-    options: RunOptions,
-) -> str:
-    """`run_twins` with a progress bar; the tables in Markdown."""
-    count = len(jobs[options.shard.index :: options.shard.count])
-    with progress("twins", count, unit="pairs") as advance:
-        twins = run_twins(policy, jobs, folder, facts, settings, options, advance)
-    tables = [to_markdown(table) for table in twin_tables(twins)]
-    return "\n".join([*tables, *twins.notes])
 
 
 def read_twins(folder: Path) -> list[TwinLine]:
@@ -509,6 +498,11 @@ def twin_tables(twins: Twins) -> list[Table]:
     first = len(twins.tasks)
     strong = {len(rows) - 1}
     return [Table("Twin accuracy (%)", columns, rows, {first}, strong, notes=twins.notes)]
+
+
+def twins_text(twins: Twins) -> str:
+    """The tables in Markdown, and what was left out."""
+    return "\n".join([*map(to_markdown, twin_tables(twins)), *twins.notes])
 
 
 def _row(name: str, accuracies: Mapping[str, Accuracy]) -> list[str]:

@@ -5,7 +5,7 @@ Nothing is trained and no policy acts: the memory selects along demonstrated epi
 (`evidence.py`).
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import comb
 from typing import TYPE_CHECKING, Any
@@ -126,13 +126,13 @@ class Operations:
 
     stored: of each fact that a decision depends on, whether the memory keeps a frame of it there.
     updated: of each fact that another one replaced before the decision, whether as many frames of
-    the new one are kept there as of the old one, and at least one. kept: facts kept at each
+    the new one are kept there as of the old one, and at least one. n_stored: facts stored at each
     decision.
     """
 
     stored: Sequence[bool]
     updated: Sequence[bool]
-    kept: Sequence[int]
+    n_stored: Sequence[int]
 
 
 def operations_of(selection: Selection, facts: Sequence[Fact]) -> Operations:
@@ -143,7 +143,7 @@ def operations_of(selection: Selection, facts: Sequence[Fact]) -> Operations:
     """
     stored: list[bool] = []
     updated: list[bool] = []
-    kept: list[int] = []
+    n_stored: list[int] = []
     decisions: set[int] = set()
     for fact in facts:
         decisions.update(fact.needed)
@@ -151,15 +151,16 @@ def operations_of(selection: Selection, facts: Sequence[Fact]) -> Operations:
         frames = selection(decision)
         needed = [fact for fact in facts if decision in fact.needed]
         counts = [_frames_of(fact, frames) for fact in needed]
-        stored += [count > 0 for count in counts]
-        kept.append(sum(count > 0 for count in counts))
+        of_decision = [count > 0 for count in counts]
+        stored += of_decision
+        n_stored.append(sum(of_decision))
         for fact, count in zip(needed, counts, strict=True):
             if fact.changed is None or fact.changed > decision:
                 continue
             for other, new in zip(needed, counts, strict=True):
                 if other.frames[0] == fact.changed:
                     updated.append(new >= max(count, 1))
-    return Operations(stored, updated, kept)
+    return Operations(stored, updated, n_stored)
 
 
 def _frames_of(fact: Fact, frames: np.ndarray) -> int:
@@ -180,29 +181,6 @@ class Writing:
     operations: dict[str, list[Operations]] = field(default_factory=dict)
     budget: int | None = None
 
-    def operations_row(self, tasks: Iterable[str]) -> dict[str, float | None]:
-        """`storage`, `update` and `compression` over the episodes of these tasks.
-
-        storage, update: shares of `Operations.stored` and `updated`; None where there is none.
-        compression: facts kept at a decision for each token of the memory's budget.
-        """
-        stored: list[bool] = []
-        updated: list[bool] = []
-        kept: list[int] = []
-        for task in tasks:
-            for operations in self.operations.get(task, ()):
-                stored += operations.stored
-                updated += operations.updated
-                kept += operations.kept
-        row: dict[str, float | None] = {"storage": None, "update": None, "compression": None}
-        if stored:
-            row["storage"] = float(np.mean(stored))
-        if updated:
-            row["update"] = float(np.mean(updated))
-        if kept and self.budget:
-            row["compression"] = float(np.mean(kept)) / self.budget
-        return row
-
     def to_dict(self) -> dict[str, Any]:
         """`tasks` and `mean`: rows of `precision`, `recall`, `score`, `chance`, `lag`, `held`,
         `facts`, `episodes`, `storage`, `update` and `compression`.
@@ -210,10 +188,10 @@ class Writing:
         lag: mean, in frames; None where no fact was kept. held: share of the facts that were kept
         at some step.
         """
-        rows = {
-            task: _row(episodes) | self.operations_row([task])
-            for task, episodes in self.tasks.items()
-        }
+        rows = {}
+        for task, episodes in self.tasks.items():
+            operations = self.operations.get(task, ())
+            rows[task] = _row(episodes) | _operations_row(operations, self.budget)
         mean: dict[str, Any] = {}
         for name in next(iter(rows.values()), {}):
             values = [row[name] for row in rows.values() if row[name] is not None]
@@ -235,6 +213,29 @@ def _row(episodes: Sequence[EpisodeWriting]) -> dict[str, Any]:
     row["held"] = len(lags) / facts
     row["facts"] = facts
     row["episodes"] = len(episodes)
+    return row
+
+
+def _operations_row(episodes: Sequence[Operations], budget: int | None) -> dict[str, float | None]:
+    """`storage`, `update` and `compression` over some episodes.
+
+    storage, update: shares of `Operations.stored` and `updated`; None where there is none.
+    compression: facts stored at a decision for each token of the budget.
+    """
+    stored: list[bool] = []
+    updated: list[bool] = []
+    n_stored: list[int] = []
+    for operations in episodes:
+        stored += operations.stored
+        updated += operations.updated
+        n_stored += operations.n_stored
+    row: dict[str, float | None] = {"storage": None, "update": None, "compression": None}
+    if stored:
+        row["storage"] = float(np.mean(stored))
+    if updated:
+        row["update"] = float(np.mean(updated))
+    if n_stored and budget:
+        row["compression"] = float(np.mean(n_stored)) / budget
     return row
 
 

@@ -11,15 +11,18 @@ import torch
 
 from mme_vla.config.plugins import import_plugins
 from mme_vla.embodiment.robomme import choice_row
+from mme_vla.envs import make
 from mme_vla.envs.base import environment
 from mme_vla.envs.facts import Candidates
 from mme_vla.envs.make import make_env
 from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import SceneError, UserError
 from mme_vla.evaluation.rollout.evaluation import RunOptions
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.arms import UNPROBED
+from mme_vla.extras.probing.settings import ProbeChoice
 from mme_vla.extras.probing.twins import (
     FIGURES,
     LINES,
@@ -29,8 +32,8 @@ from mme_vla.extras.probing.twins import (
     TwinLine,
     Twins,
     aggregate_twins,
-    approached,
     check_pair,
+    nearest_candidates,
     read_twins,
     run_twins,
     share_correct,
@@ -50,16 +53,16 @@ SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 
 def test_the_reached_candidate_counts_and_else_the_one_whose_distance_fell_most() -> None:
     start = np.array([-1.0, -1.0])
-    assert approached(SQUARE, start, np.array([0.9, 1.1])).tolist() == [3]
-    assert approached(SQUARE, start, np.array([-0.9, -1.0])).tolist() == [1]
+    assert nearest_candidates(SQUARE, start, np.array([0.9, 1.1])).tolist() == [3]
+    assert nearest_candidates(SQUARE, start, np.array([-0.9, -1.0])).tolist() == [1]
     # On the way past the first corner the tool has reached the last one, which lies in line.
-    assert approached(SQUARE, start, np.array([1.2, 1.2])).tolist() == [3]
+    assert nearest_candidates(SQUARE, start, np.array([1.2, 1.2])).tolist() == [3]
 
 
 def test_a_tie_counts_by_the_share_that_is_correct() -> None:
     candidates = Candidates(SQUARE.tolist(), [3])
     middle, ahead = [0.5, -1.0], [0.5, -0.6]
-    assert approached(SQUARE, np.array(middle), np.array(ahead)).tolist() == [2, 3]
+    assert nearest_candidates(SQUARE, np.array(middle), np.array(ahead)).tolist() == [2, 3]
     assert share_correct(candidates, middle, ahead) == 0.5
     assert share_correct(candidates, middle, middle) == 0.25, "a tool that does not move"
 
@@ -95,6 +98,20 @@ def test_tasks_weigh_the_same_and_left_out_pairs_are_named() -> None:
     assert [row[0] for row in table.rows] == [
         "VideoUnmask", "PickHighlight", "Permanence", "Reference", "all",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("with", ["shuffle"]), ("recordings", "data"), ("online", True)]
+)
+def test_what_has_no_effect_on_twins_is_refused(key: str, value: Any) -> None:
+    config: dict[str, Any] = {
+        "compare": None, "card": False, "twins": True, "offline": True, "online": False,
+        "recordings": None, "event": None, "server": None, "references": {}, "with": None,
+    }  # fmt: skip
+    assert not ProbeChoice.from_config(config).on_recordings
+    ProbeChoice.from_config(config).check()
+    with pytest.raises(UserError, match=f"leave out {key}="):
+        ProbeChoice.from_config({**config, key: value}).check()
 
 
 # An environment of one's own ----------------------------------------------------------------------
@@ -247,6 +264,19 @@ def check_script(task: str, folder: Path) -> None:
     twins = run_twins(policy, jobs, folder, FACTS, settings, options)
     assert twins.total[UNPROBED.name].accuracy == 1, twins.notes
     assert twins.total[UNPROBED.name].pairs >= 1
+
+
+def test_a_scene_that_cannot_be_built_is_left_out_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def no_place(*_: Any, **__: Any) -> None:
+        raise SceneError("a cube finds no place")
+
+    monkeypatch.setattr(make, "make_task", no_place)
+    policy = Planted(small_policy("pi05", embodiment="robomme_choice_front"), lambda _: move(0.0))
+    jobs = [Job("ButtonUnmask", "test", 0)]
+    twins = run_twins(policy, jobs, tmp_path, FACTS, RolloutSettings(seed=7), SILENT)
+    assert twins.notes[-1] == "Left out: ButtonUnmask: a cube finds no place (episodes 0)."
 
 
 @pytest.mark.parametrize("task", ["PickXtimes", "SwingXtimes", "BinFill", "StopCube"])

@@ -84,12 +84,12 @@ def test_storage_and_update_are_counted_at_the_decisions() -> None:
     unused = Fact("light", "red", (30, 35))
     facts = [old, new, unused]
     both = operations_of(lambda step: np.array([3, 22, 25, 33]), facts)
-    assert (both.stored, both.updated, both.kept) == ([True] * 4, [True] * 2, [2, 2])
+    assert (both.stored, both.updated, both.n_stored) == ([True] * 4, [True] * 2, [2, 2])
     stale = operations_of(lambda step: np.array([1, 3, 22]), facts)
     assert (stale.stored, stale.updated) == ([True] * 4, [False] * 2)
     lost = operations_of(lambda step: np.array([22] if step < 50 else [step]), facts)
     assert lost.stored == [False, True, False, False]
-    assert (lost.updated, lost.kept) == ([True, False], [1, 0])
+    assert (lost.updated, lost.n_stored) == ([True, False], [1, 0])
     later = operations_of(lambda step: np.array([3]), [Fact("a", "1", (0, 9), (15,), changed=20)])
     assert (later.stored, later.updated) == ([True], [])
 

@@ -19,7 +19,7 @@ from mme_vla.envs.robomme.scene.placement import Draws, SceneError
 from mme_vla.envs.robomme.scene.predicates import over
 from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.robomme.tasks import register_task
-from mme_vla.envs.robomme.tasks.families.stages import end_stick_video
+from mme_vla.envs.robomme.tasks.families.stages import end_stick_video, next_leg
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task, candidates_among
 
@@ -103,11 +103,10 @@ class PatternLock(Task):
 
     def candidates(self) -> Candidates | None:
         """The neighbours of the disc that the next move starts from."""
-        subtask = self.progress.current
-        if subtask is None or subtask.video:
+        leg = next_leg(self, self.path)
+        if leg is None:
             return None
-        remaining = len(self.progress.to_come)
-        here, goal = self.path[-remaining - 1], self.path[-remaining]
+        here, goal = leg
         nearest = SPACING * math.sqrt(2) + 1e-6
         neighbours = []
         for disc in self.discs:

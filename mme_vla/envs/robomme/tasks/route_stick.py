@@ -18,7 +18,7 @@ from mme_vla.envs.robomme.scene.placement import Draws
 from mme_vla.envs.robomme.scene.predicates import over
 from mme_vla.envs.robomme.scene.things import distance_xy
 from mme_vla.envs.robomme.tasks import register_task
-from mme_vla.envs.robomme.tasks.families.stages import end_stick_video
+from mme_vla.envs.robomme.tasks.families.stages import end_stick_video, next_leg
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task, candidates_among
 
@@ -117,13 +117,13 @@ class RouteStick(Task):
 
     def candidates(self) -> Candidates | None:
         """The discs beside the one that the next move starts from."""
-        subtask = self.progress.current
-        if subtask is None or subtask.video:
+        leg = next_leg(self, self.route)
+        if leg is None:
             return None
-        remaining = len(self.progress.to_come)
-        here = self.discs.index(self.route[-remaining - 1])
-        beside = self.discs[max(here - 1, 0) : here] + self.discs[here + 1 : here + 2]
-        return candidates_among(beside, [self.route[-remaining]])
+        here, goal = leg
+        i = self.discs.index(here)
+        beside = self.discs[max(i - 1, 0) : i] + self.discs[i + 1 : i + 2]
+        return candidates_among(beside, [goal])
 
     def cues(self) -> list[Cue]:
         """Of the next move: a disc under its target, and smaller ones along its arc."""

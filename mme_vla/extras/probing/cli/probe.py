@@ -46,28 +46,22 @@ def probe(cfg: DictConfig) -> None:
         probed_folder,
         run_probe,
     )
-    from mme_vla.extras.probing.twins import FIGURES, measure_twins
+    from mme_vla.extras.probing.settings import ProbeChoice
+    from mme_vla.extras.probing.twins import FIGURES, run_twins, twins_text
     from mme_vla.policy.build import policy_config
     from mme_vla.utils import safe_name
 
     values = policy_config(cfg)
-    if (folders := values["compare"]) is not None:
-        listed = [folders] if isinstance(folders, str) else list(folders)
-        print(table_of({folder: probed_folder(Path(folder)) for folder in listed}))
+    choice = ProbeChoice.from_config(values)
+    if choice.compare is not None:
+        folders = [choice.compare] if isinstance(choice.compare, str) else choice.compare
+        print(table_of({folder: probed_folder(Path(folder)) for folder in folders}))
         return
-    card = values["card"]
-    twins = values["twins"]
-    if twins:
-        # It makes its own scenes.
-        values["offline"] = False
-    if values["server"] is not None:
-        # A server chooses a chunk once: recordings are what contents are taken from.
-        values["offline"] = False
-    events = event_arms(values["event"])
+    events = event_arms(choice.event)
     settings = RolloutSettings.from_config({**values, "event": None})
     offline = read_section(OfflineSettings, values, others=True)
     jobs = []
-    if values["online"] or card or twins:
+    if choice.in_closed_loop or choice.twins:
         jobs = choose_episodes(
             named_tasks(values), values["episodes"], settings.split, settings.env
         )
@@ -77,22 +71,23 @@ def probe(cfg: DictConfig) -> None:
     log_to_terminal(logger)
     device = process_device(str(cfg.device))
     policy, name, source = load_policy(PolicyChoice.from_config(values), "probe", logger, device)
-    data = values["recordings"]
-    recordings = [] if data is None else all_recordings(open_sources(data, policy.embodiment))
-    numbers = (
-        choose_numbers(values["recorded"], len(recordings), "the data") if values["offline"] else []
-    )
-    probed = [recordings[i] for i in numbers]
+    recordings = []
+    if choice.recordings is not None:
+        recordings = all_recordings(open_sources(choice.recordings, policy.embodiment))
+    probed = []
+    if choice.on_recordings:
+        numbers = choose_numbers(values["recorded"], len(recordings), "the data")
+        probed = [recordings[i] for i in numbers]
     subgoals = None
-    if jobs and not twins:
+    if jobs and not choice.twins:
         subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
     predictor = None if subgoals is None else str(values["subgoal"]["name"])
     facts = facts_of(policy, name, source, settings, predictor)
     # A shipped policy has a folder of its name; one that an earlier version began continues.
     kind = "probe"
-    if card:
+    if choice.card:
         kind = "card"
-    if twins:
+    if choice.twins:
         kind = "twins"
     model = safe_name(name, "the policy's name")
     folder = Path("outputs", kind, model, str(facts.checkpoint))
@@ -100,17 +95,17 @@ def probe(cfg: DictConfig) -> None:
         folder = Path("outputs", kind, str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
-    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, events)
+    plan = ProbePlan(choice.arms, probed, recordings, jobs, offline, events)
     options = RunOptions(subgoals, shard, source)
     try:
-        if twins:
-            text = measure_twins(policy.eval(), jobs, folder, facts, settings, options)
-            page = folder / FIGURES
-        elif card:
-            graded = run_card(
-                policy.eval(), plan, folder, facts, settings, options, values["references"]
+        if choice.twins:
+            twins = run_twins(policy.eval(), jobs, folder, facts, settings, options)
+            text, page = twins_text(twins), folder / FIGURES
+        elif choice.card:
+            card = run_card(
+                policy.eval(), plan, folder, facts, settings, options, choice.references
             )
-            text, page = card_text(graded), folder / PAGE
+            text, page = card_text(card), folder / PAGE
         else:
             page = run_probe(policy.eval(), plan, folder, facts, settings, options).page
             text = (folder / "table.md").read_text(encoding="utf-8")

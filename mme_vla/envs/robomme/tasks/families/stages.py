@@ -326,6 +326,19 @@ def end_stick_video(env: Task, steps: int = 30) -> list[SubTask]:
     ]
 
 
+def next_leg(env: Task, path: Sequence[Disc]) -> tuple[Disc, Disc] | None:
+    """The discs where the stick's next move of the execution starts and ends; None in the video and
+    at the end.
+
+    path: of the execution, whose last sub-tasks are its moves.
+    """
+    subtask = env.progress.current
+    if subtask is None or subtask.video:
+        return None
+    remaining = len(env.progress.to_come)
+    return path[-remaining - 1], path[-remaining]
+
+
 # Options of multi-choice --------------------------------------------------------------------------
 
 
