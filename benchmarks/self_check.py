@@ -92,12 +92,12 @@ def swapped(policy: Policy) -> Iterator[tuple[str, Policy]]:
 def shifted(stats: QuantileStats) -> QuantileStats:
     """Statistics moved by `SHIFT` of their range."""
     change = SHIFT * (stats.q99 - stats.q01)
-    moved: dict[str, np.ndarray] = {}
+    values_by_name: dict[str, np.ndarray] = {}
     for name in ("mean", "q01", "q99", "min", "max"):
         values = getattr(stats, name)
         if values is not None:
-            moved[name] = values + change
-    return replace(stats, **moved)
+            values_by_name[name] = values + change
+    return replace(stats, **values_by_name)
 
 
 def other_statistics(policy: Policy, name: str) -> Policy:

@@ -26,18 +26,16 @@ class Command:
     """A command of `mme-vla`.
 
     module: its `main` runs the command. text: one line of help. config: the YAML file of the tree's
-    top level that configures it; empty for commands with options. usage: how it is typed; by
-    default `mme-vla NAME`. processes: what it does where a launcher starts several: `one` is
-    refused, `shared` divides the work, `any` only reads. reads_words: its `main` reads the command
-    line itself, and takes no configuration. check: `module:function` that reads the configuration,
-    plain and resolved, before PyTorch is imported, and raises a `UserError` on values that cannot
-    work.
+    top level that configures it; empty for commands with options. processes: what it does where a
+    launcher starts several: `one` is refused, `shared` divides the work, `any` only reads.
+    reads_words: its `main` reads the command line itself, and takes no configuration. check:
+    `module:function` that reads the configuration, plain and resolved, before PyTorch is imported,
+    and raises a `UserError` on values that cannot work.
     """
 
     module: str
     text: str
     config: str = ""
-    usage: str = ""
     processes: Literal["one", "shared", "any"] = "one"
     reads_words: bool = False
     check: str = ""

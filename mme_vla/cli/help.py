@@ -27,7 +27,7 @@ def configured_commands() -> dict[str, str]:
     usages = {"policy": "build_policy(…)", "server": "RemotePolicy(…)"}
     for name, command in commands().items():
         if command.config:
-            usages[command.config] = command.usage or f"mme-vla {name}"
+            usages[command.config] = f"mme-vla {name}"
     return usages
 
 

@@ -120,7 +120,7 @@ def page(command: str) -> str:
 
 def included(stem: str) -> str:
     """A link to the page with the keys of a YAML file that another one includes."""
-    command = cli_help.configured_commands()[stem].replace("mme_vla.", "").split()[-1]
+    command = cli_help.configured_commands()[stem].split()[-1]
     if command in commands():
         return f"[`{command}`]({command}.md)"
     return f"[`{command}`](../configuration.md)"
