@@ -15,7 +15,7 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule
-from mme_vla.policy.episode import Episode
+from mme_vla.policy.episode import Episode, executable_actions
 from mme_vla.policy.identity import PolicyIdentity
 from mme_vla.policy.saving import load_policy, push_folder, save_policy
 from mme_vla.policy.sections import PolicySections
@@ -268,20 +268,6 @@ class Policy(nn.Module):
         """
         raise NotImplementedError
 
-    def executable_actions(self, chunk: Tensor, episodes: Sequence[Episode]) -> np.ndarray:
-        """A normalised chunk [n, h, a] float32 as the embodiment executes it [n, h, w], without the
-        steps of a chunk that lie in the past.
-        """
-        processor = self.require_processor()
-        absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
-        space = self.embodiment.action
-        decided = []
-        for episode, rows in zip(episodes, absolute, strict=True):
-            decided.append(space.decide(rows, episode.options))
-        n_past = processor.samples.window - 1
-        actions: np.ndarray = torch.stack(decided).numpy()[:, n_past:]
-        return actions
-
     # Folders
 
     @classmethod
@@ -432,7 +418,7 @@ def choose_actions(
         chunk = chunk.float().cpu()
     finally:
         policy.train(was_training)
-    actions = policy.executable_actions(chunk, episodes)
+    actions = executable_actions(policy, chunk, episodes)
     for episode, executed in zip(episodes, actions, strict=True):
         episode.acted(executed)
     return SelectedActions(batch, chunk, actions)

@@ -20,6 +20,7 @@ from mme_vla.types import FrameBatch, HistoryTokens, Overlap, PastViews
 
 if TYPE_CHECKING:
     from mme_vla.memory.base import MemoryModule
+    from mme_vla.policy.base import Policy
     from mme_vla.processing.base import PolicyProcessor
 
 
@@ -552,3 +553,18 @@ def prefix_overlap(
         actions[i] = processor.actions(padded, states[i])
         weight[i, :, :width] = overlap_weights(prefix.delay, count, horizon)[:, None]
     return Overlap(actions, weight)
+
+
+def executable_actions(policy: "Policy", chunk: Tensor, episodes: Sequence[Episode]) -> np.ndarray:
+    """A normalised chunk [n, h, a] float32 as the embodiment executes it, float32 [n, h, w],
+    without the steps of a chunk that lie in the past.
+    """
+    processor = policy.require_processor()
+    absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
+    space = policy.embodiment.action
+    decided = []
+    for episode, rows in zip(episodes, absolute, strict=True):
+        decided.append(space.decide(rows, episode.options))
+    n_past = processor.samples.window - 1
+    actions: np.ndarray = torch.stack(decided).numpy()[:, n_past:]
+    return actions

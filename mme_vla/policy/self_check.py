@@ -17,6 +17,7 @@ from torch import Tensor
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.policy.episode import executable_actions
 from mme_vla.policy.tensor_files import check_header, check_values, read_safetensors
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.types import stack_noise
@@ -388,7 +389,7 @@ def predict_chunk(
         becomes_actions = chunk
         if stored and chunk[0].shape == check.chunk.shape:
             becomes_actions = torch.from_numpy(check.chunk)[None]
-        actions = policy.executable_actions(becomes_actions, [episode])[0].astype(np.float32)
+        actions = executable_actions(policy, becomes_actions, [episode])[0].astype(np.float32)
     return chunk[0].numpy(), actions
 
 
