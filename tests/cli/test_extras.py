@@ -265,14 +265,12 @@ def name_of(case: Case) -> str:
     return f"{'+'.join(case.extras) or 'none'}:{command}:{case.says}"
 
 
-def needs_few_processes(case: Case) -> bool:
-    """Each set of extras is a process: without any, and with the simulator alone, are slow tests;
-    the other sets are nightly.
-    """
-    return case.extras in ((), ("sim",))
+def needs_no_extra(case: Case) -> bool:
+    """Each set of extras is a process: without any is a slow test, the other sets are nightly."""
+    return case.extras == ()
 
 
-@pytest.mark.parametrize("case", slow_or_nightly(SUFFICE, needs_few_processes, name_of))
+@pytest.mark.parametrize("case", slow_or_nightly(SUFFICE, needs_no_extra, name_of))
 def test_the_command_runs_with_this_extra_alone(
     outcomes: Callable[[Case], tuple[int, str]], case: Case
 ) -> None:
@@ -302,7 +300,7 @@ def test_nano_run_again_computes_nothing_twice(
     assert len(read_folders(find_records([nano / "further" / "framesamp_modul"]))) == 2
 
 
-@pytest.mark.parametrize("case", slow_or_nightly(NEED, needs_few_processes, name_of))
+@pytest.mark.parametrize("case", slow_or_nightly(NEED, needs_no_extra, name_of))
 def test_a_command_names_the_extra_that_it_needs(
     outcomes: Callable[[Case], tuple[int, str]], case: Case
 ) -> None:

@@ -6,6 +6,7 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_tasks import steps_of_demonstration
+from helpers.tiers import ONE_OF_A_SUITE, slow_or_nightly
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.subtasks import Progress, SubTask
@@ -36,8 +37,7 @@ def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:
     return np.stack(observed), texts
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("task", slow_or_nightly(TASK_NAMES, lambda task: task in ONE_OF_A_SUITE))
 def test_the_same_seed_gives_bit_equal_states_twice(task: str) -> None:
     (first, words), (second, same_words) = states(task, "hard"), states(task, "hard")
     assert np.array_equal(first, second) and words == same_words

@@ -14,6 +14,7 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
+from helpers.tiers import ONE_OF_A_SUITE, slow_or_nightly
 from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks, make_env, make_task
 from mme_vla.envs.metadata import TASK_NAMES
@@ -81,8 +82,7 @@ def test_a_scene_built_from_its_values_is_the_same(task: str) -> None:
     check_round_trip(task, metadata.episode(task, "ood", 49).options)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task", TASK_NAMES)
+@pytest.mark.parametrize("task", slow_or_nightly(TASK_NAMES, lambda task: task in ONE_OF_A_SUITE))
 def test_twenty_scenes_built_from_their_values_are_the_same(task: str) -> None:
     built = 0
     for episode in range(50):

@@ -5,6 +5,9 @@ from typing import Any
 
 import pytest
 
+ONE_OF_A_SUITE = ("PickXtimes", "VideoUnmask", "PickHighlight", "PatternLock")
+"""A task of each suite of the benchmark."""
+
 
 def slow_or_nightly(
     values: Iterable[Any], is_slow: Callable[[Any], bool], ids: Callable[[Any], str] | None = None

@@ -10,6 +10,7 @@ import torch
 from torch.func import functional_call
 
 from helpers import commands
+from helpers.tiers import slow_or_nightly
 from mme_vla import cli
 from mme_vla.cli import check_launcher
 from mme_vla.cli.train import check_processes
@@ -49,8 +50,10 @@ def test_hooks_of_a_model_run_when_it_is_called() -> None:
     assert len(seen) == 1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "port"), [("ddp", "29613"), ("fsdp", "29614")])
+@pytest.mark.parametrize(
+    ("kind", "port"),
+    slow_or_nightly([("ddp", "29613"), ("fsdp", "29614")], lambda case: case[0] == "fsdp"),
+)
 def test_two_processes_exchange_the_gradients_of_a_model_that_is_called(
     kind: str, port: str, tmp_path: Path
 ) -> None:

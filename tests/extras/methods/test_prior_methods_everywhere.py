@@ -18,6 +18,7 @@ from helpers.prior_vla_runs import TOWERS, UNTESTED, losses, run
 from helpers.rollout_fakes import InlineEnvs, roll
 from helpers.scripted_env import SIZE, make_scripted_env
 from helpers.serving_fakes import Served, challenge
+from helpers.tiers import slow_or_nightly
 from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.config.composition import compose
 from mme_vla.data.convert import ConvertOptions, convert
@@ -138,7 +139,9 @@ RESUMED = {
 }
 
 
-@pytest.mark.parametrize("case", RESUMED)
+@pytest.mark.parametrize(
+    "case", slow_or_nightly(RESUMED, lambda case: case in ("adapters", "a recurrent memory"))
+)
 def test_it_trains_by_the_command_and_resumes_to_the_bit(
     case: str, data: Callable[[str], str], tmp_path: Path
 ) -> None:

@@ -73,6 +73,7 @@ def nano_run(cfg: DictConfig) -> NanoRun:
     return NanoRun.from_config(resolved(cfg))
 
 
+@pytest.mark.nightly
 def test_all_memories_read_decisions_and_the_same_frames() -> None:
     rows = compose_rows(nano_run(compose("nano", ["nano=nano16"])))
     decisions = np.array([66, 71, 140, 333, 640, 1201])

@@ -194,6 +194,7 @@ def test_a_sample_and_what_is_executed_of_it(golden: Any) -> None:
         close(executed, arrays["out/executed_actions"], SAMPLES)
 
 
+@pytest.mark.nightly
 def test_the_released_size_to_the_number_and_what_it_computes(folder: Path) -> None:
     arrays, about = case(folder, "full_size")
     meta = build_policy("diffusion_policy", backbone="dp", device="meta")
