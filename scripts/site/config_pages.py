@@ -93,9 +93,10 @@ def page_link(page: str, anchor: str, folder: str) -> str:
 
 def code(text: str) -> str:
     """Text in backticks within a table, where a bar would end the cell. A value that is computed
-    is named: `outputs/<name>/<now>`.
+    is named: `outputs/<name>/<now>`, and `$NAME` for a variable of the environment.
     """
-    text = re.sub(r"\$\{(\w+)(?::[^}]*)?\}", r"<\1>", text)
+    text = re.sub(r"\$\{oc\.env:(\w+)[^}]*\}", r"$\1", text)
+    text = re.sub(r"\$\{([\w.]+)(?::[^}]*)?\}", r"<\1>", text)
     return f"`{text.replace('|', chr(92) + '|')}`" if text else ""
 
 

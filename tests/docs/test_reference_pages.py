@@ -113,7 +113,25 @@ def test_comments_become_markdown() -> None:
     linked = config_pages.prose("see docs/train/weights.md#formats.", "reference/configuration")
     assert linked == "see [Weights](../../train/weights.md#formats)."
     assert config_pages.prose("docs/no/page.md") == "docs/no/page.md"
-    assert config_pages.code("outputs/${name}/${now:%Y}") == "`outputs/<name>/<now>`"
+    assert config_pages.code("outputs/${player.name}/${now:%Y}") == "`outputs/<player.name>/<now>`"
+    assert config_pages.code("${oc.env:MY_KEY,null}") == "`$MY_KEY`"
+
+
+def test_generated_pages_have_links_and_words_in_place_of_paths_and_interpolations() -> None:
+    for path, page in (command_pages.pages() | config_pages.pages()).items():
+        text = re.sub(r"^```.*?^```", "", page, flags=re.DOTALL | re.MULTILINE)
+        assert "${" not in text, path
+        assert not re.search(r"(?<!/)docs/[\w/-]+\.md", text), path
+
+
+def test_the_page_of_a_command_opens_with_no_sentence_and_no_link_twice() -> None:
+    for path, page in command_pages.pages().items():
+        opening = re.sub(r"^```.*?^```", "", page, flags=re.DOTALL | re.MULTILINE)
+        opening = opening.partition("\n## ")[0]
+        links = re.findall(r"\]\(([^)]+)\)", opening)
+        assert len(links) == len(set(links)) > 0, path
+        sentences = [part.strip() for part in re.split(r"(?<=[.?])\s", opening) if part.strip()]
+        assert len(sentences) == len(set(sentences)), path
 
 
 def test_values_of_pages_do_not_break() -> None:
