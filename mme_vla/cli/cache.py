@@ -12,7 +12,7 @@ from mme_vla.config.sections import read_section
 from mme_vla.data.cache import cache_folder, default_cache_root, fingerprint
 from mme_vla.data.cache_building import build_cache, clear_cache, estimate, process_rank
 from mme_vla.data.sources import open_sources
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, counted
 from mme_vla.policy.build import build_from_config
 from mme_vla.training.runs import start_from, weights_to_start_from
 from mme_vla.training.settings import TrainRun
@@ -81,4 +81,5 @@ def main(cfg: DictConfig) -> None:
                 expected,
                 batch_size=settings.batch_size,
             )
-        print(f"{source.name}: {n_encoded} episodes encoded, {len(source)} in all, at {folder}")
+        encoded = counted(n_encoded, "episode")
+        print(f"{source.name}: {encoded} encoded, {len(source)} in all, at {folder}")

@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from mme_vla.config.sections import read_section
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
+from mme_vla.errors import counted
 
 
 def main(cfg: DictConfig) -> None:
@@ -24,5 +25,6 @@ def main(cfg: DictConfig) -> None:
     )
     already = len(episodes) - n_converted
     print(
-        f"{output}: {len(episodes)} episodes ({n_converted} written now, {already} already there)."
+        f"{output}: {counted(len(episodes), 'episode')} ({n_converted} written now,"
+        f" {already} already there)."
     )

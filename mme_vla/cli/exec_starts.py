@@ -16,7 +16,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import ARM_JOINTS
-from mme_vla.errors import listed, require
+from mme_vla.errors import counted, listed, require
 from mme_vla.utils import write_json
 
 # radians on average: a demonstration that was made anew differs a little, another episode by far
@@ -93,4 +93,6 @@ def main(cfg: DictConfig) -> None:
         starts = first_frames(cfg.dataset, episodes)
     write_json(output, {str(episode): start for episode, start in enumerate(starts)})
     videos = sum(start > 0 for start in starts)
-    print(f"{output}: {len(starts)} episodes, {videos} of them with a conditioning video.")
+    print(
+        f"{output}: {counted(len(starts), 'episode')}, {videos} of them with a conditioning video."
+    )

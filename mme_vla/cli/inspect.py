@@ -35,7 +35,7 @@ from mme_vla.data.sources import (
 from mme_vla.data.statistics import normalised_states
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.action_space import numbered
-from mme_vla.errors import UserError, printable, require
+from mme_vla.errors import UserError, counted, printable, require
 from mme_vla.evaluation.records import display_name
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import OnlineHistory
@@ -547,11 +547,13 @@ def draw_memory(
     table = _table(f"{name} at step {step}", "", "")
     table.add_row(
         "remembers",
-        f"{len(selected)} of {memory.budget} tokens, in {len(remembered)} of {step + 1} frames",
+        f"{len(selected)} of {counted(memory.budget, 'token')}, in {len(remembered)} of"
+        f" {counted(step + 1, 'frame')}",
     )
     table.add_row("frames", ", ".join(map(str, remembered)))
     table.add_row(
-        "stored", f"{len(stored)} frames of {memory.storage.grid}×{memory.storage.grid} tokens"
+        "stored",
+        f"{counted(len(stored), 'frame')} of {memory.storage.grid}×{memory.storage.grid} tokens",
     )
     _show(table, console)
     folder.mkdir(parents=True, exist_ok=True)

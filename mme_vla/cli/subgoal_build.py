@@ -8,6 +8,7 @@ from typing import Any, Literal
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.sections import NonNegativeInt, PathText, read_section
+from mme_vla.errors import counted
 from mme_vla.subgoal.finetuning.collecting import build, open_input
 from mme_vla.subgoal.finetuning.rows import RowOptions
 from mme_vla.subgoal.finetuning.training import write_arguments
@@ -44,5 +45,6 @@ def main(cfg: DictConfig) -> dict[str, int]:
     counts = build(episodes, output, settings.sets, options)
     for name, count in counts.items():
         write_arguments(output, name)
-        print(f"{output / name}.jsonl: {count} rows of {len(episodes)} episodes")
+        of = counted(len(episodes), "episode")
+        print(f"{output / name}.jsonl: {counted(count, 'row')} of {of}")
     return counts

@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -96,10 +95,9 @@ def open_table(root: Path, columns: Sequence[str], features: Mapping[str, Featur
     large = any(features[name].dtype == "image" for name in columns)
     files = parquet_files(root, "data")
     folder = user_cache("tables") / _tables_key(root, files, large)
-    with (
-        decoding(root / "data", "tables of frames", REMEDY),
-        nullcontext() if large and sys.stderr.isatty() else SuppressProgressBars(),
-    ):
+    if large and not folder.exists() and sys.stderr.isatty():
+        print(f"{root}: copying the images once to {folder} …", file=sys.stderr, flush=True)
+    with decoding(root / "data", "tables of frames", REMEDY), SuppressProgressBars():
         table = Dataset.from_parquet(
             [str(file) for file in files],
             columns=list(columns),

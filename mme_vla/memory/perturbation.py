@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 
 from mme_vla.config.sections import NonNegative, NonNegativeInt, Range, read_section
-from mme_vla.errors import check_choice, require
+from mme_vla.errors import check_choice, counted, require
 from mme_vla.registry import PERTURBATIONS
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ class Pause(Perturbation):
 
     @property
     def meaning(self) -> str:
-        return f"time stands still for {self.frames} frames"
+        return f"time stands still for {counted(self.frames, 'frame')}"
 
     @property
     def hold(self) -> int:

@@ -15,7 +15,7 @@ from mme_vla.data.dataset import GroupDataset, TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.sources import Split, default_val_episodes, open_sources, split_episodes
 from mme_vla.data.statistics import check_ranges, compute_norm_stats
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, counted, require
 from mme_vla.memory.perturbation import build_transforms
 from mme_vla.policy.base import Policy
 from mme_vla.policy.sections import PolicySections
@@ -87,8 +87,9 @@ def prepare_data(
         val = _samples(policy, data, sources, caches, split.val, seed, held_out=True)
     names = ", ".join(source.name for source in sources)
     say(
-        f"data {names}: {len(train)} training steps in {sum(map(len, split.train))} episodes,"
-        f" {0 if val is None else len(val)} held-out steps in {held_out}"
+        f"data {names}: {counted(len(train), 'training step')} in"
+        f" {counted(sum(map(len, split.train)), 'episode')},"
+        f" {counted(0 if val is None else len(val), 'held-out step')} in {held_out}"
     )
     return SplitData(train, val, [source.fingerprint for source in sources])
 

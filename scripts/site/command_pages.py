@@ -98,11 +98,11 @@ def page(command: str) -> str:
     # The file's comment says what the command does; the table of commands where it has none.
     if not cli_help.heading(file)[1]:
         parts.append(f"{purpose[0].upper()}{purpose[1:]}.")
-    parts += [
-        config_pages.introduction(file),
-        guide,
-        f"## Keys of [{file.name}]({config_pages.source_link(file)})",
-    ]
+    introduction = config_pages.introduction(file)
+    parts.append(introduction)
+    if f"../../{GUIDES[command]}" not in introduction:
+        parts.append(guide)
+    parts.append(f"## Keys of [{file.name}]({config_pages.source_link(file)})")
     parts.append(config_pages.key_table(file))
     chosen = cli_help.defaults(file)
     if chosen.files:

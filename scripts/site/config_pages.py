@@ -27,6 +27,8 @@ arguments: `build_policy("framesamp_modul", backbone="pi05", memory={"budget": 2
 A misspelt key is an error that names the nearest keys.
 """  # noqa: E501
 
+UNBROKEN = 24
+"""Characters of a default that is never broken into lines."""
 _KEY = re.compile(
     r"^(?P<indent> *(?:- )?)(?P<key>[\w/]+):(?: +(?P<value>[^#]*?))?(?: +# (?P<comment>.*))?$"
 )
@@ -93,9 +95,10 @@ def page_link(page: str, anchor: str, folder: str) -> str:
 
 def code(text: str) -> str:
     """Text in backticks within a table, where a bar would end the cell. A value that is computed
-    is named: `outputs/<name>/<now>`.
+    is named: `outputs/<name>/<now>`, and `$NAME` for a variable of the environment.
     """
-    text = re.sub(r"\$\{(\w+)(?::[^}]*)?\}", r"<\1>", text)
+    text = re.sub(r"\$\{oc\.env:(\w+)[^}]*\}", r"$\1", text)
+    text = re.sub(r"\$\{([\w.]+)(?::[^}]*)?\}", r"<\1>", text)
     return f"`{text.replace('|', chr(92) + '|')}`" if text else ""
 
 
@@ -108,10 +111,12 @@ def introduction(file: Path, folder: str = "reference/commands") -> str:
 
 def key_table(file: Path, folder: str = "reference/commands") -> str:
     """A file's keys with their defaults and comments; empty where it has none."""
-    rows = [
-        f"| {code(key.name)} | {code(key.default)} | {prose(key.comment, folder)} |"
-        for key in keys(file)
-    ]
+    rows = []
+    for key in keys(file):
+        default = code(key.default)
+        if 0 < len(key.default) <= UNBROKEN:
+            default += "{ .value }"  # docs/stylesheets/site.css keeps it on one line
+        rows.append(f"| {code(key.name)} | {default} | {prose(key.comment, folder)} |")
     return "\n".join(["| key | default | |", "|---|---|---|", *rows]) if rows else ""
 
 

@@ -51,6 +51,8 @@ BOOST = {
 """Folder or page → weight in the search, 1 for the others."""
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)(#[^)\s]*)?\)")
 DRAWING = re.compile(r'<img alt="([^"]*)" src="([^"]*\.svg)" />')
+UNITS = "[KMGT]i?B|[mµ]?s|min|h|[mck]?m|px|Hz|fps"
+"""Units of values on the pages, as a regular expression."""
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", ".toml": "toml"}
 
 
@@ -167,8 +169,10 @@ def headline() -> str:
 
 
 def unbroken(text: str) -> str:
-    """A page's text whose values stay on one line: `63 %`, `49.17 ± 0.48`, `16 × 16`."""
-    value = re.compile(r"(?<=\d) (?=[%±×])|(?<=[±×]) (?=\d)")
+    """A page's text whose values stay on one line: `63 %`, `49.17 ± 0.48`, `16 × 16`,
+    `7 GB`.
+    """
+    value = re.compile(rf"(?<=\d) (?=[%±×]|(?:{UNITS})\b)|(?<=[±×]) (?=\d)")
 
     def change(part: str) -> str:
         pieces = re.split(r"(`[^`\n]*`)", part)

@@ -113,14 +113,33 @@ def test_comments_become_markdown() -> None:
     linked = config_pages.prose("see docs/train/weights.md#formats.", "reference/configuration")
     assert linked == "see [Weights](../../train/weights.md#formats)."
     assert config_pages.prose("docs/no/page.md") == "docs/no/page.md"
-    assert config_pages.code("outputs/${name}/${now:%Y}") == "`outputs/<name>/<now>`"
+    assert config_pages.code("outputs/${player.name}/${now:%Y}") == "`outputs/<player.name>/<now>`"
+    assert config_pages.code("${oc.env:MY_KEY,null}") == "`$MY_KEY`"
+
+
+def test_generated_pages_have_links_and_words_in_place_of_paths_and_interpolations() -> None:
+    for path, page in (command_pages.pages() | config_pages.pages()).items():
+        text = re.sub(r"^```.*?^```", "", page, flags=re.DOTALL | re.MULTILINE)
+        assert "${" not in text, path
+        assert not re.search(r"(?<!/)docs/[\w/-]+\.md", text), path
+
+
+def test_the_page_of_a_command_opens_with_no_sentence_and_no_link_twice() -> None:
+    for path, page in command_pages.pages().items():
+        opening = re.sub(r"^```.*?^```", "", page, flags=re.DOTALL | re.MULTILINE)
+        opening = opening.partition("\n## ")[0]
+        links = re.findall(r"\]\(([^)]+)\)", opening)
+        assert len(links) == len(set(links)) > 0, path
+        sentences = [part.strip() for part in re.split(r"(?<=[.?])\s", opening) if part.strip()]
+        assert len(sentences) == len(set(sentences)), path
 
 
 def test_values_of_pages_do_not_break() -> None:
-    text = "49.17 ± 0.48, 63 %, 16 × 16, `1 % 2`\n\n```text\n3 %\n```"
-    assert hooks.unbroken(text) == text.replace("49.17 ± 0.48", "49.17\u00a0±\u00a00.48").replace(
-        "63 %", "63\u00a0%"
-    ).replace("16 × 16", "16\u00a0×\u00a016")
+    text = "49.17 ± 0.48, 63 %, 16 × 16, 7 GB, 5 ms, 4 steps, `1 % 2`\n\n```text\n3 %\n```"
+    expected = text
+    for value in ("49.17 ± 0.48", "63 %", "16 × 16", "7 GB", "5 ms"):
+        expected = expected.replace(value, value.replace(" ", "\u00a0"))
+    assert hooks.unbroken(text) == expected
 
 
 def test_the_landing_page_has_the_first_table_of_the_readme() -> None:
@@ -133,6 +152,7 @@ def test_each_command_has_a_page_with_its_options() -> None:
     pages = command_pages.pages()
     assert set(pages) == {f"reference/commands/{command}.md" for command in commands()}
     assert "| `max_steps` |" in pages["reference/commands/evaluate.md"]
+    assert "| `port` | `8002`{ .value } |" in pages["reference/commands/play.md"]
     assert "| [`model`](../configuration/model.md) |" in pages["reference/commands/train.md"]
     assert "--compare" in pages["reference/commands/results.md"]
     for command in commands():

@@ -2,6 +2,7 @@
 cameras, no video.
 """
 
+import io
 import json
 import re
 import shlex
@@ -25,6 +26,8 @@ from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
 from mme_vla.data.cache import cache_folder, fingerprint
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.frame_tables import open_table
+from mme_vla.data.lerobot_files import read_info
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.envs.vector.pool import Job
 from mme_vla.memory.history import StorageSpec
@@ -113,6 +116,28 @@ class Robot:
     def execute(self, actions: np.ndarray) -> None:
         assert actions.shape == (8, 14) and np.isfinite(actions).all()
         self.executed.append(actions)
+
+
+@pytest.mark.slow
+def test_images_are_copied_once_with_one_line_and_no_bar(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("MME_VLA_CACHE", str(tmp_path))
+    root = place / "demonstrations"
+    features = read_info(root).features
+    columns = [name for name in features if name.startswith("observation.images.")]
+    printed = []
+    for _ in range(2):
+        terminal = Terminal()
+        monkeypatch.setattr("sys.stderr", terminal)
+        assert open_table(root, columns, features).num_rows == 25
+        printed.append(terminal.getvalue())
+    assert re.fullmatch(r".*demonstrations: copying the images once to .* …\n", printed[0])
+    assert printed[1] == ""
 
 
 def test_the_page_shows_the_file_that_is_tested() -> None:

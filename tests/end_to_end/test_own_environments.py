@@ -38,9 +38,13 @@ def environment_of(example: str) -> dict[str, str]:
 
 
 def run(folder: Path, example: str, command: str, *words: str) -> str:
-    """Output of a command that runs in `folder`, with the example's module on the path."""
+    """Output of a command that runs in `folder`, with the example's module on the path: without
+    tracebacks and bars of other packages.
+    """
     done = commands.run("mme_vla", command, *words, cwd=folder, env=environment_of(example))
     assert done.returncode == 0, done.stderr[-3000:]
+    for noise in ("Traceback", "torchcodec", "it/s", "examples/s", "%|"):
+        assert noise not in done.stdout + done.stderr, done.stderr[-3000:]
     return done.stdout
 
 

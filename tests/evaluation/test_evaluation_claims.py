@@ -187,6 +187,8 @@ def test_the_forecast_follows_whoever_is_slower() -> None:
         " before them did"
     )
     assert Durations([]).forecast(JOBS, workers=1) is None
+    short = Durations([record(0, 4)]).forecast(JOBS[:1], workers=1)
+    assert str(short).startswith("forecast: about a minute at most for 1 episode, 1 at a time")
 
 
 def test_an_episode_that_is_tried_again_comes_last() -> None:

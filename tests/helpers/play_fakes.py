@@ -69,6 +69,13 @@ class BlocksEnv:
         return {"front_rgb_list": frames, "joint_state_list": [np.zeros(7)] * count}
 
 
+class SessionWithObjects(ChoiceSession):
+    """Knows where the blocks are."""
+
+    def objects(self) -> dict[str, list[tuple[float, float]]]:
+        return {"a": [(float(row), float(column)) for row, column in BLOCKS.values()]}
+
+
 def an_episode(number: int = 0) -> EpisodeSpec:
     return EpisodeSpec("VideoUnmask", "test", number, 560000 + 100 * number, "easy")
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from mme_vla.errors import require
+from mme_vla.errors import counted, require
 from mme_vla.evaluation.pairing import Pairing, pair
 from mme_vla.evaluation.records import EpisodeKey
 from mme_vla.evaluation.results.aggregate import Method, by_task
@@ -99,7 +99,8 @@ class Comparison:
         text += f" (p {p})"
         if self.flipped:
             text += (
-                f"; of {self.repeated:,} episodes run twice alike, {self.flipped:,} ended otherwise"
+                f"; of {counted(self.repeated, 'episode')} run twice alike,"
+                f" {self.flipped:,} ended otherwise"
             )
         return text
 

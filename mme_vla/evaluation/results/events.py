@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mme_vla.errors import require
+from mme_vla.errors import counted, require
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Method, Results
@@ -81,7 +81,7 @@ def idle_events(records: Sequence[EpisodeRecord]) -> list[str]:
         if record.outcome != "error":
             counts.update(did_not_act(record))
     return [
-        f"event={event} did not act in {count} episodes: its place never came."
+        f"event={event} did not act in {counted(count, 'episode')}: its place never came."
         for event, count in counts.items()
     ]
 

@@ -22,7 +22,7 @@ from rich.progress import (
 )
 
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError, printable
+from mme_vla.errors import UserError, counted, printable
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import find_records, read_records
 
@@ -97,8 +97,8 @@ class RolloutProgress:
         if record.difficulty:
             episode += f" ({record.difficulty})"
         line = (
-            f"{self._prefix}{episode}: {record.outcome},"
-            f" {record.steps} steps in {seconds.total:.0f} s (simulation {seconds.sim:.0f},"
+            f"{self._prefix}{episode}: {record.outcome}, {counted(record.steps, 'step')} in"
+            f" {seconds.total:.0f} s (simulation {seconds.sim:.0f},"
             f" rendering {seconds.render:.0f}, policy {seconds.policy:.0f})"
         )
         if record.error:
@@ -195,8 +195,13 @@ class Forecast:
 
     def __str__(self) -> str:
         hours = self.seconds / 3600
-        time = f"{hours:.1f} h" if hours >= 1 else f"{self.seconds / 60:.0f} min"
+        if hours >= 1:
+            time = f"{hours:.1f} h"
+        elif self.seconds >= 60:
+            time = f"{self.seconds / 60:.0f} min"
+        else:
+            time = "a minute at most"
         return (
-            f"forecast: about {time} for {self.episodes:,} episodes, {self.at_once} at a time, if"
-            f" they take as long as the {self.records:,} before them did"
+            f"forecast: about {time} for {counted(self.episodes, 'episode')}, {self.at_once} at a"
+            f" time, if they take as long as the {self.records:,} before them did"
         )

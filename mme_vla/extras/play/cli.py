@@ -19,7 +19,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.rendering import render_backend
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, counted
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import INDIFFERENT
 from mme_vla.extras.play import build_player
@@ -160,7 +160,7 @@ def line(record: EpisodeRecord) -> str:
     parts = [
         f"{record.task} {record.episode}: {record.outcome}",
         " ".join(choices) or "no choice",
-        f"{record.steps} steps, {record.seconds.total:.0f} s",
+        f"{counted(record.steps, 'step')}, {record.seconds.total:.0f} s",
     ]
     reason = record.error or record.extra.get("ended_by", "")
     if reason:

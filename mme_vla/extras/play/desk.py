@@ -13,12 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, counted
+from mme_vla.errors import UserError, counted, require
 from mme_vla.extras.play.game import ChoiceSession
 from mme_vla.extras.play.run import PlayRun
 
 log = logging.getLogger("mme_vla.play")
 QUALITY = 92  # of the JPEG frames
+REACH = 24.0
+"""Pixels between a point and the object that it means, at most. In five tasks that were measured no
+object had a pixel more than 19 away from its place. A policy's point takes the nearest object from
+anywhere.
+"""
 
 
 class StaleError(Exception):
@@ -45,6 +50,7 @@ class Desk:
         self.address = ""
         self.session: ChoiceSession | None = None
         self.session_id = ""
+        self._objects: dict[str, list[tuple[float, float]]] = {}  # see `ChoiceSession.objects`
         self._since = time.monotonic()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="simulator")
 
@@ -76,7 +82,14 @@ class Desk:
             or requested != (self.session_id, len(session.decisions))
         ):
             raise StaleError("This was decided already; the page shows the present question.")
-        session.check(request)
+        option, point = session.check(request)
+        if point is not None and (pixels := self._objects.get(option.label)):
+            nearest = min(float(np.hypot(*np.subtract(pixel, point))) for pixel in pixels)
+            require(
+                nearest <= REACH,
+                f"There is no object at row {point[0]:g}, column {point[1]:g}: the nearest is"
+                f" {nearest:.0f} pixels away, and {REACH:g} are allowed. Click an object.",
+            )
         action = {"choice": request["choice"], "point": request.get("point")}
         self._enter("moving")
         self._work(lambda: self._move(session, action))
@@ -143,7 +156,11 @@ class Desk:
                 "problem": session.error,
                 "ended_by": session.ended_by,
                 "max_choices": session.max_choices,
-                "options": [vars(option) for option in session.options],
+                "options": [
+                    {**vars(option), "objects": self._objects.get(option.label)}
+                    for option in session.options
+                ],
+                "reach": REACH,
                 "reveals": [
                     {"title": r.title, "start": r.start, "count": len(r.frames)} for r in reveals
                 ],
@@ -197,6 +214,7 @@ class Desk:
 
     def _after(self, session: ChoiceSession) -> None:
         if not session.over:
+            self._objects = session.objects()
             return self._enter("choosing")
         self.run.save(session, participant=self.participant)
         which = session.episode

@@ -15,6 +15,7 @@ import numpy as np
 
 from mme_vla.embodiment.action_space import Option
 from mme_vla.embodiment.robomme import SIDE
+from mme_vla.envs.grounding import project
 from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.scene_hash import NO_VALUES
 from mme_vla.errors import UserError, did_you_mean, require
@@ -245,6 +246,21 @@ class ChoiceSession:
                 **extra,
             },
         )
+
+    def objects(self) -> dict[str, list[tuple[float, float]]]:
+        """Letter of an option → pixel [y, x] of each object among which its point chooses now.
+        Empty where the environment is no task of this library.
+        """
+        task: Any = getattr(self.env, "task", None)
+        pixels: dict[str, list[tuple[float, float]]] = {}
+        if not hasattr(task, "choices"):
+            return pixels
+        for choice in task.choices():
+            if choice.candidates is not None:
+                pixels[choice.label] = [
+                    tuple(project(thing.position).tolist()) for thing in choice.candidates
+                ]
+        return pixels
 
     def close(self) -> None:
         """Free the environment."""

@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from mme_vla.config.sections import NonNegativeInt, PositiveInt
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, counted
 from mme_vla.extras.probing.channels import Remembered, same_progress
 from mme_vla.extras.probing.recordings import Recording
 from mme_vla.memory.history import History
@@ -169,7 +169,8 @@ class Delay(Perturbation):
     @property
     def meaning(self) -> str:
         direction = "earlier" if self.frames < 0 else "later"
-        return f"every entry seems to be {abs(self.frames)} frames {direction} than it was"
+        frames = counted(abs(self.frames), "frame")
+        return f"every entry seems to be {frames} {direction} than it was"
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         shifted = list(store.entries)
@@ -191,6 +192,8 @@ class Recent(Perturbation):
 
     @property
     def meaning(self) -> str:
+        if self.frames == 1:
+            return "only the last frame can be remembered"
         return f"only the last {self.frames} frames can be remembered"
 
     def only(self, moment: Moment) -> np.ndarray | None:
@@ -333,7 +336,7 @@ class SubgoalDelay(Perturbation):
 
     @property
     def meaning(self) -> str:
-        return f"the subgoal is the one of {self.decisions} chunks ago"
+        return f"the subgoal is the one of {counted(self.decisions, 'chunk')} ago"
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         if not moment.subgoals:

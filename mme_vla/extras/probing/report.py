@@ -165,7 +165,7 @@ def measures_table(findings: Findings, explained: bool = False) -> Table:
             rows.append([measure, question, arm, show(arms[arm])])
     reach, video = findings.reach(), findings.from_video()
     if reach is not None:
-        rows.append([*REACH, "each entry removed", f"{reach:.0f} frames"])
+        rows.append([*REACH, "each entry removed", counted(round(reach), "frame")])
     if video is not None:
         rows.append([*FROM_VIDEO, "each entry removed", f"{100 * video:.0f} %"])
     columns = ["measure", "what is measured", "intervention", "change"]

@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from mme_vla.config.sections import PositiveInt
+from mme_vla.errors import counted
 from mme_vla.extras.probing.interventions import Moment
 from mme_vla.memory.perturbation import Perturbation
 from mme_vla.policy.episode import Episode
@@ -175,6 +176,10 @@ class Linger(Perturbation):
     dial: ClassVar = "frames"
     needs: ClassVar = frozenset({"stream", "pauses"})
 
+    @property
+    def meaning(self) -> str:
+        return f"the frame of the decision is repeated {counted(self.frames, 'more time')}"
+
     def show(self, frames: Shown, moment: Moment) -> Shown:
         last = len(frames) - 1
         return frames.take(np.append(np.arange(len(frames)), np.full(self.frames, last)))
@@ -190,6 +195,10 @@ class Late(Perturbation):
     frames: PositiveInt = 8
     dial: ClassVar = "frames"
     needs: ClassVar = frozenset({"stream"})
+
+    @property
+    def meaning(self) -> str:
+        return f"the images of the execution arrive {counted(self.frames, 'frame')} late"
 
     @property
     def lag(self) -> int:

@@ -17,7 +17,15 @@ from pathlib import Path
 import pytest
 
 from helpers.browser import Browser
-from helpers.play_fakes import BLOCKS, MOTION, VIDEO, a_session, an_episode
+from helpers.play_fakes import (
+    BLOCKS,
+    MOTION,
+    VIDEO,
+    BlocksEnv,
+    SessionWithObjects,
+    a_session,
+    an_episode,
+)
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import read_records
 from mme_vla.extras.play import web
@@ -78,6 +86,10 @@ def served(folder, make=lambda which: a_session(which.episode), episodes=2, **op
         finally:
             server.should_exit = True
             thread.join(30)
+
+
+def with_objects(which):
+    return SessionWithObjects(BlocksEnv(), which)
 
 
 # Over HTTP ----------------------------------------------------------------------------------------
@@ -157,6 +169,30 @@ def test_a_choice_that_cannot_be_made_is_answered_and_changes_nothing(tmp_path):
         )
         assert response.status == 400
         assert page.state()["decisions"] == []
+
+
+def test_a_point_far_from_every_object_is_answered_and_one_near_an_object_is_kept(tmp_path):
+    row, column = BLOCKS["blue"]
+    with served(tmp_path, with_objects) as page:
+        state = page.until("choosing")
+        red, blue = [list(map(float, place)) for place in BLOCKS.values()]
+        assert [option["objects"] for option in state["options"]] == [[red, blue], None, None]
+        request = {"session": state["session"], "decision": 0, "choice": "a"}
+        response, content = page.ask("POST", "/choose", {**request, "point": [row - 25, column]})
+        assert response.status == 400
+        assert "no object at row 155, column 190: the nearest is 25 pixels" in content.decode()
+        assert page.state()["decisions"] == []
+        response, _ = page.ask("POST", "/choose", {**request, "point": [row - 24, column]})
+        assert response.status == 200
+        page.desk._thread.submit(lambda: None).result()
+        assert page.state()["decisions"][0]["point"] == [row - 24, column]
+
+
+def test_a_policy_may_point_anywhere():
+    session = with_objects(an_episode())
+    session.start()
+    session.choose({"choice": "a", "point": [250, 10]})
+    assert len(session.decisions) == 1
 
 
 def test_only_this_machine_is_answered_and_the_page_loads_nothing_foreign(tmp_path):
@@ -257,7 +293,7 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
         # Scrub back into the video, and see that a point is only taken in the present image.
         browser.press("ArrowLeft", shift=True)
         browser.wait("document.querySelector('#frame').classList.contains('video')")
-        assert browser.text("#hint") == "Watch the clip, then choose."
+        assert browser.text("#hint") == "Choose the next action.", "it was watched"
         browser.click('.option[data-label="a"]')
         browser.wait("document.querySelector('#badge').innerText === 'Present'")
         assert browser.run("document.querySelector('#do').disabled")
@@ -296,6 +332,31 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
     first, second = read_records(tmp_path / "run" / "episodes.jsonl")
     assert [d["point"] for d in first.extra["decisions"]] == [[180, 190], [67, 68]]
     assert (first.outcome, second.outcome, second.error) == ("success", "error", "no path")
+
+
+def test_the_page_marks_the_object_that_a_point_means(tmp_path):
+    hidden = "document.querySelector('#object').hidden"
+    row, column = BLOCKS["blue"]
+    with (
+        served(tmp_path / "run", with_objects) as page,
+        Browser(tmp_path / "profile") as browser,
+    ):
+        browser.open(f"http://127.0.0.1:{page.port}/")
+        browser.wait("document.querySelector('#badge').innerText === 'Present'")
+        browser.press("a")
+        browser.click("#image", (0.95, 0.05))
+        browser.wait("document.querySelector('#hint').innerText.includes('no object here')")
+        assert browser.run(hidden) and browser.run("document.querySelector('#do').disabled")
+        browser.press("Enter")
+        browser.click("#image", ((row + 10) / 256, (column - 10) / 256))
+        browser.wait("document.querySelector('#hint').innerText.includes('dashed ring')")
+        assert not browser.run(hidden)
+        place = browser.run("parseFloat(document.querySelector('#object').style.top)")
+        assert place == pytest.approx(100 * (row + 0.5) / 256, abs=0.01), "of the object"
+        browser.press("Enter")
+        browser.wait("document.querySelectorAll('#history li').length === 1")
+        assert browser.run(hidden)
+        assert browser.problems == []
 
 
 def test_the_page_says_when_the_server_is_gone(tmp_path):

@@ -5,11 +5,14 @@ environment.
 import json
 from dataclasses import replace
 from itertools import count
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from helpers.play_fakes import BLOCKS, MOTION, VIDEO, BlocksEnv, a_session, an_episode
+from mme_vla.envs.grounding import project
+from mme_vla.envs.subtasks import Choice
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import read_records
@@ -96,6 +99,17 @@ def test_nothing_can_be_selected_before_the_start_and_recorded_before_the_end():
         session.record("human")
     with pytest.raises(UserError, match="has begun"):
         session.start()
+
+
+def test_the_objects_of_an_option_are_pixels_of_the_present_scene():
+    cube = SimpleNamespace(position=np.array([0.0, 0.1, 0.02]))
+    choices = [Choice("a", "pick", print, [cube]), Choice("b", "press", print)]
+    session = a_session()
+    assert session.objects() == {}, "it does not say where its objects are"
+    session.env.task = SimpleNamespace(choices=lambda: choices)
+    assert session.objects() == {"a": [tuple(project(cube.position))]}
+    cube.position = np.array([0.1, 0.0, 0.02])
+    assert session.objects() == {"a": [tuple(project(cube.position))]}
 
 
 def test_an_environment_of_another_kind_is_refused():

@@ -12,7 +12,7 @@ from mme_vla.data.console import progress, quiet_libraries
 from mme_vla.envs.base import Environment
 from mme_vla.envs.facts import FACTS, Fact, write_facts
 from mme_vla.envs.metadata import EpisodeSpec
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, counted
 from mme_vla.utils import parse_json, write_atomically
 
 STATE = "observation.state"
@@ -80,8 +80,8 @@ def record_own(
             frames += length
         if dataset is None:
             raise UserError(
-                f"None of {len(specs)} demonstrations ended with info['success']: nothing was"
-                " written."
+                f"None of {counted(len(specs), 'demonstration')} ended with info['success']:"
+                " nothing was written."
             )
         dataset.finalize()
     write_facts(draft / FACTS, tables)

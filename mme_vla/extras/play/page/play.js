@@ -9,6 +9,7 @@ let state = { phase: "loading", options: [], reveals: [], decisions: [] };
 let fetched = 0; // clips whose frames are here
 let chosen = null; // the option selected
 let point = null; // [row, column]
+let seen = -1; // the latest frame that has been shown
 let fetching = false;
 let sending = false;
 let focused = ""; // the outcome that has had the focus
@@ -42,6 +43,7 @@ function take(next) {
   if (other) {
     player.clear();
     fetched = 0;
+    seen = -1;
     deselect();
   }
   fetchClips();
@@ -68,7 +70,7 @@ async function fetchClips() {
 }
 
 async function send() {
-  if (!ready() || !chosen || (chosen.needs_point && !point)) return;
+  if (!complete()) return;
   const message = { session: state.session, decision: state.decisions.length, choice: chosen.label, point };
   complain("");
   await post("choose", message, deselect);
@@ -90,6 +92,17 @@ async function post(path, message, done = () => {}) {
 // What is seen -----------------------------------------------------------------------------------------------------
 
 const ready = () => state.phase === "choosing" && fetched === state.reveals.length && player.last >= 0;
+const complete = () => ready() && Boolean(chosen) && (!chosen.needs_point || (point !== null && !far()));
+
+// The object that the point means: the nearest, within reach. Undefined where there is none.
+function meant() {
+  const distance = ([row, column]) => Math.hypot(row - point[0], column - point[1]);
+  const near = (chosen.objects ?? []).filter((pixel) => distance(pixel) <= state.reach);
+  return near.sort((a, b) => distance(a) - distance(b))[0];
+}
+
+// An environment need not say where its objects are: then no point is far from all of them.
+const far = () => Boolean(chosen.objects) && !meant();
 
 function render() {
   const { phase } = state;
@@ -127,7 +140,7 @@ function renderOptions() {
     button.disabled = !ready();
     button.setAttribute("aria-pressed", String(chosen?.label === button.dataset.label));
   }
-  $("do").disabled = !ready() || !chosen || (chosen.needs_point && !point);
+  $("do").disabled = !complete();
   const pointing = ready() && chosen?.needs_point;
   $("frame").classList.toggle("pointing", Boolean(pointing));
   renderHint();
@@ -135,10 +148,15 @@ function renderOptions() {
 
 function renderHint() {
   const pointing = ready() && chosen?.needs_point;
-  const seen = player.at === player.last;
-  $("hint").textContent = !ready() ? "" : !chosen ? (seen ? "Choose the next action." : "Watch the clip, then choose.")
+  const watched = seen === player.last;
+  $("hint").textContent = !ready() ? "" : !chosen ? (watched ? "Choose the next action." : "Watch the clip, then choose.")
     : pointing && !point ? "Click the object in the image (or move the point with the arrow keys)."
-    : pointing ? `Point: row ${point[0]}, column ${point[1]}.` : "";
+    : pointing ? `Point: row ${point[0]}, column ${point[1]}. ${pointed()}` : "";
+}
+
+function pointed() {
+  if (far()) return "There is no object here: click on one.";
+  return chosen.objects ? "The object meant has a dashed ring." : "";
 }
 
 function renderClips() {
@@ -171,6 +189,7 @@ function renderClips() {
 
 function showFrame() {
   const { at, last, playing } = player;
+  seen = Math.max(seen, Math.min(at, last));
   $("seek").max = Math.max(last, 0);
   $("seek").value = at;
   $("seek").disabled = last < 0;
@@ -180,12 +199,18 @@ function showFrame() {
   $("frame").classList.toggle("video", inVideo);
   $("badge").textContent = last < 0 ? "" : inVideo ? "Conditioning video" : at === last ? "Present" : "Execution";
   renderHint();
-  const marker = $("marker");
-  marker.hidden = !(chosen?.needs_point && point && at === last);
-  if (point) {
-    marker.style.top = `${((point[0] + 0.5) / SIDE) * 100}%`;
-    marker.style.left = `${((point[1] + 0.5) / SIDE) * 100}%`;
-  }
+  const marked = chosen?.needs_point && point && at === last;
+  mark($("marker"), marked ? point : undefined);
+  mark($("object"), marked ? meant() : undefined);
+  $("marker").classList.toggle("far", Boolean(marked) && far());
+}
+
+// Shows a mark at a pixel, or hides it.
+function mark(box, pixel) {
+  box.hidden = !pixel;
+  if (!pixel) return;
+  box.style.top = `${((pixel[0] + 0.5) / SIDE) * 100}%`;
+  box.style.left = `${((pixel[1] + 0.5) / SIDE) * 100}%`;
 }
 
 function showOutcome() {
