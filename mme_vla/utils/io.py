@@ -318,7 +318,7 @@ def is_text(value: object) -> bool:
     """Whether a value is text that can be written and tokenised: JSON's escapes allow half
     characters, UTF-8 does not.
 
-    >>> is_text("\ud800")
+    >>> is_text(chr(0xD800))
     False
     """
     if not isinstance(value, str):
