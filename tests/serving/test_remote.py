@@ -498,19 +498,19 @@ def test_a_server_that_reads_nothing_is_waited_for_no_longer_than_the_time_out()
         thread.join(10)
 
 
-def test_a_message_larger_than_any_reply_ends_the_connection(
-    stubs: Any, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("protocol", ["openpi", "challenge", "harness"])
+def test_a_reply_above_the_limit_ends_its_episode_with_its_size_and_is_not_asked_for_again(
+    protocol: str, stubs: Any, inline: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("mme_vla.serving.client.LARGEST_REPLY", 1000)
-    request = {
-        "front": np.zeros((2, 2, 3), np.uint8),
-        "observation/state": np.zeros(8, np.float32),
-        "prompt": "",
-    }
-    stub = stubs.Stub(policy=lambda _: np.zeros((99, 8)))
-    too_big = pytest.raises(ConnectionError, match=r"1009|too big")
-    with stubs.serving("openpi", stub) as url, Client(url, timeout=5) as client, too_big:
-        client.request(request)
+    stub = stubs.Stub(policy=lambda _: np.zeros((99, 800)))
+    with stubs.serving(protocol, stub) as url:
+        policy = connect(url, protocol)
+        (record,) = run(policy, tmp_path, PICK[:1], retries=1)
+        policy.close()
+    assert record.outcome == "error"
+    reason = r"malformed: frame with \d{4,} bytes exceeds limit of 1000 bytes"
+    assert record.error is not None and re.search(reason, record.error), record.error
 
 
 @pytest.mark.parametrize(
