@@ -143,6 +143,32 @@ def test_messages_carry_the_conditioning_video_and_every_frame_once(
         assert np.array_equal(buffer["state"][:, :7], np.stack(request["joint_state_list"]))
 
 
+@pytest.mark.parametrize("protocol", ["openpi", "robomme", "harness"])
+def test_a_request_without_a_new_frame_shows_the_current_one_again(
+    protocol: str, stubs: Any
+) -> None:
+    stub = stubs.Stub()
+    frames = {name: np.full((1, 8, 8, 3), 77, np.uint8) for name in ROBOMME_JOINT.camera_names}
+    nothing = {name: np.zeros((0, 1, 1, 3), np.uint8) for name in frames}
+    state = np.full((1, 8), 0.25, np.float32)
+    with stubs.serving(protocol, stub) as url:
+        policy = connect(url, protocol)
+        episode = policy.start_episode("go")
+        episode.observe(frames, state)
+        first = policy.act(episode)
+        episode.observe(nothing, state[:0])
+        assert np.array_equal(policy.act(episode), first) and episode.failure is None
+        episode.observe(frames, state)
+        policy.act(episode)
+        policy.close()
+    if protocol == "robomme":
+        added = [request for request in stub.requests if "images" in request]
+        assert len(added) == 2, "no frame is remembered twice"
+    if protocol != "harness":
+        shown = [request for request in stub.requests if "prompt" in request]
+        assert [int(request["observation/image"].max()) for request in shown] == [77] * 3
+
+
 REFUSED = {
     "error": "out of memory|refuses",
     "garbage": "malformed",
@@ -585,6 +611,8 @@ def test_lists_of_several_lengths_are_a_malformed_action() -> None:
         options=(),
         views=dict.fromkeys(ROBOMME_JOINT.camera_names, image),
         states=np.zeros((1, 8), np.float32),
+        current=dict.fromkeys(ROBOMME_JOINT.camera_names, image[0]),
+        state=np.zeros(8, np.float32),
         n_video=0,
         executed=None,
         first=True,
