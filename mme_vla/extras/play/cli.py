@@ -95,6 +95,7 @@ def main(cfg: DictConfig) -> None:
         max_steps,
         {**asdict(settings), "player": seat.settings},
         limits,
+        seat.of_policy,
     )
     make = partial(
         make_session,
@@ -122,7 +123,7 @@ class Seat(NamedTuple):
     """Who plays, and under which name.
 
     player: None: a person on the page. name, checkpoint, seed: of the records. settings: what
-    decides the choices. folder: of the records.
+    decides the choices. folder: of the records. of_policy: see `Identity`.
     """
 
     player: Player | None
@@ -131,6 +132,7 @@ class Seat(NamedTuple):
     seed: int
     settings: Mapping[str, Any]
     folder: Path
+    of_policy: Mapping[str, Any]
 
 
 def _choose_player(command: PlayCommand, cfg: DictConfig, max_steps: int) -> Seat:
@@ -139,6 +141,7 @@ def _choose_player(command: PlayCommand, cfg: DictConfig, max_steps: int) -> Sea
     checkpoint: int | str = 0
     seed = command.player.get("seed", 0)
     decisive = {k: v for k, v in command.player.items() if k not in INDIFFERENT}
+    of_policy = {}
     player: Player | None = None
     if command.policy is not None:
         require(
@@ -146,9 +149,12 @@ def _choose_player(command: PlayCommand, cfg: DictConfig, max_steps: int) -> Sea
         )
         from mme_vla.extras.play.policy_player import load_player  # PyTorch
 
-        player, checkpoint, decisive = load_player(cfg, max_steps)
+        player, facts, decisive = load_player(cfg, max_steps)
+        checkpoint = facts.checkpoint
         seed = command.seed
         folder = Path("outputs", "play", player.model, str(checkpoint))
+        for name in ("memory_budget", "composition", "training"):
+            of_policy[name] = getattr(facts, name)
     elif kind == HUMAN:
         require_page()
         checkpoint = str(command.player["participant"])
@@ -156,8 +162,8 @@ def _choose_player(command: PlayCommand, cfg: DictConfig, max_steps: int) -> Sea
         player = build_player(command.player)
     if command.output is not None:
         folder = Path(command.output).expanduser()
-    name = HUMAN if player is None else player.model
-    return Seat(player, name, checkpoint, seed, decisive, folder)
+    model = HUMAN if player is None else player.model
+    return Seat(player, model, checkpoint, seed, decisive, folder, of_policy)
 
 
 def _by_itself(run: PlayRun, player: Any) -> None:

@@ -16,6 +16,7 @@ from mme_vla.errors import require
 from mme_vla.evaluation.rollout.environment import OPTIONS, Frames, Report
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.evaluation import facts_of, run_settings
+from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.play.game import ChoiceSession
 from mme_vla.extras.play.players import NoChoiceError, Player
@@ -100,9 +101,9 @@ class PolicyPlayer(Player):
             self._running.episode.close()
 
 
-def load_player(cfg: DictConfig, max_steps: int) -> tuple[PolicyPlayer, int | str, dict[str, Any]]:
-    """The policy of `checkpoint=…` or `server=…` as a player, its checkpoint's name in records, and
-    what decides its choices.
+def load_player(cfg: DictConfig, max_steps: int) -> tuple[PolicyPlayer, RunFacts, dict[str, Any]]:
+    """The policy of `checkpoint=…` or `server=…` as a player, what its records say of it, and what
+    decides its choices.
     """
     config = policy_config(cfg)
     choice = PolicyChoice.from_config({**config, "name": "policy"})
@@ -123,4 +124,4 @@ def load_player(cfg: DictConfig, max_steps: int) -> tuple[PolicyPlayer, int | st
     except BaseException:
         release(policy)
         raise
-    return PolicyPlayer(policy.eval(), facts.model, settings.seed), facts.checkpoint, decisive
+    return PolicyPlayer(policy.eval(), facts.model, settings.seed), facts, decisive

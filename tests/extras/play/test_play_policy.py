@@ -95,7 +95,7 @@ def test_a_served_policy_plays_what_it_chooses_when_it_is_evaluated(tmp_path: Pa
         )
     played = taken()
     settings = RolloutSettings(max_steps=1300, max_actions=6, workers=1, max_batch=1)
-    facts = facts_of(policy, None, None, settings, None)
+    facts = facts_of(policy, "test", None, settings, None)
     options = RunOptions(base=open_blocks, show_progress=False)
     jobs = [Job("VideoUnmask", "test", episode) for episode in range(2)]
     evaluate(policy, jobs, tmp_path / "evaluated", facts, settings, options)
@@ -106,6 +106,9 @@ def test_a_served_policy_plays_what_it_chooses_when_it_is_evaluated(tmp_path: Pa
     steps = {record.episode: record.steps for record in evaluated}
     assert {record.episode: record.steps for record in records} == steps
     assert {record.action_space for record in records} == {"multi_choice"}
+    assert {record.run for record in records} == {record.run for record in evaluated}, (
+        "`results` has one row for both"
+    )
     assert [len(record.extra["decisions"]) for record in records] == [6, 6]
     assert [record.outcome for record in records] == ["timeout", "timeout"]
 
