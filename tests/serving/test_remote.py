@@ -20,6 +20,7 @@ from helpers.rollout_fakes import use_inline_envs
 from helpers.scripted_env import make_moving_env
 from helpers.serving_fakes import Served, serving_policy
 from mme_vla import UserError
+from mme_vla.cli import results
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.receipts import read_receipt
@@ -336,6 +337,18 @@ def test_the_receipt_names_the_server_and_its_times(
     assert part["server"]["metadata"] == {"policy": "stub"}
     assert part["server"]["times"]["requests"] == 3
     assert part["server"]["times"]["round_trip_ms"]["p50"] > 0
+
+
+def test_results_read_the_run_of_a_served_policy(
+    stubs: Any, inline: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with stubs.serving("openpi", stubs.Stub()) as url:
+        policy = connect(url, "openpi", name="mine", checkpoint="30000")
+        run(policy, tmp_path, PICK)
+        policy.close()
+    results.main([str(tmp_path)])
+    shown = capsys.readouterr().out
+    assert "mine" in shown and "30000" in shown and "3 of 3" in shown
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "challenge", "challenge-http", "harness"])
