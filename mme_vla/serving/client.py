@@ -19,6 +19,7 @@ try:
         InvalidStatus,
         InvalidURI,
     )
+    from websockets.frames import CloseCode
     from websockets.sync.client import connect
     from websockets.uri import parse_uri
 except ImportError as error:
@@ -148,9 +149,7 @@ class Client:
             response = self._socket.recv(timeout)
         except ConnectionClosed as error:
             self.close()
-            raise ConnectionError(
-                f"The server at {self._address} closed the connection: {error}"
-            ) from None
+            raise closed(self._address, error) from None
         except TimeoutError:
             self.close()  # an answer that came later would be taken for that of the next request
             raise TimeoutError(
@@ -231,6 +230,16 @@ def open_socket(
         raise UserError(text) from None
     except (OSError, TimeoutError, EOFError) as error:
         raise ConnectionError(f"No policy server responds at {name}: {error}") from error
+
+
+def closed(name: str, error: ConnectionClosed) -> UserError | ConnectionError:
+    """What to raise where a connection to the server `name` is closed: `UserError` where this side
+    closed it for the size of a reply, which another try would meet again.
+    """
+    by_server = error.rcvd is not None and error.rcvd_then_sent
+    if error.sent is not None and error.sent.code == CloseCode.MESSAGE_TOO_BIG and not by_server:
+        return UserError(f"The server's reply is malformed: {error.sent.reason}.")
+    return ConnectionError(f"The server at {name} closed the connection: {error}")
 
 
 def decoded_map(data: bytes) -> dict[str, Any]:

@@ -126,10 +126,10 @@ def _buffer(value: Any) -> list[Any]:
     return list(value[:, 0])
 
 
-def _counted(images: list[Any], most: int) -> list[Any]:
-    if not 1 <= len(images) <= most:
+def _counted(images: list[Any], least: int, most: int) -> list[Any]:
+    if not least <= len(images) <= most:
         raise ValueError(
-            f"holds {len(images)} frames; this server takes 1 … {most} (limits.frames)."
+            f"holds {len(images)} frames; this server takes {least} … {most} (limits.frames)."
         )
     return images
 
@@ -149,6 +149,8 @@ def _numbers(value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
         array = np.asarray(value)
     except (ValueError, TypeError, OverflowError):  # rows of different lengths
         raise ValueError(expected) from None
+    if array.shape == (0,) and shape[0] is None:  # an empty list of rows
+        array = array.reshape(0, *[size or 0 for size in shape[1:]])
     if array.dtype.kind not in "fiu" or array.ndim != len(shape):
         raise ValueError(expected)
     for size, expected_size in zip(array.shape, shape, strict=True):
@@ -304,9 +306,13 @@ class RequestReader:
     def __init__(self, robot: Embodiment, most_frames: int) -> None:
         self._robot = robot
         width = robot.state.width
-        counted = BeforeValidator(partial(_counted, most=most_frames))
+        counted = BeforeValidator(partial(_counted, least=1, most=most_frames))
+        # A choice may move nothing, and the next request then has no new frame.
+        least = 0 if robot.action.choice else 1
+        listed_count = BeforeValidator(partial(_counted, least=least, most=most_frames))
         same_size = AfterValidator(_same_size)
-        one_size = Annotated[list[Image], FailFast(), counted, BeforeValidator(_images), same_size]
+        images = BeforeValidator(_images)
+        one_size = Annotated[list[Image], FailFast(), listed_count, images, same_size]
         buffer = Annotated[list[Image], FailFast(), counted, BeforeValidator(_buffer), same_size]
         depth = Annotated[np.ndarray, PlainValidator(partial(_depth, n_axes=2))]
         depths = Annotated[np.ndarray, PlainValidator(partial(_depth, n_axes=3))]
@@ -421,12 +427,18 @@ class RequestReader:
             lengths["joint_state_list"] = len(joints)
             lengths["gripper_state_list"] = len(grippers)
             _check_lengths(lengths)
-            states = np.stack([benchmark_state(*row) for row in zip(joints, grippers, strict=True)])
+            rows = [benchmark_state(*row) for row in zip(joints, grippers, strict=True)]
+            states = np.array(rows, np.float32).reshape(-1, self._robot.state.width)
         else:
             states = frames.state_list
             lengths["state_list"] = len(states)
             _check_lengths(lengths)
-        self._check_depth(views, "{}_list")
+        require(
+            len(states) or not frames.is_first_step,
+            "The request with is_first_step holds 0 frames: send the current one at least.",
+        )
+        if len(states):
+            self._check_depth(views, "{}_list")
         executed = frames.executed_action_list
         exec_start = frames.exec_start_idx
         if executed is not None and len(executed) > len(states):

@@ -214,7 +214,7 @@ class Session:
 
         kind: of the message. Clients may scale the images of one kind and not those of the other.
         """
-        sizes = {(kind, name): view[0].shape[:2] for name, view in views.items()}
+        sizes = {(kind, name): view[0].shape[:2] for name, view in views.items() if len(view)}
         for key, size in sizes.items():
             before = self._sizes.get(key, size)
             if size != before:

@@ -311,6 +311,10 @@ def test_a_policy_that_chooses_is_served_with_its_choices_in_words() -> None:
         assert later["choices"][0]["choice"] == "B", (
             "options stay as they were until others are given"
         )
+        again = client.infer(challenge(frames[:0], frames[:0], states[:0], False))
+        assert again["actions"].shape == (1, 10), "a choice that moved nothing shows no frame"
+        with pytest.raises(UserError, match="is_first_step holds 0 frames"):
+            client.infer(challenge(frames[:0], frames[:0], states[:0], True))
         with pytest.raises(UserError, match="cannot be chosen"):
             client.infer({**request, "available_multi_choices": [{"label": "Z", "action": "go"}]})
     with (

@@ -35,6 +35,7 @@ class BlocksEnv:
         return self._observation(VIDEO + 1 if self.video else 1), self._info("ongoing")
 
     def step(self, action: dict[str, Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        action = {**action, "choice": action["choice"].lower()}
         self.received_actions.append(action)
         if action["choice"] == "c":
             return (
@@ -66,7 +67,11 @@ class BlocksEnv:
             for name, (row, column) in BLOCKS.items():
                 frame[row - 20 : row + 20, column - 20 : column + 20] = COLOURS[name]
             frames.append(frame)
-        return {"front_rgb_list": frames, "joint_state_list": [np.zeros(7)] * count}
+        return {
+            "front_rgb_list": frames,
+            "joint_state_list": [np.zeros(7)] * count,
+            "gripper_state_list": [np.zeros(2)] * count,
+        }
 
 
 class SessionWithObjects(ChoiceSession):

@@ -18,6 +18,7 @@ from vla_eval.api import serve_background  # noqa: E402
 from vla_eval.benchmarks.base import StepBenchmark, StepResult  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
 from vla_eval.model_servers import serve as harness_serve  # noqa: E402
+from vla_eval.model_servers.predict import PredictModelServer  # noqa: E402
 from vla_eval.runners.base import ModelActError  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, RAW  # noqa: E402
@@ -26,14 +27,18 @@ from websockets.sync.client import connect  # noqa: E402
 from websockets.typing import Origin  # noqa: E402
 
 from mme_vla.cli.harness import main  # noqa: E402
+from mme_vla.embodiment import ROBOMME_JOINT  # noqa: E402
 from mme_vla.errors import UserError  # noqa: E402
 from mme_vla.policy.mme import MMEPolicy  # noqa: E402
 from mme_vla.serving import harness  # noqa: E402
 from mme_vla.serving.harness import MMEVLAModelServer  # noqa: E402
+from mme_vla.serving.remote.policy import RemotePolicy  # noqa: E402
+from mme_vla.serving.remote.settings import ServerChoice  # noqa: E402
 from mme_vla.serving.settings import Limits  # noqa: E402
 from mme_vla.testing.small import small_policy  # noqa: E402
 
 STEPS, VIDEO = 37, 5
+DEMO = np.arange(6) < 5
 
 
 class Scripted(StepBenchmark):
@@ -163,6 +168,51 @@ def test_sessions_act_in_one_batch_and_stay_apart(
     expected = in_process(policy, [0, 1, 3])
     np.testing.assert_allclose(actions, expected, atol=1e-5)
     assert np.abs(expected[0] - expected[1]).max() > 1e-3
+
+
+class ReturnsState(PredictModelServer):
+    """A model server of the harness, of which this library defines the model alone: a chunk of four
+    actions that are the state.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(chunk_size=4)
+        self.observed: list[dict[str, Any]] = []
+
+    def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
+        self.observed.append(obs)
+        return {"actions": np.repeat(obs["states"][None], 4, axis=0)}
+
+    def get_action_spec(self) -> Any:
+        return {}
+
+    def get_observation_spec(self) -> Any:
+        return {}
+
+
+@pytest.mark.slow  # waits until the server has said nothing
+def test_a_model_server_of_the_harness_is_recognised_and_acts_as_a_remote_policy() -> None:
+    states = np.random.default_rng(0).uniform(-1, 1, (10, 8)).astype(np.float32)
+    images = np.random.default_rng(1).integers(0, 255, (10, 16, 16, 3), np.uint8)
+    views = {"front": images, "wrist": images}
+    model = ReturnsState()
+    with serve_background(model) as handle:
+        remote = RemotePolicy(ServerChoice(handle.url), ROBOMME_JOINT)
+        episode = remote.start_episode("touch the square")
+        episode.observe({name: view[:6] for name, view in views.items()}, states[:6], DEMO)
+        actions = [remote.act(episode)[0]]
+        for step in range(6, 10):
+            episode.observe({name: view[[step]] for name, view in views.items()}, states[[step]])
+            actions.append(remote.act(episode)[0])
+        remote.close()
+    assert remote.protocol.name == "harness" and episode.failure is None
+    # Their server cuts the chunk: four actions from one observation.
+    assert np.array_equal(actions, states[[5, 5, 5, 5, 9]])
+    first, second = model.observed
+    assert first["task_description"] == "touch the square"
+    assert np.array_equal(first["images"]["agentview"], images[5])
+    assert np.array_equal(np.stack(first["video_history"]), images[:5])
+    assert "video_history" not in second
 
 
 def test_an_observation_without_images_ends_its_episode_alone(policy: MMEPolicy) -> None:

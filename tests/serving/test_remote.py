@@ -20,6 +20,7 @@ from helpers.rollout_fakes import use_inline_envs
 from helpers.scripted_env import make_moving_env
 from helpers.serving_fakes import Served, serving_policy
 from mme_vla import UserError
+from mme_vla.cli import results
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.receipts import read_receipt
@@ -141,6 +142,32 @@ def test_messages_carry_the_conditioning_video_and_every_frame_once(
     for buffer, request in zip(sent, sent_lists, strict=True):
         assert np.array_equal(buffer["images"][:, 0], np.stack(request["front_rgb_list"]))
         assert np.array_equal(buffer["state"][:, :7], np.stack(request["joint_state_list"]))
+
+
+@pytest.mark.parametrize("protocol", ["openpi", "robomme", "harness"])
+def test_a_request_without_a_new_frame_shows_the_current_one_again(
+    protocol: str, stubs: Any
+) -> None:
+    stub = stubs.Stub()
+    frames = {name: np.full((1, 8, 8, 3), 77, np.uint8) for name in ROBOMME_JOINT.camera_names}
+    nothing = {name: np.zeros((0, 1, 1, 3), np.uint8) for name in frames}
+    state = np.full((1, 8), 0.25, np.float32)
+    with stubs.serving(protocol, stub) as url:
+        policy = connect(url, protocol)
+        episode = policy.start_episode("go")
+        episode.observe(frames, state)
+        first = policy.act(episode)
+        episode.observe(nothing, state[:0])
+        assert np.array_equal(policy.act(episode), first) and episode.failure is None
+        episode.observe(frames, state)
+        policy.act(episode)
+        policy.close()
+    if protocol == "robomme":
+        added = [request for request in stub.requests if "images" in request]
+        assert len(added) == 2, "no frame is remembered twice"
+    if protocol != "harness":
+        shown = [request for request in stub.requests if "prompt" in request]
+        assert [int(request["observation/image"].max()) for request in shown] == [77] * 3
 
 
 REFUSED = {
@@ -310,6 +337,18 @@ def test_the_receipt_names_the_server_and_its_times(
     assert part["server"]["metadata"] == {"policy": "stub"}
     assert part["server"]["times"]["requests"] == 3
     assert part["server"]["times"]["round_trip_ms"]["p50"] > 0
+
+
+def test_results_read_the_run_of_a_served_policy(
+    stubs: Any, inline: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with stubs.serving("openpi", stubs.Stub()) as url:
+        policy = connect(url, "openpi", name="mine", checkpoint="30000")
+        run(policy, tmp_path, PICK)
+        policy.close()
+    results.main([str(tmp_path)])
+    shown = capsys.readouterr().out
+    assert "mine" in shown and "30000" in shown and "3 of 3" in shown
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "challenge", "challenge-http", "harness"])
@@ -498,19 +537,19 @@ def test_a_server_that_reads_nothing_is_waited_for_no_longer_than_the_time_out()
         thread.join(10)
 
 
-def test_a_message_larger_than_any_reply_ends_the_connection(
-    stubs: Any, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("protocol", ["openpi", "challenge", "harness"])
+def test_a_reply_above_the_limit_ends_its_episode_with_its_size_and_is_not_asked_for_again(
+    protocol: str, stubs: Any, inline: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("mme_vla.serving.client.LARGEST_REPLY", 1000)
-    request = {
-        "front": np.zeros((2, 2, 3), np.uint8),
-        "observation/state": np.zeros(8, np.float32),
-        "prompt": "",
-    }
-    stub = stubs.Stub(policy=lambda _: np.zeros((99, 8)))
-    too_big = pytest.raises(ConnectionError, match=r"1009|too big")
-    with stubs.serving("openpi", stub) as url, Client(url, timeout=5) as client, too_big:
-        client.request(request)
+    stub = stubs.Stub(policy=lambda _: np.zeros((99, 800)))
+    with stubs.serving(protocol, stub) as url:
+        policy = connect(url, protocol)
+        (record,) = run(policy, tmp_path, PICK[:1], retries=1)
+        policy.close()
+    assert record.outcome == "error"
+    reason = r"malformed: frame with \d{4,} bytes exceeds limit of 1000 bytes"
+    assert record.error is not None and re.search(reason, record.error), record.error
 
 
 @pytest.mark.parametrize(
@@ -585,6 +624,8 @@ def test_lists_of_several_lengths_are_a_malformed_action() -> None:
         options=(),
         views=dict.fromkeys(ROBOMME_JOINT.camera_names, image),
         states=np.zeros((1, 8), np.float32),
+        current=dict.fromkeys(ROBOMME_JOINT.camera_names, image[0]),
+        state=np.zeros(8, np.float32),
         n_video=0,
         executed=None,
         first=True,

@@ -183,7 +183,7 @@ class ChunkEnv:
         self._ask(draw)
         with self._simulation():
             observation, info = self._env.reset()
-        frames = _Frames(self._robot)
+        frames = Frames(self._robot)
         count = frames.add(observation)
         self._note_pose(observation)
         self._note_subgoal(info)
@@ -207,7 +207,7 @@ class ChunkEnv:
             self._max_steps += command.hold
         else:
             actions = list(np.asarray(command.actions))
-        frames = _Frames(self._robot)
+        frames = Frames(self._robot)
         executed = n_frames = 0
         total_reward = 0.0
         terminated = truncated = False
@@ -348,7 +348,7 @@ class ChunkEnv:
         self._simulating = self._rendered = 0.0
         return report
 
-    def _draw_reset(self, frames: "_Frames", count: int) -> None:
+    def _draw_reset(self, frames: "Frames", count: int) -> None:
         """Add the conditioning video, and the current frame, to the episode's video."""
         if self._video is None:
             return
@@ -358,9 +358,7 @@ class ChunkEnv:
                 caption = "step 0"
             self._video.add(views, self._goal, caption, demo=number < count)
 
-    def _draw(
-        self, frames: "_Frames", count: int, subgoal: str | None, outcome: str | None
-    ) -> None:
+    def _draw(self, frames: "Frames", count: int, subgoal: str | None, outcome: str | None) -> None:
         """Add the frames of an action. outcome: of the episode that it ended."""
         if self._video is None:
             return
@@ -375,14 +373,14 @@ class ChunkEnv:
 MISSING = "which this environment does not deliver"
 
 
-def _require(observation: dict[str, list[Any]], name: str, message: str) -> None:
+def _require(observation: Mapping[str, list[Any]], name: str, message: str) -> None:
     require(
         f"{name}_list" in observation,
         f"{message}; there are only {', '.join(sorted(observation))}.",
     )
 
 
-class _Frames:
+class Frames:
     """Collects frames in the policy's form; the benchmark's own cameras too, for the video."""
 
     def __init__(self, robot: Embodiment) -> None:
@@ -396,7 +394,7 @@ class _Frames:
         self._readings: dict[str, list[np.ndarray]] = {name: [] for name in robot.readings}
         self._states: list[np.ndarray] = []
 
-    def add(self, observation: dict[str, list[Any]]) -> int:
+    def add(self, observation: Mapping[str, list[Any]]) -> int:
         """Take the benchmark's lists; how many frames they hold."""
         if "state_list" in observation:  # an environment of the user's own
             states = observation["state_list"]

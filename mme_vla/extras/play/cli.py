@@ -8,24 +8,24 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import log_to_terminal
 from mme_vla.config.composition import resolved
-from mme_vla.config.sections import PathText, PositiveInt, Range, read_section
+from mme_vla.config.sections import NonNegativeInt, PathText, PositiveInt, Range, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.rendering import render_backend
-from mme_vla.errors import UserError, counted
+from mme_vla.errors import UserError, counted, require
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import INDIFFERENT
 from mme_vla.extras.play import build_player
 from mme_vla.extras.play.desk import Desk
 from mme_vla.extras.play.game import ChoiceSession
-from mme_vla.extras.play.players import play
+from mme_vla.extras.play.players import Player, play
 from mme_vla.extras.play.run import Identity, PlayRun, make_session
 from mme_vla.extras.play.web import require_page, serve
 
@@ -53,9 +53,19 @@ class PlayCommand:
     env: str
     max_steps: PositiveInt | None
     retry_errors: bool
-    output: PathText
+    output: PathText | None
     host: str
     port: Annotated[int, Range(0, 65535)]
+    seed: NonNegativeInt
+    checkpoint: PathText | None
+    server: PathText | None
+
+    @property
+    def policy(self) -> str | None:
+        """The words that name a policy which plays; None where a player of `player` does."""
+        if self.checkpoint is None and self.server is None:
+            return None
+        return f"checkpoint={self.checkpoint}" if self.server is None else f"server={self.server}"
 
 
 def main(cfg: DictConfig) -> None:
@@ -72,30 +82,20 @@ def main(cfg: DictConfig) -> None:
     if command.max_steps is None:
         limits = {spec.task: source.task_limit(spec.task, spec.split) for spec in specs}
     settings = read_section(PlaySettings, {**config, "max_steps": max_steps}, others=True)
-    by_hand = command.player["name"] == HUMAN
-    built = None if by_hand else build_player(command.player)
-    if by_hand:
-        require_page()
+    seat = _choose_player(command, cfg, max_steps)
+    built = seat.player
     needs_images = built is None or built.needs_images
     source.check_installed()
     if command.env == "mme_vla" and needs_images:
         render_backend()
-    name = HUMAN
-    participant: int | str = 0
-    if built is None:
-        participant = str(command.player["participant"])
-    else:
-        name = built.model
     identity = Identity(
-        name,
-        participant,
-        command.player.get("seed", 0),
+        seat.name,
+        seat.checkpoint,
+        seat.seed,
         max_steps,
-        {
-            **asdict(settings),
-            "player": {k: v for k, v in command.player.items() if k not in INDIFFERENT},
-        },
+        {**asdict(settings), "player": seat.settings},
         limits,
+        seat.of_policy,
     )
     make = partial(
         make_session,
@@ -104,11 +104,10 @@ def main(cfg: DictConfig) -> None:
         max_choices=settings.max_choices,
         images=needs_images,
     )
-    folder = Path(command.output).expanduser()
     try:
-        with PlayRun(folder, specs, identity, make, command.retry_errors) as run:
+        with PlayRun(seat.folder, specs, identity, make, command.retry_errors) as run:
             if built is None:
-                serve(Desk(run, str(participant)), command.host, command.port)
+                serve(Desk(run, str(seat.checkpoint)), command.host, command.port)
                 played = len(run.episodes) - len(run.todo)
                 of = f"{played} of {len(run.episodes)} episodes played"
                 log.info("ended · %s; the same command continues with the others", of)
@@ -118,6 +117,53 @@ def main(cfg: DictConfig) -> None:
     finally:
         if built is not None:
             built.close()
+
+
+class Seat(NamedTuple):
+    """Who plays, and under which name.
+
+    player: None: a person on the page. name, checkpoint, seed: of the records. settings: what
+    decides the choices. folder: of the records. of_policy: see `Identity`.
+    """
+
+    player: Player | None
+    name: str
+    checkpoint: int | str
+    seed: int
+    settings: Mapping[str, Any]
+    folder: Path
+    of_policy: Mapping[str, Any]
+
+
+def _choose_player(command: PlayCommand, cfg: DictConfig, max_steps: int) -> Seat:
+    kind = str(command.player["name"])
+    folder = Path("outputs", "play", kind)
+    checkpoint: int | str = 0
+    seed = command.player.get("seed", 0)
+    decisive = {k: v for k, v in command.player.items() if k not in INDIFFERENT}
+    of_policy = {}
+    player: Player | None = None
+    if command.policy is not None:
+        require(
+            kind == HUMAN, f"{command.policy} and player={kind} are two players: leave out one."
+        )
+        from mme_vla.extras.play.policy_player import load_player  # PyTorch
+
+        player, facts, decisive = load_player(cfg, max_steps)
+        checkpoint = facts.checkpoint
+        seed = command.seed
+        folder = Path("outputs", "play", player.model, str(checkpoint))
+        for name in ("memory_budget", "composition", "training"):
+            of_policy[name] = getattr(facts, name)
+    elif kind == HUMAN:
+        require_page()
+        checkpoint = str(command.player["participant"])
+    else:
+        player = build_player(command.player)
+    if command.output is not None:
+        folder = Path(command.output).expanduser()
+    model = HUMAN if player is None else player.model
+    return Seat(player, model, checkpoint, seed, decisive, folder, of_policy)
 
 
 def _by_itself(run: PlayRun, player: Any) -> None:

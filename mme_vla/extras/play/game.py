@@ -93,6 +93,9 @@ class ChoiceSession:
         reason.
         """
         self.options: tuple[Option, ...] = ()
+        self.observation: Mapping[str, Any] = {}
+        self.info: Mapping[str, Any] = {}
+        """What the environment returned last, for players that read more than images."""
         self.reveals: list[Reveal] = []
         self.decisions: list[Decision] = []
         self._clock, self._displayed_at = clock, 0.0
@@ -267,12 +270,14 @@ class ChoiceSession:
         self.env.close()
 
     def _frames(self, observation: Mapping[str, Any]) -> list[np.ndarray]:
+        self.observation = observation
         if self.images:
             return list(observation.get("front_rgb_list", ()))
         return [UNSEEN] * max((len(values) for values in observation.values()), default=0)
 
     def _take(self, frames: list[np.ndarray], info: Mapping[str, Any], title: str) -> None:
         self.reveals.append(Reveal(title, frames, self.n_displayed_frames))
+        self.info = info
         self.status = str(info["status"])
         if info.get("task_goal"):
             goal = info["task_goal"]

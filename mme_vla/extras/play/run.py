@@ -3,7 +3,7 @@ compare.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -39,7 +39,8 @@ def make_session(
 @dataclass(frozen=True)
 class Identity:
     """Under which name a run's records are kept. settings: all that decides its outcomes. limits:
-    task → steps, where it is not `max_steps`.
+    task → steps, where it is not `max_steps`. of_policy: what else the records of a policy say of
+    it, by their fields.
     """
 
     model: str
@@ -48,6 +49,7 @@ class Identity:
     max_steps: int
     settings: Mapping[str, Any]
     limits: Mapping[str, int] = field(default_factory=dict)
+    of_policy: Mapping[str, Any] = field(default_factory=dict)
 
     def limit_of(self, task: str) -> int:
         """Steps after which an episode of a task is a timeout."""
@@ -136,6 +138,7 @@ class PlayRun:
         return self._keep(which, record)
 
     def _keep(self, which: EpisodeSpec, record: EpisodeRecord) -> EpisodeRecord:
+        record = replace(record, **self.identity.of_policy)
         self._log.append(record)
         self.records.append(record)
         if which in self.todo:

@@ -14,7 +14,14 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from mme_vla.errors import UserError, brief
-from mme_vla.serving.client import LARGEST_REPLY, Client, decoded_map, key_header, open_socket
+from mme_vla.serving.client import (
+    LARGEST_REPLY,
+    Client,
+    closed,
+    decoded_map,
+    key_header,
+    open_socket,
+)
 from mme_vla.serving.codec import MOST_TEXT, check_size, msgpack, pack, read_array
 
 PAUSE_S = 0.5  # between two attempts to open a connection
@@ -200,9 +207,7 @@ class HarnessConnection:
         try:
             self._socket.send(msgpack.packb(message, default=_encode))
         except ConnectionClosed as error:
-            raise ConnectionError(f"The server at {self.url} closed the connection: {error}") from (
-                None
-            )
+            raise closed(self.url, error) from None
         return self._sequence
 
     def request(self, message: Mapping[str, Any]) -> dict[str, Any]:
@@ -225,9 +230,7 @@ class HarnessConnection:
             self.close()
             raise TimeoutError(f"No answer from {self.url} within {self._timeout:g} s.") from None
         except ConnectionClosed as error:
-            raise ConnectionError(f"The server at {self.url} closed the connection: {error}") from (
-                None
-            )
+            raise closed(self.url, error) from None
         message = _decoded(data)
         payload = message.get("payload")
         # As texts: an array in their place has no single truth value.

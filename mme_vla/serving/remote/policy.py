@@ -83,6 +83,8 @@ class RemoteEpisode(Episode):
         self._states: list[np.ndarray] = []
         self._n_video = 0
         self._leading: list[np.ndarray] | None = []
+        self._current: Mapping[str, Any] = {}
+        self._state = np.zeros(0, np.float32)
         self.connection: Connection | None = None
         self._failure: Failure | None = None
 
@@ -109,6 +111,9 @@ class RemoteEpisode(Episode):
         )
         self._views.append(views)
         self._states.append(np.asarray(states, np.float32))
+        if count:
+            self._current = {name: view[-1] for name, view in views.items()}
+            self._state = self._states[-1][-1]
         self._n_video += int(np.broadcast_to(np.asarray(is_demo, bool), (count,)).sum())
         if actions is not None and self._leading is not None:
             self._leading.append(np.asarray(actions, np.float32))
@@ -117,7 +122,9 @@ class RemoteEpisode(Episode):
         """What was observed since the last chunk; it is not held any longer."""
         views = {}
         for name in self._views[0] if self._views else ():
-            views[name] = np.concatenate([part[name] for part in self._views])
+            parts = [part[name] for part in self._views]
+            # A part without frames, of a choice that moved nothing, has no size of its own.
+            views[name] = np.concatenate([part for part in parts if len(part)] or parts[:1])
         executed = None
         if self._leading:
             executed = np.concatenate(self._leading)
@@ -127,6 +134,8 @@ class RemoteEpisode(Episode):
             options=self.options,
             views=views,
             states=np.concatenate(self._states),
+            current=self._current,
+            state=self._state,
             n_video=self._n_video,
             executed=executed,
             first=self.connection is None,

@@ -35,12 +35,15 @@ LONGEST_CHUNK = 4096  # actions
 
 @dataclass
 class NewFrames:
-    """What an episode observed since its last chunk, the current frame last.
+    """What an episode observed since its last chunk, the current frame last; no frame after a
+    choice that moved nothing.
 
     goal: the task in words. subgoal: its current part, if a predictor gives one. options: what can
-    be chosen. views: by camera or reading, arrays or lists of t. states: [t, s] float32. n_video:
-    how many of the frames are of the conditioning video; these come first. executed: actions [k, w]
-    that led to the last k frames. first: whether the episode begins. seed: of its noise.
+    be chosen. views: by camera or reading, arrays or lists of t. states: [t, s] float32. current,
+    state: the current frame, by camera or reading, and its state, which are there in any case.
+    n_video: how many of the frames are of the conditioning video; these come first. executed:
+    actions [k, w] that led to the last k frames. first: whether the episode begins. seed: of its
+    noise.
     """
 
     goal: str
@@ -48,6 +51,8 @@ class NewFrames:
     options: tuple[Option, ...]
     views: Mapping[str, Any]
     states: np.ndarray
+    current: Mapping[str, Any]
+    state: np.ndarray
     n_video: int
     executed: np.ndarray | None
     first: bool
@@ -121,8 +126,8 @@ class ServerProtocol:
         message: dict[str, Any] = {}
         for name in self.robot.camera_names:
             key = IMAGE_KEYS.get(name, f"observation/{name}")
-            message[keys.get(name, key)] = np.ascontiguousarray(frames.views[name][-1])
-        message[keys.get("state", "observation/state")] = frames.states[-1]
+            message[keys.get(name, key)] = np.ascontiguousarray(frames.current[name])
+        message[keys.get("state", "observation/state")] = frames.state
         message[keys.get("prompt", "prompt")] = frames.goal
         return message | self._subgoal_field(frames)
 
@@ -221,6 +226,8 @@ class RobommeProtocol(ServerProtocol):
     shares_memory = True
 
     def act(self, connection: Connection, frames: NewFrames) -> dict[str, Any]:
+        if not len(frames.states):
+            return connection.request(self.observation(frames))
         images = np.stack(list(frames.views[self.robot.memory_camera]))
         added = connection.request({
             "add_buffer": True,
@@ -276,17 +283,20 @@ class HarnessProtocol(ServerProtocol):
     def act(self, connection: Connection, frames: NewFrames) -> dict[str, Any]:
         # Frames between two decisions, of an event that holds the robot, get actions that are not
         # executed.
+        # Without a new frame the current one is observed again.
         reply: dict[str, Any] = {}
-        for number in range(frames.n_video, len(frames.states)):
+        for number in range(frames.n_video, max(len(frames.states), 1)):
+            views, state = frames.current, frames.state
+            if number < len(frames.states):
+                views = {name: view[number] for name, view in frames.views.items()}
+                state = frames.states[number]
             images = {}
             for name in self.robot.camera_names:
-                images[self.views.get(name, name)] = np.ascontiguousarray(
-                    frames.views[name][number]
-                )
+                images[self.views.get(name, name)] = np.ascontiguousarray(views[name])
             message: dict[str, Any] = {
                 "images": images,
                 "task_description": frames.goal,
-                "states": frames.states[number],
+                "states": state,
             }
             if self.subgoal is not None and frames.subgoal is not None:
                 message["subgoal"] = frames.subgoal
