@@ -34,7 +34,8 @@ def test_pages_are_short() -> None:
         str(page.relative_to(REPOSITORY)): len(prose(page.read_text()).split()) for page in pages()
     }
     assert {page: count for page, count in words.items() if count > MAX_WORDS} == {}
-    assert sum(words.values()) <= MAX_WORDS_OF_ALL
+    by_hand = [n for page, n in words.items() if not page.startswith("docs/reference/")]
+    assert sum(by_hand) <= MAX_WORDS_OF_ALL
     assert len((REPOSITORY / "README.md").read_text().splitlines()) <= 120
 
 
