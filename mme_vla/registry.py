@@ -419,8 +419,9 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`,
             `processor`, `subgoal` (a predictor), `task`, `env`, `player`, `reward`, `prompt` (a
-            prompt format) or `perturbation` (of training, rollouts or probes; also called
-            `history_transform`, `event` and `intervention`).
+            prompt format), `perturbation` (of training, rollouts or probes; also called
+            `history_transform`, `event` and `intervention`), `training_set`, `side_file` (of a
+            dataset) or `split_policy`.
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

@@ -88,6 +88,8 @@ class MMEPolicy(NetworkPolicy):
                 `ieee` or `tf32`.
         """
         model = MMEModel(backbone, memory, integration, transform_images=self.transform_images)
+        # Before `super().__init__`, whose `compute_dtype` the model keeps; `nn.Module` refuses to
+        # register a module that early.
         object.__setattr__(self, "model", model)
         super().__init__(
             processor,

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from mme_vla import MMEPolicy
+from mme_vla.model import unit_images
 from mme_vla.testing.small import moving_frames, random_batch, small_policy
 
 
@@ -95,3 +96,10 @@ def test_a_chunk_takes_six_calls_in_four_files(
         "output",
     ]
     assert len({frame.filename for frame in calls}) == 4
+
+
+def test_a_model_without_a_transform_refuses_augmentation() -> None:
+    images = torch.zeros(1, 1, 3, 4, 4, dtype=torch.uint8)
+    assert torch.equal(unit_images(images), torch.full((1, 1, 3, 4, 4), -1.0))
+    with pytest.raises(ValueError, match="does not augment"):
+        unit_images(images, torch.zeros(1, 2))
