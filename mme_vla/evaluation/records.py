@@ -34,6 +34,11 @@ def display_name(model: str, checkpoint: int | str) -> str:
     return f"{checkpoint}{dot}{arm}"
 
 
+def checkpoint_number(checkpoint: int | str) -> int | str:
+    """A checkpoint as records have it: 60000 and "60000" are one."""
+    return int(checkpoint) if str(checkpoint).isdecimal() else checkpoint
+
+
 class RunKey(NamedTuple):
     """What one pass over the benchmark is a pass of: one policy, one training, one checkpoint, one
     model seed.
@@ -197,9 +202,7 @@ class EpisodeRecord:
     made_up: bool = False
 
     def __post_init__(self) -> None:
-        if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():
-            # 60000 and "60000" are one checkpoint
-            object.__setattr__(self, "checkpoint", int(self.checkpoint))
+        object.__setattr__(self, "checkpoint", checkpoint_number(self.checkpoint))
 
     @property
     def success(self) -> bool:
@@ -208,15 +211,15 @@ class EpisodeRecord:
     @property
     def run(self) -> RunKey:
         return RunKey(
-            self.model,
-            self.subgoal,
-            self.memory_budget,
-            self.checkpoint,
-            self.model_seed,
-            self.split,
-            self.composition,
-            self.training,
-            self.event,
+            model=self.model,
+            subgoal=self.subgoal,
+            memory_budget=self.memory_budget,
+            checkpoint=self.checkpoint,
+            model_seed=self.model_seed,
+            split=self.split,
+            composition=self.composition,
+            training=self.training,
+            event=self.event,
         )
 
     @property

@@ -268,8 +268,8 @@ class MMEPolicy(NetworkPolicy):
     def velocity(
         self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None
     ) -> Tensor:
-        """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times
-        [b], in one pass.
+        """The network's output [b, h, a] of a flow backbone, of `flow` a velocity, at noisy chunks
+        x_t [b, h, a] and times [b], in one pass.
         """
         assert isinstance(self.backbone, HasFlowHead)
         if memory is None:
