@@ -39,7 +39,16 @@ from mme_vla.types import Batch, HistoryTokens, MemoryTokens, Noise
 
 
 def unit_images(images: Tensor, augmentation: Tensor | None = None) -> Tensor:
-    """Views [b, v, 3, s, s] uint8 → float32 in [−1, 1], without augmentation."""
+    """Views [b, v, 3, s, s] uint8 → float32 in [−1, 1].
+
+    Raises:
+        ValueError: there are random numbers of an augmentation, which this function does not have.
+    """
+    if augmentation is not None:
+        raise ValueError(
+            "unit_images() does not augment, and got augmentation: leave it out, or construct"
+            " MMEModel with another transform_images."
+        )
     return images.to(torch.float32, copy=True).div_(255).mul_(2).sub_(1)
 
 

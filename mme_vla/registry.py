@@ -149,22 +149,22 @@ class Registry[T]:
     """
 
     def __init__(
-        self, kind: str, shipped: Mapping[str, str] | None = None, key: str | None = None
+        self, kind: str, core: Mapping[str, str] | None = None, key: str | None = None
     ) -> None:
         """Make a table.
 
         Args:
             kind: what its entries are, for messages.
-            shipped: name → module that registers it, imported when the name is first asked for.
+            core: name → module that registers it, imported when the name is first asked for.
             key: the kind's name in `REGISTRIES`, under which extensions add to it; by default
                 `kind`.
         """
         self.kind, self.key = kind, key or kind
         self._entries: dict[str, T] = {}
-        self._core = dict(shipped or {})
+        self._core = dict(core or {})
 
     @property
-    def _shipped(self) -> dict[str, str]:
+    def _modules(self) -> dict[str, str]:
         """Name → module: the library's own, its extras', and those of installed packages."""
         modules = dict(self._core)
         keys = {self.key, *(key for key, registry in REGISTRIES.items() if registry is self)}
@@ -176,7 +176,7 @@ class Registry[T]:
 
     def _module_of(self, name: str) -> str | None:
         """The module that registers a name; extensions are listed only for names the core lacks."""
-        return self._core[name] if name in self._core else self._shipped.get(name)
+        return self._core[name] if name in self._core else self._modules.get(name)
 
     def register(self, name: str) -> Callable[[Any], Any]:
         """Return a decorator that files a class or function under `name`."""
@@ -185,9 +185,12 @@ class Registry[T]:
             taken = self._entries.get(name)
             module = self._module_of(name)
             if taken is None:
+                holder = f"is taken by {module}"
+                if name in self._core:
+                    holder = f"ships with the library ({module})"
                 require(
                     module in (None, getattr(entry, "__module__", None)),
-                    f"{self.kind} {name!r} ships with the library ({module}); choose another name.",
+                    f"{self.kind} {name!r} {holder}; choose another name.",
                 )
             else:
                 # A module imported twice (once as __main__) registers an equal twin.
@@ -286,10 +289,10 @@ class Registry[T]:
         )
 
     def __contains__(self, name: object) -> bool:
-        return name in self._entries or name in self._core or name in self._shipped
+        return name in self._entries or name in self._core or name in self._modules
 
     def __iter__(self) -> Iterator[str]:
-        return iter(sorted({*self._entries, *self._shipped}))
+        return iter(sorted({*self._entries, *self._modules}))
 
 
 MEMORIES: Registry[Any] = Registry(
@@ -419,8 +422,9 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`,
             `processor`, `subgoal` (a predictor), `task`, `env`, `player`, `reward`, `prompt` (a
-            prompt format) or `perturbation` (of training, rollouts or probes; also called
-            `history_transform`, `event` and `intervention`).
+            prompt format), `perturbation` (of training, rollouts or probes; also called
+            `history_transform`, `event` and `intervention`), `training_set`, `side_file` (of a
+            dataset) or `split_policy`.
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

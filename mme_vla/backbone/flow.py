@@ -1,4 +1,4 @@
-"""Flow matching: the path from noise to actions, its loss, and the Euler sampler.
+"""Flow matching: the path from noise to actions, its loss, and the times of Euler steps.
 
 τ = 1 is pure noise: x_τ = τ·noise + (1 − τ)·actions, target u = noise − actions.
 """
@@ -87,8 +87,8 @@ PredictAt = Callable[[Tensor, int], Tensor]
 
 @HEADS.register("flow")
 class FlowHead:
-    """Flow matching as π0.5 has it: time distribution, loss and Euler sampler of a network that
-    predicts the velocity.
+    """Flow matching as π0.5 has it: time distribution, loss and velocity of a network that predicts
+    the velocity. The Euler steps themselves are in `Pi05Backbone.sample`.
 
     A head of your own overrides what differs, registers under a name and is chosen with
     `backbone.head.name`.

@@ -157,8 +157,8 @@ class Pi05Backbone(
         return x
 
     def read_velocity(self, hidden: Tensor) -> Tensor:
-        """The velocity [b, h, a] in float32 from the output [b, n, d], whose last h tokens are the
-        actions.
+        """The network's output [b, h, a] in float32, of `flow` a velocity, of `clean_flow` a chunk.
+        The last h tokens of [b, n, d] are the actions.
         """
         return self._float32_linear(self.action_out, hidden[:, -self.horizon :])
 
@@ -177,8 +177,8 @@ class Pi05Backbone(
         return partial(self.velocity, injection)
 
     def velocity(self, injection: Injection, x_t: Tensor, time: Tensor) -> Tensor:
-        """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint
-        pass.
+        """The network's output (`read_velocity`) [b, h, a] at noisy chunks x_t [b, h, a] and times
+        [b], in one joint pass.
         """
         blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
         layout = self.transformer.layout(blocks, injection.visibility)

@@ -294,10 +294,7 @@ class Environment(ABC):
 
 
 def _group_of(task: str, grouping: Mapping[str, Sequence[str]]) -> str | None:
-    for name, tasks in grouping.items():
-        if task in tasks:
-            return name
-    return None
+    return next((name for name, tasks in grouping.items() if task in tasks), None)
 
 
 _idle: OrderedDict[tuple[type[Environment], str, bool], Any] = OrderedDict()

@@ -34,6 +34,11 @@ def display_name(model: str, checkpoint: int | str) -> str:
     return f"{checkpoint}{dot}{arm}"
 
 
+def checkpoint_number(checkpoint: int | str) -> int | str:
+    """A checkpoint as records have it: 60000 and "60000" are one."""
+    return int(checkpoint) if str(checkpoint).isdecimal() else checkpoint
+
+
 class RunKey(NamedTuple):
     """What one pass over the benchmark is a pass of: one policy, one training, one checkpoint, one
     model seed.
@@ -118,37 +123,45 @@ class EventEntry(TypedDict):
 class EpisodeRecord:
     """One evaluated episode.
 
-    model: name of the model (`framesamp_modul`). checkpoint: its step, or a name.
+    model: name of the model (`framesamp_modul`).
+    checkpoint: its step, or a name.
     model_seed: of the policy's noise; it does not reach the environment.
-    task, episode: which episode of the split; seed, difficulty: the environment's, from the
-    benchmark's metadata. scene: digest of the scene's values and places
-    (`mme_vla/envs/scene_hash.py`); `no values` of an environment that
-        gives none, `not built` where the episode ended before; None in records from before there
-        were digests.
+    task, episode: which episode of the split.
+    seed, difficulty: the environment's, from the benchmark's metadata.
     outcome: `success`, `fail` (the environment ended it), `timeout` (`max_steps` passed), `error`
-    (see `error`). steps: control steps executed, one an action but for planned motions. seconds:
-    where the time went. subgoal: name of the subgoal predictor, None for a policy without.
+        (see `error`).
+    steps: control steps executed, one an action but for planned motions.
+    seconds: where the time went.
+    subgoal: name of the subgoal predictor, None for a policy without.
     memory_budget: memory tokens, where it is not the model's usual number (a sweep over budgets).
     composition: `composition_digest` (policy/saving.py) of the policy, so that no two
-    configurations are averaged
-        under one name; None in records written before there was one, and of players that are no
-        policy of this library.
+        configurations are averaged under one name; None in records written before there was one,
+        and of players that are no policy of this library.
     training: seed, recipe, data and weights of the training that the checkpoint is of; None in
-    records written before
-        checkpoints named it, and of what was not trained.
+        records written before checkpoints named it, and of what was not trained.
     event: what happened in the rollout (`pause:100@subtask:2`); None in the matched arm, which is
-    the plain run.
+        the plain run.
     when: UTC time of the end, ISO 8601.
     extra: whatever else a runner of one's own keeps.
+    scene: digest of the scene's values and places (`mme_vla/envs/scene_hash.py`); `no values` of
+        an environment that gives none, `not built` where the episode ended before; None in records
+        from before there were digests.
 
-    What follows is of rollouts, and is not written where it is None or empty. env: the
-    environment's name. goal: the instruction. chunks: how often the policy acted. video_frames:
-    observed frames of the conditioning video. actions_sha256: digest of the executed actions.
-    suite: the task's, where its environment has suites. groups: the task's in its environment's
-    further groupings, title → name. refused: what the environment says of an
-    episode that failed. video: name of the file. process: where the chain of sub-tasks broke
-    (`ProcessScore`). events: what happened, and at which control step. subgoals: their score
-    (`SubgoalScore`). made_up: whether the record is synthetic.
+    What follows is of rollouts, and is not written where it is None or empty.
+
+    env: the environment's name.
+    goal: the instruction.
+    chunks: how often the policy acted.
+    video_frames: observed frames of the conditioning video.
+    actions_sha256: digest of the executed actions.
+    suite: the task's, where its environment has suites.
+    groups: the task's in its environment's further groupings, title → name.
+    refused: what the environment says of an episode that failed.
+    video: name of the file.
+    process: where the chain of sub-tasks broke (`ProcessScore`).
+    events: what happened, and at which control step.
+    subgoals: their score (`SubgoalScore`).
+    made_up: whether the record is synthetic.
     """
 
     model: str
@@ -189,9 +202,7 @@ class EpisodeRecord:
     made_up: bool = False
 
     def __post_init__(self) -> None:
-        if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():
-            # 60000 and "60000" are one checkpoint
-            object.__setattr__(self, "checkpoint", int(self.checkpoint))
+        object.__setattr__(self, "checkpoint", checkpoint_number(self.checkpoint))
 
     @property
     def success(self) -> bool:
@@ -200,15 +211,15 @@ class EpisodeRecord:
     @property
     def run(self) -> RunKey:
         return RunKey(
-            self.model,
-            self.subgoal,
-            self.memory_budget,
-            self.checkpoint,
-            self.model_seed,
-            self.split,
-            self.composition,
-            self.training,
-            self.event,
+            model=self.model,
+            subgoal=self.subgoal,
+            memory_budget=self.memory_budget,
+            checkpoint=self.checkpoint,
+            model_seed=self.model_seed,
+            split=self.split,
+            composition=self.composition,
+            training=self.training,
+            event=self.event,
         )
 
     @property

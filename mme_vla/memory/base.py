@@ -201,7 +201,7 @@ class MemoryModule(nn.Module):
 
 
 Memory = MemoryModule
-"""The former name."""
+"""The public name, `mme_vla.Memory`."""
 
 
 def take_options[T](kind: type[T], options: dict[str, Any]) -> T:

@@ -1,7 +1,7 @@
-"""The history store: one episode's pooled vision tokens, grown online or read from the cache.
+"""`StorageSpec`, `FrameScorer`, and `History`: one episode's stored vision tokens.
 
-Both forms have the same three members: the number of frames (`len`), the scorer's rows (`scores`),
-and the tokens at some (frame, patch) pairs (`gather`). A memory cannot tell them apart.
+A history grows in an episode (`OnlineHistory`, `LazyHistory`) or is read from the cache
+(`CachedHistory`). A memory reads all of them through the same members.
 """
 
 import ast
@@ -20,6 +20,11 @@ from mme_vla.errors import UserError, check_choice, check_sizes, require
 from mme_vla.types import FrameBatch
 
 
+def is_kept[T: (int, np.ndarray)](frames: T, every: int) -> T:
+    """Which frames are kept of every so many: frame 0, and frames k·every − 1."""
+    return (frames == 0) | ((frames + 1) % every == 0)
+
+
 @dataclass(frozen=True)
 class StorageSpec:
     """What is stored of each frame for a memory. It is data, so that a cache can be named after it.
@@ -28,6 +33,7 @@ class StorageSpec:
         stored. It divides the backbone's (`check_grid`).
     pooling: `mean` (as released) or `max` (paper, section 4.2).
     keep_every: frame 0 and frames k·keep_every − 1 are kept; 1 keeps all. Others are never encoded.
+        Options of memories call this interval `stride` or `spacing`, keys of a cache `every`.
     scorer: key of the frame scorer whose rows are stored beside the tokens (`FrameScorer.key`);
         empty for none.
     """
@@ -51,7 +57,7 @@ class StorageSpec:
     def stored_frames(self, length: int) -> np.ndarray:
         """Ascending indices of the stored frames among the first `length`."""
         frames = np.arange(length)
-        return frames[(frames == 0) | ((frames + 1) % self.keep_every == 0)]
+        return frames[is_kept(frames, self.keep_every)]
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)

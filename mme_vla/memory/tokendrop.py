@@ -7,7 +7,14 @@ import numpy as np
 
 from mme_vla.errors import UserError, check_sizes, require
 from mme_vla.memory.base import PerceptualMemory
-from mme_vla.memory.history import FORMER_KEYS, FrameScorer, FrameScores, History, StorageSpec
+from mme_vla.memory.history import (
+    FORMER_KEYS,
+    FrameScorer,
+    FrameScores,
+    History,
+    StorageSpec,
+    is_kept,
+)
 from mme_vla.registry import MEMORIES
 
 FIRST_FRAME_SCORE = 1000.0  # above any change, so that the first frame always stays
@@ -30,11 +37,11 @@ class ChangeScorer(FrameScorer):
 
     def frames_scored(self, length: int) -> np.ndarray:
         frames = np.arange(length)
-        return frames[(frames == 0) | ((frames + 1) % self.stride == 0)]
+        return frames[is_kept(frames, self.stride)]
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
         """Score one frame [H, W, 3] uint8, or keep it as a reference."""
-        if frame_index and (frame_index + 1) % self.stride:
+        if not is_kept(frame_index, self.stride):
             return None
         height, width, _ = frame.shape
         if height % self.grid or width % self.grid:
@@ -53,7 +60,7 @@ class ChangeScorer(FrameScorer):
 
 
 # Caches made before keys were derived from the code have this key.
-FORMER_KEYS["c7f24220"] = "change{grid}x{grid}-every{stride}"
+FORMER_KEYS["4b59d5ca"] = "change{grid}x{grid}-every{stride}"
 
 
 @MEMORIES.register("tokendrop")
@@ -78,7 +85,8 @@ class TokenDrop(PerceptualMemory):
 
         Args:
             grid: side of a frame's token grid. stride: frames between two scored ones.
-            candidates: length of the list of best patches that is kept along an episode.
+            candidates: length of the list of best patches that is kept along an episode. With
+                `causal` it changes no choice and is checked alone.
             causal: only frames up to the current one compete for that list. False lets the whole
                 episode compete, as the released offline preprocessing does; it needs a finished
                 episode.

@@ -16,7 +16,7 @@ from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, require
 from mme_vla.integration.base import Integration, extension_points
-from mme_vla.memory.base import Memory, MemoryModule, check_scorer
+from mme_vla.memory.base import MemoryModule, check_scorer
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import policy_class
 from mme_vla.policy.sections import SECTIONS, PolicySections
@@ -26,14 +26,14 @@ from mme_vla.processing.prompt import PROMPTS
 from mme_vla.registry import ENVS, MEMORIES, PROCESSORS
 
 
-def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: int) -> Memory:
+def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: int) -> MemoryModule:
     """The memory of a configuration.
 
     Args:
         d_vision: width of a vision token. grid: side of a view's token grid. width: of the memory's
             own tokens.
     """
-    memory: Memory = MEMORIES.build(section, d_vision=d_vision, width=width)
+    memory: MemoryModule = MEMORIES.build(section, d_vision=d_vision, width=width)
     check_grid(memory, grid)
     check_scorer(memory)
     return memory
@@ -53,7 +53,10 @@ def check_grid(memory: MemoryModule, views: int) -> None:
 
 
 def check_integrated(
-    config: Mapping[str, Any], integration: Integration, memory: Memory | None, supports: Set[str]
+    config: Mapping[str, Any],
+    integration: Integration,
+    memory: MemoryModule | None,
+    supports: Set[str],
 ) -> None:
     """Make sure that memory, integration and backbone fit together."""
     takes_tokens = integration.memory_width > 0
@@ -79,7 +82,7 @@ def check_integrated(
     check_positions(config, integration, memory, supports)
 
 
-def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) -> None:
+def check_past(config: Mapping[str, Any], memory: MemoryModule, supports: Set[str]) -> None:
     """Make sure that the backbone reads past views if the memory gives them."""
     sections = PolicySections.of(config)
     if memory.past_view_spec is not None and "past" not in supports:
@@ -92,7 +95,7 @@ def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) ->
 
 
 def check_positions(
-    config: Mapping[str, Any], integration: Integration, memory: Memory, supports: Set[str]
+    config: Mapping[str, Any], integration: Integration, memory: MemoryModule, supports: Set[str]
 ) -> None:
     """Make sure that positions in time are possible: the tokens have a time, and the backbone takes
     positions.

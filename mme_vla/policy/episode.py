@@ -343,9 +343,9 @@ class Episode:
             )
         self.history.restart_clock()
 
-    def begun(self, frames: Sequence[int], exec_start: int) -> None:
-        """Note the frames at which sub-tasks began, if the environment reports them; only probes
-        use it.
+    def note_subtask_starts(self, frames: Sequence[int], exec_start: int) -> None:
+        """Take the frames at which sub-tasks began so far, before each decision, where the
+        environment reports them. Nothing by default: probes override it.
         """
 
     @property
@@ -372,7 +372,7 @@ class Episode:
     def noise_state(self, state: Tensor) -> None:
         self._generator.set_state(state)
 
-    def draw(self) -> dict[str, Tensor]:
+    def sample_noise(self) -> dict[str, Tensor]:
         """Sample the next chunk's random numbers from this episode's own generator, independent of
         batching.
         """

@@ -45,7 +45,16 @@ from mme_vla.speed import (
 )
 from mme_vla.speed.graphs import CapturedSampling
 from mme_vla.speed.sharding import ShardGroup, backbone_groups
-from mme_vla.types import Batch, MemoryTokens, Noise, map_noise, named_noise, send, stack_noise
+from mme_vla.types import (
+    Batch,
+    HistoryTokens,
+    MemoryTokens,
+    Noise,
+    map_noise,
+    named_noise,
+    send,
+    stack_noise,
+)
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -88,6 +97,8 @@ class MMEPolicy(NetworkPolicy):
                 `ieee` or `tf32`.
         """
         model = MMEModel(backbone, memory, integration, transform_images=self.transform_images)
+        # Before `super().__init__`, whose `compute_dtype` the model keeps; `nn.Module` refuses to
+        # register a module that early.
         object.__setattr__(self, "model", model)
         super().__init__(
             processor,
@@ -257,8 +268,8 @@ class MMEPolicy(NetworkPolicy):
     def velocity(
         self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None
     ) -> Tensor:
-        """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times
-        [b], in one pass.
+        """The network's output [b, h, a] of a flow backbone, of `flow` a velocity, at noisy chunks
+        x_t [b, h, a] and times [b], in one pass.
         """
         assert isinstance(self.backbone, HasFlowHead)
         if memory is None:
@@ -271,8 +282,8 @@ class MMEPolicy(NetworkPolicy):
         if not isinstance(self.backbone, Recomputes):
             name = type(self.backbone).__name__
             raise UserError(
-                f"train.recompute: {name} does not inherit from mme_vla.speed.Recomputes. Set it to"
-                " false."
+                f"train.gradient_checkpointing={mode}: {name} does not inherit from"
+                " mme_vla.speed.Recomputes. Set it to false."
             )
         self.backbone.recompute(mode)
 
@@ -398,14 +409,37 @@ class MMEPolicy(NetworkPolicy):
         steps: int | None = None,
     ) -> Tensor:
         """A chunk for the batch of `observation`, with the episodes' memories."""
-        memory = self._memory_tokens(episodes, batch)
+        memory = self.encode_memories(episodes, batch)
         return self.sample_actions(batch, noise, steps, memory=memory)
 
+    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
+        """As in `NetworkPolicy`, for backbones that read stored tokens without the prompt.
+
+        Raises:
+            UserError: the backbone needs the prompt, as `MMEModel.memory_tokens` gives it.
+        """
+        conditioning = getattr(self.backbone.condition_on_prompt, "__func__", None)
+        if history is not None and conditioning is not Backbone.condition_on_prompt:
+            raise UserError(
+                f"encode_memory: {type(self.backbone).__name__} reads stored tokens with the"
+                " prompt. Call policy.model.memory_tokens(batch)."
+            )
+        return super().encode_memory(history)
+
     @torch.no_grad()
-    def _memory_tokens(self, episodes: Sequence[Episode], batch: Batch) -> MemoryTokens | None:
-        """Memory tokens of running episodes, from the states of their streams."""
+    def encode_memories(
+        self, episodes: Sequence[Episode], batch: Batch | None = None
+    ) -> MemoryTokens | None:
+        """Memory tokens of running episodes, from the states of their streams.
+
+        Args:
+            batch: of `observation`, whose prompts the backbone may read stored tokens with; made
+                by default.
+        """
         if self.memory is None:
             return None
+        if batch is None:
+            batch = self.observation(episodes)
         with self.autocast():
             histories = []
             for i, episode in enumerate(episodes):

@@ -98,7 +98,7 @@ class NetworkPolicy(Policy, Recomputes):
     def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
         """Encode selections into memory tokens; None without memory or selections.
 
-        For the losses of prior methods. A policy with an `MMEModel` encodes it in the model.
+        For the losses of prior methods. A policy with an `MMEModel` has `MMEModel.memory_tokens`.
         """
         if self.memory is None or history is None:
             return None

@@ -37,7 +37,7 @@ def check_integration(
     draws = policy.training_noise(2, torch.Generator().manual_seed(0))
     assert batch.history is not None
     with torch.no_grad():
-        memory_tokens = policy.encode_memory(batch.history)
+        memory_tokens = policy.model.memory_tokens(batch)
         assert memory_tokens is not None
         before = _loss(policy, batch, draws, memory_tokens)
         check_reach(policy, batch, draws, memory_tokens, before)

@@ -65,6 +65,11 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     registry.MEMORIES._entries.pop("paling", None)
 
 
+def test_a_name_of_an_installed_package_is_taken_by_its_module(package: Path) -> None:
+    with pytest.raises(UserError, match=f"memory 'paling' is taken by {PACKAGE}; choose another"):
+        registry.register("memory", "paling")(type("Mine", (), {}))
+
+
 def test_an_installed_package_adds_a_memory_and_its_files(package: Path) -> None:
     assert "paling" in registry.MEMORIES and PACKAGE not in sys.modules
     policy = build_policy("paling_modul", backbone="tiny", device="meta")
@@ -106,4 +111,4 @@ def test_a_name_of_the_core_is_not_replaced(monkeypatch: pytest.MonkeyPatch) -> 
     extension = Extension(parts={"shape": {"dot": "elsewhere"}})
     monkeypatch.setattr(registry, "extensions", lambda: (extension,))
     shapes: Registry[object] = Registry("shape", {"dot": "collections"})
-    assert shapes._shipped == {"dot": "collections"}
+    assert shapes._modules == {"dot": "collections"}

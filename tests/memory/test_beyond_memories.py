@@ -311,7 +311,7 @@ def test_an_episode_that_grows_acts_as_one_that_is_read_at_once(policy: MMEPolic
             episode.observe(view, states[part], demo[part], executed)
             if not demo[part].any():
                 # what the memory carries along is asked on the way, and again at the end
-                policy._memory_tokens([episode], policy.observation([episode]))
+                policy.encode_memories([episode])
         chunks.append(policy.act([episode]))
     assert np.abs(chunks[0] - chunks[1]).max() < 1e-4 and np.abs(chunks[0] - chunks[2]).max() < 1e-4
 

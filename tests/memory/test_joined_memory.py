@@ -170,7 +170,7 @@ def test_a_running_episode_acts_as_a_fresh_start_and_a_saved_policy_as_the_first
             episode.observe(
                 {"front": frames_, "wrist": frames_}, np.zeros((len(frames_), 8), np.float32)
             )
-            which._memory_tokens([episode], which.observation([episode]))
+            which.encode_memories([episode])
         return which.act(episode)
 
     streamed = chunks(policy, [slice(0, 1), slice(1, 17), slice(17, 33)])

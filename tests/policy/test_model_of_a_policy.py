@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from mme_vla import MMEPolicy
+from mme_vla import MMEPolicy, UserError
+from mme_vla.memory.base import stack_history
+from mme_vla.model import unit_images
 from mme_vla.testing.small import moving_frames, random_batch, small_policy
 
 
@@ -95,3 +97,47 @@ def test_a_chunk_takes_six_calls_in_four_files(
         "output",
     ]
     assert len({frame.filename for frame in calls}) == 4
+
+
+def test_a_model_without_a_transform_refuses_augmentation() -> None:
+    images = torch.zeros(1, 1, 3, 4, 4, dtype=torch.uint8)
+    assert torch.equal(unit_images(images), torch.full((1, 1, 3, 4, 4), -1.0))
+    with pytest.raises(ValueError, match="does not augment"):
+        unit_images(images, torch.zeros(1, 2))
+
+
+def test_a_backbone_that_cannot_recompute_names_the_switch(policy: MMEPolicy) -> None:
+    policy.backbone = torch.nn.Identity()  # type: ignore[assignment]
+    with pytest.raises(UserError, match=r"train\.gradient_checkpointing=attention: Identity"):
+        policy.recompute("attention")
+
+
+@torch.no_grad()
+def test_memory_tokens_of_episodes_are_read_with_their_prompts(policy: MMEPolicy) -> None:
+    policy.eval()
+    episode = policy.start_episode("press the button", seed=0)
+    frames = moving_frames(3, size=policy.backbone.image_size)
+    episode.observe({"front": frames, "wrist": frames}, np.zeros((3, 8), np.float32))
+    before = policy.encode_memories([episode])
+    assert torch.equal(before.tokens, policy.encode_memory(selection_of(policy, episode)).tokens)
+
+    def with_prompt(tokens: torch.Tensor, prompt: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        return tokens + (prompt * mask).sum(1)[:, None, None]
+
+    policy.backbone.condition_on_prompt = lambda tokens, prompt, prompt_mask: with_prompt(
+        tokens, prompt, prompt_mask
+    )  # type: ignore[method-assign]
+    batch = policy.observation([episode])
+    batch.history = selection_of(policy, episode)
+    valid = before.mask  # padding is conditioned in a batch alone, and never read
+    tokens = policy.encode_memories([episode]).tokens[valid]
+    assert torch.equal(tokens, policy.model.memory_tokens(batch).tokens[valid])
+    assert not torch.equal(tokens, before.tokens[valid])
+    with pytest.raises(UserError, match=r"policy\.model\.memory_tokens"):
+        policy.encode_memory(batch.history)
+
+
+def selection_of(policy: MMEPolicy, episode: Any) -> Any:
+    """The stored tokens of an episode that its memory reads now, as a batch of one."""
+    history = episode.required_history()
+    return stack_history([policy.memory.gather_selection(history, len(history) - 1)])

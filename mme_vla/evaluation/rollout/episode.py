@@ -319,4 +319,4 @@ class RunningEpisode:
         self._leading = leading
         self._at = 0
         began = np.searchsorted(self._visible, self.report.began)  # as numbers of observed frames
-        self.episode.begun(began.tolist(), self.video_frames)
+        self.episode.note_subtask_starts(began.tolist(), self.video_frames)

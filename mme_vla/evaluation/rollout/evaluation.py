@@ -376,16 +376,16 @@ def facts_of(
     """
     identity = policy.info.identity or identify_policy(policy, name, source)
     return RunFacts(
-        name or identity.model,
-        identity.checkpoint,
-        settings.seed,
-        settings.split,
-        settings.max_steps,
-        subgoal,
-        identity.memory_budget,
-        identity.composition,
-        identity.training,
-        settings.event,
+        model=name or identity.model,
+        checkpoint=identity.checkpoint,
+        model_seed=settings.seed,
+        split=settings.split,
+        max_steps=settings.max_steps,
+        subgoal=subgoal,
+        memory_budget=identity.memory_budget,
+        composition=identity.composition,
+        training=identity.training,
+        event=settings.event,
     )
 
 

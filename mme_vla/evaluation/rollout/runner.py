@@ -19,7 +19,7 @@ from mme_vla.envs.metadata import DEFAULT_STEPS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import SceneError, UserError, place_of, text_of
-from mme_vla.evaluation.records import EpisodeRecord, RunKey
+from mme_vla.evaluation.records import EpisodeRecord, RunKey, checkpoint_number
 from mme_vla.evaluation.rollout.environment import Command
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.events import read_events
@@ -99,19 +99,16 @@ class RunFacts:
     @property
     def run(self) -> RunKey:
         """The run that its records are of."""
-        checkpoint = self.checkpoint
-        if str(checkpoint).isdecimal():
-            checkpoint = int(checkpoint)
         return RunKey(
-            self.model,
-            self.subgoal,
-            self.memory_budget,
-            checkpoint,
-            self.model_seed,
-            self.split,
-            self.composition,
-            self.training,
-            self.event,
+            model=self.model,
+            subgoal=self.subgoal,
+            memory_budget=self.memory_budget,
+            checkpoint=checkpoint_number(self.checkpoint),
+            model_seed=self.model_seed,
+            split=self.split,
+            composition=self.composition,
+            training=self.training,
+            event=self.event,
         )
 
 

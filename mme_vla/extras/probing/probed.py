@@ -178,7 +178,7 @@ class ProbedEpisode(Episode):
     def restart_clock(self) -> None:
         self.inner.restart_clock()
 
-    def begun(self, frames: Sequence[int], exec_start: int) -> None:
+    def note_subtask_starts(self, frames: Sequence[int], exec_start: int) -> None:
         """Note where sub-tasks began, the execution among them, as numbers of observed frames."""
         self._starts = np.array(sorted({0, exec_start, *frames}), np.int64)
         self.boundaries = self.numbers(self._starts)

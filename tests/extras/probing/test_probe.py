@@ -182,7 +182,7 @@ def test_through_the_probe_an_unprobed_policy_answers_as_it_does(name: str) -> N
         policy.observation([its]),
         {k: v[None] for k, v in draws[0].items()},
         2,
-        memory=policy._memory_tokens([its], policy.observation([its])),
+        memory=policy.encode_memories([its]),
     )
     action = policy.embodiment.action
     assert torch.allclose(actual, expected[0, : action.execute, : action.width], atol=1e-5)

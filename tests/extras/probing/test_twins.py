@@ -146,7 +146,7 @@ class PlantedEpisode:
         self.images += list(images)
         self.n_observed_frames += len(images)
 
-    def begun(self, frames: Sequence[int], exec_start: int) -> None:
+    def note_subtask_starts(self, frames: Sequence[int], exec_start: int) -> None:
         pass
 
 
