@@ -45,6 +45,8 @@ NOT_RUN = {
     r"^(pip install|uv |python3 -m venv)": "installs packages",
     r"^(cd |IMAGE_MAX_TOKEN_NUM)": "needs ms-swift and GPUs",
     r"^B=": "sets a shell variable",
+    r"^pytest tests/": "these tests run by themselves",
+    r"mme-vla audit checkpoint=": "evaluates for minutes",
     r"torchrun|accelerate launch|--multirun": "needs several GPUs or a cluster",
     r"<|…": "has a place for a file or folder of the reader's own",
     r"mme(_vla\.|-vla )train ": "trains for minutes or hours",
