@@ -54,7 +54,7 @@ NOT_RUN = {
     r"mme-vla vision-pretrain ": (
         "trains for minutes; tests/extras/nano/test_vision_pretrain.py runs it on few scenes"
     ),
-    r"mme(_vla\.|-vla )(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": (
+    r"mme(_vla\.|-vla )(inspect|evaluate|serve|probe) .*checkpoint=(outputs|runs)/": (
         "needs a policy that was trained before"
     ),
     r"--checkpoint outputs/": "needs a policy that was trained before",
@@ -62,6 +62,7 @@ NOT_RUN = {
         "needs the records of an evaluation"
     ),
     r"mme-vla probe card": "needs recorded episodes",
+    r"scripts/figures\.py .*--probe outputs/": "needs a finished probe",
     r"analyse writing --memories anchors": (
         "demonstrates 48 episodes; tests/extras/probing/test_writing.py runs it on one"
     ),
