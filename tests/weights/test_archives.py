@@ -158,8 +158,6 @@ def test_entries_that_overlap_are_refused(tmp_path: Path) -> None:
         outer = archive.getinfo("params/d/1")
         hidden.header_offset = outer.header_offset + len(outer.FileHeader())
         archive.filelist.append(hidden)
-    with zipfile.ZipFile(file) as archive:
-        assert archive.read("params/d/1") == inner.read_bytes()
     with pytest.raises(UserError, match="the bytes of 'params/d/1' overlap"):
         open_source(file)
 
