@@ -15,6 +15,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
+import mme_vla.memory  # noqa: F401  (registers what ships)
 from mme_vla.errors import require
 from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.memory.history import FrameScores
@@ -228,7 +229,5 @@ def _policy(config: str) -> MMEPolicy:
 
 @cache
 def _memory(section: str) -> "Memory":
-    import mme_vla.memory  # noqa: F401  (registers what ships)
-
     memory: Memory = MEMORIES.build(json.loads(section), d_vision=_SOME_WIDTH, width=_SOME_WIDTH)
     return memory
