@@ -21,6 +21,7 @@ from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.memory.history import FrameScores
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.mme import MMEPolicy, mme_of
+from mme_vla.policy.sections import PolicySections
 from mme_vla.registry import MEMORIES
 from mme_vla.utils import write_atomically
 
@@ -169,9 +170,10 @@ class TokenStore:
     @classmethod
     def of(cls, folder: Path, configs: Sequence[Mapping[str, Any]]) -> "TokenStore":
         """The store of rows that share a tower: their composed configurations."""
-        sections = {
-            json.dumps(config["memory"], sort_keys=True) for config in configs if config["memory"]
-        }
+        sections = set()
+        for config in configs:
+            if memory := PolicySections.of(config).memory:
+                sections.add(json.dumps(memory, sort_keys=True))
         scored = sorted(text for text in sections if _memory(text).storage.scorer)
         return cls(json.dumps(dict(configs[0])), folder, tuple(scored))
 
