@@ -209,17 +209,15 @@ class TokenStore:
         if not path.is_file():
             return False
         with safe_open(path, "pt") as tensors:
-            scored = {
-                name.removeprefix("scores/")
-                for name in tensors.keys()  # noqa: SIM118
-                if name.startswith("scores/")
-            }
+            scored = set()
+            widths = set()
+            for name in tensors.keys():  # noqa: SIM118
+                kind, _, key = name.partition("/")
+                if kind == "scores":
+                    scored.add(key)
+                elif kind == "tokens":
+                    widths.add(tensors.get_slice(name).get_shape()[-1])
             required = {_memory(text).storage.scorer for text in self.memories}
-            widths = {
-                tensors.get_slice(name).get_shape()[-1]
-                for name in tensors.keys()  # noqa: SIM118
-                if name.startswith("tokens/")
-            }
             complete = widths == {_policy(self.config).backbone.vision_width} and required <= scored
             return bool(tensors.metadata().get("stamp") == stamp) and complete
 
