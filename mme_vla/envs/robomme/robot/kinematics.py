@@ -62,7 +62,11 @@ class Arm:
 
     def forward(self, qpos: np.ndarray) -> sapien.Pose:
         """Pose of the tool centre point in the world."""
-        return self.base * sapien.Pose(self.transform(qpos))
+        return self.base * self.forward_in_base(qpos)
+
+    def forward_in_base(self, qpos: np.ndarray) -> sapien.Pose:
+        """Pose of the tool centre point in the frame of the robot's base."""
+        return sapien.Pose(self.transform(qpos))
 
     def transform(self, qpos: np.ndarray) -> np.ndarray:
         """The same as a homogeneous matrix [4, 4] in double precision."""
