@@ -111,6 +111,11 @@ _ADAPTERS: dict[Any, TypeAdapter[Any]] = {}
 """pydantic's readers of the dataclasses that were read before."""
 
 
+def without(section: Mapping[str, Any], *keys: str) -> dict[str, Any]:
+    """A section but for some of its keys, such as the `name` that chose its class."""
+    return {key: value for key, value in section.items() if key not in keys}
+
+
 def section_keys(values: Any, where: str, known: Iterable[str]) -> dict[str, Any]:
     """A mapping with no unknown key."""
     if not isinstance(values, Mapping):

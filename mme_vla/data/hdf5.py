@@ -425,9 +425,12 @@ def recorded_options(refs: Sequence[EpisodeRef]) -> dict[str, Any]:
     poses = list(POSE_ACTIONS)
     tool_pose = choices = True
     partly = False
-    for file in dict.fromkeys(ref.file for ref in refs):
+    groups: dict[Path, list[str]] = {}
+    for ref in refs:
+        groups.setdefault(ref.file, []).append(ref.group)
+    for file, groups_of_file in groups.items():
         with _open(file) as handle:
-            for group in (ref.group for ref in refs if ref.file == file):
+            for group in groups_of_file:
                 poses = [
                     name for name in poses if f"{group}/timestep_0/{POSE_ACTIONS[name]}" in handle
                 ]

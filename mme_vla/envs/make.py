@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 from mme_vla.envs import metadata
 from mme_vla.envs.metadata import TASK_NAMES, check_task_name, read_variant
 from mme_vla.envs.observations import Include
+from mme_vla.envs.rendering import render_backend
 from mme_vla.envs.rows import DIFFICULTIES, TaskOptions
 from mme_vla.errors import check_known, missing_extra, require
 from mme_vla.registry import TASKS
@@ -163,8 +164,6 @@ def make_task(
         require_simulator()
     backend = "none"
     if render:
-        from mme_vla.envs.rendering import render_backend
-
         backend = render_backend()
     return TASKS[task](
         obs_mode=obs_mode, render_backend=backend, sim_backend="physx_cpu", **options

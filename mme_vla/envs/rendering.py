@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mme_vla.errors import UserError, require
+from mme_vla.utils import user_cache, write_atomically
 
 if TYPE_CHECKING:
     import sapien
@@ -178,8 +179,6 @@ def lean_shaders() -> "ShaderConfig | None":
 def _pipeline_folder() -> Path | None:
     """The folder of changed shaders, made once for an installed SAPIEN."""
     import sapien
-
-    from mme_vla.utils import user_cache, write_atomically
 
     stock = Path(sapien.__file__).parent / "vulkan_shader"
     shaders = {}

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.building import shape_of
+from mme_vla.config.sections import without
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import (
@@ -187,7 +188,7 @@ class Processor(PolicyProcessor):
         backbone = shape_of(sections["backbone"])
         sizes = {"image_size": backbone.image_size, "action_dim": backbone.action_dim}
         robot = embodiment_of(sections)
-        settings = {key: value for key, value in sections["processor"].items() if key != "name"}
+        settings = without(sections["processor"], "name")
         settings["goal_case"] = settings.get("goal_case") or goal_case(robot)
         processor = cls.from_config({**settings, **sizes, "embodiment": robot.to_dict()})
         vocab_size = sections["backbone"].get("vocab_size")

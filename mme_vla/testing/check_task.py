@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.envs.make import make_task
 from mme_vla.errors import counted
 
 
@@ -45,8 +46,6 @@ def check_task(task: str, seed: int = 1, difficulty: str | None = None, **option
 
 
 def _make(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> Any:
-    from mme_vla.envs.make import make_task
-
     return make_task(task, render=False, seed=seed, difficulty=difficulty, **options)
 
 

@@ -67,7 +67,10 @@ def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
             raise UserError(
                 f"{folder / name} does not describe a LeRobot processor: `steps` must list objects."
             )
-        for file in (step["state_file"] for step in steps if step.get("state_file")):
+        for step in steps:
+            file = step.get("state_file")
+            if not file:
+                continue
             require(
                 isinstance(file, str),
                 f"{folder / name}: state_file={brief(file)} must be the name of a file.",

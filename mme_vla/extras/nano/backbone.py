@@ -34,6 +34,7 @@ from mme_vla.extras.nano.tower import PlaceTower, TowerConfig, by_class, load_sh
 from mme_vla.extras.nano.vision import CLASSES, ConvTower
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import Recompute, Recomputes
+from mme_vla.speed.rtc import rtc_guidance
 from mme_vla.types import Batch, Noise, map_noise
 
 
@@ -437,8 +438,6 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
 
         velocity = self.head.velocity(clean, times, noise)
         if batch.overlap is not None:
-            from mme_vla.speed.rtc import rtc_guidance
-
             velocity = rtc_guidance(velocity, batch.overlap, times)
         for index in range(len(times)):
             x = x - velocity(x, index).to(x.dtype) / len(times)

@@ -19,13 +19,13 @@ from mme_vla.embodiment.robomme import CAMERAS, benchmark_action, benchmark_stat
 from mme_vla.envs.facts import Fact
 from mme_vla.envs.make import make_task
 from mme_vla.envs.observations import RenderRequest, capture, read_images
-from mme_vla.errors import require
+from mme_vla.envs.robomme.recording.frames import FrameChoice, choices_of, motions_of
+from mme_vla.errors import SceneError, require
 from mme_vla.subgoal.oracle import online_subgoal
 from mme_vla.utils import parse_json, write_atomically
 
 if TYPE_CHECKING:
     from mme_vla.embodiment.action_space import ActionSpace
-    from mme_vla.envs.robomme.recording.frames import FrameChoice
     from mme_vla.envs.robomme.recording.recorder import RecordedStep
     from mme_vla.envs.task import Task
 
@@ -134,7 +134,7 @@ class Scene:
     difficulty: str
     folder: Path
     cameras: tuple[str, ...]
-    choices: tuple["FrameChoice", ...]
+    choices: tuple[FrameChoice, ...]
     carried_out: bool = False
     acts: "ActionSpace | None" = None
 
@@ -189,7 +189,7 @@ class Scene:
 def frames_required(
     decisions: np.ndarray,
     exec_start: int,
-    choices: Sequence["FrameChoice"],
+    choices: Sequence[FrameChoice],
     cameras: Sequence[str],
 ) -> dict[str, set[int]]:
     """Camera → the frames to render: those of the decisions, and at the front all that the memories
@@ -231,7 +231,7 @@ def record(
     task: str,
     seed: int,
     difficulty: str,
-    choices: Sequence["FrameChoice"],
+    choices: Sequence[FrameChoice],
     cameras: Sequence[str] = ("front", "wrist"),
     carried_out: bool = False,
     acts: "ActionSpace | None" = None,
@@ -247,8 +247,6 @@ def record(
         acts: of the robot that will learn from it. Where it chooses among options, the choices
             stand in place of motions, and the options behind the goal; None: motions.
     """
-    from mme_vla.envs.robomme.scene.placement import SceneError
-
     try:
         env = make_task(task, render=True, seed=seed, difficulty=difficulty)
     except SceneError:
@@ -361,7 +359,6 @@ def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
 
 def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
     """The motions of a demonstration, or its choices, if it succeeds."""
-    from mme_vla.envs.robomme.recording.frames import choices_of, motions_of
     from mme_vla.envs.robomme.recording.recorder import Recorder
 
     steps: list[RecordedStep] = []

@@ -18,8 +18,10 @@ from mme_vla.envs.episodes import choose_episodes, choose_tasks
 from mme_vla.envs.make import make_env, make_task
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import Include
+from mme_vla.envs.robomme.recording.frames import motions_of
+from mme_vla.envs.robomme.recording.processes import carry_out
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import require
+from mme_vla.errors import SceneError, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import (
     VIDEOS,
@@ -188,9 +190,7 @@ def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
 
 
 def _planned(spec: EpisodeSpec) -> Motions | None:
-    from mme_vla.envs.robomme.recording.frames import motions_of
     from mme_vla.envs.robomme.recording.recorder import Recorder
-    from mme_vla.envs.robomme.scene.placement import SceneError
 
     try:
         env = make_task(spec.task, render=False, **spec.options)
@@ -209,8 +209,6 @@ def play_all(
     """A row that nothing was trained for: plays what `folder` has no record of yet; its records of
     these episodes.
     """
-    from mme_vla.envs.robomme.recording.processes import carry_out
-
     settings = {**asdict(rules), "model": name, "max_steps": rules.steps}
     del settings["workers"], settings["shard"]
     claim_run(folder, settings)
@@ -322,8 +320,6 @@ def built_scenes(
 
     file: keeps both, so that they are looked for once.
     """
-    from mme_vla.envs.robomme.recording.processes import carry_out
-
     require(
         isinstance(count, int),
         f"episodes={count}: with replace=true write how many scenes of each task.",
@@ -362,8 +358,6 @@ def _key(spec: EpisodeSpec) -> str:
 
 def tried_scene(spec: EpisodeSpec) -> tuple[str, str]:
     """Task and number of an episode, and why its scene cannot be built; empty if it can."""
-    from mme_vla.envs.robomme.scene.placement import SceneError
-
     try:
         make_task(spec.task, render=False, **spec.options).close()
     except SceneError as error:

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.backbone.pi05 import initialise
+from mme_vla.data.console import progress
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.envs.grounding import project
 from mme_vla.envs.observations import INTRINSIC, front_extrinsic
@@ -208,8 +209,6 @@ def pretrain(
         folder: of the run.
     """
     from safetensors.torch import save_file
-
-    from mme_vla.data.console import progress
 
     weights_file, draft = folder / "nano_tower.safetensors", folder / "draft.pt"
     if weights_file.is_file():

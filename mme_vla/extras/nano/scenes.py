@@ -13,11 +13,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import sapien
 
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.envs.grounding import project
 from mme_vla.envs.make import make_task
 from mme_vla.envs.observations import RenderRequest, capture, read_images
+from mme_vla.envs.robomme.recording.recorder import Recorder
+from mme_vla.envs.robomme.robot.kinematics import Arm
+from mme_vla.envs.robomme.scene.articulated import Button, Peg
+from mme_vla.envs.robomme.scene.motions import Highlight
+from mme_vla.envs.robomme.scene.objects import (
+    BELOW_TABLE,
+    COLOURS,
+    Board,
+    Container,
+    Cube,
+    Disc,
+)
+from mme_vla.envs.robomme.scene.predicates import pressed
+from mme_vla.envs.robomme.scene.things import UNDER_THE_FLOOR, Thing, distance_xy
 from mme_vla.extras.nano.tower import CLASSES
 from mme_vla.processing.images import resize_with_pad_uint8
 from mme_vla.utils import write_atomically
@@ -59,9 +74,6 @@ def find_places(env: "Task") -> list[Place]:
 
 
 def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
-    from mme_vla.envs.robomme.scene.articulated import Button, Peg
-    from mme_vla.envs.robomme.scene.predicates import pressed
-
     yield "hand", env.tcp_pose.p, [int(link.per_scene_id[0]) for link in env.agent.robot.links]
     lit = list(_lit_discs(env))
     for thing in env.things:
@@ -86,10 +98,6 @@ def _visible_ids(thing: Any, lit: Sequence[Any]) -> list[int]:
     """The ids of what shows where a thing is: of a button both parts, of a disc also the mark that
     covers it.
     """
-    from mme_vla.envs.robomme.scene.articulated import Button
-    from mme_vla.envs.robomme.scene.objects import Disc
-    from mme_vla.envs.robomme.scene.things import distance_xy
-
     ids: list[int] = thing.segmentation_ids
     if isinstance(thing, Button):
         return ids + [int(link.per_scene_id[0]) for link in thing.articulation.links]
@@ -101,9 +109,6 @@ def _visible_ids(thing: Any, lit: Sequence[Any]) -> list[int]:
 
 
 def _class_of(thing: Any) -> str:
-    from mme_vla.envs.robomme.scene.articulated import Button, Peg
-    from mme_vla.envs.robomme.scene.objects import COLOURS, Board, Container, Cube, Disc
-
     if isinstance(thing, Cube):
         colour = thing.colour
         if isinstance(colour, str):
@@ -120,8 +125,6 @@ def _class_of(thing: Any) -> str:
 
 def _lit_discs(env: "Task") -> Iterator[tuple[str, Any]]:
     """The discs that mark or highlight something now; they are no things of a task."""
-    from mme_vla.envs.robomme.scene.things import UNDER_THE_FLOOR, Thing
-
     for name, actor in env.scene.actors.items():
         kind = "highlight" if name.startswith("highlight") else "mark"
         if name.startswith(("highlight", "mark", "disc_red")):
@@ -194,9 +197,6 @@ def record_scene(
     Args:
         arrangements: images with everything put elsewhere, behind those of the demonstration.
     """
-    from mme_vla.envs.robomme.recording.recorder import Recorder
-    from mme_vla.envs.robomme.robot.kinematics import Arm
-
     path = folder / f"{task}-{difficulty}-{seed}.npz"
     if path.is_file():
         return path
@@ -266,10 +266,6 @@ def _relocate(thing: Any, rng: np.random.Generator) -> None:
 
 def _light(env: "Task", rng: np.random.Generator) -> None:
     """Marks over some targets and discs, highlights under some cubes; the others out of the way."""
-    from mme_vla.envs.robomme.scene.motions import Highlight
-    from mme_vla.envs.robomme.scene.objects import BELOW_TABLE
-    from mme_vla.envs.robomme.scene.things import Thing
-
     bases: dict[str, list[Thing]] = {"highlight": [], "mark": []}
     for thing in env.things:
         name = _class_of(thing)
@@ -286,8 +282,6 @@ def _light(env: "Task", rng: np.random.Generator) -> None:
 
 
 def _pose(p: Any = (0, 0, 0), q: Any = (1, 0, 0, 0)) -> Any:
-    import sapien
-
     return sapien.Pose(p, q)
 
 

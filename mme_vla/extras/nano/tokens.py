@@ -15,11 +15,13 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
+import mme_vla.memory  # noqa: F401  (registers what ships)
 from mme_vla.errors import require
 from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.memory.history import FrameScores
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.mme import MMEPolicy, mme_of
+from mme_vla.policy.sections import PolicySections
 from mme_vla.registry import MEMORIES
 from mme_vla.utils import write_atomically
 
@@ -168,9 +170,10 @@ class TokenStore:
     @classmethod
     def of(cls, folder: Path, configs: Sequence[Mapping[str, Any]]) -> "TokenStore":
         """The store of rows that share a tower: their composed configurations."""
-        sections = {
-            json.dumps(config["memory"], sort_keys=True) for config in configs if config["memory"]
-        }
+        sections = set()
+        for config in configs:
+            if memory := PolicySections.of(config).memory:
+                sections.add(json.dumps(memory, sort_keys=True))
         scored = sorted(text for text in sections if _memory(text).storage.scorer)
         return cls(json.dumps(dict(configs[0])), folder, tuple(scored))
 
@@ -206,17 +209,15 @@ class TokenStore:
         if not path.is_file():
             return False
         with safe_open(path, "pt") as tensors:
-            scored = {
-                name.removeprefix("scores/")
-                for name in tensors.keys()  # noqa: SIM118
-                if name.startswith("scores/")
-            }
+            scored = set()
+            widths = set()
+            for name in tensors.keys():  # noqa: SIM118
+                kind, _, key = name.partition("/")
+                if kind == "scores":
+                    scored.add(key)
+                elif kind == "tokens":
+                    widths.add(tensors.get_slice(name).get_shape()[-1])
             required = {_memory(text).storage.scorer for text in self.memories}
-            widths = {
-                tensors.get_slice(name).get_shape()[-1]
-                for name in tensors.keys()  # noqa: SIM118
-                if name.startswith("tokens/")
-            }
             complete = widths == {_policy(self.config).backbone.vision_width} and required <= scored
             return bool(tensors.metadata().get("stamp") == stamp) and complete
 
@@ -228,7 +229,5 @@ def _policy(config: str) -> MMEPolicy:
 
 @cache
 def _memory(section: str) -> "Memory":
-    import mme_vla.memory  # noqa: F401  (registers what ships)
-
     memory: Memory = MEMORIES.build(json.loads(section), d_vision=_SOME_WIDTH, width=_SOME_WIDTH)
     return memory

@@ -266,11 +266,8 @@ def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> C
         matched: of the run without an intervention. arms: label → outcomes on the same scenes.
             again: of an equal run with other noise.
     """
-    keys = [
-        key
-        for key in matched
-        if key in again and all(key in outcomes for outcomes in arms.values())
-    ]
+    in_every_arm = set(again).intersection(*arms.values())
+    keys = [key for key in matched if key in in_every_arm]
     require(
         keys,
         "No scene ended in every arm: each ended in an error somewhere. Repeat the command to try"
@@ -329,10 +326,8 @@ def clock_scores(
     def select(outcomes: Outcomes, tasks: Sequence[str]) -> Outcomes:
         return {key: value for key, value in outcomes.items() if key.task in tasks}
 
-    others = (again, *arms.values())
-    names = dict.fromkeys(
-        key.task for key in matched if all(key in outcomes for outcomes in others)
-    )
+    in_every_arm = set(again).intersection(*arms.values())
+    names = dict.fromkeys(key.task for key in matched if key in in_every_arm)
     protocol = Protocol(tuple(names), task_suites=task_suites)
     suites = {suite: protocol.choose("suite", suite) for suite in protocol.suites}
     if len(suites) < 2:

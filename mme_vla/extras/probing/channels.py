@@ -5,6 +5,7 @@ No network is changed: a channel gives the policy other entries in place of its 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import starmap
 from typing import Any
 
 import numpy as np
@@ -284,14 +285,10 @@ class WritableChannel(Channel):
         self, episode: Episode, step: int | None = None, only: np.ndarray | None = None
     ) -> MemorySnapshot:
         assert isinstance(episode, WritableMemory)
-        stores = [
-            Remembered(
-                tuple(Entry(time, content) for time, content in store.entries),
-                store.now,
-                store.name,
-            )
-            for store in episode.writable_memory()
-        ]
+        stores = []
+        for store in episode.writable_memory():
+            entries = tuple(starmap(Entry, store.entries))
+            stores.append(Remembered(entries, store.now, store.name))
         return MemorySnapshot(tuple(stores))
 
     def counterfactual(

@@ -16,6 +16,7 @@ from mme_vla.envs.facts import Fact, evidence_of
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
+from mme_vla.errors import SceneError
 
 if TYPE_CHECKING:
     from mme_vla.envs.robomme.recording.recorder import RecordedStep
@@ -54,7 +55,6 @@ def record_evidence(
     rendered: frames whose image is wanted. Without any an episode takes about a second.
     """
     from mme_vla.envs.robomme.recording.recorder import Recorder
-    from mme_vla.envs.robomme.scene.placement import SceneError
 
     render = rendered != frozenset()
     env = make_task(spec.task, render=render, **spec.options)

@@ -108,7 +108,7 @@ def _complete_length(content: bytes) -> int:
     if end:
         return end
     try:
-        _parse(content[start:])
+        _from_dict(verified(parse_json(content[start:], "the line"), "the line"))
     except UserError:
         return _complete_length(content[:start])
     return len(content)
@@ -131,10 +131,6 @@ def read(path: Path) -> tuple[list[Line], set[str]]:
 def read_all(folder: Path) -> list[Line]:
     """The lines of every shard."""
     return [line for path in sorted(folder.glob(LINES)) for line in read(path)[0]]
-
-
-def _parse(text: bytes) -> Line | DoneLine:
-    return _from_dict(verified(parse_json(text, "the line"), "the line"))
 
 
 def _from_dict(row: dict[str, Any]) -> Line | DoneLine:

@@ -26,6 +26,7 @@ from mme_vla.envs.make import make_env, make_task
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.oracle import oracle_of
+from mme_vla.envs.robomme.recording.frames import motions_of
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import SceneError, require, text_of
 from mme_vla.evaluation.results.scopes import Protocol
@@ -313,7 +314,6 @@ def _script(base: Any, spec: EpisodeSpec, robot: Embodiment) -> Iterator[np.ndar
 
 def _recorded_actions(spec: EpisodeSpec, space: str) -> Sequence[np.ndarray]:
     """What a demonstration of RoboMME executes, in the action space of a policy."""
-    from mme_vla.envs.robomme.recording.frames import motions_of
     from mme_vla.envs.robomme.recording.recorder import Recorder
 
     if space not in ("joint_angle", "waypoint"):

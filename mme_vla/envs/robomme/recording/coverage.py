@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mme_vla.data.hdf5 import list_episodes, open_episode
+from mme_vla.data.lerobot_files import SIDE_FILE
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import listed
@@ -31,14 +33,10 @@ def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, 
     """
     goals: dict[str, set[str]] = {}
     if dataset is not None:
-        from mme_vla.data.lerobot_files import SIDE_FILE
-
         side = read_json(dataset / SIDE_FILE, "the facts of a recorded dataset")
         for episode in side["episodes"]:
             goals.setdefault(episode["task"], set()).add(episode["goals"][0])
         return goals
-    from mme_vla.data.hdf5 import list_episodes, open_episode
-
     for ref in list_episodes(official):
         with open_episode(ref) as opened:
             goals.setdefault(ref.task, set()).add(opened.goals[0])

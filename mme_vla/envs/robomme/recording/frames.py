@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import mme_vla.memory  # noqa: F401  (registers what ships)
 from mme_vla.data.waypoints import (
     CHOICE_NUMBERS,
     Motions,
@@ -138,7 +139,5 @@ def _video(steps: Sequence["RecordedStep"]) -> int:
 
 
 def _build(section: Mapping[str, Any]) -> "Memory":
-    import mme_vla.memory  # noqa: F401  (registers what ships)
-
     memory: Memory = MEMORIES.build(section, d_vision=_SOME_WIDTH, width=_SOME_WIDTH)
     return memory

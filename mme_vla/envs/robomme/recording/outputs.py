@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
+from mme_vla.data.convert import ConvertOptions, convert, drop_work, planned_options
+from mme_vla.data.hdf5 import EpisodeRef, list_episodes, open_episode
+from mme_vla.data.lerobot_files import SIDE_FILE
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.facts import FACTS, Fact, write_facts
 from mme_vla.envs.observations import INTRINSIC
@@ -17,7 +20,6 @@ from mme_vla.errors import require
 from mme_vla.utils import read_json, remove_drafts, write_atomically
 
 if TYPE_CHECKING:
-    from mme_vla.data.convert import ConvertOptions
     from mme_vla.envs.robomme.recording.recorder import RecordedStep
     from mme_vla.envs.task import Task
 
@@ -166,7 +168,7 @@ class RecordingPlan:
                 places.append(self._official(task))
         return places
 
-    def missing(self, options: "ConvertOptions") -> list[Path]:
+    def missing(self, options: ConvertOptions) -> list[Path]:
         """The places that are still to be written; what is there holds exactly these episodes."""
         missing = []
         for place in self.places:
@@ -184,13 +186,10 @@ class RecordingPlan:
             )
         return missing
 
-    def write(self, missing: Sequence[Path], episodes: Path, options: "ConvertOptions") -> None:
+    def write(self, missing: Sequence[Path], episodes: Path, options: ConvertOptions) -> None:
         """Write these places from the recorded files in `episodes`; each appears whole or not at
         all.
         """
-        from mme_vla.data.convert import convert
-        from mme_vla.data.hdf5 import EpisodeRef
-
         for place in missing:
             if place != self.dataset:
                 place.parent.mkdir(parents=True, exist_ok=True)
@@ -229,8 +228,6 @@ class RecordingPlan:
         """Remove what earlier runs left beside the dataset, which is there; the caller holds the
         recording's folder.
         """
-        from mme_vla.data.convert import drop_work
-
         if self.dataset is not None:
             drop_work(self.dataset)
 
@@ -242,8 +239,6 @@ class RecordingPlan:
         return [job for job in self.jobs if self._official(job.task) == place]
 
     def _is_official(self, place: Path) -> bool:
-        from mme_vla.data.hdf5 import list_episodes, open_episode
-
         jobs = {job.episode: job for job in self._of(place)}
         refs = list_episodes([place])
         if {ref.index for ref in refs} != set(jobs):
@@ -254,10 +249,7 @@ class RecordingPlan:
                     return False
         return True
 
-    def _is_dataset(self, options: "ConvertOptions") -> bool:
-        from mme_vla.data.convert import planned_options
-        from mme_vla.data.lerobot_files import SIDE_FILE
-
+    def _is_dataset(self, options: ConvertOptions) -> bool:
         assert self.dataset is not None
         if not (self.dataset / SIDE_FILE).is_file():
             return False

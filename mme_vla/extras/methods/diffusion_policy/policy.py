@@ -323,10 +323,11 @@ class DiffusionPolicy(NetworkPolicy):
 
 def _pooled(section: Mapping[str, Any], sizes: DiffusionSizes) -> PooledIntegration:
     """The integration of a configuration, which must hand memory over as one vector."""
-    kind = INTEGRATIONS[section.get("name", "")]
+    name = section.get("name", "")
+    kind = INTEGRATIONS[name]
     if not (isinstance(kind, type) and issubclass(kind, PooledIntegration)):
         raise UserError(
-            f"Diffusion Policy has no place for what the integration {section['name']!r} brings:"
+            f"Diffusion Policy has no place for what the integration {name!r} brings:"
             " memory reaches it as one vector. Choose integration=film."
         )
     built: PooledIntegration = INTEGRATIONS.build(section, sizes)

@@ -14,6 +14,7 @@ from torch.nn import functional
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, check_choice, check_integer, did_you_mean, require
+from mme_vla.extras.methods.diffusion_policy.config import DiffusionSizes
 from mme_vla.extras.methods.goal_encoders import (
     HASHED,
     ClipEncoder,
@@ -147,12 +148,8 @@ class DiffusionProcessor(GoalProcessor):
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
-        from mme_vla.extras.methods.diffusion_policy.config import DiffusionSizes
-
-        sizes, settings = (
-            DiffusionSizes.from_dict(sections["backbone"]),
-            dict(sections["processor"]),
-        )
+        sizes = DiffusionSizes.from_dict(sections["backbone"])
+        settings = dict(sections["processor"])
         settings.pop("name", None)
         for key in settings:
             if key not in ("text", "window", "frames", "stats"):

@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers import additive_mask
+from mme_vla.config.sections import read_section, without
 from mme_vla.errors import check_sizes, require
 from mme_vla.extras.methods.memoryvla.action_head import Dit, DitConfig, Schedule
 from mme_vla.extras.methods.memoryvla.bank import BankState, EpisodeBank, MemoryRetrieval
@@ -106,6 +108,11 @@ class MemoryVlaConfig:
     dropout: float = 0.1
     ddim_steps: int = 10
     guidance: float = 1.5
+
+    @classmethod
+    def from_dict(cls, section: Mapping[str, Any]) -> Self:
+        """Read the section `backbone` of a configuration, but for its `name`."""
+        return read_section(cls, without(section, "name"), "backbone")
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.backbone.building import shapes_only
-from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, require
 from mme_vla.extras.methods.memoryvla.episode import MemoryVlaEpisode, words
@@ -115,8 +114,7 @@ class MemoryVlaPolicy(NetworkPolicy):
         fresh_backbone: bool = True,
     ) -> Self:
         sections = PolicySections.of(config)
-        section = {key: value for key, value in sections.backbone.items() if key != "name"}
-        sizes = read_section(MemoryVlaConfig, section, "backbone")
+        sizes = MemoryVlaConfig.from_dict(sections.backbone)
         embodiment_of(config).check_network(sizes.action_dim, sizes.horizon)
         if sections.integration:
             name = sections.integration.get("name")

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.config.sections import read_section
+from mme_vla.config.sections import without
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import check_integer, require
 from mme_vla.extras.methods.memoryvla.model import MemoryVlaConfig
@@ -74,9 +74,7 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         """As `OpenVlaProcessor.from_config`, with `group_size` beside the other settings."""
         size = config.get("group_size", GROUP_SIZE)
         check_integer("processor.group_size", size)
-        built = super().from_config(
-            {key: value for key, value in config.items() if key != "group_size"}
-        )
+        built = super().from_config(without(config, "group_size"))
         built.samples = SampleSpec(group_size=size, cameras=(built.embodiment.memory_camera,))
         return built
 
@@ -85,8 +83,7 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         """As `Processor.from_sections`, at the sizes of the section `backbone`, which is no
         `Backbone` here.
         """
-        of_network = {key: value for key, value in sections["backbone"].items() if key != "name"}
-        sizes = read_section(MemoryVlaConfig, of_network, "backbone")
+        sizes = MemoryVlaConfig.from_dict(sections["backbone"])
         options = {"image_size": sizes.vision.image_size, "action_dim": sizes.action_dim}
         built = cls.from_config(
             {**sections["processor"], **options, "embodiment": embodiment_of(sections).to_dict()}

@@ -100,10 +100,10 @@ class OpenVlaConfig:
     def __post_init__(self) -> None:
         check_sizes(
             "backbone",
-            **{
-                name: getattr(self, name)
-                for name in ("vocab_size", "end_id", "action_dim", "horizon")
-            },
+            vocab_size=self.vocab_size,
+            end_id=self.end_id,
+            action_dim=self.action_dim,
+            horizon=self.horizon,
         )
         require(self.state_dim >= 0, f"backbone.state_dim={self.state_dim} must be at least 0.")
         require(

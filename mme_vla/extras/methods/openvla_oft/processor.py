@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.config.sections import without
 from mme_vla.errors import brief, require
 from mme_vla.processing.base import Sample, SampleSpec, StatsSpec
 from mme_vla.processing.images import as_uint8_frames, hsv_to_rgb, rgb_to_hsv, to_unit_range
@@ -253,9 +254,7 @@ class OpenVlaProcessor(Processor):
         """As `Processor.from_config`, with `jpeg` beside the other settings."""
         jpeg = config.get("jpeg", False)
         require(isinstance(jpeg, bool), f"processor.jpeg must be true or false, not {brief(jpeg)}.")
-        built = super().from_config(
-            {key: value for key, value in config.items() if key not in ("name", "jpeg")}
-        )
+        built = super().from_config(without(config, "name", "jpeg"))
         require(
             built.embodiment.action.width == built.action_dim,
             f"backbone.action_dim={built.action_dim}: this network's actions are as wide as the"

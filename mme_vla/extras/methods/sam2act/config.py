@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Self
 
-from mme_vla.config.sections import Range, read_section
+from mme_vla.config.sections import Range, read_section, without
 from mme_vla.errors import UserError, check_multiple, require
 from mme_vla.extras.methods.sam2act.geometry import VIEWS
 
@@ -86,9 +86,7 @@ class SAM2ActSizes:
     @classmethod
     def from_dict(cls, section: Mapping[str, Any]) -> Self:
         """Read the section `backbone` of a configuration, but for its `name`."""
-        return read_section(
-            cls, {key: value for key, value in section.items() if key != "name"}, "backbone"
-        )
+        return read_section(cls, without(section, "name"), "backbone")
 
     def __post_init__(self) -> None:
         check_multiple("backbone.", "width", self.width, "backbone.heads", self.heads)

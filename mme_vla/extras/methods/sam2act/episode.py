@@ -148,15 +148,9 @@ class KeyframeEpisode(Episode):
             rendered: the same frames for every camera; depth and poses are given for these alone.
         """
         self._check_readings(frames)
+        by_camera = [] if rendered is None else list(rendered.values())
         require(
-            not (
-                rendered is not None
-                and any(
-                    not np.array_equal(rendered[n], places)
-                    for places in rendered.values()
-                    for n in rendered
-                )
-            ),
+            all(np.array_equal(by_camera[0], places) for places in by_camera),
             "This policy sees through all of its cameras at once: draw the same frames of each.",
         )
         super().observe(frames, states, is_demo, actions, rendered)

@@ -151,18 +151,17 @@ class EpisodeKeyframes:
         """What the cameras saw at these frames, each of them a kept one."""
         arrays = self._read("frames", "colours", "depth", "intrinsic", "extrinsic")
         places = np.searchsorted(arrays["frames"], frames)
-        return [
-            [
-                Shot(
-                    arrays["colours"][at, c],
-                    arrays["depth"][at, c],
-                    arrays["intrinsic"][c],
-                    arrays["extrinsic"][at, c],
-                )
-                for c in range(arrays["colours"].shape[1])
-            ]
-            for at in places
-        ]
+        shots = []
+        for at in places:
+            by_camera = zip(
+                arrays["colours"][at],
+                arrays["depth"][at],
+                arrays["intrinsic"],
+                arrays["extrinsic"][at],
+                strict=True,
+            )
+            shots.append([Shot(*parts) for parts in by_camera])
+        return shots
 
     @cached_property
     def frames(self) -> np.ndarray:

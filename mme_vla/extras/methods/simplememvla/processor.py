@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mme_vla.config.sections import Positive, PositiveInt, Range, read_section
+from mme_vla.config.sections import Positive, PositiveInt, Range, read_section, without
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, check_choice
@@ -85,8 +85,7 @@ class PromptSettings:
 
 def processor_settings(config: Mapping[str, Any]) -> PromptSettings:
     """The section `processor` of a policy's configuration."""
-    values = {key: value for key, value in config["processor"].items() if key != "name"}
-    return read_section(PromptSettings, values, "processor")
+    return read_section(PromptSettings, without(config["processor"], "name"), "processor")
 
 
 @dataclass

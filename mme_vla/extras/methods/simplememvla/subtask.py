@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from mme_vla.backbone.base import FineTuneSpec
 from mme_vla.backbone.building import read_backbone
+from mme_vla.config.sections import without
 from mme_vla.errors import UserError
 from mme_vla.extras.methods.simplememvla.prompt import clean_response
 from mme_vla.integration.base import Integration
@@ -52,7 +53,7 @@ class SubtaskProcessor(Processor):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        return super().from_config({key: value for key, value in config.items() if key != "name"})
+        return super().from_config(without(config, "name"))
 
     def item(self, sample: Sample) -> dict[str, Any]:
         if sample.subgoal is None:

@@ -16,7 +16,7 @@ from mme_vla.envs.episodes import choose_tasks
 from mme_vla.envs.make import require_simulator
 from mme_vla.envs.robomme.recording.processes import carry_out
 from mme_vla.envs.rows import DIFFICULTIES
-from mme_vla.errors import UserError, require
+from mme_vla.errors import SceneError, UserError, require
 from mme_vla.evaluation.store import claim_run
 from mme_vla.extras.nano.pretraining import PretrainSettings, fresh_tower, pretrain
 from mme_vla.extras.nano.tower import TowerConfig
@@ -119,9 +119,7 @@ def _recorded(job: tuple[Path, str, int, str, int, int]) -> tuple[int, Path | No
     """The scene's seed, its file, and why there is none: the benchmark's own rule tries a layout so
     many times.
     """
-    # They import the simulator, which is asked for first.
-    from mme_vla.envs.robomme.scene.placement import SceneError
-    from mme_vla.extras.nano.scenes import record_scene
+    from mme_vla.extras.nano.scenes import record_scene  # with the simulator, asked for first
 
     try:
         return job[2], record_scene(*job), ""

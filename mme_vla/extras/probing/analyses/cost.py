@@ -17,7 +17,6 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla.config.composition import compose
-from mme_vla.config.trees import library_files
 from mme_vla.errors import UserError
 from mme_vla.evaluation.results.paper import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
@@ -65,11 +64,6 @@ def on_meta(model: str, budget: int | None = None, backbone: str | None = None) 
     if policy.memory is None:
         raise UserError(f"{model} has no memory, so no budget of {budget} tokens.")
     return build_policy(model, backbone=backbone, device="meta", memory={"budget": budget})
-
-
-def all_models() -> list[str]:
-    """The models that ship, by name."""
-    return list(library_files("model"))
 
 
 def _check_attention_is_counted() -> None:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
+from mme_vla.config.trees import library_files
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.policy.sections import PolicySections
 from mme_vla.utils import require_replaceable, safe_name
@@ -86,28 +87,25 @@ def modulation(args: argparse.Namespace) -> None:
     watch = ModulationWatch(policy)
 
     def laps() -> dict[str, float]:
-        pairs = watch.lap().overall.items()
-        return {f"modulation/{part}_{kind}": value for part, values in pairs
-                for kind, value in zip(("mean", "deviation"), values, strict=True)}  # fmt: skip
+        numbers = {}
+        for part, (mean, deviation) in watch.lap().overall.items():
+            numbers[f"modulation/{part}_mean"] = mean
+            numbers[f"modulation/{part}_deviation"] = deviation
+        return numbers
 
     chunks = _watch(args, watch, laps, policy, source)
     stats = watch.result()
-    layers = [
-        [str(i), *(f"{mean[i]:.4f} ± {std[i]:.4f}" for mean, std in (stats.scale, stats.bias))]
-        for i in range(len(stats.scale[0]))
-    ]
-    rows = [*layers, ["all", *(f"{mean:.4f} ± {std:.4f}" for mean, std in stats.overall.values())]]
+    rows = []
+    for i in range(len(stats.scale[0])):
+        cells = [f"{mean[i]:.4f} ± {std[i]:.4f}" for mean, std in (stats.scale, stats.bias)]
+        rows.append([str(i), *cells])
+    rows.append(["all", *(f"{mean:.4f} ± {std:.4f}" for mean, std in stats.overall.values())])
     known = _paper("modulation_stats", name)
     if known:
-        rows.append(
-            [
-                "paper",
-                *(
-                    f"{known[f'{part}_mean']} ± {known[f'{part}_std']}"
-                    for part in ("scale", "bias")
-                ),
-            ]
-        )
+        printed = [
+            f"{known[f'{part}_mean']} ± {known[f'{part}_std']}" for part in ("scale", "bias")
+        ]
+        rows.append(["paper", *printed])
     _print(
         f"{name}: what the modulator predicts, {chunks} chunks of {source.name}",
         ["layer", "scale", "bias"],
@@ -218,9 +216,9 @@ def cost(args: argparse.Namespace) -> None:
     paper's success.
     """
     from mme_vla.evaluation.results.paper import paper_table, write_costs
-    from mme_vla.extras.probing.analyses.cost import all_models, count_model
+    from mme_vla.extras.probing.analyses.cost import count_model
 
-    known = all_models()
+    known = list(library_files("model"))
     models = args.models or (
         ["framesamp_modul", "tokendrop_modul"] if args.budgets is not None else known
     )
