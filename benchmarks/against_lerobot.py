@@ -2,13 +2,13 @@ r"""A training step and a sampled chunk of `pi05` against LeRobot's own PI05 as 
 width.
 
     python benchmarks/against_lerobot.py [--threads 1] [--batch 1] [--rounds 10] [--compile] \
-        [--cpu-time]
+        [--cpu-time] [--profile]
 
 Both have two cameras at 224 pixels, 200 prompt tokens of which 60 are used, a chunk of 20, a frozen
 vision tower and the same dimensions; they take turns in one process. Ours runs twice: on the 200
 tokens as they are, and as its own pipeline makes batches, without the padding that no prompt of the
-batch uses (the answer is the same). LeRobot's is as shipped (eager). Needs the extra `vlm`
-(LeRobot's policy is built on transformers).
+batch uses (the answer is the same). LeRobot's is as shipped (eager). `--profile` adds where the
+time of a chunk goes. Needs the extra `vlm` (LeRobot's policy is built on transformers).
 """
 
 import argparse
@@ -118,6 +118,26 @@ def trainer(model: nn.Module, loss: Callable[[], Tensor]) -> Callable[[], None]:
     return step
 
 
+KINDS = {
+    "matrix products": ("aten::addmm", "aten::mm", "aten::bmm"),
+    "attention": ("aten::_scaled_dot_product_flash_attention_for_cpu", "aten::_softmax"),
+    "copies and casts": ("aten::copy_", "aten::cat"),
+    "convolution of patches": ("aten::mkldnn_convolution", "aten::_slow_conv2d_forward"),
+}
+
+
+def shares(work: Callable[[], object]) -> dict[str, float]:
+    """Share of the CPU time that each kind of operation takes; the rest is elementwise or small."""
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+        work()
+    times = {event.key: event.self_cpu_time_total for event in profile.key_averages()}
+    total = sum(times.values())
+    result = {
+        kind: sum(times.get(name, 0.0) for name in names) / total for kind, names in KINDS.items()
+    }
+    return result | {"norms, elementwise, calls": 1 - sum(result.values())}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -130,6 +150,7 @@ def main() -> None:
     parser.add_argument(
         "--cpu-time", action="store_true", help="CPU time, where others use the machine too"
     )
+    parser.add_argument("--profile", action="store_true", help="where the time of a chunk goes")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
@@ -185,6 +206,9 @@ def main() -> None:
             print(
                 f"{what:15} {name:22} {1e3 * seconds:7.1f} ms   {seconds / result['LeRobot']:.2f}x"
             )
+    for name, chunk in chunks.items() if args.profile else ():
+        parts = ", ".join(f"{kind} {share:.0%}" for kind, share in shares(chunk).items())
+        print(f"chunk, {name}: {parts}")
 
 
 if __name__ == "__main__":

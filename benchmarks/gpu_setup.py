@@ -35,6 +35,11 @@ data sheets.
 """
 
 
+OPENPI = "pi05 with openpi's settings"
+OPENPI_OPTIONS = {"processor.prompt_length": 200, "embodiment.action.horizon": 50}
+"""What openpi configures for π0.5, beside training every weight."""
+
+
 @dataclass
 class Setup:
     """What is measured: sizes, device and how often.
@@ -129,9 +134,12 @@ def sample_flops(model: str, backbone: str) -> tuple[int, int]:
 
 
 def built(model: str, backbone: str, device: torch.device, attention: str = "auto") -> MMEPolicy:
-    """A policy as it is trained, its tower frozen."""
+    """A policy as it is trained, its tower frozen; or `OPENPI`, with all weights trained."""
     # PaliGemma's tokenizer is gated, and no text is measured.
     options: dict[str, Any] = {"policy.augment": False, "processor.tokenizer": "sample"}
+    as_openpi = model == OPENPI
+    if as_openpi:
+        model, options = "pi05", options | OPENPI_OPTIONS
     if device.type == "cuda":
         options["policy.compute_dtype"] = "bfloat16"
     policy = build_policy(model, backbone=backbone, device=device, **options)
@@ -139,7 +147,7 @@ def built(model: str, backbone: str, device: torch.device, attention: str = "aut
     backbone_module = policy.backbone
     assert isinstance(backbone_module, HasAttentionBackends)
     backbone_module.set_attention_backend(attention)
-    policy.backbone.vision.requires_grad_(False)
+    policy.backbone.vision.requires_grad_(as_openpi)
     return policy.train()
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch._dynamo.utils import counters
 
 from mme_vla.backbone.base import Hook, LayerHooks, bind_hook
 from mme_vla.policy.mme import MMEPolicy
@@ -80,6 +81,46 @@ def test_a_run_compiles_few_graphs_at_any_depth(model: str, depth: int) -> None:
         "other lengths, batches and validation need no code of their own"
     )
     assert counted.graphs >= 3, "the tower, a layer, and the last layer"
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("model", ["framesamp_modul", "ttt_expert", "rmt_context"])
+def test_compiled_updates_equal_eager_ones(model: str) -> None:
+    counters.clear()
+    eager, reference = updated(model, compiled=False)
+    compiled, gradients = updated(model, compiled=True)
+    assert compiled == pytest.approx(eager, rel=1e-6)
+    for name, gradient in gradients.items():
+        tolerance = 1e-5 * float(reference[name].abs().max())
+        torch.testing.assert_close(gradient, reference[name], atol=tolerance, rtol=0)
+    assert counters["stats"]["unique_graphs"] == 4
+    assert not counters["graph_break"]
+
+
+def updated(model: str, compiled: bool) -> tuple[list[float], dict[str, torch.Tensor]]:
+    """Losses of three updates, and the gradients of the first."""
+    depths = {"backbone.depth": 2} | SHORT_TOWER
+    # In bfloat16 another order of sums may round a number up instead of down.
+    exact = {"memory.attention_dtype": "float32"} if model == "rmt_context" else {}
+    policy = small_policy(model, **depths, **exact, policy={"augment": False}).train()
+    policy.backbone.vision.requires_grad_(False)
+    if compiled:
+        policy.compile()
+    batch = random_batch(policy, 2)
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
+    optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], lr=1e-3)
+    losses: list[float] = []
+    gradients: dict[str, torch.Tensor] = {}
+    for _ in range(3):
+        loss, _ = policy(batch, draws)
+        loss.backward()
+        for name, parameter in policy.named_parameters() if not losses else ():
+            if parameter.grad is not None:
+                gradients[name] = parameter.grad.clone()
+        optimizer.step()
+        optimizer.zero_grad()
+        losses.append(float(loss.detach()))
+    return losses, gradients
 
 
 def test_a_hook_of_layers_answers_as_one_of_numbers() -> None:

@@ -75,6 +75,18 @@ def mock_driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return library
 
 
+def run_on(driver: Path, program: str, *words: str) -> str:
+    """What a script of `benchmarks` prints on the mock driver."""
+    environment = os.environ | {
+        "LD_PRELOAD": str(driver),
+        "LD_LIBRARY_PATH": str(driver.parent),
+        "PYTHONPATH": str(REPOSITORY),
+    }
+    command = [sys.executable, str(REPOSITORY / "benchmarks" / program), *words]
+    done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+    return done.stdout
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize(
     ("model", "launches", "products"),
@@ -89,17 +101,34 @@ def mock_driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_full_size_chunk_launches_few_kernels(
     model: str, launches: int, products: int, mock_driver: Path
 ) -> None:
-    environment = os.environ | {
-        "LD_PRELOAD": str(mock_driver),
-        "LD_LIBRARY_PATH": str(mock_driver.parent),
-        "PYTHONPATH": str(REPOSITORY),
-    }
-    program = REPOSITORY / "benchmarks" / "gpu_kernels.py"
-    command = [sys.executable, str(program), model, "--ways", "compiled"]
-    lines = subprocess.run(
-        command, env=environment, check=True, stdout=subprocess.PIPE, text=True
-    ).stdout.splitlines()
-    counted = json.loads(lines[-1])
+    words = ("gpu_kernels.py", model, "--ways", "compiled")
+    counted = json.loads(run_on(mock_driver, *words).splitlines()[-1])
     assert counted["launches"] <= launches
     assert counted["products"] == products
     assert counted["waits"] == 0
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("model", "parts"),
+    [
+        ("pi05", ("attention", "chunk", "training")),
+        ("framesamp_modul", ("chunk", "training")),
+        ("ttt_expert", ("chunk",)),
+        ("pi05", ("lerobot", "openpi")),
+        ("tokendrop_expert", ("profile", "feeding")),
+    ],
+)
+def test_no_row_of_the_measurement_of_a_gpu_fails_where_that_shows_without_one(
+    model: str, parts: tuple[str, ...], mock_driver: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "gpu.json"
+    sizes = ("--backbone", "tiny", "--rounds", "1", "--batch", "1", "--workers", "1")
+    words = ("--rehearse", *sizes, "--models", model, "--output", str(output))
+    printed = run_on(mock_driver, "gpu.py", *words, "--parts", *parts)
+    assert "FAILED" not in printed
+    measured = json.loads(output.read_text())
+    rows = {**measured, **measured["models"].get(model, {})}
+    assert set(parts) - {"lerobot"} <= set(rows)
+    if "profile" in parts:
+        assert "the profiler saw no kernel" in rows["profile"]
