@@ -336,8 +336,8 @@ def rows_of(
         rows.append((["openpi", "training", how], measure, of_model(OPENPI, "training", how)))
     if "profile" in parts:
         place = ["models", models[0], "profile"]
-        measure = partial(slowest_kernels, models[0], setup)
-        rows.append((place, measure, of_model(models[0], "profile")))
+        slowest = partial(slowest_kernels, models[0], setup)
+        rows.append((place, slowest, of_model(models[0], "profile")))
     if "feeding" in parts:
         place = ["models", models[0], "feeding"]
         measure = partial(feeding, models[0], setup, workers)
