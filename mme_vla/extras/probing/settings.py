@@ -25,7 +25,8 @@ IN_CLOSED_LOOP = (
 class ProbeChoice:
     """What a probe is to do; the keys and their meaning are those of `configs/probe.yaml`.
 
-    arms: of `with`. compare: alone or a list.
+    arms: of `with`. compare: alone or a list. trust_plugins: whether the checkpoint's plugins are
+    imported, which may register perturbations.
     """
 
     compare: PathText | tuple[PathText, ...] | None
@@ -38,6 +39,7 @@ class ProbeChoice:
     server: Any
     references: Mapping[str, PathText] | None
     arms: Any
+    trust_plugins: bool
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -76,8 +78,8 @@ class ProbeChoice:
         needs_data = self.on_recordings and not self.card
         require(not needs_data or self.recordings is not None, NO_DATA)
         require(self.online or not event_arms(self.event), IN_CLOSED_LOOP)
-        if self.arms is None:
-            return
+        if self.arms is None or self.trust_plugins:
+            return  # arms are read again once the policy is loaded
         for spec in listed_arms(self.arms):
             if not isinstance(spec, Mapping):
                 words_of_arm(spec)

@@ -12,6 +12,7 @@ import torch
 from helpers.probe_fakes import made_up, probed, reader
 from helpers.rollout_fakes import quick_policy
 from mme_vla import probe
+from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.extras.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.extras.probing.channels import channel_of
@@ -20,7 +21,9 @@ from mme_vla.extras.probing.interventions import NoDemo
 from mme_vla.extras.probing.lines import EntryLine, MomentLine, append, read
 from mme_vla.extras.probing.offline import compare_chunks
 from mme_vla.extras.probing.probed import ProbedPolicy
+from mme_vla.extras.probing.settings import ProbeChoice
 from mme_vla.memory.perturbation import Pause, Perturbation
+from mme_vla.policy.build import policy_config
 from mme_vla.testing.small import small_policy
 
 NEURAL_ARMS = [
@@ -256,3 +259,11 @@ def test_settings_of_recordings_and_rollouts_are_keywords(tmp_path: Path) -> Non
     assert "shuffle" in page.read_text()
     with pytest.raises(UserError, match="Unknown key moment"):
         probe(policy, "sample", ["shuffle"], output=tmp_path, moment=1)
+
+
+def test_names_of_a_checkpoints_plugins_are_checked_once_the_plugins_are_imported() -> None:
+    words = ["checkpoint=run", "recordings=data", "with=[hesitate:8]"]
+    trusting = policy_config(compose("probe", [*words, "trust_plugins=true"]))
+    ProbeChoice.from_config(trusting).check()
+    with pytest.raises(UserError, match="name='hesitate'"):
+        ProbeChoice.from_config(policy_config(compose("probe", words))).check()

@@ -107,6 +107,7 @@ def test_what_has_no_effect_on_twins_is_refused(key: str, value: Any) -> None:
     config: dict[str, Any] = {
         "compare": None, "card": False, "twins": True, "offline": True, "online": False,
         "recordings": None, "event": None, "server": None, "references": {}, "with": None,
+        "trust_plugins": False,
     }  # fmt: skip
     assert not ProbeChoice.from_config(config).on_recordings
     ProbeChoice.from_config(config).check()
