@@ -10,6 +10,7 @@ import sys
 import sysconfig
 import tarfile
 import zipfile
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -56,8 +57,8 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     versions.
 
     They come from uv's cache, without network. Where that lacks them (no uv, or torch from
-    elsewhere), they are the running environment's: its folder joins the path, but not what its own
-    .pth files add, so never the repository.
+    elsewhere), they are the running environment's: its folder joins the path, but of what its own
+    .pth files add only pinocchio's, so never the repository.
     """
     folder = tmp_path_factory.mktemp("empty")
     run([sys.executable, "-m", "venv", "--without-pip", str(folder)], cwd=folder)
@@ -94,7 +95,10 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ).strip()
     )
     zipfile.ZipFile(wheel).extractall(site_packages)
-    (site_packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    paths = [sysconfig.get_path("purelib")]
+    if find_spec("cmeel_pth") is not None:
+        paths.append("import cmeel_pth")
+    (site_packages / "dependencies.pth").write_text("\n".join(paths))
     script = python.with_name("mme-vla")
     script.write_text(f"#!{python}\nfrom mme_vla.__main__ import main\nmain()\n")
     script.chmod(0o755)
