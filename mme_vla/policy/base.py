@@ -407,7 +407,7 @@ def choose_actions(
     """
     policy.require_processor().require_stats()  # before the noise or memory of an episode changes
     batch = policy.observation(episodes)
-    noise = stack_noise([episode.sample_noise() for episode in episodes])
+    noise = stack_noise([episode.draw() for episode in episodes])
     was_training = policy.training
     policy.eval()
     try:

@@ -372,7 +372,7 @@ class Episode:
     def noise_state(self, state: Tensor) -> None:
         self._generator.set_state(state)
 
-    def sample_noise(self) -> dict[str, Tensor]:
+    def draw(self) -> dict[str, Tensor]:
         """Sample the next chunk's random numbers from this episode's own generator, independent of
         batching.
         """

@@ -76,7 +76,7 @@ def test_streaming_and_offline_give_the_same_actions(policy, frames):
         prompt_mask=prompt_mask[None],
         history=history,
     )
-    noise = policy.start_episode("pick up the cube", seed=0).sample_noise()["noise"][None]
+    noise = policy.start_episode("pick up the cube", seed=0).draw()["noise"][None]
     chunk = policy.sample_actions(batch, noise)
     offline = processor.absolute_actions(chunk, torch.zeros(1, 8)).numpy()
     assert np.abs(streamed - offline).max() < 1e-4

@@ -160,7 +160,7 @@ def test_one_broken_episode_does_not_fail_those_that_act_with_it(policy, monkeyp
     def brittle(episodes, steps):
         if any(episode.goal == "break" for episode in episodes):
             for episode in episodes:
-                episode.sample_noise()  # as far as the policy got
+                episode.draw()  # as far as the policy got
             raise ValueError("broken")
         return act(episodes, steps)
 

@@ -81,7 +81,7 @@ def test_lerobots_pipelines_and_policy_give_our_actions(
     episode = policy.start_episode(GOAL, seed=4)
     episode.observe({"front": frames[:1], "wrist": frames[1:]}, state[None])
     expected = policy.act(episode)
-    noise = policy.start_episode(GOAL, seed=4).sample_noise()["noise"]
+    noise = policy.start_episode(GOAL, seed=4).draw()["noise"]
     views = torch.from_numpy(frames).permute(0, 3, 1, 2) / 255
     names = ("observation.images.image", "observation.images.wrist_image")
     inputs = before(

@@ -61,9 +61,7 @@ class RandomPolicy(Policy):
             return single
         chunks = []
         for episode in episodes:
-            chunk = self.embodiment.action.decide(
-                episode.sample_noise()["chunk"], episode.options
-            ).numpy()
+            chunk = self.embodiment.action.decide(episode.draw()["chunk"], episode.options).numpy()
             episode.acted(chunk)
             chunks.append(chunk)
         return np.stack(chunks)

@@ -182,7 +182,7 @@ def test_an_episode_stores_as_a_sample_does_and_saves_nothing(policy: MemoryVlaP
     batch = replace(
         policy.observation([episode]), history=stack_history([episode.gather_selection()])
     )
-    draws_ = {name: value[None] for name, value in episode.sample_noise().items()}
+    draws_ = {name: value[None] for name, value in episode.draw().items()}
     expected = policy.require_processor().absolute_actions(
         policy.sample_actions(batch, draws_, 2), torch.zeros(1, 8)
     )

@@ -200,7 +200,7 @@ def test_episodes_in_one_batch_act_as_alone_and_their_past_matters(policy: Memor
     np.testing.assert_allclose(chunks[True], chunks[False], atol=1e-4)
     empty = policy.start_episode("press the button", seed=0)
     empty.observe(frames(1), states(1))
-    empty.sample_noise()
+    empty.draw()
     assert np.abs(policy.act(empty) - chunks[True][0]).max() > 1e-3
 
 
@@ -217,7 +217,7 @@ def test_acting_over_a_stream_equals_a_group_of_its_moments(policy: MemoryVlaPol
         clip, ids.expand(1, 3, -1), mask.expand(1, 3, -1), torch.arange(3)[None], valid
     )
     last = policy.start_episode("press the button")
-    draws = [last.sample_noise() for _ in range(3)][-1]
+    draws = [last.draw() for _ in range(3)][-1]
     normalised = policy.sample_actions(group, {"noise": draws["noise"][None]})
     expected = processor.absolute_actions(normalised, torch.zeros(1, 8))[0].numpy()
     np.testing.assert_allclose(chunk, expected, atol=1e-4)
