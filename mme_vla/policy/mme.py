@@ -418,8 +418,8 @@ class MMEPolicy(NetworkPolicy):
         Raises:
             UserError: the backbone needs the prompt, as `MMEModel.memory_tokens` gives it.
         """
-        conditioning = getattr(self.backbone.condition_on_prompt, "__func__", None)
-        if history is not None and conditioning is not Backbone.condition_on_prompt:
+        conditions = type(self.backbone).condition_on_prompt is not Backbone.condition_on_prompt
+        if history is not None and conditions:
             raise UserError(
                 f"encode_memory: {type(self.backbone).__name__} reads stored tokens with the"
                 " prompt. Call policy.model.memory_tokens(batch)."

@@ -113,7 +113,9 @@ def test_a_backbone_that_cannot_recompute_names_the_switch(policy: MMEPolicy) ->
 
 
 @torch.no_grad()
-def test_memory_tokens_of_episodes_are_read_with_their_prompts(policy: MMEPolicy) -> None:
+def test_memory_tokens_of_episodes_are_read_with_their_prompts(
+    policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     policy.eval()
     episode = policy.start_episode("press the button", seed=0)
     frames = moving_frames(3, size=policy.backbone.image_size)
@@ -121,12 +123,12 @@ def test_memory_tokens_of_episodes_are_read_with_their_prompts(policy: MMEPolicy
     before = policy.encode_memories([episode])
     assert torch.equal(before.tokens, policy.encode_memory(selection_of(policy, episode)).tokens)
 
-    def with_prompt(tokens: torch.Tensor, prompt: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        return tokens + (prompt * mask).sum(1)[:, None, None]
+    def with_prompt(
+        self: Any, tokens: torch.Tensor, prompt: torch.Tensor, prompt_mask: torch.Tensor
+    ) -> torch.Tensor:
+        return tokens + (prompt * prompt_mask).sum(1)[:, None, None]
 
-    policy.backbone.condition_on_prompt = lambda tokens, prompt, prompt_mask: with_prompt(
-        tokens, prompt, prompt_mask
-    )  # type: ignore[method-assign]
+    monkeypatch.setattr(type(policy.backbone), "condition_on_prompt", with_prompt)
     batch = policy.observation([episode])
     batch.history = selection_of(policy, episode)
     valid = before.mask  # padding is conditioned in a batch alone, and never read
