@@ -20,7 +20,7 @@ from mme_vla.errors import UserError, check_choice, check_sizes, require
 from mme_vla.types import FrameBatch
 
 
-def is_kept[T: (int, np.ndarray)](frames: T, every: int) -> T:
+def on_interval[T: (int, np.ndarray)](frames: T, every: int) -> T:
     """Which frames are kept of every so many: frame 0, and frames k·every − 1."""
     return (frames == 0) | ((frames + 1) % every == 0)
 
@@ -57,7 +57,7 @@ class StorageSpec:
     def stored_frames(self, length: int) -> np.ndarray:
         """Ascending indices of the stored frames among the first `length`."""
         frames = np.arange(length)
-        return frames[is_kept(frames, self.keep_every)]
+        return frames[on_interval(frames, self.keep_every)]
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)

@@ -13,7 +13,7 @@ from mme_vla.memory.history import (
     FrameScores,
     History,
     StorageSpec,
-    is_kept,
+    on_interval,
 )
 from mme_vla.registry import MEMORIES
 
@@ -37,11 +37,11 @@ class ChangeScorer(FrameScorer):
 
     def frames_scored(self, length: int) -> np.ndarray:
         frames = np.arange(length)
-        return frames[is_kept(frames, self.stride)]
+        return frames[on_interval(frames, self.stride)]
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
         """Score one frame [H, W, 3] uint8, or keep it as a reference."""
-        if not is_kept(frame_index, self.stride):
+        if not on_interval(frame_index, self.stride):
             return None
         height, width, _ = frame.shape
         if height % self.grid or width % self.grid:
@@ -60,7 +60,7 @@ class ChangeScorer(FrameScorer):
 
 
 # Caches made before keys were derived from the code have this key.
-FORMER_KEYS["4b59d5ca"] = "change{grid}x{grid}-every{stride}"
+FORMER_KEYS["5f47a9f0"] = "change{grid}x{grid}-every{stride}"
 
 
 @MEMORIES.register("tokendrop")

@@ -166,8 +166,8 @@ def test_a_request_without_a_new_frame_shows_the_current_one_again(
         added = [request for request in stub.requests if "images" in request]
         assert len(added) == 2, "no frame is remembered twice"
     if protocol != "harness":
-        shown = [request for request in stub.requests if "prompt" in request]
-        assert [int(request["observation/image"].max()) for request in shown] == [77] * 3
+        requests = [request for request in stub.requests if "prompt" in request]
+        assert [int(request["observation/image"].max()) for request in requests] == [77] * 3
 
 
 REFUSED = {
@@ -347,8 +347,8 @@ def test_results_read_the_run_of_a_served_policy(
         run(policy, tmp_path, PICK)
         policy.close()
     results.main([str(tmp_path)])
-    shown = capsys.readouterr().out
-    assert "mine" in shown and "30000" in shown and "3 of 3" in shown
+    printed = capsys.readouterr().out
+    assert "mine" in printed and "30000" in printed and "3 of 3" in printed
 
 
 @pytest.mark.parametrize("protocol", ["openpi", "challenge", "challenge-http", "harness"])

@@ -41,9 +41,9 @@ class PolicyPlayer(Player):
         self.seed = seed
         self._running: RunningEpisode | None = None
         self._frames = Frames(policy.embodiment)
-        self._chosen: list[np.ndarray] = []
+        self._actions: list[np.ndarray] = []
         """Actions of the chunk that are still to be executed."""
-        self._n_chosen = 0  # actions of the chunk that are executed
+        self._n_executed = 0  # actions of the latest chunk
 
     def start(self, session: ChoiceSession) -> None:
         self._end_episode()
@@ -51,23 +51,23 @@ class PolicyPlayer(Player):
         job = Job(which.task, which.split, which.episode)
         self._running = RunningEpisode(self.policy, job, self.seed)
         self._frames = Frames(self.policy.embodiment)
-        self._chosen = []
-        self._n_chosen = 0
+        self._actions = []
+        self._n_executed = 0
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
         assert self._running is not None
         space = self.policy.embodiment.action
         self._frames.add(session.observation)
-        if not self._chosen:
+        if not self._actions:
             self._observe(session, self._running)
             chunk = self.policy.act(self._running.episode)
             failure = self._running.episode.failure
             if failure is not None:
                 raise NoChoiceError("error", failure.reason)
             self._running.set_actions(chunk[: space.execute])
-            self._chosen = list(chunk[: space.execute])
-            self._n_chosen = len(self._chosen)
-        action = benchmark_action(space, self._chosen.pop(0))
+            self._actions = list(chunk[: space.execute])
+            self._n_executed = len(self._actions)
+        action = benchmark_action(space, self._actions.pop(0))
         assert isinstance(action, dict)
         point = [min(value, SIDE - 1) for value in action["point"]]  # a share of 1 is the last
         return {"choice": action["choice"], "point": point}, {}
@@ -79,7 +79,7 @@ class PolicyPlayer(Player):
         report = Report(
             goal=session.goal,
             options=session.info.get(OPTIONS),
-            executed=self._n_chosen,
+            executed=self._n_executed,
             steps=len(frames["state"]),
         )
         running.take_report(report)

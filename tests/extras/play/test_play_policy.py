@@ -119,8 +119,10 @@ def test_a_checkpoint_plays_as_its_server_does(tmp_path: Path) -> None:
     play(tmp_path / "here", f"checkpoint={checkpoint}")
     here = taken()
     policy = MMEPolicy.from_pretrained(checkpoint)
-    with Served(policy, str(checkpoint), max_batch=1, flow_steps=policy.info.sample_steps) as far:
-        records = play(tmp_path / "there", f"server=ws://127.0.0.1:{far.server.port}")
+    with Served(
+        policy, str(checkpoint), max_batch=1, flow_steps=policy.info.sample_steps
+    ) as served:
+        records = play(tmp_path / "there", f"server=ws://127.0.0.1:{served.server.port}")
     assert here == taken()
     assert {record.checkpoint for record in records} == {3}
 
