@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from omegaconf import DictConfig
 
@@ -82,21 +82,11 @@ def main(cfg: DictConfig) -> None:
     if command.max_steps is None:
         limits = {spec.task: source.task_limit(spec.task, spec.split) for spec in specs}
     settings = read_section(PlaySettings, {**config, "max_steps": max_steps}, others=True)
-    seat = _choose_player(command, cfg, max_steps)
-    built = seat.player
+    built, identity, folder = _choose_player(command, cfg, settings, limits)
     needs_images = built is None or built.needs_images
     source.check_installed()
     if command.env == "mme_vla" and needs_images:
         render_backend()
-    identity = Identity(
-        seat.name,
-        seat.checkpoint,
-        seat.seed,
-        max_steps,
-        {**asdict(settings), "player": seat.settings},
-        limits,
-        seat.of_policy,
-    )
     make = partial(
         make_session,
         env=command.env,
@@ -105,9 +95,9 @@ def main(cfg: DictConfig) -> None:
         images=needs_images,
     )
     try:
-        with PlayRun(seat.folder, specs, identity, make, command.retry_errors) as run:
+        with PlayRun(folder, specs, identity, make, command.retry_errors) as run:
             if built is None:
-                serve(Desk(run, str(seat.checkpoint)), command.host, command.port)
+                serve(Desk(run, str(identity.checkpoint)), command.host, command.port)
                 played = len(run.episodes) - len(run.todo)
                 of = f"{played} of {len(run.episodes)} episodes played"
                 log.info("ended · %s; the same command continues with the others", of)
@@ -119,25 +109,13 @@ def main(cfg: DictConfig) -> None:
             built.close()
 
 
-class Seat(NamedTuple):
-    """Who plays, and under which name.
-
-    player: None: a person on the page. name, checkpoint, seed: of the records. settings: what
-    decides the choices. folder: of the records. of_policy: see `Identity`.
-    """
-
-    player: Player | None
-    name: str
-    checkpoint: int | str
-    seed: int
-    settings: Mapping[str, Any]
-    folder: Path
-    of_policy: Mapping[str, Any]
-
-
-def _choose_player(command: PlayCommand, cfg: DictConfig, max_steps: int) -> Seat:
+def _choose_player(
+    command: PlayCommand, cfg: DictConfig, settings: PlaySettings, limits: Mapping[str, int]
+) -> tuple[Player | None, Identity, Path]:
+    """Who plays (None: a person on the page), under which name, and the folder of the records."""
     kind = str(command.player["name"])
     folder = Path("outputs", "play", kind)
+    model = HUMAN
     checkpoint: int | str = 0
     seed = command.player.get("seed", 0)
     decisive = {k: v for k, v in command.player.items() if k not in INDIFFERENT}
@@ -149,10 +127,9 @@ def _choose_player(command: PlayCommand, cfg: DictConfig, max_steps: int) -> Sea
         )
         from mme_vla.extras.play.policy_player import load_player  # PyTorch
 
-        player, facts, decisive = load_player(cfg, max_steps)
-        checkpoint = facts.checkpoint
-        seed = command.seed
-        folder = Path("outputs", "play", player.model, str(checkpoint))
+        player, facts, decisive = load_player(cfg, settings.max_steps)
+        model, checkpoint, seed = player.model, facts.checkpoint, command.seed
+        folder = Path("outputs", "play", model, str(checkpoint))
         for name in ("memory_budget", "composition", "training"):
             of_policy[name] = getattr(facts, name)
     elif kind == HUMAN:
@@ -160,10 +137,19 @@ def _choose_player(command: PlayCommand, cfg: DictConfig, max_steps: int) -> Sea
         checkpoint = str(command.player["participant"])
     else:
         player = build_player(command.player)
+        model = player.model
     if command.output is not None:
         folder = Path(command.output).expanduser()
-    model = HUMAN if player is None else player.model
-    return Seat(player, model, checkpoint, seed, decisive, folder, of_policy)
+    identity = Identity(
+        model,
+        checkpoint,
+        seed,
+        settings.max_steps,
+        {**asdict(settings), "player": decisive},
+        limits,
+        of_policy,
+    )
+    return player, identity, folder
 
 
 def _by_itself(run: PlayRun, player: Any) -> None:
