@@ -15,10 +15,11 @@ compiled layers: p50, p99, how far apart, and how long the start took); `trainin
 (forward, backward, clipping, AdamW, EMA) at each batch, compiled and eager, with model and hardware
 FLOP utilisation, samples/s and peak memory; `lerobot`, its PI05 beside these; `openpi`, `pi05` with
 the settings of openpi (prompt of 200, chunk of 50, all weights trained); `profile`, the ten slowest
-kernels of a compiled chunk; `feeding`, the share of time that updates wait for the embedded
-demonstrations. No row begins after `--minutes`, and what was not reached is named; rows that the
-output file has are kept, except those that failed. Under a launcher: an update over all processes,
-weights whole (ddp) and shared (fsdp). Goals: 50 % of the peak in training, 15 ms a chunk.
+kernels of a compiled chunk; `tuned`, a compiled chunk with one more switch of Inductor; `feeding`,
+the share of time that updates wait for the embedded demonstrations. No row begins after
+`--minutes`, and what was not reached is named; rows that the output file has are kept, except those
+that failed. Under a launcher: an update over all processes, weights whole (ddp) and shared (fsdp).
+Goals: 50 % of the peak in training, 15 ms a chunk.
 """
 
 import argparse
@@ -37,6 +38,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch._inductor.config as inductor_config
 from gpu_setup import OPENPI, Setup, batch_of, built, draws_of, join_processes, milliseconds, wait
 from gpu_training import feeding, training
 from timing import machine
@@ -51,45 +53,64 @@ from mme_vla.speed.compiler import keep_compiled_code
 GOAL_MFU, GOAL_CHUNK_MS = 0.5, 15.0
 NOT_MEASURED = "not measured"
 NO_MEMORY = "not enough memory"
-PARTS = ("attention", "chunk", "training", "lerobot", "openpi", "profile", "feeding")
+PARTS = ("attention", "chunk", "training", "lerobot", "openpi", "profile", "tuned", "feeding")
 MODELS = ("pi05", "framesamp_modul", "tokendrop_expert", "ttt_expert", "rmt_context")
+TUNINGS: dict[str, dict[str, Any]] = {
+    "autotuned products": {"max_autotune_gemm": True},
+    "dependent launch": {"triton.enable_pdl": True},
+}
+"""Switches of Inductor that `sampling=compiled` leaves off: each chooses or starts the kernels of a
+chunk otherwise. `TORCHINDUCTOR_MAX_AUTOTUNE_GEMM=1` and `TORCHINDUCTOR_ENABLE_PDL=1` set them.
+"""
 Projections = tuple[Tensor, Tensor, Tensor]  # queries, keys, values
 
 
-def chunks(model: str, setup: Setup) -> dict[str, Any]:
-    """A chunk of one episode each way: p50 and p99, and the largest difference from
-    the eager one.
-    """
+def sampler_of(model: str, setup: Setup) -> tuple[MMEPolicy, Callable[[], Tensor]]:
+    """A policy, and what samples a chunk of one episode from its ready memory tokens."""
     device = setup.device
     policy = built(model, setup.backbone, device).to(setup.dtype).eval().requires_grad_(False)
     batch = replace(batch_of(policy, 1, device), actions=None)
     noise = draws_of(policy, 1, device)["noise"]
     with torch.no_grad(), policy.autocast():
         memory = policy.encode_memory(batch.history)
-    rows: dict[str, Any] = {}
-    reference: Tensor | None = None
+    return policy, partial(policy.sample_actions, batch, noise, memory=memory)
 
-    def measure(way: str, start_s: float = 0.0) -> None:
-        nonlocal reference
-        took = milliseconds(
-            lambda: policy.sample_actions(batch, noise, memory=memory), setup.rounds, 3, device
-        )
-        chunk = policy.sample_actions(batch, noise, memory=memory).float()
-        reference = chunk if reference is None else reference
-        rows[way] = {
-            "p50_ms": statistics.median(took),
-            "p99_ms": took[min(int(0.99 * len(took)), len(took) - 1)],
-            "difference": float((chunk - reference).abs().max()),
-            "start_s": start_s,
-        }
 
-    measure("eager")
-    on_gpu = device.type == "cuda"
+def timed_chunk(
+    sample: Callable[[], Tensor], reference: Tensor | None, setup: Setup, start_s: float
+) -> dict[str, float]:
+    """p50 and p99 of a chunk, and its largest difference from the eager one."""
+    took = milliseconds(sample, setup.rounds, 3, setup.device)
+    chunk = sample().float()
+    apart = 0.0 if reference is None else float((chunk - reference).abs().max())
+    return {
+        "p50_ms": statistics.median(took),
+        "p99_ms": took[min(int(0.99 * len(took)), len(took) - 1)],
+        "difference": apart,
+        "start_s": start_s,
+    }
+
+
+def chunks(model: str, setup: Setup) -> dict[str, Any]:
+    """A chunk of one episode each way: eager, one CUDA graph, a graph of compiled layers."""
+    policy, sample = sampler_of(model, setup)
+    reference = sample().float()
+    rows = {"eager": timed_chunk(sample, reference, setup, 0.0)}
+    on_gpu = setup.device.type == "cuda"
     if on_gpu:
-        measure("graph", _started(policy, layers=False))
+        rows["graph"] = timed_chunk(sample, reference, setup, _started(policy, layers=False))
     if setup.compiled:
-        measure("compiled graph" if on_gpu else "compiled", _started(policy, layers=True))
+        way = "compiled graph" if on_gpu else "compiled"
+        rows[way] = timed_chunk(sample, reference, setup, _started(policy, layers=True))
     return rows
+
+
+def tuned_chunk(model: str, setup: Setup, options: dict[str, Any]) -> dict[str, Any]:
+    """A chunk of compiled layers, compiled with further `options` of Inductor."""
+    policy, sample = sampler_of(model, setup)
+    reference = sample().float()
+    with inductor_config.patch(options):
+        return timed_chunk(sample, reference, setup, _started(policy, layers=True))
 
 
 def _started(policy: MMEPolicy, layers: bool) -> float:
@@ -101,20 +122,19 @@ def _started(policy: MMEPolicy, layers: bool) -> float:
 
 def slowest_kernels(model: str, setup: Setup, count: int = 10) -> list[dict[str, Any]] | str:
     """The kernels of one compiled chunk that take most of its time, and their share of it."""
-    device = setup.device
-    policy = built(model, setup.backbone, device).to(setup.dtype).eval().requires_grad_(False)
+    policy, sample = sampler_of(model, setup)
     policy.compile_sampling(layers=setup.compiled)
-    batch = replace(batch_of(policy, 1, device), actions=None)
-    noise = draws_of(policy, 1, device)["noise"]
-    with torch.no_grad(), policy.autocast():
-        memory = policy.encode_memory(batch.history)
-    policy.sample_actions(batch, noise, memory=memory)
+    sample()
     with torch.profiler.profile() as profile:
-        policy.sample_actions(batch, noise, memory=memory)
-        wait(device)
+        sample()
+        wait(setup.device)
     times: dict[str, tuple[float, int]] = {}
     for event in profile.key_averages():
-        took = event.self_device_time_total if device.type == "cuda" else event.self_cpu_time_total
+        took = (
+            event.self_device_time_total
+            if setup.device.type == "cuda"
+            else event.self_cpu_time_total
+        )
         if took > 0:
             times[event.key] = (took, event.count)
     total = sum(took for took, _ in times.values())
@@ -248,7 +268,8 @@ def show_model(model: str, row: dict[str, Any]) -> None:
             f"{model}: from {fed['workers']} reading processes {fed['samples_per_s']:.1f}"
             f" samples/s, {fed['waiting']:.0%} of the time waiting for data"
         )
-    for way, took in row.get("chunk", {}).items():
+    tuned = {f"compiled, {name}": took for name, took in row.get("tuned", {}).items()}
+    for way, took in {**row.get("chunk", {}), **tuned}.items():
         apart = f", differs by {took['difference']:.1e}" if "difference" in took else ""
         print(
             f"{model}: chunk, {way}: p50 {took['p50_ms']:.1f} ms, p99 {took['p99_ms']:.1f}{apart}",
@@ -338,6 +359,11 @@ def rows_of(
         place = ["models", models[0], "profile"]
         slowest = partial(slowest_kernels, models[0], setup)
         rows.append((place, slowest, of_model(models[0], "profile")))
+    tunings = TUNINGS.items() if "tuned" in parts and setup.compiled else ()
+    for name, options in tunings:
+        place = ["models", models[0], "tuned", name]
+        measure = partial(tuned_chunk, models[0], setup, options)
+        rows.append((place, measure, of_model(models[0], "tuned", name)))
     if "feeding" in parts:
         place = ["models", models[0], "feeding"]
         measure = partial(feeding, models[0], setup, workers)

@@ -110,13 +110,28 @@ def test_a_full_size_chunk_launches_few_kernels(
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(
+    ("model", "launches", "products"),
+    [("pi05", 1870, 655), ("framesamp_modul", 2470, 876)],
+)
+def test_a_compiled_full_size_update_launches_few_kernels(
+    model: str, launches: int, products: int, mock_driver: Path
+) -> None:
+    words = ("gpu_kernels.py", model, "--what", "update", "--ways", "compiled", "--batch", "1")
+    counted = json.loads(run_on(mock_driver, *words).splitlines()[-1])
+    assert counted["launches"] <= launches
+    assert counted["products"] == products
+    assert counted["waits"] == 0
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
     ("model", "parts"),
     [
         ("pi05", ("attention", "chunk", "training")),
         ("framesamp_modul", ("chunk", "training")),
         ("ttt_expert", ("chunk",)),
         ("pi05", ("lerobot", "openpi")),
-        ("tokendrop_expert", ("profile", "feeding")),
+        ("tokendrop_expert", ("profile", "tuned", "feeding")),
     ],
 )
 def test_no_row_of_the_measurement_of_a_gpu_fails_where_that_shows_without_one(
