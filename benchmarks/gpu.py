@@ -44,6 +44,11 @@ from gpu_training import feeding, training
 from timing import machine
 from torch import Tensor, distributed
 from torch.nn import functional
+from torch.nn.attention import (
+    activate_flash_attention_impl,
+    list_flash_attention_impls,
+    restore_flash_attention_impl,
+)
 
 from mme_vla import MMEPolicy
 from mme_vla.backbone.layers import MaskLayout, Span, attend, build_mask
@@ -151,35 +156,52 @@ def attention_rows(
     setup: Setup, lengths: Sequence[int] = (512, 512, 64, 20), width: int = 256
 ) -> dict[str, Any]:
     """Attention alone, with memory, images, prompt and actions so long: each backend's time and
-    error.
+    error, and those of `varlen` with other kernels of flash attention where their package is.
     """
     spans = [Span(name, length) for name, length in zip(MEMORY_VISIBILITY, lengths, strict=True)]
+    on_gpu = setup.device.type == "cuda"
     rows: dict[str, Any] = {}
     for backend in ("sdpa", "flex", "varlen"):
-        if backend == "flex" and setup.device.type != "cuda":
+        if backend == "flex" and not on_gpu:
             rows[backend] = NOT_MEASURED  # it has no backward pass there
             continue
-        mask_layout, tensors, exact, gradients = _attention_case(spans, setup, width)
-        mask = build_mask(mask_layout, setup.dtype, backend, compiled=False)
-
-        def both(tensors: Projections = tensors, mask: Any = mask) -> Tensor:
-            for x in tensors:
-                x.grad = None
-            output = attend(*tensors, mask)
-            output.sum().backward()
-            return output
-
-        output = both().detach()
-        rows[backend] = {
-            "ms": statistics.median(milliseconds(both, setup.rounds, 2, setup.device)),
-            "error": float((output.float() - exact).abs().max()),
-            "gradient_error": max(
-                float((x.grad.float() - expected).abs().max() / expected.abs().max())
-                for x, expected in zip(tensors, gradients, strict=True)
-                if x.grad is not None
-            ),
-        }
+        rows[backend] = timed_attention(backend, spans, setup, width)
+    for kernels in list_flash_attention_impls() if on_gpu else ():
+        row = f"varlen, {kernels}"
+        try:
+            activate_flash_attention_impl(kernels)
+            rows[row] = timed_attention("varlen", spans, setup, width)
+        except (ImportError, RuntimeError) as error:  # no package, or not for this GPU or width
+            rows[row] = f"{NOT_MEASURED}: {error}"
+        finally:
+            restore_flash_attention_impl(_raise_warn=False)
     return rows
+
+
+def timed_attention(
+    backend: str, spans: Sequence[Span], setup: Setup, width: int
+) -> dict[str, float]:
+    """Forward and backward of one attention: milliseconds, and the error against float32."""
+    mask_layout, tensors, exact, gradients = _attention_case(spans, setup, width)
+    mask = build_mask(mask_layout, setup.dtype, backend, compiled=False)
+
+    def both() -> Tensor:
+        for x in tensors:
+            x.grad = None
+        output = attend(*tensors, mask)
+        output.sum().backward()
+        return output
+
+    output = both().detach()
+    return {
+        "ms": statistics.median(milliseconds(both, setup.rounds, 2, setup.device)),
+        "error": float((output.float() - exact).abs().max()),
+        "gradient_error": max(
+            float((x.grad.float() - expected).abs().max() / expected.abs().max())
+            for x, expected in zip(tensors, gradients, strict=True)
+            if x.grad is not None
+        ),
+    }
 
 
 def _attention_case(
