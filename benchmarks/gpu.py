@@ -494,6 +494,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     args = parser.parse_args(arguments)
     torch.backends.cudnn.enabled = not args.rehearse
+    if args.rehearse:
+        inductor_config.test_configs.max_mm_configs = 1  # tries one kernel of each product
     keep_compiled_code()
     device, rank, processes = join_processes(args.device)
     setup = Setup(
