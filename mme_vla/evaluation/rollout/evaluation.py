@@ -360,7 +360,7 @@ def run_settings(
         "seed": settings.seed,
         "split": settings.split,
         "env": settings.env,
-        "max_steps": settings.max_steps,
+        "max_steps": settings.step_limit,
         "render": settings.render,
     }
     # Left out where they are not set, as in runs from before there were these options.
@@ -440,7 +440,7 @@ def facts_of(
         checkpoint=identity.checkpoint,
         model_seed=settings.seed,
         split=settings.split,
-        max_steps=settings.max_steps,
+        max_steps=settings.step_limit,
         subgoal=subgoal,
         memory_budget=identity.memory_budget,
         composition=identity.composition,
