@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mme_vla.config.sections import without
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
@@ -373,7 +374,7 @@ def run_settings(
 
 
 def _predictor_facts(name: str | None, subgoals: SubgoalPredictor) -> dict[str, Any]:
-    decisive = {key: value for key, value in subgoals.settings.items() if key not in INDIFFERENT}
+    decisive = without(subgoals.settings, *INDIFFERENT)
     for key in ("model", "adapter"):
         if key in decisive:
             decisive[key] = _end_of(decisive[key])

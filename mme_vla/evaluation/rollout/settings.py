@@ -114,5 +114,6 @@ def check_config(config: Mapping[str, Any]) -> None:
     """
     # Each event is a run of its own, which the command checks.
     RolloutSettings.from_config({**config, "event": None})
-    if config["checkpoint"] is not None:
-        check_on_machine(find_run(Path(str(config["checkpoint"])).expanduser()))
+    checkpoint = config["checkpoint"]
+    if checkpoint is not None:
+        check_on_machine(find_run(Path(str(checkpoint)).expanduser()))
