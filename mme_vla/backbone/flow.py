@@ -207,9 +207,9 @@ class FlowHead:
         velocity = self.velocity(predict, times, {"noise": noise})
         states = [noise]
         for index, increment in enumerate(increments.unbind(1)):
-            added = increment if deviation else None
-            moved = velocity(states[-1], index)
-            states.append(self.step(states[-1], moved, steps, added, deviation))
+            noisy = increment if deviation else None
+            v = velocity(states[-1], index)
+            states.append(self.step(states[-1], v, steps, noisy, deviation))
         return torch.stack(states, 1)
 
     def path_log_prob(self, predict: PredictAt, path: Tensor, deviation: float) -> Tensor:

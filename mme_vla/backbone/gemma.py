@@ -262,8 +262,8 @@ class JointBlock(nn.Module):
             keys.append(k)
             values.append(v)
             if q is not None:
-                own_condition, own_hook = (of_mlp, hook) if adaptive else (None, None)
-                querying.append(Querying(segment, layer, rows, x, gate, own_condition, own_hook))
+                mlp_condition, mlp_hook = (of_mlp, hook) if adaptive else (None, None)
+                querying.append(Querying(segment, layer, rows, x, gate, mlp_condition, mlp_hook))
                 queries.append(q)
             row = rows.stop
 
