@@ -35,7 +35,7 @@ from mme_vla.backbone.layers import Block, autocast
 from mme_vla.errors import UserError, check_known
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
-from mme_vla.types import Batch, HistoryTokens, MemoryTokens, Noise
+from mme_vla.types import Batch, HistoryTokens, MemoryTokens, Noise, to_unit_range
 
 
 def unit_images(images: Tensor, augmentation: Tensor | None = None) -> Tensor:
@@ -49,7 +49,7 @@ def unit_images(images: Tensor, augmentation: Tensor | None = None) -> Tensor:
             "unit_images() does not augment, and got augmentation: leave it out, or construct"
             " MMEModel with another transform_images."
         )
-    return images.to(torch.float32, copy=True).div_(255).mul_(2).sub_(1)
+    return to_unit_range(images)
 
 
 class MMEModel(nn.Module):

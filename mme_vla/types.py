@@ -24,6 +24,12 @@ def send(x: Tensor, device: torch.device) -> Tensor:
     return x.to(device)
 
 
+def to_unit_range(images: Tensor) -> Tensor:
+    """Map uint8 0…255 to float32 -1…1."""
+    # In place: the images of an episode are large, and each step would take as much memory again.
+    return images.to(torch.float32, copy=True).div_(255).mul_(2).sub_(1)
+
+
 Noise = dict[str, Tensor]
 """Random numbers by name, one row a sample. The caller makes them, so that batching and sharding
 cannot change them.

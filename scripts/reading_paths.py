@@ -50,7 +50,7 @@ TRAINING = [
 """
 EVALUATION = [
     ("cli/evaluate.py", "evaluate_one"), ("evaluation/rollout/settings.py", "from_config"),
-    ("evaluation/rollout/evaluation.py", "evaluate"), ("evaluation/store.py", "claim_run"),
+    ("evaluation/rollout/evaluation.py", "run_episodes"), ("evaluation/store.py", "claim_run"),
     ("evaluation/rollout/runner.py", "rounds"), ("envs/vector/pool.py", "recv"),
     ("envs/vector/worker.py", "serve"), ("evaluation/rollout/environment.py", "step"),
     ("evaluation/rollout/episode.py", "read"), ("evaluation/rollout/render_plan.py", "of_chunk"),

@@ -42,11 +42,10 @@ class _WithoutInit(TorchFunctionMode):
 
 def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
     """The class that the section `backbone` names, and its sizes."""
-    from mme_vla.config.sections import read_section
+    from mme_vla.config.sections import read_section, without
 
     kind: type[Backbone] = BACKBONES[str(section.get("name"))]
-    sizes = {key: value for key, value in section.items() if key != "name"}
-    return kind, read_section(kind.Config, sizes, "backbone")
+    return kind, read_section(kind.Config, without(section, "name"), "backbone")
 
 
 def shape_of(section: Mapping[str, Any]) -> Backbone:

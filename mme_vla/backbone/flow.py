@@ -143,7 +143,7 @@ class FlowHead:
         """The flow times at which the network is called while sampling, one an Euler step."""
         return euler_times(steps, device)
 
-    # While sampling: from x at time 1, for each of the `times`, x ← x − velocity / steps
+    # While sampling: `start` gives x at time 1, and one `step` follows for each of the `times`
 
     def start(self, noise: Mapping[str, Tensor], steps: int, overlap: Overlap | None) -> Tensor:
         """The state x [b, h, a] at flow time 1.
@@ -171,6 +171,25 @@ class FlowHead:
         """
         return predict
 
+    def step(
+        self,
+        x: Tensor,
+        velocity: Tensor,
+        steps: int,
+        increment: Tensor | None = None,
+        deviation: float | None = None,
+    ) -> Tensor:
+        """One Euler step of x [b, h, a]: x − v/steps, and with Gaussian noise + σ·ε.
+
+        Args:
+            increment: ε [b, h, a], standard normal; None for none.
+            deviation: σ; the head's own by default.
+        """
+        x = x - velocity.to(x.dtype) / steps
+        if increment is not None:
+            x = x + (self.deviation if deviation is None else deviation) * increment
+        return x
+
     # Gaussian steps, whose density is known
 
     def sample_path(
@@ -188,10 +207,9 @@ class FlowHead:
         velocity = self.velocity(predict, times, {"noise": noise})
         states = [noise]
         for index, increment in enumerate(increments.unbind(1)):
-            state = states[-1] - velocity(states[-1], index).to(noise.dtype) / steps
-            if deviation:
-                state = state + deviation * increment
-            states.append(state)
+            noisy = increment if deviation else None
+            v = velocity(states[-1], index)
+            states.append(self.step(states[-1], v, steps, noisy, deviation))
         return torch.stack(states, 1)
 
     def path_log_prob(self, predict: PredictAt, path: Tensor, deviation: float) -> Tensor:

@@ -179,6 +179,22 @@ def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
     return x + update if gate is None else torch.addcmul(x, update, gate.to(x.dtype))
 
 
+class Querying(NamedTuple):
+    """A segment with queries, between its projection and the end of its layer.
+
+    rows: its place in the sequence. x: its tokens [b, n, d]. gate: of the attention's output.
+    condition: of the MLP's norm. hook: changes what the MLP reads.
+    """
+
+    segment: Segment
+    layer: ExpertLayer
+    rows: slice
+    x: Tensor
+    gate: Tensor | None
+    condition: Tensor | Modulation | None
+    hook: Callable[[Tensor], Tensor] | None
+
+
 class JointBlock(nn.Module):
     """One layer of all experts: a real module, so that sharding, checkpointing and compilation wrap
     it whole.
@@ -233,7 +249,8 @@ class JointBlock(nn.Module):
             of_attention = of_mlp = condition
 
         # Every expert projects its own tokens.
-        querying, queries, keys, values = [], [], [], []
+        querying: list[Querying] = []
+        queries, keys, values = [], [], []
         row = 0
         for segment in segments:
             layer: ExpertLayer = self.experts[segment.expert]  # type: ignore[assignment]
@@ -245,8 +262,8 @@ class JointBlock(nn.Module):
             keys.append(k)
             values.append(v)
             if q is not None:
-                last = (of_mlp, hook) if adaptive else (None, None)
-                querying.append((segment, x, layer, gate, *last, rows))
+                mlp_condition, mlp_hook = (of_mlp, hook) if adaptive else (None, None)
+                querying.append(Querying(segment, layer, rows, x, gate, mlp_condition, mlp_hook))
                 queries.append(q)
             row = rows.stop
 
@@ -256,16 +273,18 @@ class JointBlock(nn.Module):
         if not querying:
             return [], (k, v)
         if len(querying) < len(segments):
-            mask = select_rows(mask, [rows for *_, rows in querying], k.dtype)
+            mask = select_rows(mask, [each.rows for each in querying], k.dtype)
         attended = attend(_join(queries), all_k, all_v, mask)
 
         # Every expert finishes its own.
-        pieces = attended.split([rows.stop - rows.start for *_, rows in querying], dim=1)
+        lengths = [each.rows.stop - each.rows.start for each in querying]
+        pieces = attended.split(lengths, dim=1)
         updated = []
-        for (segment, x, layer, gate, of, change, _), piece in zip(querying, pieces, strict=True):
-            following = Segment(segment.expert, *layer.finish(x, piece, gate, of, change))
-            if segment.update is None:
-                following = Segment(segment.expert, following.summed())
+        for each, piece in zip(querying, pieces, strict=True):
+            finished = each.layer.finish(each.x, piece, each.gate, each.condition, each.hook)
+            following = Segment(each.segment.expert, *finished)
+            if each.segment.update is None:
+                following = Segment(following.expert, following.summed())
             updated.append(following)
         return updated, (k, v)
 

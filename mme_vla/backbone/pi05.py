@@ -245,10 +245,10 @@ class Pi05Backbone(
             velocity = rtc_guidance(velocity, batch.overlap, times)
 
         # Euler steps from noise to actions.
+        increments = noise.get("increments")
         for index in range(len(times)):
-            x = x - velocity(x, index).to(x.dtype) / len(times)
-            if "increments" in noise:
-                x = x + self.head.deviation * noise["increments"][:, index]
+            increment = None if increments is None else increments[:, index]
+            x = self.head.step(x, velocity(x, index), len(times), increment)
         return x
 
     def conditions(self, steps: int) -> Conditioning:

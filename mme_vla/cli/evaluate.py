@@ -22,8 +22,7 @@ from mme_vla.config.devices import process_device
 from mme_vla.config.sections import PathText, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
-from mme_vla.errors import check_choice, counted
-from mme_vla.evaluation.api import policy_of_split
+from mme_vla.errors import check_choice
 from mme_vla.evaluation.records import EpisodeRecord, count_outcomes
 from mme_vla.evaluation.results.events import event_table, idle_events
 from mme_vla.evaluation.results.report import policy_facts
@@ -34,9 +33,7 @@ from mme_vla.evaluation.rollout.evaluation import (
     check_subgoals,
     choose_episodes,
     choose_shard,
-    default_output,
-    evaluate_events,
-    facts_of,
+    evaluate_policy,
     kind_section,
 )
 from mme_vla.evaluation.rollout.events import event_arms
@@ -124,25 +121,17 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
     predictor = None
     if subgoals is not None and run.subgoal is not None:
         predictor = str(run.subgoal["name"])
-    facts = facts_of(policy, name, source, settings, predictor)
     if not settings.render:
         logger.warning(
             "render=false: the policy sees black images; only the time of the simulation means"
             " anything"
         )
-    output = default_output(facts) if run.output is None else Path(run.output).expanduser()
-    output = output / training
-    count = counted(len(jobs), "episode")
-    if shard.count > 1:
-        count += f", shared as {shard.index}/{shard.count},"
-    logger.info("%s into %s", count, output)
     notes = {
         "device": str(device),
         "workers": settings.workers,
         "max_batch": settings.max_batch,
         "deterministic": run.deterministic,
         "policy": policy_facts(policy.config),
-        "composition": facts.composition,
     }
     options = RunOptions(
         subgoals=subgoals,
@@ -155,14 +144,17 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
         # a job of joblib: a worker of ours cannot look that way up
         multiprocessing.set_start_method("spawn", force=True)
     try:
-        done = evaluate_events(
-            policy_of_split(policy, settings.split, run.recordings),
+        done = evaluate_policy(
+            policy,
             jobs,
-            output,
-            facts,
             settings,
             events,
             options,
+            name=name,
+            predictor=predictor,
+            output=run.output,
+            training=training,
+            recordings=run.recordings,
         )
         if policy.info.server is not None:
             logger.info("server: %s", policy.info.server.get("times"))
@@ -171,7 +163,7 @@ def evaluate_one(run: EvalRun, training: str = "") -> None:
         if subgoals is not None:
             report_usage(subgoals.usage)
             subgoals.close()
-    report(done, output)
+    report(done)
 
 
 def choose_subgoals(
@@ -206,7 +198,7 @@ def choose_subgoals(
     return predictor
 
 
-def report(done: Evaluation, output: Path) -> None:
+def report(done: Evaluation) -> None:
     """Say how it went, task by task, and where the table comes from."""
     is_scored = total_score(done.records) is not None
     columns = ["task", "episodes", "success", "fail", "timeout", "error", "success rate"]
@@ -246,7 +238,7 @@ def report(done: Evaluation, output: Path) -> None:
         )  # fmt: skip
     if any(record.outcome == "error" for record in done.records):
         logger.warning("some episodes ended in an error: the same command tries them again")
-    logger.info("mme-vla results %s", output)
+    logger.info("mme-vla results %s", done.output)
 
 
 def report_usage(usage: Usage) -> None:

@@ -18,7 +18,7 @@ from mme_vla.backbone.building import shape_of
 from mme_vla.cli.loading import words_of
 from mme_vla.config.composition import resolved
 from mme_vla.config.devices import find_device
-from mme_vla.config.sections import PathText, PositiveInt, read_section
+from mme_vla.config.sections import PathText, PositiveInt, read_section, without
 from mme_vla.config.trees import library_trees, yaml_files
 from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource, check_episode
@@ -215,9 +215,8 @@ def data_of(checkpoint: Path) -> tuple[DataSettings, list[str]] | None:
     section = read_state(checkpoint)["config"].get("data")
     if not isinstance(section, Mapping):
         return None
-    settings = {key: value for key, value in section.items() if key != "content"}
     content = section.get("content") or []
-    return DataSettings.from_dict(settings), [str(text) for text in content]
+    return DataSettings.from_dict(without(section, "content")), [str(text) for text in content]
 
 
 def held_out_episodes(

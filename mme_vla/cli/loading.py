@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from mme_vla.config.devices import find_device
-from mme_vla.config.sections import PathText, read_section
+from mme_vla.config.sections import PathText, PositiveInt, read_section
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.evaluation.records import display_name
@@ -32,7 +32,8 @@ class PolicyChoice:
     """The keys of a command that say which policy it is about.
 
     config: all of the command's configuration, plain. Without a checkpoint its model is built.
-    server: a server that has the policy, in place of a checkpoint.
+    server: a server that has the policy, in place of a checkpoint; it is asked for the robot
+    `embodiment`, and `execute` actions of a chunk are executed.
     """
 
     name: PathText
@@ -43,6 +44,9 @@ class PolicyChoice:
     trust_plugins: bool
     config: Mapping[str, Any]
     server: ServerChoice | None = None
+    embodiment: Any = None
+    execute: PositiveInt | None = None
+    flow_steps: PositiveInt | None = None
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -126,12 +130,12 @@ def _connect(choice: PolicyChoice, server: ServerChoice, logger: logging.Logger)
     if named:
         raise UserError(f"A server brings its own model: leave out {' '.join(named)}.")
     require(
-        choice.config.get("flow_steps") is None,
-        f"flow_steps={choice.config.get('flow_steps')}: a server chooses its own; leave it out, or"
+        choice.flow_steps is None,
+        f"flow_steps={choice.flow_steps}: a server chooses its own; leave it out, or"
         " set it where the server is started.",
     )
-    robot = Embodiment.from_dict(choice.config.get("embodiment"))
-    policy = RemotePolicy(server, robot, choice.config.get("execute"))
+    robot = Embodiment.from_dict(choice.embodiment)
+    policy = RemotePolicy(server, robot, choice.execute)
     assert policy.info.identity is not None
     name = policy.info.identity.model
     protocol = policy.protocol.name

@@ -48,16 +48,25 @@ class Step:
     recorded: np.ndarray
 
 
+@dataclass(frozen=True)
+class ColumnNames:
+    """Columns of a dataset that training reads beside a robot's own.
+
+    labels: of the current frame, that the backbone reads; those of the memory follow from it.
+    weights: the column of sample weights.
+    """
+
+    labels: Sequence[str] = ()
+    weights: str | None = None
+
+
 class FurtherColumns:
-    """Labels and sample weights of one dataset, read and checked once; see `TrainingDataset`."""
+    """Labels and sample weights of one dataset, read and checked once; see `ColumnNames`."""
 
     def __init__(
-        self,
-        source: EpisodeSource,
-        labels: Sequence[str],
-        memory_labels: Sequence[str],
-        weights: str | None,
+        self, source: EpisodeSource, names: ColumnNames, memory_labels: Sequence[str]
     ) -> None:
+        labels, weights = names.labels, names.weights
         key = "The policy's labels"
         self._source, self._memory_labels = source, tuple(memory_labels)
         self._labels = {
@@ -109,8 +118,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         mask_padding: bool = False,
         jitter: bool = False,
         subgoal: SubgoalText | None = None,
-        labels: Sequence[str] = (),
-        weights: str | None = None,
+        columns: ColumnNames = ColumnNames(),
         seed: int = 42,
         transforms: Sequence[Perturbation] = (),
     ) -> None:
@@ -131,9 +139,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             jitter: hand the memory a random generator, for memories that vary their selection in
                 training.
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
-            labels: of the current frame, that the backbone reads; those of the memory follow from
-                it.
-            weights: the column of sample weights.
+            columns: labels and sample weights.
             seed: of all randomness.
             transforms: of the frames of an episode, before anything reads its past.
         """
@@ -176,9 +182,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.seed = seed
         self.epoch = 0
         self.transforms = tuple(transforms)
-        self.columns = [
-            FurtherColumns(source, labels, labels_read(memory), weights) for source in sources
-        ]
+        self.columns = [FurtherColumns(source, columns, labels_read(memory)) for source in sources]
         # Source and number of each episode, and where its items end.
         if episodes is None:
             episodes = [np.arange(len(source)) for source in sources]

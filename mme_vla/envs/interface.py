@@ -477,7 +477,7 @@ class RoboMMEEnv(gymnasium.Env):
     def _options(self) -> list[dict[str, Any]]:
         """What the task offers to choose from."""
         choices = self.task.choices()
-        options = [choice.to_dict() for choice in choices]
+        options = [choice.option.to_dict() for choice in choices]
         if self.include.possible:
             possible = [self._is_possible(choice) for choice in choices]
             if not any(possible):  # something has to be chosen

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from mme_vla.embodiment.action_space import Option
 from mme_vla.errors import UserError, brief, require
 from mme_vla.registry import REWARDS
 
@@ -96,9 +97,10 @@ class Choice:
         """Whether a pixel of the front image must come with the choice."""
         return self.candidates is not None
 
-    def to_dict(self) -> dict[str, Any]:
-        """The option as the benchmark lists it."""
-        return {"label": self.label, "action": self.action, "need_parameter": self.needs_point}
+    @property
+    def option(self) -> Option:
+        """What a policy is told of it."""
+        return Option(self.label, self.action, self.needs_point)
 
 
 class Progress:

@@ -9,21 +9,16 @@ from typing import Any, Unpack
 from mme_vla.config.sections import read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
-from mme_vla.envs.metadata import read_variant
-from mme_vla.errors import require
 from mme_vla.evaluation.rollout.evaluation import (
     Evaluation,
     RunOptions,
     choose_episodes,
-    default_output,
-    evaluate_events,
-    facts_of,
+    evaluate_policy,
     predictor_of,
 )
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.settings import RolloutKeywords, RolloutSettings
 from mme_vla.policy.base import Policy
-from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.subgoal import SubgoalPredictor
 
 
@@ -72,42 +67,25 @@ def evaluate(
     0.4
     """
     run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
-    arms = event_arms(event)
+    events = event_arms(event)
     jobs = choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
     if base is make_env:
         environment(run_settings.env).check_installed()
     loaded, source = load(policy)
     predictor = predictor_of(loaded, subgoal)
     label = type(subgoal).__name__ if isinstance(subgoal, SubgoalPredictor) else subgoal
-    facts = facts_of(loaded, name, source, run_settings, label)
-    folder = default_output(facts) if output is None else Path(output).expanduser()
-    wrapped = policy_of_split(loaded.eval(), run_settings.split, recordings)
-    return evaluate_events(
-        wrapped,
+    options = RunOptions(subgoals=predictor, source=source, base=base, show_progress=show_progress)
+    return evaluate_policy(
+        loaded.eval(),
         jobs,
-        folder,
-        facts,
         run_settings,
-        arms,
-        RunOptions(subgoals=predictor, source=source, base=base, show_progress=show_progress),
+        events,
+        options,
+        name=name,
+        predictor=label,
+        output=output,
+        recordings=recordings,
     )
-
-
-def policy_of_split(policy: Policy, split: str, recordings: Any = None) -> Policy:
-    """The policy as a split evaluates it.
-
-    Args:
-        recordings: datasets whose episodes a split shows before its own (`stress:sessions=<n>`).
-    """
-    variant = read_variant(split)
-    if variant is not None and variant.dial in SPLIT_POLICIES:
-        wrapped: Policy = SPLIT_POLICIES[variant.dial](policy, split, recordings)
-        return wrapped
-    require(
-        not recordings,
-        f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.",
-    )
-    return policy
 
 
 def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:

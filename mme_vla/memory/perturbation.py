@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from mme_vla.config.sections import NonNegative, NonNegativeInt, Range, read_section
+from mme_vla.config.sections import NonNegative, NonNegativeInt, Range, read_section, without
 from mme_vla.errors import check_choice, counted, require
 from mme_vla.registry import PERTURBATIONS
 
@@ -377,9 +377,8 @@ def build_perturbation(section: Mapping[str, Any], option: str, key: str) -> Per
     if not has_checked_options:
         built: Perturbation = PERTURBATIONS.build(section)
         return built
-    options = {key: value for key, value in section.items() if key != "name"}
     where = f"{key}: {name}" if "=" in key else f"{key}.{name}"
-    read: Perturbation = read_section(kind, options, where)
+    read: Perturbation = read_section(kind, without(section, "name"), where)
     return read
 
 

@@ -392,6 +392,13 @@ class SelectedActions:
     actions: np.ndarray
 
 
+def draw_noise(policy: Policy, count: int, generator: torch.Generator | None = None) -> Noise:
+    """The noise of so many new samples in one batch, from PyTorch's generator by default."""
+    if generator is None:
+        generator = torch.default_generator
+    return stack_noise([policy.sampling_noise(generator) for _ in range(count)])
+
+
 def choose_actions(
     policy: Policy,
     episodes: Sequence[Episode],

@@ -26,8 +26,8 @@ from mme_vla.memory.base import (
 )
 from mme_vla.memory.history import PromptConditionedHistory
 from mme_vla.memory.recurrent import RecurrentMemory
-from mme_vla.model import MMEModel, unit_images
-from mme_vla.policy.base import Policy
+from mme_vla.model import MMEModel
+from mme_vla.policy.base import Policy, draw_noise
 from mme_vla.policy.build import build_memory, check_integrated
 from mme_vla.policy.episode import Episode, prefix_overlap
 from mme_vla.policy.network import MemoryTower, NetworkPolicy
@@ -53,7 +53,7 @@ from mme_vla.types import (
     map_noise,
     named_noise,
     send,
-    stack_noise,
+    to_unit_range,
 )
 
 if TYPE_CHECKING:
@@ -307,7 +307,7 @@ class MMEPolicy(NetworkPolicy):
 
     def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
         """Views in [−1, 1], augmented as the cameras of the embodiment say."""
-        views = unit_images(images)
+        views = to_unit_range(images)
         if augmentation is None:
             return views
         return augment_views(views, self.embodiment.augmentations, augmentation)
@@ -333,8 +333,7 @@ class MMEPolicy(NetworkPolicy):
                 `batch.history`.
         """
         if noise is None:
-            source = torch.default_generator if generator is None else generator
-            noise = stack_noise([self.sampling_noise(source) for _ in range(len(batch.prompt))])
+            noise = draw_noise(self, len(batch.prompt), generator)
         values = map_noise(named_noise(noise), lambda value: send(value, self.device))
         # Real-time chunking also runs the network backwards, which a graph does not contain.
         if self._sampler is None or self.training or batch.overlap is not None:

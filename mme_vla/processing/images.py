@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from mme_vla.errors import UserError
 from mme_vla.memory.base import PastViewSpec
-from mme_vla.types import FrameBatch, PastViews
+from mme_vla.types import FrameBatch, PastViews, to_unit_range
 
 
 def resize_with_pad_uint8(frames: np.ndarray, size: tuple[int, int] | int) -> np.ndarray:
@@ -78,12 +78,6 @@ def resize_with_pad(images: Tensor, size: tuple[int, int] | int) -> Tensor:
     )
     borders = (left, width - inner_w - left, top, height - inner_h - top)
     return functional.pad(resized.clamp(-1, 1), borders, value=-1.0)
-
-
-def to_unit_range(images: Tensor) -> Tensor:
-    """Map uint8 0…255 to float32 -1…1."""
-    # In place: the images of an episode are large, and each step would take as much memory again.
-    return images.to(torch.float32, copy=True).div_(255).mul_(2).sub_(1)
 
 
 def as_uint8_frames(image: np.ndarray | Tensor) -> np.ndarray:

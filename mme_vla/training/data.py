@@ -11,7 +11,7 @@ import numpy as np
 
 from mme_vla.data.cache import COMMAND
 from mme_vla.data.cache_building import ensure_cache
-from mme_vla.data.dataset import GroupDataset, TrainingDataset
+from mme_vla.data.dataset import ColumnNames, GroupDataset, TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.sources import Split, default_val_episodes, open_sources, split_episodes
 from mme_vla.data.statistics import check_ranges, compute_norm_stats
@@ -218,6 +218,7 @@ def _samples(
     memory_parts: set[Any] = set()
     if policy.memory is not None:
         memory_parts = set(policy.memory.modules())
+    labels = labels_read(*(part for part in policy.modules() if part not in memory_parts))
     dataset = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
     return dataset(
         sources,
@@ -229,8 +230,7 @@ def _samples(
         mask_padding=data.mask_padding,
         jitter=data.jitter and not held_out,
         subgoal=SubgoalText.from_config(PolicySections.of(policy.config).subgoal_text),
-        labels=labels_read(*(part for part in policy.modules() if part not in memory_parts)),
-        weights=data.weights,
+        columns=ColumnNames(labels, data.weights),
         seed=seed,
         transforms=() if held_out else build_transforms(data.history_transforms),
     )

@@ -143,7 +143,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.usefixtures("registered")
 def test_settings_know_the_limit_of_each_task_unless_another_is_set() -> None:
     settings = RolloutSettings(env="corridors")
-    assert settings.max_steps == 9
+    assert settings.step_limit == 9 and settings.max_steps is None
     assert [settings.limit_of(task) for task in ("Short", "Wide")] == [4, 9]
     assert RolloutSettings(env="corridors", max_steps=6).limit_of("Short") == 6
     assert RolloutSettings().limit_of("StopCube") == 1300

@@ -40,7 +40,7 @@ from mme_vla.evaluation.results.events import (
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.statistics import Interval, wilson
 from mme_vla.evaluation.rollout.episode import EventCourse
-from mme_vla.evaluation.rollout.evaluation import RunOptions, evaluate_events
+from mme_vla.evaluation.rollout.evaluation import RunOptions, run_with_events
 from mme_vla.evaluation.rollout.events import event_arms, read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.training_identity import TrainingIdentity
@@ -235,7 +235,7 @@ def test_a_policy_whose_frames_have_no_numbers_cannot_restart(
     memoryless: MMEPolicy, tmp_path: Path
 ) -> None:
     with pytest.raises(UserError, match="no memory that numbers frames"):
-        evaluate_events(memoryless, JOBS, tmp_path, FACTS, RolloutSettings(), ["restart@step:4"])
+        run_with_events(memoryless, JOBS, tmp_path, FACTS, RolloutSettings(), ["restart@step:4"])
 
 
 def test_events_act_by_sub_task_and_episode_by_episode(memoryless: MMEPolicy) -> None:
@@ -331,7 +331,7 @@ def test_every_event_run_has_its_matched_arm(
     settings = RolloutSettings(max_steps=24, flow_steps=2, workers=2, max_batch=1)
     jobs = JOBS[2:4]
     options = RunOptions(base=make_slow_env, show_progress=False)
-    done = evaluate_events(
+    done = run_with_events(
         memoryless, jobs, tmp_path, FACTS, settings, ["pause:9@subtask:30", "pause:9"], options
     )
     assert [r.event for r in done.records] == ["pause:9@subtask:30"] * 2 + ["pause:9"] * 2
@@ -342,7 +342,7 @@ def test_every_event_run_has_its_matched_arm(
     assert all(
         r.steps != baseline[r.key][1] or facts(r) != baseline[r.key] for r in done.records[2:]
     )
-    again = evaluate_events(memoryless, jobs, tmp_path, FACTS, settings, ["pause:9"], options)
+    again = run_with_events(memoryless, jobs, tmp_path, FACTS, settings, ["pause:9"], options)
     assert again.workload.chunks == 0 and [facts(r) for r in again.records] == [
         facts(r) for r in done.records[2:]
     ]

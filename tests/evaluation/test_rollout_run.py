@@ -27,8 +27,8 @@ from mme_vla.evaluation.rollout.evaluation import (
     Shard,
     choose_shard,
     default_output,
-    evaluate,
-    evaluate_events,
+    run_episodes,
+    run_with_events,
 )
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -147,7 +147,7 @@ def test_shards_side_by_side_make_the_full_run(
     monkeypatch.setattr(Claims, "take", at_most)
     for index in range(2):
         shard = Shard(index, 2)
-        mine = evaluate(
+        mine = run_episodes(
             policy,
             JOBS[:4],
             tmp_path,
@@ -250,7 +250,7 @@ def test_only_the_first_of_several_arms_forecasts_its_time(
     save_records(tmp_path / "earlier", roll(quick_policy("pi05"), JOBS[:1], InlineEnvs()))
     options = RunOptions(base=make_moving_env, times_from=tmp_path / "earlier")
     events = ["pause:4"]
-    evaluate_events(
+    run_with_events(
         quick_policy("pi05"), JOBS[:1], tmp_path / "run", FACTS, settings, events, options
     )
     assert capsys.readouterr().err.count("forecast") == 1

@@ -139,7 +139,8 @@ def test_a_task_named_all_keeps_its_row_beside_that_of_all_episodes(
         records=[replace(won, task="all"), replace(lost, task="other")],
         matched=[],
         workload=SimpleNamespace(batches=0),
+        output=tmp_path,
     )
-    report(done, tmp_path)  # type: ignore[arg-type]
+    report(done)  # type: ignore[arg-type]
     lines = [line for line in capsys.readouterr().out.splitlines() if " all " in line]
     assert ["100.0 %" in lines[0], "50.0 %" in lines[1], len(lines)] == [True, True, 2]

@@ -17,6 +17,7 @@ from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.metadata import BASE, HARD, TWIN, read_variant
 from mme_vla.envs.rows import OOD, TIERS
 from mme_vla.envs.scene_hash import scene_digest
+from mme_vla.errors import SceneError
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, merge
 from mme_vla.evaluation.results.aggregate import record_table, repeated_episodes
@@ -210,8 +211,6 @@ def amount_of(task: str, split: str, key: EpisodeKey, scene: str | None = None) 
     None where the scene cannot be built, or is another one here than the one with the digest
     `scene`.
     """
-    from mme_vla.envs.robomme.scene.placement import SceneError
-
     spec = metadata.episode(task, split, key.episode)
     values: dict[str, Any] = dict(spec.row["spec"]) if spec.row is not None else {}
     if not values:

@@ -70,9 +70,10 @@ class Report:
     failed, where the environment reports it. info: what the environment itself sends, for subgoal
     predictors. options: of a robot that chooses, what there is to choose. scene: digest of the
     scene.
-    executed: actions. steps: frames. held: the action [w] that keeps the robot where it is after a
-    command to hold it; None before the first action. subtask: number of the execution's current
-    sub-task from 1; 0 where the environment has none. began: frames at which sub-tasks began.
+    executed: actions. frames: what these took, one each unless an action is a motion. held: the
+    action [w] that keeps the robot where it is after a command to hold it; None before the first
+    action. subtask: number of the execution's current sub-task from 1; 0 where the environment has
+    none. began: frames at which sub-tasks began.
     process: where the chain of sub-tasks broke, for the record. oracle: the action [w] that the
     task's script takes next, if it was requested. video: name of the finished video's file.
     simulated_s, rendered_s: seconds since the last report.
@@ -85,7 +86,7 @@ class Report:
     options: Sequence[Mapping[str, Any]] | None = None
     scene: str = NOT_BUILT
     executed: int = 0
-    steps: int = 0
+    frames: int = 0
     held: np.ndarray | None = None
     subtask: int = 0
     began: Sequence[int] = ()
@@ -249,7 +250,7 @@ class ChunkEnv:
             if terminated or truncated:
                 break
         self._returned = frames.leave(draw, self._returned)
-        report = replace(self._report(info), executed=executed, steps=n_frames)
+        report = replace(self._report(info), executed=executed, frames=n_frames)
         if command.hold:
             report = replace(report, held=self._hold_action())
         if (terminated or truncated) and self._video is not None:

@@ -77,8 +77,21 @@ class EventCourse:
                     return
 
 
+def select_frames(frames: Observation, numbers: np.ndarray) -> Observation:
+    """The frames with these numbers, int64 [n]."""
+    selected: Observation = {"state": frames["state"][numbers]}
+    for name, values in frames.items():
+        if name != "state":
+            selected[name] = [values[i] for i in numbers]
+    return selected
+
+
 class RunningEpisode:
     """One episode between its first observation and its end.
+
+    In a round `begin` or `resume` takes the frames, `read` has the policy observe them,
+    `set_subgoal` and `set_actions` take what was decided, and the environment executes it. `end`
+    counts the last actions.
 
     Frames arrive all at once and are taken into memory in pieces (`read`), so that the hundreds of
     a conditioning video do not keep other episodes waiting.
@@ -129,6 +142,8 @@ class RunningEpisode:
         self._leading: np.ndarray | None = None  # Actions that led to the waiting frames
         self._at = 0
 
+    # Observe: frames arrive, and are read piece by piece
+
     def take_report(self, report: Report) -> None:
         """Note what the environment says: its time, its scene, and what there is to choose."""
         self.report = report
@@ -150,55 +165,64 @@ class RunningEpisode:
         if goal is None:
             raise UserError(f"{self.job}: the environment's info has no task_goal.")
         self.episode.goal = goal
-        length = len(frames["state"])
-        frames = self._observed(
-            frames, length, np.append(self.events.video(length - 1), length - 1)
-        )
+        # Events may leave out or repeat frames of the video; the current one is always observed.
+        last = len(frames["state"]) - 1
+        observed = np.append(self.events.video(last), last)
+        self._note_observed(last + 1, observed)
+        frames = select_frames(frames, observed)
         self.video_frames = len(frames["state"]) - 1
         if self._subgoals is not None:
             video = None
             if self.video_frames and self._subgoals.sees_video:
                 video = np.stack(frames[self._robot.memory_camera][:-1])
             self.watched = self._subgoals.start_episode(goal, video, self.job.task)
-        self._expect(frames, np.arange(self.video_frames + 1) < self.video_frames, None)
+        self._queue(frames, np.arange(self.video_frames + 1) < self.video_frames, None)
 
     def resume(self, frames: Observation) -> None:
         """Take the frames that the executed actions led to: one each, unless an action is a motion
         of many.
         """
-        self._count()
+        self._count_executed()
         length = len(frames["state"])
         has_one_a_frame = self._robot.action.frames is not None
         leading: np.ndarray | None
         if self.events.holding is None:
-            self._observed(frames, length)
+            self._note_observed(length, np.arange(length))
             leading = self._sent[: self.report.executed]
             n_frames = self.report.executed if has_one_a_frame else length
         else:
             # An event held the robot: the newest frames of that time are observed.
             self.events.hold_steps += length
             n_frames = min(self.events.holding.observed, length)
-            frames = self._observed(frames, length, np.arange(length - n_frames, length))
+            observed = np.arange(length - n_frames, length)
+            self._note_observed(length, observed)
+            frames = select_frames(frames, observed)
             leading = self._sent[:0]
             if has_one_a_frame:
                 leading = None  # before the first action
                 if self.report.held is not None:
                     target = np.asarray(self.report.held, np.float32)
                     leading = np.repeat(target[None], n_frames, axis=0)
-        self._expect(frames, np.zeros(n_frames, bool), leading)
+        self._queue(frames, np.zeros(n_frames, bool), leading)
 
-    @property
-    def unobserved(self) -> int:
-        """Frames of the environment that events withheld so far; below 0 where they
-        repeated some.
-        """
-        return self._simulated - len(self._visible)
+    def _note_observed(self, length: int, observed: np.ndarray) -> None:
+        """Note which of the environment's next `length` frames the policy observes, int64 [n]."""
+        self._visible = np.concatenate([self._visible, self._simulated + observed])
+        self._simulated += length
 
-    def end(self) -> None:
-        """Count the last actions; their frames are not needed any more."""
-        self._count()
-        self.process = self.report.process
-        self.video = self.report.video
+    def _queue(self, frames: Observation, demo: np.ndarray, leading: np.ndarray | None) -> None:
+        """Have these frames wait to be read; `leading` are the actions that led to them."""
+        if len(frames["state"]) != len(demo):
+            raise UserError(
+                f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need"
+                " one frame an action."
+            )
+        self._frames = frames
+        self._demo = demo
+        self._leading = leading
+        self._at = 0
+        began = np.searchsorted(self._visible, self.report.began)  # as numbers of observed frames
+        self.episode.note_subtask_starts(began.tolist(), self.video_frames)
 
     @property
     def pieces(self) -> int:
@@ -252,9 +276,7 @@ class RunningEpisode:
                 views[name] = np.stack([images[i] for i in places])
         return views, rendered
 
-    def add_policy_seconds(self, seconds: float) -> None:
-        """Add this episode's share of the policy's time."""
-        self._thinking += seconds
+    # Decide and act
 
     def set_subgoal(self, subgoal: Subgoal, latency_s: float) -> None:
         """Take the subgoal of the current frame, which came after so many seconds."""
@@ -266,6 +288,31 @@ class RunningEpisode:
         """Note the actions [n, w] that are sent to the environment."""
         self._sent = actions
         self.chunks += 1
+
+    def add_policy_seconds(self, seconds: float) -> None:
+        """Add this episode's share of the policy's time."""
+        self._thinking += seconds
+
+    # Record
+
+    def _count_executed(self) -> None:
+        """Count the actions of the last command, for the record."""
+        executed = self._sent[: self.report.executed]
+        self.steps += self.report.frames
+        self._actions.update(np.ascontiguousarray(executed, np.float32).tobytes())
+
+    def end(self) -> None:
+        """Count the last actions; their frames are not needed any more."""
+        self._count_executed()
+        self.process = self.report.process
+        self.video = self.report.video
+
+    @property
+    def unobserved(self) -> int:
+        """Frames of the environment that events withheld so far; below 0 where they
+        repeated some.
+        """
+        return self._simulated - len(self._visible)
 
     @property
     def seconds(self) -> Seconds:
@@ -282,41 +329,3 @@ class RunningEpisode:
         last bit.
         """
         return self._actions.hexdigest()[:16]
-
-    def _observed(
-        self, frames: Observation, length: int, numbers: np.ndarray | None = None
-    ) -> Observation:
-        """Those of the environment's next frames that the policy observes; by default all."""
-        everything = np.arange(length)
-        if numbers is None:
-            numbers = everything
-        self._visible = np.concatenate([self._visible, self._simulated + numbers])
-        self._simulated += length
-        if np.array_equal(numbers, everything):
-            return frames
-        observed: Observation = {}
-        for name, values in frames.items():
-            if name == "state":
-                observed[name] = values[numbers]
-            else:
-                observed[name] = [values[i] for i in numbers]
-        return observed
-
-    def _count(self) -> None:
-        executed = self._sent[: self.report.executed]
-        self.steps += self.report.steps
-        self._actions.update(np.ascontiguousarray(executed, np.float32).tobytes())
-
-    def _expect(self, frames: Observation, demo: np.ndarray, leading: np.ndarray | None) -> None:
-        """Have these frames wait to be read; `leading` are the actions that led to them."""
-        if len(frames["state"]) != len(demo):
-            raise UserError(
-                f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need"
-                " one frame an action."
-            )
-        self._frames = frames
-        self._demo = demo
-        self._leading = leading
-        self._at = 0
-        began = np.searchsorted(self._visible, self.report.began)  # as numbers of observed frames
-        self.episode.note_subtask_starts(began.tolist(), self.video_frames)

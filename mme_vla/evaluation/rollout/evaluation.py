@@ -2,6 +2,7 @@
 at once.
 """
 
+import logging
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -10,11 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mme_vla.config.sections import without
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
+from mme_vla.envs.metadata import read_variant
 from mme_vla.envs.vector.pool import Job, VecEnv
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, counted, require
 from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
@@ -36,9 +39,12 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.identity import identify_policy
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.prompt import subgoal_kind
+from mme_vla.registry import SPLIT_POLICIES
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
 from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.utils import remove_drafts, safe_name
+
+logger = logging.getLogger("mme_vla.evaluate")
 
 
 @dataclass(frozen=True)
@@ -95,12 +101,13 @@ class Evaluation(NamedTuple):
     """The outcome of a run: the records of its episodes, old and new, and what the policy did this
     time.
 
-    Of several processes that share a run each has the records that it wrote. matched: those of the
-    plain run, where `records` are of events.
+    Of several processes that share a run each has the records that it wrote. output: the run's
+    folder. matched: the records of the plain run, where `records` are of events.
     """
 
     records: list[EpisodeRecord]
     workload: Workload
+    output: Path
     matched: Sequence[EpisodeRecord] = ()
 
     @property
@@ -140,7 +147,61 @@ class RunOptions:
     name: str | None = None
 
 
-def evaluate_events(
+def evaluate_policy(
+    policy: Policy,
+    jobs: Sequence[Job],
+    settings: RolloutSettings,
+    events: Sequence[str],
+    options: RunOptions,
+    *,
+    name: str | None = None,
+    predictor: str | None = None,
+    output: str | Path | None = None,
+    training: str = "",
+    recordings: Any = None,
+) -> Evaluation:
+    """Evaluate a loaded policy: what the command and `mme_vla.evaluate` have in common.
+
+    Args:
+        events: arms, each a run of its own beside the run without one.
+        name: what records call the policy; None for its own name.
+        predictor: name of the subgoal predictor, for the records.
+        output: the run's folder; None for the one that the same command finds again.
+        training: of several trainings the one that this is; its records are in a folder of that
+            name below the run's.
+        recordings: datasets whose episodes a split shows before its own.
+    """
+    facts = facts_of(policy, name, options.source, settings, predictor)
+    folder = default_output(facts) if output is None else Path(output).expanduser()
+    folder = folder / training
+    count = counted(len(jobs), "episode")
+    if options.shard.count > 1:
+        count += f", shared as {options.shard.index}/{options.shard.count},"
+    logger.info("%s into %s", count, folder)
+    notes = {**(options.notes or {}), "composition": facts.composition}
+    policy = policy_of_split(policy, settings.split, recordings)
+    options = replace(options, notes=notes)
+    return run_with_events(policy, jobs, folder, facts, settings, events, options)
+
+
+def policy_of_split(policy: Policy, split: str, recordings: Any = None) -> Policy:
+    """The policy as a split evaluates it.
+
+    Args:
+        recordings: datasets whose episodes a split shows before its own (`stress:sessions=<n>`).
+    """
+    variant = read_variant(split)
+    if variant is not None and variant.dial in SPLIT_POLICIES:
+        wrapped: Policy = SPLIT_POLICIES[variant.dial](policy, split, recordings)
+        return wrapped
+    require(
+        not recordings,
+        f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.",
+    )
+    return policy
+
+
+def run_with_events(
     policy: Policy,
     jobs: Sequence[Job],
     output: Path,
@@ -152,14 +213,14 @@ def evaluate_events(
     """Run every episode in `output`, then once more under each event, in a folder of its own below.
 
     The runs have the same scenes and the same noise, and differ in the event alone. Without events
-    it is `evaluate`.
+    it is `run_episodes`.
 
     events: arms, such as `pause:100@subtask:2`.
     """
     for event in events:
         for placed in read_events(event):
             placed.perturbation.check(policy)
-    matched = evaluate(policy, jobs, output, facts, settings, options)
+    matched = run_episodes(policy, jobs, output, facts, settings, options)
     if not events:
         return matched
     options = replace(
@@ -169,12 +230,12 @@ def evaluate_events(
     for event in events:
         folder = output / ("event-" + re.sub(r"[^\w.+-]", "-", event))
         named = replace(facts, event=event)
-        run = evaluate(policy, jobs, folder, named, replace(settings, event=event), options)
+        run = run_episodes(policy, jobs, folder, named, replace(settings, event=event), options)
         records += run.records
-    return Evaluation(records, run.workload, matched.records)
+    return Evaluation(records, run.workload, output, matched.records)
 
 
-def evaluate(
+def run_episodes(
     policy: Policy,
     jobs: Sequence[Job],
     output: Path,
@@ -244,7 +305,7 @@ def evaluate(
                         workload,
                     )
                     rollout.run(Waiting(missing, claims))
-    return Evaluation(_done(output, jobs, facts, shard), workload)
+    return Evaluation(_done(output, jobs, facts, shard), workload, output)
 
 
 def _environments(
@@ -300,7 +361,7 @@ def run_settings(
         "seed": settings.seed,
         "split": settings.split,
         "env": settings.env,
-        "max_steps": settings.max_steps,
+        "max_steps": settings.step_limit,
         "render": settings.render,
     }
     # Left out where they are not set, as in runs from before there were these options.
@@ -313,7 +374,7 @@ def run_settings(
 
 
 def _predictor_facts(name: str | None, subgoals: SubgoalPredictor) -> dict[str, Any]:
-    decisive = {key: value for key, value in subgoals.settings.items() if key not in INDIFFERENT}
+    decisive = without(subgoals.settings, *INDIFFERENT)
     for key in ("model", "adapter"):
         if key in decisive:
             decisive[key] = _end_of(decisive[key])
@@ -380,7 +441,7 @@ def facts_of(
         checkpoint=identity.checkpoint,
         model_seed=settings.seed,
         split=settings.split,
-        max_steps=settings.max_steps,
+        max_steps=settings.step_limit,
         subgoal=subgoal,
         memory_budget=identity.memory_budget,
         composition=identity.composition,

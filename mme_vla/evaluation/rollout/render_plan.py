@@ -127,7 +127,7 @@ class RenderPlan:
     def _reads_of(self, exec_start: int) -> np.ndarray | None:
         """Frames that the policy reads of an episode with this video, until its step limit."""
         action = self._robot.action
-        most = self._settings.max_steps + self._hold_steps + 2
+        most = self._settings.step_limit + self._hold_steps + 2
         # A motion, or an event that holds the robot, takes any number of frames: the policy may act
         # at each.
         if action.frames is None or self._hold_steps:

@@ -17,8 +17,8 @@ class RolloutSettings:
     """The protocol, and how it is run. The defaults are the paper's.
 
     seed: of the policy's noise; it does not reach the environments.
-    max_steps: actions until the outcome is `timeout`; by default as many as the split allows, of
-    environments whose tasks differ the most of any (`limit_of`).
+    max_steps: actions until the outcome is `timeout`; None: as many as the task allows
+    (`limit_of`).
     max_actions: actions, whatever frames they take, until the outcome is `timeout`; None: the
     policy's own limit. only_possible: by choices, offer no option whose every object is out of
     reach. execute: actions of a chunk that are executed before the policy acts again; None: the
@@ -36,7 +36,7 @@ class RolloutSettings:
     seed: NonNegativeInt = 42
     split: str = "test"
     env: str = "mme_vla"
-    max_steps: PositiveInt = 0  # of the split
+    max_steps: PositiveInt | None = None
     max_actions: PositiveInt | None = None
     only_possible: bool = False
     execute: PositiveInt | None = None
@@ -57,24 +57,26 @@ class RolloutSettings:
         source.check_split(self.split)
         if any(event.perturbation.hold for event in read_events(self.event)):
             source.check_hold()
-        if not self.max_steps:
-            object.__setattr__(self, "max_steps", source.step_limit(self.split))
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read the keys of a configuration that are settings; others are ignored."""
-        provided = {
-            key: value for key, value in config.items() if (key, value) != ("max_steps", None)
-        }
-        return read_section(cls, provided, others=True)
+        return read_section(cls, config, others=True)
+
+    @property
+    def step_limit(self) -> int:
+        """Actions until the outcome is `timeout`, of the task that takes the most."""
+        if self.max_steps is not None:
+            return self.max_steps
+        return environment(self.env).step_limit(self.split)
 
     def limit_of(self, task: str) -> int:
         """Actions until the outcome of a task is `timeout`: its own number unless another was
         set.
         """
         source = environment(self.env)
-        if self.max_steps != source.step_limit(self.split):
-            return self.max_steps
+        if self.step_limit != source.step_limit(self.split):
+            return self.step_limit
         return source.task_limit(task, self.split)
 
     def worker_count(self, episodes: int) -> int:
@@ -88,7 +90,7 @@ class RolloutKeywords(TypedDict, total=False):
 
     split: str
     env: str
-    max_steps: int
+    max_steps: int | None
     max_actions: int | None
     only_possible: bool
     execute: int | None
@@ -112,5 +114,6 @@ def check_config(config: Mapping[str, Any]) -> None:
     """
     # Each event is a run of its own, which the command checks.
     RolloutSettings.from_config({**config, "event": None})
-    if config["checkpoint"] is not None:
-        check_on_machine(find_run(Path(str(config["checkpoint"])).expanduser()))
+    checkpoint = config["checkpoint"]
+    if checkpoint is not None:
+        check_on_machine(find_run(Path(str(checkpoint)).expanduser()))

@@ -439,10 +439,10 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, Recomputes):
         velocity = self.head.velocity(clean, times, noise)
         if batch.overlap is not None:
             velocity = rtc_guidance(velocity, batch.overlap, times)
+        increments = noise.get("increments")
         for index in range(len(times)):
-            x = x - velocity(x, index).to(x.dtype) / len(times)
-            if "increments" in noise:
-                x = x + self.head.deviation * noise["increments"][:, index]
+            increment = None if increments is None else increments[:, index]
+            x = self.head.step(x, velocity(x, index), len(times), increment)
         return x
 
     def predictor(self, batch: Batch, injection: Injection) -> Predict:

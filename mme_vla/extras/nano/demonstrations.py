@@ -350,10 +350,7 @@ class _Taken:
 
 def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
     """What a task offers to choose from."""
-    options = [
-        Option(choice.label, choice.action, choice.needs_point).to_dict()
-        for choice in env.choices()
-    ]
+    options = [choice.option.to_dict() for choice in env.choices()]
     return read_options(options, len(chooser.choice))
 
 

@@ -27,9 +27,9 @@ from mme_vla.evaluation.rollout.evaluation import (
     VIDEOS,
     RunOptions,
     choose_shard,
-    evaluate,
     facts_of,
     predictor_of,
+    run_episodes,
 )
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
@@ -228,7 +228,7 @@ def play_all(
     return [record for record in read_records(file) if record.key in selected]
 
 
-def run_episodes(
+def run_checkpoint(
     checkpoint: Path,
     folder: Path,
     specs: Sequence[EpisodeSpec],
@@ -269,7 +269,7 @@ def run_episodes(
         facts = replace(facts, model=named(facts.model, arm))
     jobs = [Job(spec.task, spec.split, spec.episode) for spec in specs]
     options = RunOptions(subgoals=subgoals, shard=choose_shard(rules.shard), source=str(checkpoint))
-    return evaluate(policy, jobs, folder, facts, settings, options).records
+    return run_episodes(policy, jobs, folder, facts, settings, options).records
 
 
 def evaluate_row(
@@ -285,7 +285,7 @@ def evaluate_row(
 
     oracle: name of the row in which it is evaluated with the oracle's frames, a ceiling.
     """
-    records = run_episodes(checkpoint, folder, specs, rules, oracle=oracle is not None)
+    records = run_checkpoint(checkpoint, folder, specs, rules, oracle=oracle is not None)
     # Only then: a folder of other weights was refused, and keeps its files.
     shutil.copy(training / CONFIG, folder / CONFIG)
     about = read_json(training / TRAINED, "a training's end")
@@ -308,7 +308,7 @@ def record_videos(
         record = next((record for record in records if record.success is won), None)
         if record is not None:
             specs = choose_episodes(record.task, [record.episode], record.split)
-            run_episodes(checkpoint, folder / name, specs, alone, video="all")
+            run_checkpoint(checkpoint, folder / name, specs, alone, video="all")
     return sorted(folder.glob(f"*/{VIDEOS}/*.mp4"))
 
 

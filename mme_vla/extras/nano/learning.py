@@ -26,13 +26,14 @@ from mme_vla.memory.base import Memory, stack_history
 from mme_vla.memory.history import CachedHistory, History
 from mme_vla.memory.perturbation import Perturbation
 from mme_vla.memory.transforms import TransformedHistory, map_frames
+from mme_vla.policy.base import draw_noise
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.sections import PolicySections
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.normalise import NormStats, RunningStats
 from mme_vla.processing.prompt import perturb_point, subgoal_kind
 from mme_vla.training.order import generator_for, seed_of
-from mme_vla.types import Batch, HistoryTokens, labels_read, stack_noise
+from mme_vla.types import Batch, HistoryTokens, labels_read
 
 # of an action's number, in metres or radians: less than that is jitter, and is not blown up
 NARROWEST = 0.1
@@ -321,7 +322,7 @@ def _predicted(
     for start in range(0, len(rows), 64):
         batch = val_set.collate(rows[start : start + 64])
         assert batch.actions is not None and batch.state is not None
-        noise = stack_noise([policy.sampling_noise(generator) for _ in range(len(batch.prompt))])
+        noise = draw_noise(policy, len(batch.prompt), generator)
         chunk = policy.sample_actions(batch, noise).float()
         predicted.append(processor.absolute_actions(chunk, batch.state)[:, 0])
         recorded.append(processor.absolute_actions(batch.actions, batch.state)[:, 0])

@@ -80,7 +80,7 @@ class PolicyPlayer(Player):
             goal=session.goal,
             options=session.info.get(OPTIONS),
             executed=self._n_executed,
-            steps=len(frames["state"]),
+            frames=len(frames["state"]),
         )
         running.take_report(report)
         if running.chunks == 0:

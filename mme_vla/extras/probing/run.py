@@ -25,10 +25,10 @@ from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import (
     RunOptions,
     choose_episodes,
-    evaluate,
-    evaluate_events,
     facts_of,
     predictor_of,
+    run_episodes,
+    run_with_events,
 )
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -175,11 +175,11 @@ def _in_closed_loop(
             name=f"{display_name(facts.model, facts.checkpoint)}{ARM}{arm.name}",
         )
         if arm is UNPROBED:
-            evaluate_events(policy, plan.jobs, output, facts, settings, plan.events, arm_options)
+            run_with_events(policy, plan.jobs, output, facts, settings, plan.events, arm_options)
         else:
             probed = ProbedPolicy(policy, arm, plan.lend, donors).eval()
             arm_facts = replace(facts, model=named(facts.model, arm))
-            evaluate(probed, plan.jobs, output, arm_facts, settings, arm_options)
+            run_episodes(probed, plan.jobs, output, arm_facts, settings, arm_options)
 
 
 def _on_recordings(

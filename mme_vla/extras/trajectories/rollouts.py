@@ -287,7 +287,7 @@ class _Collector(Rollout):
         keep: Sequence[str],
         oracle_share: float,
     ) -> None:
-        facts = RunFacts("rollouts", "rollouts", settings.seed, settings.split, settings.max_steps)
+        facts = RunFacts("rollouts", "rollouts", settings.seed, settings.split, settings.step_limit)
         super().__init__(policy, envs, facts, settings, record=lambda record: None)
         self.keep, self.oracle_share = keep, oracle_share
         self.finished: list[Trajectory] = []

@@ -184,7 +184,7 @@ def test_what_is_possible_is_queried_again_after_each_choice() -> None:
             {"label": "b", "action": "pick up", "need_parameter": False, "possible": possible},
             press,
         ]
-        return Report(goal="do it", options=options, executed=1, steps=1)
+        return Report(goal="do it", options=options, executed=1, frames=1)
 
     frames = {"state": np.zeros((1, 8), np.float32), "front": [np.zeros((256, 256, 3), np.uint8)]}
     running = RunningEpisode(policy("pi05"), Job("StopCube", "test", 0), 0, None, 32, None)

@@ -79,7 +79,7 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
             for n in range(2)
         ]
 
-    monkeypatch.setattr(evaluating, "run_episodes", episodes)
+    monkeypatch.setattr(evaluating, "run_checkpoint", episodes)
     words = with_settings(["task=VideoUnmask", "nano=null", "model=framesamp_modul", "budget=2,4"])
     words += ["trainings=2", "beside=[]", "rendered_for=[]", "planner=false", "videos=false"]
     words += ["train.steps=2", "train.val_samples=4", "train.batch_size=2", "train.log_every=1"]

@@ -315,7 +315,7 @@ def test_a_card_without_another_scene_to_show_has_no_recovery(
         lambda arm, *_, **__: "a camera" if arm.name == "distract:1" else None,
     )
     monkeypatch.setattr(card_module, "run_probe", lambda policy, plan, *_, **__: plans.append(plan))
-    monkeypatch.setattr(card_module, "evaluate", lambda *_, **__: None)
+    monkeypatch.setattr(card_module, "run_episodes", lambda *_, **__: None)
     ended = {
         EpisodeKey(record.task, record.episode): [record] for record in records("test", [1, 1])
     }
@@ -334,7 +334,7 @@ def test_a_card_runs_every_arm_and_resumes(tmp_path: Path, monkeypatch: pytest.M
     policy, donors = reader(CONTENT), recordings()
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
     settings = RolloutSettings(max_steps=16, flow_steps=2, workers=1, max_batch=1)
-    facts = replace(FACTS, max_steps=settings.max_steps)
+    facts = replace(FACTS, max_steps=settings.step_limit)
     options = RunOptions(base=make_choice_env, show_progress=False)
     card = run_card(policy, plan, tmp_path, facts, settings, options)
     assert set(card.arms) == set(ARMS) - {"oracle frames"} and "oracle frames" in card.notes[0]

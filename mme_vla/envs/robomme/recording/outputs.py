@@ -43,7 +43,7 @@ class EpisodeWriter:
         self._file = h5py.File(path, "w")
         self._episode = self._file.create_group(f"episode_{index}")
         self._steps = 0
-        choices = [choice.to_dict() for choice in task.choices()]
+        choices = [choice.option.to_dict() for choice in task.choices()]
         setup = self._episode.create_group("setup")
         setup["seed"] = np.int64(task.seed)
         texts = {"difficulty": task.difficulty, "available_multi_choices": json.dumps(choices)}

@@ -21,6 +21,7 @@ from mme_vla.extras.methods.diffusion_policy.processor import DiffusionBatch, Di
 from mme_vla.integration.film import PooledIntegration
 from mme_vla.memory.base import Memory, full_history
 from mme_vla.model import masked_mean
+from mme_vla.policy.base import draw_noise
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
@@ -29,7 +30,7 @@ from mme_vla.policy.sections import PolicySections
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed import Recompute
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
+from mme_vla.types import MemoryTokens, Noise, map_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -240,9 +241,7 @@ class DiffusionPolicy(NetworkPolicy):
             memory: memory tokens encoded beforehand.
         """
         if noise is None:
-            noise = stack_noise(
-                [self.sampling_noise(torch.default_generator) for _ in range(len(batch.state))]
-            )
+            noise = draw_noise(self, len(batch.state))
         sampled = map_noise(noise, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history) if memory is None else memory
         with self.autocast():

@@ -29,6 +29,7 @@ from mme_vla.extras.methods.openvla_oft.processor import augment, centre_cut, dr
 from mme_vla.extras.methods.prismatic import IMAGENET, Prismatic
 from mme_vla.memory.base import Memory, full_history
 from mme_vla.model import masked_mean
+from mme_vla.policy.base import draw_noise
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
@@ -39,7 +40,7 @@ from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
 from mme_vla.speed import Recompute, compile_parts
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
+from mme_vla.types import MemoryTokens, Noise, map_noise
 
 
 @POLICIES.register("memoryvla")
@@ -287,9 +288,7 @@ class MemoryVlaPolicy(NetworkPolicy):
             memory: memory tokens of the last moments, encoded beforehand.
         """
         if noise is None:
-            noise = stack_noise(
-                [self.sampling_noise(torch.default_generator) for _ in range(len(batch.images))]
-            )
+            noise = draw_noise(self, len(batch.images))
         if self.memory is not None:
             batch = batch.last()
             memory = self.encode_memory(batch.history) if memory is None else memory

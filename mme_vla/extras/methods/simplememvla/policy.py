@@ -44,6 +44,7 @@ from mme_vla.extras.methods.simplememvla.prompt import (
 )
 from mme_vla.extras.methods.simplememvla.video import TEMPORAL, Window, augment, augmentation_draw
 from mme_vla.memory.base import MemoryModule, full_history
+from mme_vla.policy.base import draw_noise
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
@@ -53,7 +54,7 @@ from mme_vla.processing.base import PolicyProcessor
 from mme_vla.registry import POLICIES
 from mme_vla.speed import Recompute
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
+from mme_vla.types import MemoryTokens, Noise, map_noise
 
 _STAMP_TOKENS, _REQUEST_TOKENS, _RESPONSE_TOKENS = 9, 105, 12
 """Text tokens of a timestamp, of a prompt's remaining text and of a response, where costs are
@@ -300,9 +301,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             memory: memory tokens encoded beforehand.
         """
         if noise is None:
-            noise = stack_noise(
-                [self.sampling_noise(torch.default_generator) for _ in range(len(batch.ids))]
-            )
+            noise = draw_noise(self, len(batch.ids))
         memory = self.encode_memory(batch.history) if memory is None else memory
         _, condition = self.generate(batch, memory)
         return self._sample(batch, condition, noise, steps)
