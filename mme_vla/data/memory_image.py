@@ -5,6 +5,7 @@ themselves.
 import numpy as np
 from PIL import Image, ImageDraw
 
+from mme_vla.errors import counted
 from mme_vla.utils.media import FAINT, GAP, INK, LABEL, TILE, Tile, contact_sheet, font, thumbnail
 from mme_vla.utils.style import rgb
 
@@ -51,7 +52,7 @@ def memory_sheet(
     hidden = len(remembered) - len(displayed)
     note = "In colour: remembered patches. Dimmed: the rest of those frames."
     if hidden:
-        note += f" {hidden} more frames are remembered in part."
+        note += f" Remembered in part: {counted(hidden, 'more frame')}."
     draw.text((0, header.height - LABEL - 4), note, FAINT, font(13))
     return contact_sheet(tiles, COLUMNS, title, header)
 

@@ -14,7 +14,7 @@ from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ROBOMME, check_sessions, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, counted
 from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.rollout.environment import base_env, make_rollout_env
@@ -219,8 +219,8 @@ def evaluate(
         with RolloutProgress(len(jobs), completed, options.show_progress, name) as progress:
             if completed:
                 progress.say(
-                    f"{output} holds {len(completed)} of {len(jobs)} episodes: continuing with the"
-                    " others"
+                    f"{output} holds {len(completed)} of {counted(len(jobs), 'episode')}:"
+                    " continuing with the others"
                 )
             forecast = durations.forecast(missing, workers, shard.count)
             if forecast and options.show_forecast:
