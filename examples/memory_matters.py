@@ -287,7 +287,7 @@ def plot(results: list[dict], path: Path) -> None:
         axes.axvline(0.75, color=INK, ls="--", lw=1, label="guessing a colour")
         axes.set_yticks(range(len(rows)), list(rows))
         axes.set_ylim(len(rows) - 0.5, -0.5)
-        axes.set_xlim(0, 0.9)
+        axes.set_xlim(0, max(0.9, axes.get_xlim()[1]))
         axes.grid(True, axis="x")
         axes.grid(False, axis="y")
         n = len(results[0]["errors"])

@@ -322,7 +322,9 @@ def summary_rows(policy: Policy, folder: Path) -> list[tuple[str, str]]:
         relative = f"{len(space.of_pose)} of them differences to the tool's pose"
     memory = "none"
     if policy.memory is not None:
-        budget = f"{policy.memory.budget} tokens" if policy.memory.budget else "no tokens"
+        budget = (
+            f"{counted(policy.memory.budget, 'token')}" if policy.memory.budget else "no tokens"
+        )
         parts_of = [str(sections.memory.get("name", "memory")), budget]
         parts_of.append(f"of the camera {robot.memory_camera}")
         parts_of.append(f"integration {sections.integration.get('name', 'none')}")
@@ -331,8 +333,8 @@ def summary_rows(policy: Policy, folder: Path) -> list[tuple[str, str]]:
         ("model", f"{names[0]}, backbone {names[1]} ({type(policy).__name__})"),
         ("parameters", f"{sum(parts.values()):,}: {sizes}"),
         ("robot", f"{robot.name}: cameras {', '.join(robot.camera_names)}, {rate}"),
-        ("state", f"{robot.state.width} numbers"),
-        ("action", f"{space.width} numbers, {relative}"),
+        ("state", f"{counted(robot.state.width, 'number')}"),
+        ("action", f"{counted(space.width, 'number')}, {relative}"),
         ("chunk", f"{space.horizon} actions, of which {space.execute} are executed"),
         ("memory", memory),
         ("text", policy.require_processor().prompt_spec.encoder),
@@ -402,7 +404,8 @@ def show_details(policy: Policy, folder: Path, console: Console) -> None:
     if (folder / STATE).is_file():
         state = read_state(folder)
         settings.add_row(
-            "trained for", f"{state['step']} steps; weights here are averages, raw ones beside them"
+            "trained for",
+            f"{counted(state['step'], 'step')}; weights here are averages, raw ones beside them",
         )
         settings.add_row("recipe", _summary(state["config"].get("train", {})))
         settings.add_row("data", _summary(state["config"].get("data", {})))

@@ -262,8 +262,8 @@ def main(cfg: DictConfig) -> None:
             there = {path.stem for path in (work / "episodes").glob("*.json")}
             begun = time.perf_counter()
             done = record(jobs, work / "episodes", run.workers, previews)
-            seconds = time.perf_counter() - begun
             recording_plan.write(missing, work / "episodes", options)
+            seconds = time.perf_counter() - begun  # the conversion is part of the time
             n_steps, n_failed = 0, 0
             n_new, n_new_steps = 0, 0
             for job, recorded in zip(jobs, done, strict=True):

@@ -31,7 +31,7 @@ from mme_vla.data.lerobot_files import (
     read_records,
     read_tasks,
 )
-from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.errors import UserError, brief, counted, listed, require
 from mme_vla.utils import read_json
 
 log = logging.getLogger(__name__)
@@ -125,8 +125,9 @@ def _check_rows(dataset: Description, rows: Mapping[str, np.ndarray]) -> None:
     # Before anything of that size: a damaged length may be larger than memory.
     require(
         len(index) == total,
-        f"{root}: the tables hold {len(index)} rows where meta/episodes describes {total} in"
-        f" {len(lengths)} episodes; the dataset is incomplete or mixed up. {REMEDY}",
+        f"{root}: the tables hold {counted(len(index), 'row')} where meta/episodes describes"
+        f" {total} in {counted(len(lengths), 'episode')}; the dataset is incomplete or mixed up."
+        f" {REMEDY}",
     )
     episodes = np.repeat(np.arange(len(lengths)), lengths)
     row = first_wrong(index != episodes)
@@ -189,7 +190,8 @@ def _check_side_file(dataset: Description, rows: Mapping[str, np.ndarray]) -> No
     lengths, starts = dataset.lengths, dataset.starts
     require(
         len(records) <= len(lengths),
-        f"{path} tells of {len(records)} episodes, meta/episodes of {len(lengths)}. {CORRECT}"
+        f"{path} tells of {counted(len(records), 'episode')}, meta/episodes of {len(lengths)}."
+        f" {CORRECT}"
         " Without the file, episodes have no names of tasks.",
     )
     for episode, record in enumerate(records):
@@ -225,7 +227,7 @@ def _find_tasks(dataset: Description, rows: Mapping[str, np.ndarray]) -> FrameTa
     if row is not None:
         raise UserError(
             f"{root}: {dataset.place(row)}, has task_index {numbers[row]}, but {TASKS} holds"
-            f" {len(texts)} tasks. {CORRECT}"
+            f" {counted(len(texts), 'task')}. {CORRECT}"
         )
     begins = np.concatenate([[True], numbers[1:] != numbers[:-1]])
     begins[starts] = True

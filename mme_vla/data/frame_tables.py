@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.lerobot_files import REMEDY, Feature, content_fingerprint, parquet_files
-from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.errors import UserError, brief, counted, listed, require
 from mme_vla.utils import decoding, file_sum, user_cache
 
 INDEX_COLUMNS = ("episode_index", "frame_index", "timestamp", "index", "task_index")
@@ -69,10 +69,13 @@ def read_index_columns(
                 )
             numbers = flat(values)
             missing = max(values.null_count, numbers.null_count)
-            require(not missing, f"{root}: {missing} rows have no {name}. {REMEDY}")
+            require(
+                not missing, f"{root}: {name} is missing in {counted(missing, 'row')}. {REMEDY}"
+            )
             require(
                 len(numbers) == table.num_rows,
-                f"{root}: {name} has {len(numbers)} numbers in {table.num_rows} rows. {REMEDY}",
+                f"{root}: {name} has {counted(len(numbers), 'number')} in"
+                f" {counted(table.num_rows, 'row')}. {REMEDY}",
             )
             target = pa.float64() if name == "timestamp" else pa.int64()
             columns[name] = numbers.cast(target).to_numpy(zero_copy_only=False)

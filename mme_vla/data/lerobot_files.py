@@ -21,7 +21,7 @@ from pydantic import BaseModel, Field
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import POSE_WIDTH
-from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.errors import UserError, brief, counted, listed, require
 from mme_vla.utils import decoding, inside, read_json, require_file
 from mme_vla.utils.validation import validated
 
@@ -498,7 +498,8 @@ def read_episode_table(root: Path, video_columns: Sequence[str]) -> EpisodeTable
         columns = {name: table[name].to_numpy() for name in kinds}
     require(
         not empty and table.num_rows,
-        f"{meta} describes {table.num_rows} episodes; empty cells in: {listed(empty) or 'none'}."
+        f"{meta} describes {counted(table.num_rows, 'episode')}; empty cells in:"
+        f" {listed(empty) or 'none'}."
         f" {REMEDY}",
     )
 

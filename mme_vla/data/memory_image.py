@@ -5,7 +5,19 @@ themselves.
 import numpy as np
 from PIL import Image, ImageDraw
 
-from mme_vla.utils.media import FAINT, GAP, INK, LABEL, TILE, Tile, contact_sheet, font, thumbnail
+from mme_vla.errors import counted
+from mme_vla.utils.media import (
+    FAINT,
+    GAP,
+    GROUND,
+    INK,
+    LABEL,
+    TILE,
+    Tile,
+    contact_sheet,
+    font,
+    thumbnail,
+)
 from mme_vla.utils.style import rgb
 
 COLUMNS = 8  # tiles a row
@@ -45,13 +57,13 @@ def memory_sheet(
         tiles.append(Tile(np.asarray(_highlighted(frames[frame], patches, grid)), label, colour))
     tiles.append(Tile(frames[step], f"now: frame {step}", NOW))
     columns = max(min(COLUMNS, len(tiles)), 6)
-    header = Image.new("RGB", (columns * (TILE + GAP) - GAP, TIMELINE + 2 * LABEL), "white")
+    header = Image.new("RGB", (columns * (TILE + GAP) - GAP, TIMELINE + 2 * LABEL), GROUND)
     draw = ImageDraw.Draw(header)
     _timeline(draw, counts, grid**2, exec_start, step, (0, 0, header.width, TIMELINE))
     hidden = len(remembered) - len(displayed)
     note = "In colour: remembered patches. Dimmed: the rest of those frames."
     if hidden:
-        note += f" {hidden} more frames are remembered in part."
+        note += f" Remembered in part: {counted(hidden, 'more frame')}."
     draw.text((0, header.height - LABEL - 4), note, FAINT, font(13))
     return contact_sheet(tiles, COLUMNS, title, header)
 
@@ -64,7 +76,7 @@ def _highlighted(frame: np.ndarray, patches: np.ndarray, grid: int) -> Image.Ima
         (TILE, TILE), Image.Resampling.NEAREST
     )
     grey = image.convert("L").convert("RGB")
-    dimmed = Image.blend(grey, Image.new("RGB", grey.size, "white"), 0.62)
+    dimmed = Image.blend(grey, Image.new("RGB", grey.size, GROUND), 0.62)
     tile = Image.composite(image, dimmed, large)
     draw = ImageDraw.Draw(tile)
     edge = np.linspace(0, TILE, grid + 1).round().astype(int)
@@ -97,7 +109,7 @@ def _timeline(
     split = left + exec_start * scale
     for begin, end, colour in ((left, split, VIDEO), (split, right, EXECUTION)):
         if end > begin:
-            pale = tuple(235 + (c - 235) // 8 for c in colour)
+            pale = tuple(g + (c - g) // 5 for g, c in zip(GROUND, colour, strict=True))
             draw.rectangle((begin, top, end, bottom), fill=pale)
     for frame in np.flatnonzero(counts):
         x = left + frame * scale

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
+from mme_vla.errors import counted
 from mme_vla.evaluation.records import EpisodeRecord
 
 
@@ -47,15 +48,15 @@ class Pairing[Key: Hashable]:
         lines = []
         if self.other:
             lines.append(
-                f"{what}: {sum(self.other.values())} episodes are not paired, for their scenes are"
-                f" different ones in these runs ({_by_task(self.other)}): they were built by other"
-                " versions or on other machines."
+                f"{what}: {counted(sum(self.other.values()), 'episode')} not paired, for the"
+                f" scenes are different ones in these runs ({_by_task(self.other)}): they were"
+                " built by other versions or on other machines."
             )
         if self.mixed:
             lines.append(
-                f"{what}: {sum(self.mixed.values())} episodes are not paired, for only some of the"
-                f" runs name their scene ({_by_task(self.mixed)}): evaluate the others again with"
-                " this version."
+                f"{what}: {counted(sum(self.mixed.values()), 'episode')} not paired, for only some"
+                f" of the runs name the scene ({_by_task(self.mixed)}): evaluate the others again"
+                " with this version."
             )
         return lines
 

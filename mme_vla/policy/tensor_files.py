@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, brief, check_choice, listed, require
+from mme_vla.errors import UserError, brief, check_choice, counted, listed, require
 from mme_vla.utils import check_sums, checked_file, inside, read_json
 
 WEIGHTS = "model.safetensors"
@@ -228,7 +228,7 @@ def check_values(tensors: Mapping[str, Tensor], source: str) -> None:
     broken = [name for name, tensor in tensors.items() if not _finite(tensor)]
     if broken:
         raise UserError(
-            f"{source} holds NaN or infinities in {len(broken):,} tensors:"
+            f"{source} holds NaN or infinities in {counted(len(broken), 'tensor')}:"
             f" {listed(sorted(broken), 5)}. Its actions would mean nothing: the training diverged"
             " or the file is damaged; take an earlier checkpoint."
         )

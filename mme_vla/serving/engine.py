@@ -16,6 +16,7 @@ import numpy as np
 
 from mme_vla.embodiment import Option
 from mme_vla.embodiment.robomme import SIDE
+from mme_vla.errors import counted
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.scheduler import Act, Read, Scheduler
@@ -73,8 +74,9 @@ class ServerStats:
         if mean:
             times += f", {mean} to a batch"
         return (
-            f"{self.connections} clients · {self.counts['infer']} inferences ({times}) · "
-            f"{self.counts['refused']} requests refused, {self.counts['failed']} failed"
+            f"{counted(self.connections, 'client')} · {counted(self.counts['infer'], 'inference')}"
+            f" ({times}) · "
+            f"{counted(self.counts['refused'], 'request')} refused, {self.counts['failed']} failed"
         )
 
 

@@ -29,7 +29,7 @@ from pydantic import (
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.embodiment.action_space import read_options
 from mme_vla.embodiment.robomme import ARM_JOINTS, benchmark_state
-from mme_vla.errors import UserError, did_you_mean, require
+from mme_vla.errors import UserError, counted, did_you_mean, require
 from mme_vla.utils import is_text
 from mme_vla.utils.validation import described, validated
 
@@ -129,7 +129,8 @@ def _buffer(value: Any) -> list[Any]:
 def _counted(images: list[Any], least: int, most: int) -> list[Any]:
     if not least <= len(images) <= most:
         raise ValueError(
-            f"holds {len(images)} frames; this server takes {least} … {most} (limits.frames)."
+            f"holds {counted(len(images), 'frame')}; this server takes {least} … {most}"
+            f" (limits.frames)."
         )
     return images
 
@@ -443,8 +444,8 @@ class RequestReader:
         exec_start = frames.exec_start_idx
         if executed is not None and len(executed) > len(states):
             raise UserError(
-                f"executed_action_list has {len(executed)} actions for {len(states)} frames: send"
-                " one for each of the last frames."
+                f"executed_action_list has {counted(len(executed), 'action')} for"
+                f" {counted(len(states), 'frame')}: send one for each of the last frames."
             )
         if exec_start is not None and not (frames.is_first_step and exec_start < len(states)):
             raise UserError(

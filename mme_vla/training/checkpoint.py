@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, distributed, nn
 
 from mme_vla.config.sections import section_keys
-from mme_vla.errors import UserError, listed, require
+from mme_vla.errors import UserError, counted, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
 from mme_vla.policy.saving import save_policy, save_settings
@@ -337,6 +337,6 @@ def _check_fit(
             wrong.append(f"{name}: {tuple(tensor.shape)} {tensor.dtype}")
     require(
         not wrong,
-        f"{path} does not fit this policy: {len(wrong):,} tensors differ, such as"
+        f"{path} does not fit this policy: other values in {counted(len(wrong), 'tensor')}, such as"
         f" {listed(wrong, 4)}. It belongs to another model or other settings.",
     )

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import require
+from mme_vla.errors import counted, require
 from mme_vla.policy.base import Policy
 
 
@@ -46,8 +46,8 @@ class BatchOrder:
     ) -> None:
         require(
             samples >= batch_size,
-            f"The training split has {samples} samples, fewer than train.batch_size={batch_size}: "
-            "lower the batch size or add data.",
+            f"The training split has {counted(samples, 'sample')}, fewer than"
+            f" train.batch_size={batch_size}: lower the batch size or add data.",
         )
         require(
             batch_size % (accumulate * processes) == 0,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.config.naming import flat
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import UserError, brief, counted, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import (
     CHECKPOINTS,
@@ -137,8 +137,8 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     steps: int = config["train"]["steps"]
     require(
         state["step"] <= steps,
-        f"{checkpoint} has done {state['step']} steps already, more than train.steps={steps}: give"
-        " as many or more.",
+        f"{checkpoint} has done {counted(state['step'], 'step')} already, more than"
+        f" train.steps={steps}: give as many or more.",
     )
     newer = [
         path.name for path in checkpoints_in(checkpoint.parent) if step_of(path) > state["step"]

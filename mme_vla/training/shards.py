@@ -25,7 +25,7 @@ from torch.distributed.checkpoint.api import CheckpointException
 from torch.distributed.checkpoint.staging import DefaultStager, StagingOptions
 from torch.distributed.tensor import DTensor
 
-from mme_vla.errors import listed, require
+from mme_vla.errors import counted, listed, require
 from mme_vla.policy.tensor_files import check_header, check_values
 from mme_vla.training.parallel import reshard
 from mme_vla.utils import Sums, check_sums, decoding, inside, sum_line
@@ -205,9 +205,9 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
         wrong += stored.keys() - tensors.keys()
     require(
         not wrong,
-        f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as"
-        f" {listed(sorted(wrong), 4)}. It belongs to another model or other settings, or a file of"
-        " it is missing.",
+        f"{folder} does not fit this policy: other values in {counted(len(wrong), 'tensor')}, such"
+        f" as {listed(sorted(wrong), 4)}. It belongs to another model or other settings, or a file"
+        " of it is missing.",
     )
     try:
         with _quiet():

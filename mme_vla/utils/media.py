@@ -22,7 +22,8 @@ FPS = 30  # of videos; the simulator's steps simply play faster
 RED = (255, 0, 0)  # the border of a conditioning video's images, as in the benchmark's own
 BORDER = 10  # pixels
 CAPTION = 20  # pixels of a line of text below a video's images
-INK, FAINT = rgb("ink"), rgb("faint")
+GROUND, INK, FAINT = rgb("card", dark=True), rgb("ink", dark=True), rgb("faint", dark=True)
+"""Of sheets: a dark ground suits pages of both grounds."""
 TILE, GAP, MARGIN, LABEL = 160, 12, 20, 20  # pixels of a contact sheet
 
 
@@ -158,16 +159,14 @@ def video_frame(
 
 
 def of_one_size(images: Sequence["Image"]) -> Iterator[np.ndarray]:
-    """Images of any sizes as frames of a video: each at the top left of a white one that holds the
-    largest.
-    """
+    """Images of any sizes as frames of a video: each at the top left of the largest size."""
     from PIL import Image
 
     width = max(image.width for image in images)
     height = max(image.height for image in images)
     width, height = width + width % 2, height + height % 2  # as the format wants them
     for image in images:
-        canvas = Image.new("RGB", (width, height), "white")
+        canvas = Image.new("RGB", (width, height), GROUND)
         canvas.paste(image)
         yield np.asarray(canvas)
 
@@ -206,7 +205,7 @@ def contact_sheet(
         inner = max(inner, header.width)
         top += header.height
     width = 2 * MARGIN + inner
-    sheet = Image.new("RGB", (width, top + rows * (side + LABEL + GAP) + MARGIN), "white")
+    sheet = Image.new("RGB", (width, top + rows * (side + LABEL + GAP) + MARGIN), GROUND)
     draw = ImageDraw.Draw(sheet)
     draw.text((MARGIN, MARGIN), fitted(title, width - 2 * MARGIN, 17), INK, font(17))
     if header is not None:

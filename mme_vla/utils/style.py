@@ -51,9 +51,9 @@ def colour(name: str) -> str:
     return PALETTE[name][0]
 
 
-def rgb(name: str) -> tuple[int, int, int]:
-    """Return a colour of the palette on light ground for Pillow, 0 to 255."""
-    red, green, blue = bytes.fromhex(colour(name)[1:])
+def rgb(name: str, dark: bool = False) -> tuple[int, int, int]:
+    """Return a colour of the palette, on light or on dark ground, for Pillow, 0 to 255."""
+    red, green, blue = bytes.fromhex(PALETTE[name][dark][1:])
     return red, green, blue
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, require
+from mme_vla.errors import UserError, brief, counted, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
 from mme_vla.policy.saving import recompute_buffers
@@ -123,7 +123,9 @@ class Start:
     left: list[str]
 
     def __str__(self) -> str:
-        text = f"{len(self.taken)} tensors taken, {len(self.new)} new ({_groups(self.new)})"
+        text = (
+            f"{counted(len(self.taken), 'tensor')} taken, {len(self.new)} new ({_groups(self.new)})"
+        )
         if self.left:
             text += f", {len(self.left)} left behind ({_groups(self.left)})"
         return text

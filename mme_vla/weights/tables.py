@@ -15,7 +15,7 @@ from einops import rearrange
 from torch import Tensor
 
 from mme_vla.backbone.pi05 import Pi05Backbone
-from mme_vla.errors import UserError, listed
+from mme_vla.errors import UserError, counted, listed
 from mme_vla.policy.base import Policy
 from mme_vla.policy.sections import PolicySections
 from mme_vla.policy.tensor_files import check_fit
@@ -111,7 +111,8 @@ def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     missing = sorted(paths_of(table) - set(source))
     if missing:
         raise UserError(
-            f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}"
+            f"The checkpoint lacks {counted(len(missing), 'tensor')} this policy needs:"
+            f" {listed(missing)}"
         )
     target = {}
     for name, pieces in table.items():
@@ -190,9 +191,9 @@ class Adapter:
         unnamed = sorted(set(target) - set(self.table))
         if unnamed:
             raise UserError(
-                f"{len(unnamed)} tensors have no name in this format: {', '.join(unnamed)}. It"
-                " holds memoryless policies without adapters: convert another policy, merge the"
-                " adapters first, or choose another format."
+                f"This format has no name for {counted(len(unnamed), 'tensor')}:"
+                f" {', '.join(unnamed)}. It holds memoryless policies without adapters: convert"
+                " another policy, merge the adapters first, or choose another format."
             )
         released = write(self.table, self.unread, target, self.derived)
         return released | {name: released[original] for name, original in self.tied.items()}

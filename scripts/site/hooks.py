@@ -51,6 +51,9 @@ BOOST = {
 """Folder or page → weight in the search, 1 for the others."""
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)(#[^)\s]*)?\)")
 DRAWING = re.compile(r'<img alt="([^"]*)" src="([^"]*\.svg)" />')
+CELL = re.compile(r"(?<=<td>).*?(?=</td>)", re.DOTALL)
+VALUE = re.compile(r"<code>(?=[^<\s]{1,22}</code>)|(?<![\w.-])\d[\d.]*e-\d+(?![\w-])")
+"""In a cell of a table: a short name or setting in code, and a power of ten."""
 UNITS = "[KMGT]i?B|[mµ]?s|min|h|[mck]?m|px|Hz|fps"
 """Units of values on the pages, as a regular expression."""
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", ".toml": "toml"}
@@ -128,13 +131,22 @@ def on_page_markdown(markdown: str, page: "Page", **_: object) -> str:
 
 
 def on_page_content(html: str, page: "Page", **_: object) -> str:
-    """Put drawings into the page itself, where they follow its light and dark."""
+    """Put drawings into the page itself, where they follow its light and dark, and keep values of
+    tables on one line.
+    """
 
     def inline(match: re.Match[str]) -> str:
         target = target_of(page.file.src_uri, match[2])
         return match[0] if target is None else drawing(ROOT / target, match[1])
 
-    return DRAWING.sub(inline, html)
+    return CELL.sub(lambda cell: VALUE.sub(whole, cell[0]), DRAWING.sub(inline, html))
+
+
+def whole(value: re.Match[str]) -> str:
+    """The beginning of code, or a number, with the class of values that do not break."""
+    if value[0] == "<code>":
+        return '<code class="value">'
+    return f'<span class="value">{value[0]}</span>'
 
 
 def drawing(path: Path, description: str) -> str:

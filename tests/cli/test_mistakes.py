@@ -75,6 +75,19 @@ def test_a_reply_says_what_to_type(
     assert not list(tmp_path.iterdir())
 
 
+def test_mistakes_in_several_keys_of_a_probe_are_named_together(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    where = ["checkpoint=missing", "recordings=[not_a_dataset]"]
+    printed = reply(["probe", *where, "with=[drop:many]", "draws=0"], monkeypatch, capsys)
+    assert "No checkpoint at missing" in printed
+    assert "with=drop:many: write a name" in printed
+    assert "draws=0 must be" in printed
+    assert "No LeRobot dataset at 'not_a_dataset'" in printed
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("place", "folder"),
     [("configs/model", "configs"), ("model", "."), ("robots/model", "robots")],

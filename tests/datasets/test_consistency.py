@@ -641,7 +641,7 @@ def test_a_declared_flag_that_one_file_lacks_is_named(tmp_path: Path, flag: str)
     [
         ([[0, 0], [], *[[0]] * 7], "holds lists; expected one number a row"),
         ([[0, 0]] * 9, "holds lists; expected one number a row"),
-        ([[None], *[[0]] * 8], "1 rows have no"),
+        ([[None], *[[0]] * 8], "is missing in 1 row"),
         (["yes"] * 9, "cannot be read as numbers"),
         ([0.5] * 9, "cannot be read as numbers"),
     ],

@@ -215,7 +215,7 @@ def test_weights_that_are_no_numbers_are_refused_by_name(
         lambda place: load_weights(small_policy("framesamp_context"), place),
     ):
         with pytest.raises(
-            UserError, match=r"NaN or infinities in 1 tensors: backbone\.time_in\.bias|misshapen"
+            UserError, match=r"NaN or infinities in 1 tensor: backbone\.time_in\.bias|misshapen"
         ):
             load(folder)
 

@@ -110,15 +110,22 @@ def test_two_methods_are_compared_on_the_scenes_that_both_machines_built(
     save_records(tmp_path, every)
     main([str(tmp_path), "--tasks", "PickXtimes", "--episodes", "4", "--samples", "20", "--brief"])
     printed = capsys.readouterr().out
-    assert "m − n: 2 episodes are not paired, for their scenes are different ones" in printed
+    assert "m − n: 2 episodes not paired, for the scenes are different ones" in printed
     assert "(PickXtimes 2)" in printed
+
+
+def test_one_episode_that_is_not_paired_is_counted_as_one() -> None:
+    first = {("PickXtimes", 0): named(records("test", [1]), ["a"])}
+    second = {("PickXtimes", 0): named(records("test", [0]), ["b"])}
+    (note,) = pair([first, second]).gaps("m − n")
+    assert note.startswith("m − n: 1 episode not paired, for the scenes are different")
 
 
 @pytest.mark.parametrize(
     "scenes, reason",
     [
         (["b0", "b1", "b2", "b3"], "are different ones"),
-        ([None] * 4, "only some of the runs name their scene"),
+        ([None] * 4, "only some of the runs name the scene"),
     ],
 )
 def test_nothing_in_common_is_said_and_not_compared(
@@ -202,9 +209,7 @@ def test_events_are_matched_with_the_same_scenes() -> None:
     every = [*named(records("test", [1] * 4), HERE), *with_event]
     table = event_table(every)
     row = dict(zip(table.columns, table.rows[0], strict=True))
-    assert (row["pairs"], row["lost"]) == ("2", "2") and "2 episodes are not paired" in table.notes[
-        0
-    ]
+    assert (row["pairs"], row["lost"]) == ("2", "2") and "2 episodes not paired" in table.notes[0]
     (points,) = event_curves(every).values()
     assert [point.episodes for point in points] == [2, 2]
 
@@ -213,9 +218,7 @@ def test_twins_are_the_same_scenes() -> None:
     every = [*named(records("test", [0] * 4), HERE), *named(records("twin", [1] * 4), THERE)]
     table = twin_table(every)
     assert (
-        table is not None
-        and table.rows[0][1] == "2"
-        and "2 episodes are not paired" in table.notes[0]
+        table is not None and table.rows[0][1] == "2" and "2 episodes not paired" in table.notes[0]
     )
 
 
@@ -244,7 +247,7 @@ def test_the_page_of_a_nano_run_compares_the_same_scenes() -> None:
     }
     results, (comparison,) = compared(runs, "PickXtimes", "test", "n")
     assert comparison.episodes == 2 and any(
-        "2 episodes are not paired" in note for note in results.notes
+        "2 episodes not paired" in note for note in results.notes
     )
 
 

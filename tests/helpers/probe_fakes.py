@@ -14,9 +14,10 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.envs import Job
 from mme_vla.extras.probing.arms import Arm, read_arm, read_arms
 from mme_vla.extras.probing.lines import Line
-from mme_vla.extras.probing.offline import OfflineSettings, probe_offline
+from mme_vla.extras.probing.offline import probe_offline
 from mme_vla.extras.probing.probed import ProbedPolicy
 from mme_vla.extras.probing.recordings import Recording
+from mme_vla.extras.probing.settings import OfflineSettings
 from mme_vla.policy.mme import MMEPolicy
 
 SIDE = 64

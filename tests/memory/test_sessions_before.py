@@ -19,9 +19,9 @@ from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.evaluation.rollout.evaluation import RunOptions, policy_of_split, run_episodes
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.arms import read_arm
-from mme_vla.extras.probing.offline import OfflineSettings
 from mme_vla.extras.probing.probed import ProbedEpisode, ProbedPolicy, with_sessions
 from mme_vla.extras.probing.run import ProbePlan, run_probe
+from mme_vla.extras.probing.settings import OfflineSettings
 
 SPLIT = "stress:sessions=2"
 JOBS = [Job("VideoUnmask", SPLIT, 0), Job("PickXtimes", SPLIT, 1)]

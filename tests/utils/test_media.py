@@ -20,6 +20,7 @@ from mme_vla.utils.media import (
     video_frame,
     write_video,
 )
+from mme_vla.utils.style import rgb
 
 GREEN, BLUE, YELLOW = ((0, 200, 0), (0, 0, 200), (200, 200, 0))
 
@@ -146,3 +147,10 @@ def test_a_contact_sheet_holds_every_tile_and_outlines_the_highlighted_ones() ->
     for tile in tiles:
         assert (sheet == tile.image[0, 0]).all(-1).sum() > 150**2, tile.label
     assert 0 < (sheet == RED).all(-1).sum() < 4 * 2 * 170
+
+
+def test_a_contact_sheet_has_a_dark_ground_and_letters_that_can_be_read_on_it() -> None:
+    sheet = np.asarray(contact_sheet([Tile(baseline(GREEN), "one")], columns=1, title="all"))
+    assert tuple(sheet[0, 0]) == rgb("card", dark=True)
+    title = sheet[:40].reshape(-1, 3)
+    assert title.max() > 200 and (title.max(1) < 64).mean() > 0.8

@@ -215,5 +215,5 @@ def test_a_policy_with_memory_has_no_place_in_the_ports(pi05: MMEPolicy, tmp_pat
     memory = small_policy("framesamp_expert")
     with pytest.raises(UserError, match="has a memory, whose weights would stay unset"):
         load_weights(memory, saved(to_openpi(pi05, pi05.state_dict()), tmp_path / "base"))
-    with pytest.raises(UserError, match="have no name in this format"):
+    with pytest.raises(UserError, match="This format has no name for"):
         to_lerobot(memory, memory.state_dict())

@@ -515,8 +515,8 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
             if same.left_out:
                 notes.append(
                     f"{method.label}: its runs are not known to be of the same scenes in"
-                    f" {same.left_out} episodes, whose scenes differ or are named in some runs"
-                    " only; its mean is over all of them."
+                    f" {counted(same.left_out, 'episode')}: the scenes differ or only some runs"
+                    " name them; its mean is over all of them."
                 )
     splits: set[str] = set()
     for method in methods:

@@ -70,7 +70,7 @@ def show(figure: Figure) -> str:
         return f"{rate} ({figure.done:,} of {figure.expected:,})"
     text = show_mean(figure.mean, figure.std)
     if figure.complete < figure.runs:
-        text += f" ({figure.complete} of {figure.runs} runs)"
+        text += f" ({figure.complete} of {counted(figure.runs, 'run')})"
     return text
 
 
@@ -296,7 +296,7 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
                     if pd.isna(values[number]):
                         done = sum(key.task == name for key in run.records)
                         expected = len(results.protocol.numbers_of(name))
-                        cells[number] = f"{done} of {expected} episodes"
+                        cells[number] = f"{done} of {counted(expected, 'episode')}"
             rows.append([str(name), *cells])
         tables.append(Table(f"{method.label}, checkpoint {checkpoint}", columns, rows))
     return tables

@@ -280,8 +280,8 @@ def run_episodes(
         with RolloutProgress(len(jobs), completed, options.show_progress, name) as progress:
             if completed:
                 progress.say(
-                    f"{output} holds {len(completed)} of {len(jobs)} episodes: continuing with the"
-                    " others"
+                    f"{output} holds {len(completed)} of {counted(len(jobs), 'episode')}:"
+                    " continuing with the others"
                 )
             forecast = durations.forecast(missing, workers, shard.count)
             if forecast and options.show_forecast:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import cache
 
+from mme_vla.errors import counted
 from mme_vla.evaluation.records import EpisodeKey
 from mme_vla.extras.audit.floor import RANDOM
 from mme_vla.extras.probing.card import CONTENT, TIME, WRONG_SCENE, Card, Loss, grade, percent
@@ -109,8 +110,8 @@ def conclude(card: Card, target_loss: float) -> Conclusion:
         sentences.append(f"No loss beyond noise with {', '.join(unresolved)}: {limit}.")
     if finest > target_loss:
         sentences.append(
-            f"resolve={target_loss:g} was not reached with {card.scenes} scenes and a noise of"
-            f" {percent(card.noise)}: give more scenes (episodes=…, minutes=…)."
+            f"resolve={target_loss:g} was not reached with {counted(card.scenes, 'scene')} and a"
+            f" noise of {percent(card.noise)}: give more scenes (episodes=…, minutes=…)."
         )
     return Conclusion(verdict, tuple(sentences), finest if finest <= 1 else None)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mme_vla.errors import listed
+from mme_vla.errors import counted, listed
 from mme_vla.evaluation.results.compare import show_p
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, comparison_table, show, span
@@ -127,11 +127,11 @@ def separating(board: Board) -> list[str]:
         by_budget.setdefault(separation.budget, []).append(separation)
     sentences = []
     for budget, tested in by_budget.items():
-        tokens = f"At {budget} tokens" if budget else "At the default budgets"
+        tokens = f"At {counted(int(budget), 'token')}" if budget else "At the default budgets"
         differing = [s.task for s in tested if s.p < 0.05]
         sentence = (
             f"{tokens} the {tested[0].memories} trained policies differ in {len(differing)} of"
-            f" {len(tested)} tasks (p < 0.05){_after_colon(differing)}."
+            f" {counted(len(tested), 'task')} (p < 0.05){_after_colon(differing)}."
         )
         if tested[0].p_repeated is not None:
             differing = [s.task for s in tested if s.p_repeated is not None and s.p_repeated < 0.05]
@@ -202,7 +202,8 @@ def notes(board: Board) -> list[str]:
     if board.action_space != CHOICES:
         actions = f" Actions are `{board.action_space}`, not choices."
     lines = [
-        f"{len(board.protocol.tasks)} tasks × {board.protocol.episodes} scenes of split"
+        f"{counted(len(board.protocol.tasks), 'task')} ×"
+        f" {counted(board.protocol.episodes, 'scene')} of split"
         f" `{board.split}`, the same for all rows.{actions}"
     ]
     if noise is None:
@@ -224,7 +225,10 @@ def notes(board: Board) -> list[str]:
         )
     for row in board.rows:
         if errors := sum(run.outcomes["error"] for run in row.method.runs):
-            lines.append(f"{row.name}: {errors} episodes ended in an error and count as failures.")
+            lines.append(
+                f"{row.name}: {counted(errors, 'failure')} by an error of the environment or the"
+                " policy."
+            )
     recordings = frozenset[str]().union(*(row.recordings for row in board.rows))
     if len(recordings) > 1:
         several = sum(len(row.recordings) > 1 for row in board.rows)
@@ -367,7 +371,7 @@ def page(board: Board) -> str:
     if board.published:
         beside = [published(board), agreements(board)]
         sections.append(Section("Beside the published ranking", published_figure(board), beside))
-    return html_page("nanoMME-16", sections, f"{len(board.rows)} rows", sortable=True)
+    return html_page("nanoMME-16", sections, f"{counted(len(board.rows), 'row')}", sortable=True)
 
 
 def _cell(value: float | None, spec: str) -> str:

@@ -20,7 +20,7 @@ from mme_vla.config.naming import digest
 from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment
-from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.errors import UserError, brief, counted, listed, require
 from mme_vla.extras.nano.demonstrations import Demonstration
 from mme_vla.extras.nano.learning import Decisions, choice_errors, position_error, statistics
 from mme_vla.extras.nano.rows import CONFIG, TRAINED
@@ -205,7 +205,7 @@ def train(job: Training) -> Path:
         if job.tower_seed != job.seed:
             copy_tower(build({**job.config, "seed": job.tower_seed}), policy)
         samples, val_set = prepared(policy, job)
-        card = {"data": f"{len(job.files)} demonstrations", "recipe": dict(job.settings)}
+        card = {"data": f"{counted(len(job.files), 'demonstration')}", "recipe": dict(job.settings)}
         validation = Validation(
             val_set,
             val_set.collate,
@@ -231,7 +231,8 @@ def train(job: Training) -> Path:
         line = ProgressLine(train_settings.steps, run.step)
         loggers = open_loggers(folder, {}, run.step)
         line.say(
-            f"{trainer.describe()}; {len(samples)} decisions of {len(job.files)} demonstrations"
+            f"{trainer.describe()}; {counted(len(samples), 'decision')} of"
+            f" {counted(len(job.files), 'demonstration')}"
         )
         updates_cpu = time.process_time()
         try:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.envs.rows import DIFFICULTIES
+from mme_vla.errors import counted
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import (
@@ -99,7 +100,7 @@ def outcome_lines(
             centimetres = 100 * np.median(np.concatenate(measured))
             parts.append(f"off by {centimetres:.1f} cm on held-out decisions")
         won = sum(record.success for record in model_records)
-        parts.append(f"{won} of {len(model_records)} episodes solved")
+        parts.append(f"{won} of {counted(len(model_records), 'episode')} solved")
         lines.append(f"{model}: {', '.join(parts)}")
     return lines
 
@@ -108,7 +109,7 @@ def solved(records: Mapping[str, Sequence[EpisodeRecord]]) -> str:
     """What the first model solved, where there is no other to compare it with."""
     first = next(iter(records.values()))
     won = sum(record.success for record in first)
-    return f"{first[0].model} {won} of {len(first)} episodes"
+    return f"{first[0].model} {won} of {counted(len(first), 'episode')}"
 
 
 def compared(

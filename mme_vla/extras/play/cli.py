@@ -99,7 +99,7 @@ def main(cfg: DictConfig) -> None:
             if built is None:
                 serve(Desk(run, str(identity.checkpoint)), command.host, command.port)
                 played = len(run.episodes) - len(run.todo)
-                of = f"{played} of {len(run.episodes)} episodes played"
+                of = f"{played} of {counted(len(run.episodes), 'episode')} played"
                 log.info("ended · %s; the same command continues with the others", of)
             else:
                 _by_itself(run, built)

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.config.sections import NonNegativeInt, PositiveInt
 from mme_vla.evaluation.rollout.episode import episode_seed
 from mme_vla.extras.probing import lines
 from mme_vla.extras.probing.arms import UNPROBED, Arm
@@ -20,6 +19,7 @@ from mme_vla.extras.probing.feed import Feed
 from mme_vla.extras.probing.lines import EntryLine, Line, MomentLine
 from mme_vla.extras.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy, others
 from mme_vla.extras.probing.recordings import Recording
+from mme_vla.extras.probing.settings import OfflineSettings
 from mme_vla.policy.base import Policy
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.types import Noise
@@ -59,22 +59,6 @@ def std_of(distances: np.ndarray) -> float:
 
 def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.sqrt(np.square(first[:, None] - second[None]).mean(-1))
-
-
-@dataclass(frozen=True)
-class OfflineSettings:
-    """Settings of a probe on recorded episodes.
-
-    draws: chunks sampled at each step, of the same noise in every arm. moments: most steps of an
-    episode. scan: whether each entry is left out by itself. flow_steps: of the sampler; None for
-    the policy's own.
-    """
-
-    seed: NonNegativeInt = 42
-    draws: PositiveInt = 8
-    moments: PositiveInt | None = 8
-    scan: bool = True
-    flow_steps: int | None = None
 
 
 def probe_offline(

@@ -38,7 +38,7 @@ from mme_vla.extras.probing import lines
 from mme_vla.extras.probing.arms import UNPROBED, Arm, choose_arms, options_of, slug
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.findings import Findings
-from mme_vla.extras.probing.offline import OfflineSettings, probe_offline
+from mme_vla.extras.probing.offline import probe_offline
 from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.extras.probing.recordings import Recording, all_recordings
 from mme_vla.extras.probing.report import (
@@ -48,7 +48,7 @@ from mme_vla.extras.probing.report import (
     write_images,
     write_page,
 )
-from mme_vla.extras.probing.settings import IN_CLOSED_LOOP, NO_DATA
+from mme_vla.extras.probing.settings import IN_CLOSED_LOOP, NO_DATA, OfflineSettings
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
 

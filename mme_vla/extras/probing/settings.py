@@ -2,10 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
-from mme_vla.config.sections import PathText, read_section
-from mme_vla.errors import UserError, brief, check_choice, require
+from mme_vla.config.sections import NonNegativeInt, PathText, PositiveInt, read_section
+from mme_vla.data.lerobot_files import resolve_root
+from mme_vla.data.sources import listed_sources
+from mme_vla.errors import UserError, brief, check_all, check_choice, require
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.settings import check_config
 from mme_vla.memory.perturbation import Word, split_word
@@ -19,6 +22,22 @@ NO_DATA = (
 IN_CLOSED_LOOP = (
     "event=…: events act in closed loop: add online=true to the command, or tasks=… in Python."
 )
+
+
+@dataclass(frozen=True)
+class OfflineSettings:
+    """Settings of a probe on recorded episodes.
+
+    draws: chunks sampled at each step, of the same noise in every arm. moments: most steps of an
+    episode. scan: whether each entry is left out by itself. flow_steps: of the sampler; None for
+    the policy's own.
+    """
+
+    seed: NonNegativeInt = 42
+    draws: PositiveInt = 8
+    moments: PositiveInt | None = 8
+    scan: bool = True
+    flow_steps: int | None = None
 
 
 @dataclass(frozen=True)
@@ -62,7 +81,7 @@ class ProbeChoice:
 
     def check(self) -> None:
         """Make sure that there is something to probe, that it has what it needs, and that names in
-        `with` exist.
+        `with` and datasets exist.
         """
         if self.twins:
             self._check_twins()
@@ -78,11 +97,24 @@ class ProbeChoice:
         needs_data = self.on_recordings and not self.card
         require(not needs_data or self.recordings is not None, NO_DATA)
         require(self.online or not event_arms(self.event), IN_CLOSED_LOOP)
+        check_all(self._check_arms, self._check_recordings)
+
+    def _check_arms(self) -> None:
+        """Arms are read again once the policy is loaded, whose plugins may register some."""
         if self.arms is None or self.trust_plugins:
-            return  # arms are read again once the policy is loaded
+            return
         for spec in listed_arms(self.arms):
             if not isinstance(spec, Mapping):
                 words_of_arm(spec)
+
+    def _check_recordings(self) -> None:
+        """Datasets are opened once the policy is loaded, whose robot names their columns."""
+        if self.recordings is None:
+            return
+        for entry in listed_sources(self.recordings):
+            root = entry if isinstance(entry, str) else entry.get("root")
+            if isinstance(root, str) and root:
+                resolve_root(root)
 
     def _check_twins(self) -> None:
         """Refuse what has no effect on twins."""
@@ -110,8 +142,8 @@ def check_probe(config: Mapping[str, Any]) -> None:
     """
     choice = ProbeChoice.from_config(config)
     if choice.compare is None:
-        check_config(config)
-        choice.check()
+        offline = partial(read_section, OfflineSettings, config, others=True)
+        check_all(partial(check_config, config), choice.check, offline)
 
 
 def listed_arms(specs: Any) -> list[Any]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, missing_extra, require
+from mme_vla.errors import UserError, counted, missing_extra, require
 from mme_vla.subgoal.finetuning.rows import Collator, RowDataset
 from mme_vla.subgoal.models.qwen3vl import VLM, load_model
 
@@ -141,8 +141,8 @@ def fine_tune(cfg: "DictConfig") -> Path:
     rows = RowDataset(cfg.rows, processor.tokenizer, cfg.max_length)
     if rows.left_out:
         print(
-            f"{rows.left_out} rows are longer than max_length={cfg.max_length} tokens and are left"
-            " out."
+            f"Left out: {counted(rows.left_out, 'row')} of more than max_length={cfg.max_length}"
+            " tokens."
         )
     trainer = Trainer(
         model=vlm.model,

@@ -30,8 +30,9 @@ from mme_vla.evaluation.results.paper import average, counted, paper_method
 from mme_vla.extras.probing import lines
 from mme_vla.extras.probing.arms import read_arms
 from mme_vla.extras.probing.lines import MomentLine
-from mme_vla.extras.probing.offline import OfflineSettings, probe_offline
+from mme_vla.extras.probing.offline import probe_offline
 from mme_vla.extras.probing.recordings import all_recordings
+from mme_vla.extras.probing.settings import OfflineSettings
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import load_tensors
 

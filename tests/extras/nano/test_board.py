@@ -610,7 +610,7 @@ def test_errors_of_episodes_are_counted_beside_the_table(rows: Path, tmp_path: P
     )
     board = Board(read_rows([rows], local=[tmp_path]), samples=50)
     assert (
-        f"mine: {len(TASKS)} episodes ended in an error and count as failures."
+        f"mine: {len(TASKS)} failures by an error of the environment or the policy."
         in board_page.notes(board)
     )
 

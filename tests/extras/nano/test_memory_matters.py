@@ -3,6 +3,7 @@ one it cannot.
 """
 
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -39,3 +40,18 @@ def test_so_does_each_memory_beyond_the_paper(learn, model):
 
 def test_without_memory_it_stays_a_guess(learn):
     assert learn("pi05", steps=100)["error"] > 0.9 * GUESSING
+
+
+def test_the_picture_has_whole_intervals_and_their_number_of_episodes(learn, monkeypatch, tmp_path):
+    import memory_matters
+
+    drawn = []
+    monkeypatch.setattr(memory_matters, "svg", lambda canvas: drawn.append(canvas) or "<svg/>")
+    errors = [0.2, 1.6, 0.3, 1.5]
+    results = [
+        {"model": model, "error": 0.9, "errors": errors} for model in ("framesamp_modul", "pi05")
+    ]
+    memory_matters.plot(results, Path(tmp_path) / "picture.svg")
+    (axes,) = drawn[0].axes
+    assert "95 % over 4 unseen episodes" in axes.get_xlabel()
+    assert max(max(line.get_xdata(), default=0) for line in axes.lines) < axes.get_xlim()[1]

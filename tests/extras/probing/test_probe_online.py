@@ -15,9 +15,9 @@ from mme_vla.evaluation.rollout.evaluation import RunOptions, Shard
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.findings import Findings
 from mme_vla.extras.probing.lines import LINES
-from mme_vla.extras.probing.offline import OfflineSettings
 from mme_vla.extras.probing.report import table_of
 from mme_vla.extras.probing.run import Probe, ProbePlan, probed_folder, run_probe
+from mme_vla.extras.probing.settings import OfflineSettings
 
 SILENT = RunOptions(show_progress=False)
 

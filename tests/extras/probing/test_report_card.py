@@ -38,10 +38,10 @@ from mme_vla.extras.probing.card import (
 )
 from mme_vla.extras.probing.channels import channel_of
 from mme_vla.extras.probing.lines import MomentLine
-from mme_vla.extras.probing.offline import OfflineSettings
 from mme_vla.extras.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.extras.probing.recordings import Recording
 from mme_vla.extras.probing.run import ProbePlan
+from mme_vla.extras.probing.settings import OfflineSettings
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.utils import to_json

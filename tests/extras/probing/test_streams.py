@@ -16,10 +16,10 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.rollout.evaluation import RunOptions, facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.extras.probing.arms import read_arm
-from mme_vla.extras.probing.offline import OfflineSettings
 from mme_vla.extras.probing.probed import ProbedPolicy
 from mme_vla.extras.probing.recordings import all_recordings
 from mme_vla.extras.probing.run import ProbePlan, run_probe
+from mme_vla.extras.probing.settings import OfflineSettings
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.serving.remote.policy import RemotePolicy

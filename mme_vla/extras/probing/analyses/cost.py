@@ -17,7 +17,7 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla.config.composition import compose
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, counted
 from mme_vla.evaluation.results.paper import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.base import Policy
@@ -62,7 +62,7 @@ def on_meta(model: str, budget: int | None = None, backbone: str | None = None) 
     if budget is None:
         return policy
     if policy.memory is None:
-        raise UserError(f"{model} has no memory, so no budget of {budget} tokens.")
+        raise UserError(f"{model} has no memory, so no budget of {counted(budget, 'token')}.")
     return build_policy(model, backbone=backbone, device="meta", memory={"budget": budget})
 
 

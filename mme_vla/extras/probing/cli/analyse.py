@@ -25,7 +25,7 @@ from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
 from mme_vla.config.trees import library_files
-from mme_vla.errors import UserError, check_choice, require
+from mme_vla.errors import UserError, check_choice, counted, require
 from mme_vla.policy.sections import PolicySections
 from mme_vla.utils import require_replaceable, safe_name
 
@@ -70,7 +70,7 @@ def attention(args: argparse.Namespace) -> None:
         )
         rows.append([part, f"{mean:.1f}", f"{most:.1f}", printed])
     _print(
-        f"{name}: attention of the action tokens (%), {chunks} chunks of {source.name}",
+        f"{name}: attention of the action tokens (%), {counted(chunks, 'chunk')} of {source.name}",
         ["", "mean over layers", "maximum over layers", "paper"],
         rows,
     )
@@ -107,7 +107,7 @@ def modulation(args: argparse.Namespace) -> None:
         ]
         rows.append(["paper", *printed])
     _print(
-        f"{name}: what the modulator predicts, {chunks} chunks of {source.name}",
+        f"{name}: what the modulator predicts, {counted(chunks, 'chunk')} of {source.name}",
         ["layer", "scale", "bias"],
         rows,
     )
@@ -208,7 +208,7 @@ def selection(args: argparse.Namespace) -> None:
     last = _beside(path, ".png")
     write_video(of_one_size(sheets), path, fps=args.fps)
     sheets[-1].save(last)
-    print(f"wrote {path} ({len(sheets)} images) and {last}")
+    print(f"wrote {path} ({counted(len(sheets), 'image')}) and {last}")
 
 
 def cost(args: argparse.Namespace) -> None:
@@ -311,7 +311,7 @@ def writing(args: argparse.Namespace) -> None:
     ]
     if len(episodes) < len(specs):
         print(
-            f"{len(specs) - len(episodes)} of {len(specs)} episodes are left out: their scenes"
+            f"Left out: {counted(len(specs) - len(episodes), 'episode')} of {len(specs)}. The scene"
             " cannot be built, or the demonstrator did not succeed."
         )
     trained = None if policy is None else policy.memory

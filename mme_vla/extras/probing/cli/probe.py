@@ -38,7 +38,6 @@ def probe(cfg: DictConfig) -> None:
     from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.extras.probing.card import PAGE, card_text, run_card
-    from mme_vla.extras.probing.offline import OfflineSettings
     from mme_vla.extras.probing.recordings import all_recordings
     from mme_vla.extras.probing.report import table_of
     from mme_vla.extras.probing.run import (
@@ -46,7 +45,7 @@ def probe(cfg: DictConfig) -> None:
         probed_folder,
         run_probe,
     )
-    from mme_vla.extras.probing.settings import ProbeChoice
+    from mme_vla.extras.probing.settings import OfflineSettings, ProbeChoice
     from mme_vla.extras.probing.twins import FIGURES, run_twins, twins_text
     from mme_vla.policy.build import policy_config
     from mme_vla.utils import safe_name
