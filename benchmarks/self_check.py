@@ -49,7 +49,21 @@ def untrained(model: str, seed: int = 0) -> Policy:
     policy.require_processor().stats = unit_stats(policy.embodiment)
     if isinstance(policy, MMEPolicy):
         open_gates(policy)
+    else:
+        fill_zeros(policy)
     return policy.eval()
+
+
+def fill_zeros(policy: Policy) -> None:
+    """Draw the matrices at random that training begins with at zero: a chunk that is zero, whatever
+    the other weights, would tell nothing.
+    """
+    generator = torch.Generator().manual_seed(7)
+    with torch.no_grad():
+        for _, parameter in sorted(policy.named_parameters()):
+            if parameter.ndim > 1 and not parameter.any():
+                std = parameter.shape[-1] ** -0.5
+                parameter.copy_(std * torch.randn(parameter.shape, generator=generator))
 
 
 def perturbed(policy: Policy, share: float) -> Policy:
@@ -71,6 +85,8 @@ def other_seed(policy: Policy) -> Policy:
     if "pretrained" in vision:
         vision["pretrained"] = False
     fresh = type(policy).from_config(config, policy.processor)
+    if not isinstance(fresh, MMEPolicy):
+        fill_zeros(fresh)
     return fresh.eval()
 
 

@@ -57,7 +57,7 @@ def demonstrator(dial: str, task: str, value: int, episode: int) -> Ended:
 def oracle(dial: str, task: str, value: int, episode: int) -> Ended:
     """The oracle planner's choices in the environment that policies meet, without images."""
     spec = metadata.episode(task, f"stress:{dial}={value}", episode)
-    session = make_session(spec, "mme_vla", MAX_STEPS, MAX_CHOICES, images=False)
+    session = make_session(spec, "mme_vla", lambda _: MAX_STEPS, MAX_CHOICES, images=False)
     try:
         play(session, OraclePlayer())
         video = len(session.reveals[0].frames) - 1

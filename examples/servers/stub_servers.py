@@ -326,5 +326,6 @@ if __name__ == "__main__":
     parser.add_argument("--after", type=int, default=0, help="good replies before the fault")
     options = parser.parse_args()
     stub = Stub(fault=options.fault, after=options.after)
-    print(f"{options.protocol} at port {options.port}", flush=True)
-    make_server(options.protocol, stub, options.port).serve_forever()
+    server = make_server(options.protocol, stub, options.port)
+    print(f"{options.protocol} at port {server.socket.getsockname()[1]}", flush=True)
+    server.serve_forever()

@@ -86,7 +86,6 @@ def an_episode(number: int = 0) -> EpisodeSpec:
 
 
 def a_session(number: int = 0, **options: Any) -> ChoiceSession:
-    limits = {
-        key: options.pop(key) for key in ("max_choices", "pictures", "clock") if key in options
-    }
+    names = ("max_choices", "max_steps", "pictures", "clock")
+    limits = {key: options.pop(key) for key in names if key in options}
     return ChoiceSession(BlocksEnv(**options), an_episode(number), **limits)

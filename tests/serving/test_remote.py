@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from websockets.sync.server import serve as websocket_serve
 
-from helpers import REPOSITORY
+from helpers import REPOSITORY, commands
 from helpers.rollout_fakes import use_inline_envs
 from helpers.scripted_env import make_moving_env
 from helpers.serving_fakes import Served, serving_policy
@@ -99,6 +99,28 @@ def test_a_server_of_each_protocol_is_recognised_and_evaluated(
     if protocol in ("openpi", "robomme"):
         assert {request["prompt"] for request in observed} == {"pick up the red cube"}
         assert all(request["observation/state"].shape == (8,) for request in observed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "protocol", ["openpi", "robomme", "challenge", "challenge-http", "harness"]
+)
+def test_a_stub_that_a_user_starts_is_evaluated(
+    protocol: str, inline: None, tmp_path: Path
+) -> None:
+    file = str(REPOSITORY / "examples" / "servers" / "stub_servers.py")
+    process = commands.start(file, protocol, "--port", "0")
+    try:
+        assert process.stdout is not None
+        port = process.stdout.readline().split()[-1]
+        scheme = "http" if protocol == "challenge-http" else "ws"
+        policy = connect(f"{scheme}://127.0.0.1:{port}", protocol.removesuffix("-http"))
+        (record,) = run(policy, tmp_path, PICK[:1])
+        policy.close()
+    finally:
+        process.kill()
+        process.communicate()
+    assert record.outcome == "timeout"
 
 
 def test_one_episode_at_a_time_where_the_server_may_have_one_memory(

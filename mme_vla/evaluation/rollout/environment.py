@@ -46,6 +46,13 @@ The robot's `readings`, if it has any, are lists of all frames.
 """
 
 
+def is_out_of_reach(observation: Mapping[str, Any] | None, info: Mapping[str, Any]) -> bool:
+    """Whether an environment's `error` means that no joints or no motion reach what was asked for:
+    the policy failed, not the machine.
+    """
+    return observation == {} or info.get("exception_type") == "PlanningError"
+
+
 @dataclass(frozen=True)
 class Command:
     """What an environment executes next: actions, or a time for which the robot stays where it is.
@@ -227,8 +234,7 @@ class ChunkEnv:
             total_reward += float(reward)
             if info.get("status") == "error":
                 terminated = True
-                # Where no joints or no motion reach a pose the policy failed, not the machine.
-                if observation == {} or info.get("exception_type") == "PlanningError":
+                if is_out_of_reach(observation, info):
                     info = {**info, "status": "fail"}
                 break
             if not isinstance(action, Hold):

@@ -5,7 +5,7 @@
 import logging
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +24,7 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import INDIFFERENT
 from mme_vla.extras.play import build_player
 from mme_vla.extras.play.desk import Desk
-from mme_vla.extras.play.game import ChoiceSession
+from mme_vla.extras.play.game import MAX_CHOICES, ChoiceSession
 from mme_vla.extras.play.players import Player, play
 from mme_vla.extras.play.run import Identity, PlayRun, make_session
 from mme_vla.extras.play.web import require_page, serve
@@ -40,7 +40,7 @@ class PlaySettings:
     split: str
     env: str
     max_steps: PositiveInt
-    max_choices: PositiveInt
+    max_choices: PositiveInt | None
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ def main(cfg: DictConfig) -> None:
     make = partial(
         make_session,
         env=command.env,
-        max_steps=command.max_steps,
-        max_choices=settings.max_choices,
+        limit_of=identity.limit_of,
+        max_choices=identity.settings["max_choices"],
         images=needs_images,
     )
     try:
@@ -138,6 +138,9 @@ def _choose_player(
     else:
         player = build_player(command.player)
         model = player.model
+    if settings.max_choices is None:
+        most = MAX_CHOICES if player is None else player.max_choices
+        settings = replace(settings, max_choices=most)
     if command.output is not None:
         folder = Path(command.output).expanduser()
     identity = Identity(

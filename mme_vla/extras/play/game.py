@@ -20,6 +20,7 @@ from mme_vla.envs.metadata import DEFAULT_STEPS, EpisodeSpec
 from mme_vla.envs.scene_hash import NO_VALUES
 from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
+from mme_vla.evaluation.rollout.environment import is_out_of_reach
 
 ONGOING = "ongoing"
 UNSEEN = np.zeros((SIDE, SIDE, 3), np.uint8)  # Frame of an environment that does not render
@@ -66,9 +67,10 @@ class ChoiceSession:
         episode: which one it is.
         images: whether the player reads them; without, the environment need not render, and frames
             are black.
-        max_choices: choices after which the episode counts as timed out; a choice may move nothing
-            at all, so the environment's own limit on steps might never be reached.
+        max_choices: choices after which the episode counts as timed out; None: any number.
         clock: seconds that only grow.
+        max_steps: control steps after which it does, where a choice that moves nothing takes one,
+            as in an evaluation; None: the environment's own limit.
 
     Example:
         >>> session = ChoiceSession(env, episode)  # doctest: +SKIP
@@ -82,15 +84,18 @@ class ChoiceSession:
         self,
         env: Any,
         episode: EpisodeSpec,
-        max_choices: int = MAX_CHOICES,
+        max_choices: int | None = MAX_CHOICES,
         images: bool = True,
         clock: Callable[[], float] = time.perf_counter,
+        max_steps: int | None = None,
     ) -> None:
         self.env, self.episode, self.max_choices, self.images = env, episode, max_choices, images
+        self._max_steps = max_steps
+        self._motionless = 0  # choices that moved nothing
         self.goal, self.status, self.error = "", "not started", ""
         self.ended_by = ""
-        """What ended the episode where it was not the environment: `max_choices`, or a player's
-        reason.
+        """What ended the episode where it was not the environment: `max_choices`, `max_steps`, or a
+        player's reason.
         """
         self.options: tuple[Option, ...] = ()
         self.observation: Mapping[str, Any] = {}
@@ -140,7 +145,10 @@ class ChoiceSession:
         self._simulated += self._clock() - started
         frames = self._frames(observation or {})
         first = self.n_displayed_frames
+        self._motionless += not frames
         self.error = str(info.get("error_message", ""))
+        if info["status"] == "error" and is_out_of_reach(observation, info):
+            info = {**info, "status": "fail"}
         self._take(frames, info, option.action)
         span = (first, first + len(frames))
         self.decisions.append(
@@ -154,8 +162,8 @@ class ChoiceSession:
                 dict(note or {}),
             )
         )
-        if not self.over and len(self.decisions) >= self.max_choices:
-            self.give_up("timeout", "max_choices")
+        if not self.over:
+            self._end_at_limits()
         return self.reveals[-1]
 
     def check(self, action: Mapping[str, Any]) -> tuple[Option, tuple[float, float] | None]:
@@ -186,6 +194,12 @@ class ChoiceSession:
         self.status, self.ended_by = outcome, reason
         if outcome == "error":
             self.error = reason
+
+    def _end_at_limits(self) -> None:
+        if self.max_choices is not None and len(self.decisions) >= self.max_choices:
+            self.give_up("timeout", "max_choices")
+        elif self._max_steps is not None and self.steps + self._motionless > self._max_steps:
+            self.give_up("timeout", "max_steps")
 
     # What there is to see -------------------------------------------------------------------------
 
@@ -223,6 +237,8 @@ class ChoiceSession:
         )
         which = self.episode
         ended = {"ended_by": self.ended_by} if self.ended_by else {}
+        reason = self.error or None
+        failed = self.status == "error"
         return EpisodeRecord(
             model=model,
             checkpoint=checkpoint,
@@ -237,7 +253,8 @@ class ChoiceSession:
             scene=getattr(self.env, "scene_digest", NO_VALUES),
             outcome=self.status,
             steps=self.steps,
-            error=self.error or None,
+            error=reason if failed else None,
+            refused=None if failed else reason,
             seconds=Seconds(
                 round(self._simulated, 3),
                 round(self._policy_seconds, 3),

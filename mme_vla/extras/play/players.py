@@ -8,7 +8,7 @@ import numpy as np
 
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError
-from mme_vla.extras.play.game import ChoiceSession
+from mme_vla.extras.play.game import MAX_CHOICES, ChoiceSession
 from mme_vla.registry import PLAYERS
 
 
@@ -28,10 +28,13 @@ class Player:
         model: what its records are filed under.
         needs_images: whether it reads images; for one that does not, nothing is rendered, which is
             much faster.
+        max_choices: choices after which an episode has timed out where none are set; None: any
+            number.
     """
 
     model = "player"
     needs_images = True
+    max_choices: int | None = MAX_CHOICES
 
     def start(self, session: ChoiceSession) -> None:
         """Take note of a new episode, which has been started."""

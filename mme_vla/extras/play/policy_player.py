@@ -36,6 +36,7 @@ class PolicyPlayer(Player):
     """
 
     def __init__(self, policy: Policy, model: str, seed: int) -> None:
+        self.max_choices = policy.info.max_actions  # alone, as in an evaluation
         self.policy = policy
         self.model = model
         self.seed = seed
@@ -116,7 +117,8 @@ def load_player(cfg: DictConfig, max_steps: int) -> tuple[PolicyPlayer, RunFacts
             f" ({CHOICES}): evaluate it on the same episodes, mme-vla evaluate … video=all.",
         )
         environment(config["env"]).check_embodiment(robot)
-        settings = RolloutSettings.from_config({**config, "max_steps": max_steps})
+        limits = {"max_steps": max_steps, "max_actions": config["max_choices"]}
+        settings = RolloutSettings.from_config({**config, **limits})
         choose_subgoals(policy, None)  # none is given here, of which a policy that reads them warns
         facts = facts_of(policy, name, place, settings, None)
         safe_name(facts.model, "the policy's name")  # it names a folder

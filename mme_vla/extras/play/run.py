@@ -17,20 +17,25 @@ from mme_vla.extras.play.game import ChoiceSession
 
 
 def make_session(
-    episode: EpisodeSpec, env: str, max_steps: int | None, max_choices: int, images: bool = True
+    episode: EpisodeSpec,
+    env: str,
+    limit_of: Callable[[str], int],
+    max_choices: int | None,
+    images: bool = True,
 ) -> ChoiceSession:
     """The simulator for one episode.
 
-    episode: which one. env: name of the environment. max_steps, max_choices: when it has timed out;
-    None: after the task's own number of steps.
-    images: whether the player reads them.
+    episode: which one. env: name of the environment. limit_of: the steps of a task after which it
+    has timed out. max_choices: the choices; None: any number. images: whether the player reads
+    them.
     """
     from mme_vla.envs.base import CHOICES, open_episode
 
     which = (episode.task, episode.split, episode.episode)
-    made = open_episode(env, *which, action_space=CHOICES, max_steps=max_steps, render=images)
+    limit = limit_of(episode.task)
+    made = open_episode(env, *which, action_space=CHOICES, max_steps=limit, render=images)
     try:
-        return ChoiceSession(made, episode, max_choices, images)
+        return ChoiceSession(made, episode, max_choices, images, max_steps=limit)
     except BaseException:
         made.close()
         raise

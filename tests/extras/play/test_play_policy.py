@@ -1,6 +1,6 @@
 """A policy plays the tasks as choices, loaded here or behind a real socket, as it is evaluated."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import read_records
 from mme_vla.extras.play import cli
 from mme_vla.extras.play.game import ChoiceSession
+from mme_vla.extras.play.players import Player
 from mme_vla.policy.mme import MMEPolicy
 
 pytestmark = pytest.mark.usefixtures("blocks")
@@ -48,8 +49,11 @@ def open_blocks(**_: Any) -> BlocksEnv:
 def blocks(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Episodes are those of the blocks, without the simulator."""
 
-    def make(which: Any, max_choices: int, images: bool, **_: Any) -> ChoiceSession:
-        return ChoiceSession(open_blocks(), which, max_choices, images)
+    def make(
+        which: Any, limit_of: Callable[[str], int], max_choices: int, images: bool, **_: Any
+    ) -> ChoiceSession:
+        limit = limit_of(which.task)
+        return ChoiceSession(open_blocks(), which, max_choices, images, max_steps=limit)
 
     monkeypatch.setattr(cli, "make_session", make)
     monkeypatch.setattr(cli, "render_backend", lambda: None)
@@ -66,9 +70,11 @@ def chooser(**others: Any) -> MMEPolicy:
     return quick_policy("framesamp_modul", 8, embodiment=embodiment, memory=memory, **others).eval()
 
 
-def play(folder: Path, *words: str) -> list[EpisodeRecord]:
-    """Records of the play command on two episodes."""
-    common = ["task=VideoUnmask", "episodes=2", "max_choices=6", f"output={folder}"]
+def play(folder: Path, *words: str, most: int | None = 6) -> list[EpisodeRecord]:
+    """Records of the play command on two episodes. most: choices; None: the command's own limit."""
+    common = ["task=VideoUnmask", "episodes=2", f"output={folder}"]
+    if most is not None:
+        common.append(f"max_choices={most}")
     cli.main(compose("play", [*common, *words]))
     return read_records(folder / "episodes.jsonl")
 
@@ -125,6 +131,28 @@ def test_a_checkpoint_plays_as_its_server_does(tmp_path: Path) -> None:
         records = play(tmp_path / "there", f"server=ws://127.0.0.1:{served.server.port}")
     assert here == taken()
     assert {record.checkpoint for record in records} == {3}
+
+
+def test_a_policy_plays_for_as_many_steps_as_its_evaluation(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(Player, "max_choices", 2)  # of the other players
+    checkpoint = tmp_path / "step_000003"
+    chooser().save_pretrained(checkpoint)
+    played = play(tmp_path / "played", f"checkpoint={checkpoint}", "max_steps=20", most=None)
+    settings = RolloutSettings(max_steps=20, workers=1, max_batch=1)
+    policy = MMEPolicy.from_pretrained(checkpoint).eval()
+    facts = facts_of(policy, None, str(checkpoint), settings, None)
+    options = RunOptions(base=open_blocks, show_progress=False)
+    jobs = [Job("VideoUnmask", "test", episode) for episode in range(2)]
+    evaluate(policy, jobs, tmp_path / "evaluated", facts, settings, options)
+    evaluated = read_records(tmp_path / "evaluated" / "episodes.jsonl")
+    assert [record.chunks for record in evaluated] == [
+        len(record.extra["decisions"]) for record in played
+    ]
+    assert all(len(record.extra["decisions"]) > 2 for record in played)
+    for record, other in zip(played, evaluated, strict=True):
+        assert (record.run, record.outcome, record.steps) == (other.run, "timeout", other.steps)
 
 
 def test_a_policy_of_motions_is_referred_to_the_evaluation(tmp_path: Path) -> None:

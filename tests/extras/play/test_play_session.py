@@ -56,6 +56,32 @@ def test_a_player_that_never_gets_on_is_timed_out():
     assert (record.outcome, record.extra["ended_by"], record.steps) == ("timeout", "max_choices", 0)
 
 
+def test_a_choice_that_moves_nothing_takes_a_step_of_the_limit():
+    session = a_session(max_choices=None, max_steps=MOTION + 2)
+    session.start()
+    session.choose(press("blue"))
+    for _ in range(2):
+        session.choose({"choice": "b"})
+    assert session.status == "ongoing"
+    session.choose({"choice": "b"})
+    record = session.record("patient")
+    assert (record.outcome, record.extra["ended_by"]) == ("timeout", "max_steps")
+    assert record.steps == MOTION
+
+
+def test_what_no_motion_reaches_is_a_failure_as_in_an_evaluation():
+    class OutOfReach(BlocksEnv):
+        def step(self, action):
+            info = {"error_message": "no path", "exception_type": "PlanningError"}
+            return None, 0.0, True, False, {"status": "error", **info}
+
+    session = ChoiceSession(OutOfReach(), an_episode())
+    session.start()
+    session.choose(press("blue"))
+    record = session.record("human")
+    assert (record.outcome, record.error, record.refused) == ("fail", None, "no path")
+
+
 def test_an_error_of_the_planner_ends_the_episode_and_is_recorded():
     session = a_session()
     session.start()
