@@ -185,7 +185,7 @@ def rotate(hand: Hand) -> Actions:
     scene = hand.scene
     peg = scene.peg
     goal_angle = float(scene.target_angle[0])
-    across = _wrapped(_yaw_of(peg) + np.pi / 2 - hand.yaw)
+    across = wrapped(_yaw_of(peg) + np.pi / 2 - hand.yaw)
     ways = []
     for half_turns in (-1, 0, 1):
         for askew in np.linspace(-_ASKEW, _ASKEW, 9):
@@ -194,7 +194,7 @@ def rotate(hand: Hand) -> Actions:
             ways.append((abs(to_grasp) + abs(to_end), to_grasp))
     goal = hand.yaw + min(ways)[1]
     for _ in range(60):
-        left = _wrapped(goal - hand.yaw)
+        left = wrapped(goal - hand.yaw)
         offset = place_of(peg) + _up(0.07) - hand.position
         if abs(left) < 0.05 and np.linalg.norm(offset) < 0.015:
             break
@@ -251,7 +251,7 @@ def _up(height: float) -> np.ndarray:
     return np.array([0.0, 0.0, height])
 
 
-def _wrapped(angle: float) -> float:
+def wrapped(angle: float) -> float:
     """The same angle in (−π, π]."""
     return float(np.arctan2(np.sin(angle), np.cos(angle)))
 
