@@ -284,3 +284,40 @@ def test_a_scene_that_cannot_be_built_is_left_out_with_its_reason(
 def test_a_count_of_what_the_robot_does_has_no_twin(task: str) -> None:
     source = environment("mme_vla")
     assert source.twin(source.episode(task, "test", 0)) is None
+
+
+# MIKASA-Robo-VLA ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", ["RememberColor3", "TakeItBack"])
+def test_only_what_knows_the_fact_is_right_in_both_scenes_of_mikasa(
+    task: str, tmp_path: Path
+) -> None:
+    pytest.importorskip("mikasa_robo_suite", reason="the extra `mikasa` is not installed")
+    made: list[Any] = []
+
+    def base(**scene: Any) -> Any:
+        made.append(environment("mikasa").open(render=False, **scene))
+        return made[-1]
+
+    def towards(number: int | None) -> Rule:
+        """The chunk that moves to a candidate, None for the correct one."""
+
+        def rule(_: PlantedEpisode) -> np.ndarray:
+            candidates, place = made[-1].candidates, made[-1].tool
+            goal = candidates.places[candidates.correct[0] if number is None else number]
+            row = np.zeros(7, np.float32)
+            row[:2] = np.clip((np.asarray(goal) - place) / 0.1, -1, 1)
+            return np.tile(row, (4, 1))
+
+        return rule
+
+    options = replace(SILENT, base=base)
+    settings = RolloutSettings(env="mikasa", seed=7)
+    for name, rule, expected in (("knows", towards(None), 1), ("always the first", towards(0), 0)):
+        policy = Planted(small_policy("pi05", env="mikasa"), rule)
+        jobs = [Job(task, "test", episode) for episode in range(2)]
+        twins = run_twins(policy, jobs, tmp_path / name, FACTS, settings, options)
+        accuracy = twins.total[UNPROBED.name]
+        assert (accuracy.pairs, accuracy.accuracy) == (2, expected), twins.notes
+        assert accuracy.chance == pytest.approx(1 / 9)
