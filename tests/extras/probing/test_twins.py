@@ -143,7 +143,7 @@ class PlantedEpisode:
         self.n_observed_frames = 0
 
     def observe(self, frames: Mapping[str, np.ndarray], *_: Any, **__: Any) -> None:
-        (images,) = frames.values()
+        images = next(iter(frames.values()))
         self.images += list(images)
         self.n_observed_frames += len(images)
 
