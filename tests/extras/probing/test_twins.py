@@ -267,6 +267,37 @@ def check_script(task: str, folder: Path) -> None:
     assert twins.total[UNPROBED.name].pairs >= 1
 
 
+@pytest.mark.parametrize("robot", ["robomme_waypoint_front", "robomme_ee_pose"])
+def test_a_demonstrator_leads_motions_and_poses_to_the_decision(robot: str, tmp_path: Path) -> None:
+    made: list[Any] = []
+    space = "waypoint" if "waypoint" in robot else "ee_pose"
+
+    def base(**scene: Any) -> Any:
+        made.append(make_env(action_space=space, render=False, **scene))
+        return made[-1]
+
+    def above_the_right_one(_: PlantedEpisode) -> np.ndarray:
+        candidates = made[-1].candidates
+        x, y = candidates.places[candidates.correct[0]]
+        return np.tile(np.array([x, y, 0.2, np.pi, 0, 0, 1], np.float32), (16, 1))
+
+    policy = Planted(small_policy("pi05", embodiment=robot), above_the_right_one)
+    jobs = [Job("ButtonUnmask", "test", 0)]
+    options = replace(SILENT, base=base)
+    twins = run_twins(policy, jobs, tmp_path, FACTS, RolloutSettings(seed=7, draw="all"), options)
+    assert twins.total[UNPROBED.name].accuracy == 1, twins.notes
+
+
+def test_differences_of_poses_have_no_demonstration(tmp_path: Path) -> None:
+    policy = Planted(small_policy("pi05", embodiment="robomme_ee_delta"), lambda _: move(0.0))
+    options = replace(SILENT, base=lambda **scene: make_env(
+        action_space="ee_pose", render=False, **scene
+    ))  # fmt: skip
+    jobs = [Job("ButtonUnmask", "test", 0)]
+    twins = run_twins(policy, jobs, tmp_path, FACTS, RolloutSettings(seed=7), options)
+    assert "no demonstration has the actions of robomme_ee_delta" in twins.notes[-1]
+
+
 def test_a_scene_that_cannot_be_built_is_left_out_with_its_reason(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
