@@ -5,6 +5,7 @@ anew for each.
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -176,8 +177,78 @@ def grasp(hand: Hand, place: Any) -> Actions:
     yield from hand.hold(3, CLOSED)
 
 
+def push_round(hand: Hand) -> Actions:
+    """RotateLenient: push the peg at one end until it lies as it should. It may move, and the hand
+    pushes it round faster than it turns itself.
+    """
+    scene = hand.scene
+    while True:
+        way = float(np.sign(scene.angle_diff[0].item()))
+        end = min((1, -1), key=lambda end: _farthest(scene, end, way))
+
+        # Down to the side from which this end is pushed.
+        beside = partial(_pushing_place, scene, end, way)
+        if hand.position[2] < 0.08:
+            yield from hand.go(hand.position * [1, 1, 0] + _up(0.1), 0.02, CLOSED)
+        yield from hand.go(partial(beside, 0.07), 0.02, CLOSED)
+        yield from hand.go(beside, 0.012, CLOSED, steps=8)
+
+        # Push, and begin anew from the other side where it was too far.
+        while (left := way * float(scene.angle_diff[0])) > -0.08:
+            if left < 0.05:
+                yield hand.action(gripper=CLOSED)
+                continue
+            along, across = _axes(_yaw_of(scene.peg), end, way)
+            gap = place_of(scene.peg) - hand.position
+            motion = across * np.clip(0.12 * left, 0.02, 0.05)
+            motion += along * np.clip(along @ gap + _LEVER, -0.02, 0.02)
+            motion[2] = gap[2]
+            action = hand.action(motion, gripper=CLOSED)
+            if _reach_of(hand.position) > _LEAN:
+                action[4] = 1.0
+            yield action
+
+
+_LEVER = 0.085  # metres from the peg's middle to where it is pushed
+_LEAN = 0.7  # metres from the robot's foot beyond which the hand has to lean outward
+_FOOT = np.array([-0.615, 0.0])
+
+
+def _axes(angle: float, end: int, way: float) -> tuple[np.ndarray, np.ndarray]:
+    """Directions [3] from the middle of a peg to one of its ends, and that in which this end moves
+    when the peg turns one way.
+    """
+    along = end * np.array([np.cos(angle), np.sin(angle), 0.0])
+    across = way * np.array([-along[1], along[0], 0.0])
+    return along, across
+
+
+def _pushing_place(scene: Any, end: int, way: float, above: float = 0.0) -> np.ndarray:
+    """Where the hand begins to push [3], or so many metres above it."""
+    along, across = _axes(_yaw_of(scene.peg), end, way)
+    return place_of(scene.peg) + _LEVER * along - 0.06 * across + _up(above)
+
+
+def _farthest(scene: Any, end: int, way: float) -> float:
+    """How far the hand gets from the robot's foot if it pushes this end all the way; metres."""
+    begin = _yaw_of(scene.peg)
+    turns = np.linspace(0, abs(float(scene.angle_diff[0])), 9)
+    middle = place_of(scene.peg)
+    farthest = 0.0
+    for turn in turns:
+        along, across = _axes(begin + way * turn, end, way)
+        farthest = max(farthest, _reach_of(middle + _LEVER * along - 0.05 * across))
+        middle = middle + 0.1 * turns[1] * across  # the peg is pushed away as well
+    return farthest
+
+
+def _reach_of(place: np.ndarray) -> float:
+    """Level distance of a place [3] from the robot's foot; metres."""
+    return float(np.linalg.norm(place[:2] - _FOOT))
+
+
 def rotate(hand: Hand) -> Actions:
-    """RotateLenient and RotateStrict: take the peg in its middle and turn it.
+    """RotateStrict: take the peg in its middle and turn it.
 
     Fingers that close askew turn the peg until it lies between them, so the hand need not be right
     across it: of all ways to take it, the one with the least turning is chosen.
@@ -185,7 +256,7 @@ def rotate(hand: Hand) -> Actions:
     scene = hand.scene
     peg = scene.peg
     goal_angle = float(scene.target_angle[0])
-    across = _wrapped(_yaw_of(peg) + np.pi / 2 - hand.yaw)
+    across = wrapped(_yaw_of(peg) + np.pi / 2 - hand.yaw)
     ways = []
     for half_turns in (-1, 0, 1):
         for askew in np.linspace(-_ASKEW, _ASKEW, 9):
@@ -194,7 +265,7 @@ def rotate(hand: Hand) -> Actions:
             ways.append((abs(to_grasp) + abs(to_end), to_grasp))
     goal = hand.yaw + min(ways)[1]
     for _ in range(60):
-        left = _wrapped(goal - hand.yaw)
+        left = wrapped(goal - hand.yaw)
         offset = place_of(peg) + _up(0.07) - hand.position
         if abs(left) < 0.05 and np.linalg.norm(offset) < 0.015:
             break
@@ -251,7 +322,7 @@ def _up(height: float) -> np.ndarray:
     return np.array([0.0, 0.0, height])
 
 
-def _wrapped(angle: float) -> float:
+def wrapped(angle: float) -> float:
     """The same angle in (−π, π]."""
     return float(np.arctan2(np.sin(angle), np.cos(angle)))
 
@@ -269,7 +340,8 @@ _SCRIPTS: dict[str, Callable[[Hand], Actions]] = {
     "ChainOfColors": touch_several,
     "InterceptGrab": catch,
     "Intercept": catch_and_carry,
-    "Rotate": rotate,
+    "RotateLenient": push_round,
+    "RotateStrict": rotate,
     "TakeItBack": take_back,
 }
 """Beginning of the name of a task's class → its script; the longer ones first."""

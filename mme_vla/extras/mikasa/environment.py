@@ -6,7 +6,7 @@ not used: what they do (cameras, state, no motion while a cue is shown) is done 
 demand.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -14,11 +14,13 @@ import gymnasium
 import numpy as np
 
 from mme_vla.envs.base import Environment
+from mme_vla.envs.facts import Candidates, Fact, FactLog
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import check_known
 from mme_vla.extras.mikasa.assets import check_assets, check_package, is_there
 from mme_vla.extras.mikasa.catalog import FAMILY_OF, STEPS, by_horizon, by_memory
-from mme_vla.extras.mikasa.demonstrators import demonstrate
+from mme_vla.extras.mikasa.demonstrators import demonstrate, place_of
+from mme_vla.extras.mikasa.facts import kind_of
 from mme_vla.registry import ENVS
 
 CAMERAS = {"top": "base_camera", "wrist": "hand_camera"}
@@ -37,9 +39,10 @@ class MikasaScene(gymnasium.Env[Any, Any]):
         time: steps since the reset.
         frozen: first steps in which no action has an effect.
         cue_end: the first step at which the answer can be given.
+        known: what its frames show. log: the facts of those so far.
     """
 
-    def __init__(self, task: str, render: bool) -> None:
+    def __init__(self, task: str, render: bool, is_twin: bool = False) -> None:
         check_assets(task)
         import mani_skill.envs  # noqa: F401
         import mikasa_robo_suite.vla.memory_envs  # noqa: F401  registers the tasks
@@ -57,6 +60,8 @@ class MikasaScene(gymnasium.Env[Any, Any]):
         )
         self.scene: Any = self._env.unwrapped
         self._rendered = render
+        self._task = task
+        self._is_twin = is_twin
         self._freezes = FAMILY_OF[task].frozen and not task.endswith("-Long")
         self.time = 0
 
@@ -71,6 +76,12 @@ class MikasaScene(gymnasium.Env[Any, Any]):
             if hasattr(self.scene, name):
                 self.cue_end += int(getattr(self.scene, name)[0])
         self.frozen = self.cue_end if self._freezes else 0
+        self.known = kind_of(self._task)(self.scene, self.cue_end)
+        if self._is_twin:
+            self.known.flip()
+            self.scene.get_info()  # which places what is shown
+        self.log = FactLog()
+        self.log.add(*self.known.look(0))
         goal = info["language_instruction"]
         if not isinstance(goal, str):
             goal = goal[0]
@@ -83,6 +94,7 @@ class MikasaScene(gymnasium.Env[Any, Any]):
             action = np.zeros_like(action)
         _, reward, terminated, truncated, info = self._env.step(action)
         self.time += 1
+        self.log.add(*self.known.look(self.time))
         success = bool(info["success"])
         return (
             self.observe(),
@@ -176,7 +188,7 @@ class Mikasa(Environment):
 
     def make(self, spec: EpisodeSpec, render: bool = True) -> MikasaScene:
         self.check_installed()
-        return MikasaScene(spec.task, render)
+        return MikasaScene(spec.task, render, is_twin=spec.row is not None)
 
     def hold(self, env: MikasaScene) -> np.ndarray:
         """No motion; the gripper stays open, as it is in every scene's beginning."""
@@ -185,6 +197,21 @@ class Mikasa(Environment):
     def demonstrate(self, env: MikasaScene) -> Iterator[np.ndarray]:
         """Solve the episode from the simulator's state."""
         return demonstrate(env)
+
+    def facts(self, env: MikasaScene) -> Sequence[Fact]:
+        return env.log.facts
+
+    def twin(self, spec: EpisodeSpec) -> Mapping[str, Any] | None:
+        """The scene flips its fact itself."""
+        return {"flipped": True} if kind_of(spec.task).has_twin else None
+
+    def candidates(self, env: MikasaScene) -> Candidates | None:
+        return env.known.candidates(env.time)
+
+    def tool(self, env: MikasaScene) -> Sequence[float]:
+        """X and y of the hand, in metres."""
+        place: list[float] = place_of(env.scene.agent.tcp)[:2].tolist()
+        return place
 
 
 @ENVS.register("mikasa_video")

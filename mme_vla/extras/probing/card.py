@@ -223,8 +223,8 @@ def measure_card(
         run_probe(policy, wrong, folder, facts, settings, options)
         recovered = recovery(Findings.of(lines.read_all(folder / OFFLINE)).moments)
     writing = None
-    if in_simulation and channel.chooses:
-        writing = _writing(policy, plan)
+    if options.base is make_env and channel.chooses:
+        writing = _writing(policy, plan, settings.env)
     if isinstance(writing, str):
         notes.append(writing)
 
@@ -428,14 +428,18 @@ def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
     return resampled_means(tasks, _SAMPLES, seed=0)
 
 
-def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any] | str:
-    """The score of writing on demonstrations of the card's scenes, or why there is none."""
-    memory, env = policy.require_memory(), environment("mme_vla")
+def _writing(policy: Policy, plan: ProbePlan, name: str) -> dict[str, Any] | str:
+    """The score of writing on demonstrations of the card's scenes, or why there is none.
+
+    name: of their environment.
+    """
+    memory, env = policy.require_memory(), environment(name)
     try:
         frames = required_frames(memory)
         episodes = []
         for job in plan.jobs:
-            episode = record_evidence(env.episode(job.task, job.split, job.episode), frames)
+            spec = env.episode(job.task, job.split, job.episode)
+            episode = record_evidence(spec, frames, name)
             if episode is not None:
                 episodes.append(episode)
         encoder = policy if isinstance(policy, MMEPolicy) else None

@@ -6,17 +6,19 @@ a key pose of the video.
 """
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import benchmark_state
+from mme_vla.envs.base import Environment, environment
 from mme_vla.envs.facts import Fact, evidence_of
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import RenderRequest
-from mme_vla.errors import SceneError
+from mme_vla.errors import SceneError, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.robomme.recording.recorder import RecordedStep
@@ -27,8 +29,9 @@ class EvidenceEpisode:
     """One demonstrated episode.
 
     length: frames. exec_start: the first execution frame. facts: what frames show. boundaries:
-    frames at which a sub-task begins. states: [length, 8] float32. images: frame →
-    [256, 256, 3] uint8 of the front camera, for frames that were rendered.
+    frames at which a sub-task begins; of an environment that is not RoboMME, the execution.
+    states: [length, s] float32. images: frame → [H, W, 3] uint8 of the camera that memories see,
+    for frames that were rendered.
     """
 
     task: str
@@ -47,13 +50,67 @@ class EvidenceEpisode:
 
 
 def record_evidence(
-    spec: EpisodeSpec, rendered: Container[int] = frozenset()
+    spec: EpisodeSpec, rendered: Container[int] = frozenset(), env: str = "mme_vla"
 ) -> EvidenceEpisode | None:
     """Demonstrate an episode of a split; None where the scene cannot be built or the demonstrator
     does not succeed.
 
-    rendered: frames whose image is wanted. Without any an episode takes about a second.
+    Args:
+        rendered: frames whose image is wanted. Without any an episode takes about a second.
+        env: the environment that has the episode.
     """
+    if env == "mme_vla":
+        return _record_robomme(spec, rendered)
+    return _record_demonstration(environment(env), spec, rendered)
+
+
+def _record_demonstration(
+    source: Environment, spec: EpisodeSpec, rendered: Container[int]
+) -> EvidenceEpisode | None:
+    """An episode that the `demonstrate` of its environment acts out."""
+    require(
+        source.embodiment is not None,
+        f"{type(source).__name__} names no embodiment, which says what camera memories see.",
+    )
+    camera = Embodiment.from_dict(source.embodiment).memory_camera
+    render = rendered != frozenset()
+    env = source.open(spec.task, spec.split, spec.episode, render=render)
+    env.render_request = RenderRequest({camera: rendered}, now=(), grounded=False)
+    states: list[np.ndarray] = []
+    images: dict[int, np.ndarray] = {}
+    video = 0
+    try:
+        for frame, _, in_video in env.demonstration():
+            image = frame[camera]
+            if image is not None and len(states) in rendered:
+                images[len(states)] = image
+            states.append(np.asarray(frame["state"], np.float32))
+            video += in_video
+        facts = _within(env.facts, len(states))
+        success = env.success
+    finally:
+        env.close()
+    if not success:
+        return None
+    boundaries = np.array([video], np.int64)
+    return EvidenceEpisode(
+        spec.task, spec.episode, len(states), video, facts, boundaries, np.stack(states), images
+    )
+
+
+def _within(facts: Sequence[Fact], length: int) -> list[Fact]:
+    """The facts of the first so many frames: no policy sees the frame after the last action."""
+    within = []
+    for fact in facts:
+        first, last = fact.frames
+        needed = tuple(frame for frame in fact.needed if frame < length)
+        if first < length:
+            within.append(replace(fact, frames=(first, min(last, length - 1)), needed=needed))
+    return within
+
+
+def _record_robomme(spec: EpisodeSpec, rendered: Container[int]) -> EvidenceEpisode | None:
+    """An episode of RoboMME, by the script of its task."""
     from mme_vla.envs.robomme.recording.recorder import Recorder
 
     render = rendered != frozenset()

@@ -309,15 +309,16 @@ def _script(base: Any, spec: EpisodeSpec, robot: Embodiment) -> Iterator[np.ndar
         for action in base.environment.demonstrate(base.env):
             yield np.asarray(action, np.float32)
     else:
-        yield from _recorded_actions(spec, str(robot.action.space))
+        yield from _recorded_actions(spec, robot)
 
 
-def _recorded_actions(spec: EpisodeSpec, space: str) -> Sequence[np.ndarray]:
+def _recorded_actions(spec: EpisodeSpec, robot: Embodiment) -> Sequence[np.ndarray]:
     """What a demonstration of RoboMME executes, in the action space of a policy."""
     from mme_vla.envs.robomme.recording.recorder import Recorder
 
-    if space not in ("joint_angle", "waypoint"):
-        raise NoPairError(f"no demonstration has actions of the space {space}")
+    space = str(robot.action.space)
+    if robot.action.of_pose or space not in (*_RECORDED, "waypoint"):
+        raise NoPairError(f"no demonstration has the actions of {robot.name}")
     task = make_task(spec.task, render=False, **spec.options)
     try:
         frames = Recorder(task, render=False).record().frames
@@ -328,7 +329,11 @@ def _recorded_actions(spec: EpisodeSpec, space: str) -> Sequence[np.ndarray]:
     if space == "waypoint":
         return list(motions_of(frames).targets)
     executed = [frame for frame in frames if not frame.info["is_video_demo"]]
-    return [np.asarray(frame.action["joint_action"], np.float32) for frame in executed]
+    return [np.asarray(frame.action[_RECORDED[space]], np.float32) for frame in executed]
+
+
+_RECORDED = {"joint_angle": "joint_action", "ee_pose": "eef_action"}
+"""Action space → what a recorded step calls its action there."""
 
 
 # Many pairs ---------------------------------------------------------------------------------------

@@ -143,7 +143,7 @@ class PlantedEpisode:
         self.n_observed_frames = 0
 
     def observe(self, frames: Mapping[str, np.ndarray], *_: Any, **__: Any) -> None:
-        (images,) = frames.values()
+        images = next(iter(frames.values()))
         self.images += list(images)
         self.n_observed_frames += len(images)
 
@@ -267,6 +267,37 @@ def check_script(task: str, folder: Path) -> None:
     assert twins.total[UNPROBED.name].pairs >= 1
 
 
+@pytest.mark.parametrize("robot", ["robomme_waypoint_front", "robomme_ee_pose"])
+def test_a_demonstrator_leads_motions_and_poses_to_the_decision(robot: str, tmp_path: Path) -> None:
+    made: list[Any] = []
+    space = "waypoint" if "waypoint" in robot else "ee_pose"
+
+    def base(**scene: Any) -> Any:
+        made.append(make_env(action_space=space, render=False, **scene))
+        return made[-1]
+
+    def above_the_right_one(_: PlantedEpisode) -> np.ndarray:
+        candidates = made[-1].candidates
+        x, y = candidates.places[candidates.correct[0]]
+        return np.tile(np.array([x, y, 0.2, np.pi, 0, 0, 1], np.float32), (16, 1))
+
+    policy = Planted(small_policy("pi05", embodiment=robot), above_the_right_one)
+    jobs = [Job("ButtonUnmask", "test", 0)]
+    options = replace(SILENT, base=base)
+    twins = run_twins(policy, jobs, tmp_path, FACTS, RolloutSettings(seed=7, draw="all"), options)
+    assert twins.total[UNPROBED.name].accuracy == 1, twins.notes
+
+
+def test_differences_of_poses_have_no_demonstration(tmp_path: Path) -> None:
+    policy = Planted(small_policy("pi05", embodiment="robomme_ee_delta"), lambda _: move(0.0))
+    options = replace(SILENT, base=lambda **scene: make_env(
+        action_space="ee_pose", render=False, **scene
+    ))  # fmt: skip
+    jobs = [Job("ButtonUnmask", "test", 0)]
+    twins = run_twins(policy, jobs, tmp_path, FACTS, RolloutSettings(seed=7), options)
+    assert "no demonstration has the actions of robomme_ee_delta" in twins.notes[-1]
+
+
 def test_a_scene_that_cannot_be_built_is_left_out_with_its_reason(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -284,3 +315,40 @@ def test_a_scene_that_cannot_be_built_is_left_out_with_its_reason(
 def test_a_count_of_what_the_robot_does_has_no_twin(task: str) -> None:
     source = environment("mme_vla")
     assert source.twin(source.episode(task, "test", 0)) is None
+
+
+# MIKASA-Robo-VLA ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", ["RememberColor3", "TakeItBack"])
+def test_only_what_knows_the_fact_is_right_in_both_scenes_of_mikasa(
+    task: str, tmp_path: Path
+) -> None:
+    pytest.importorskip("mikasa_robo_suite", reason="the extra `mikasa` is not installed")
+    made: list[Any] = []
+
+    def base(**scene: Any) -> Any:
+        made.append(environment("mikasa").open(render=False, **scene))
+        return made[-1]
+
+    def towards(number: int | None) -> Rule:
+        """The chunk that moves to a candidate, None for the correct one."""
+
+        def rule(_: PlantedEpisode) -> np.ndarray:
+            candidates, place = made[-1].candidates, made[-1].tool
+            goal = candidates.places[candidates.correct[0] if number is None else number]
+            row = np.zeros(7, np.float32)
+            row[:2] = np.clip((np.asarray(goal) - place) / 0.1, -1, 1)
+            return np.tile(row, (4, 1))
+
+        return rule
+
+    options = replace(SILENT, base=base)
+    settings = RolloutSettings(env="mikasa", seed=7)
+    for name, rule, expected in (("knows", towards(None), 1), ("always the first", towards(0), 0)):
+        policy = Planted(small_policy("pi05", env="mikasa"), rule)
+        jobs = [Job(task, "test", episode) for episode in range(2)]
+        twins = run_twins(policy, jobs, tmp_path / name, FACTS, settings, options)
+        accuracy = twins.total[UNPROBED.name]
+        assert (accuracy.pairs, accuracy.accuracy) == (2, expected), twins.notes
+        assert accuracy.chance == pytest.approx(1 / 9)

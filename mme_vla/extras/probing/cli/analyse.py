@@ -275,8 +275,8 @@ def writing(args: argparse.Namespace) -> None:
     """Score what memories keep along demonstrations against the frames that show the facts of each
     task.
     """
+    from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import choose_episodes
-    from mme_vla.envs.make import require_simulator
     from mme_vla.extras.probing.evidence import record_evidence
     from mme_vla.extras.probing.writing import (
         REFERENCES,
@@ -288,7 +288,7 @@ def writing(args: argparse.Namespace) -> None:
     from mme_vla.policy.mme import MMEPolicy
     from mme_vla.policy.run_folders import resolve_checkpoint
 
-    require_simulator()
+    environment(args.env).check_installed()
     policy: MMEPolicy | None = None
     selectors: dict[str, Memory | str] = {
         name: name if name in REFERENCES else _memory(name, args.set) for name in args.memories
@@ -305,10 +305,9 @@ def writing(args: argparse.Namespace) -> None:
     ]
     rendered = frozenset(frame for frames in required for frame in frames)
     number = int(args.episodes) if args.episodes.isdecimal() else args.episodes
-    specs = choose_episodes(args.tasks, number, args.split)
-    episodes = [
-        episode for spec in specs if (episode := record_evidence(spec, rendered)) is not None
-    ]
+    specs = choose_episodes(args.tasks, number, args.split, args.env)
+    demonstrated = [record_evidence(spec, rendered, args.env) for spec in specs]
+    episodes = [episode for episode in demonstrated if episode is not None]
     if len(episodes) < len(specs):
         print(
             f"Left out: {counted(len(specs) - len(episodes), 'episode')} of {len(specs)}. The scene"
@@ -508,6 +507,9 @@ def _parser() -> argparse.ArgumentParser:
         help="3 for the first three, 0-9 for a range (default: %(default)s)",
     )
     made.add_argument("--split", default="test", help="of the benchmark (default: %(default)s)")
+    made.add_argument(
+        "--env", default="mme_vla", help="an environment with facts (default: %(default)s)"
+    )
     made = command(cost, "CSV")
     made.add_argument("--models", nargs="+", metavar="NAME", help="default: all")
     made.add_argument(

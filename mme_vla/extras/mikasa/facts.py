@@ -1,0 +1,268 @@
+"""What the tasks of MIKASA-Robo-VLA show and need later, from the simulator's state: one class for
+each kind of scene, its facts and the fact that a twin flips.
+
+Tasks whose models the package lacks have none: `Known`.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from mme_vla.envs.facts import Candidates, VisibleFact
+from mme_vla.extras.mikasa.demonstrators import place_of, wrapped
+
+_COLORS = ("red", "lime", "blue")  # of shapes in colours, by their `color_id`
+_NEAR = 0.1  # metres from the hand to a thing that it touches, or has just touched
+_MOVED = 0.01  # metres, and radians: a thing that was moved by less lies as it lay
+_COLUMN = 0.1  # metres between the three columns in which TakeItBack's cube begins
+_COLUMNS = ("right", "middle", "left")
+
+
+class Known:
+    """What the frames of a scene show. This one shows nothing that is needed later.
+
+    Args:
+        scene: has been reset; it is read at each frame.
+        cue_end: the first step at which the answer can be given.
+    """
+
+    has_twin: ClassVar[bool] = False
+
+    def __init__(self, scene: Any, cue_end: int) -> None:
+        self._scene = scene
+        self._cue_end = cue_end
+
+    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        """What the next frame shows, and whether a decision begins there that depends on the facts.
+
+        time: steps since the reset.
+        """
+        return {}, False
+
+    def flip(self) -> None:
+        """Change the fact of the twin, right after the reset, and nothing else."""
+
+    def candidates(self, time: int) -> Candidates | None:
+        """What the hand can go to, once the flipped fact decides which is right."""
+        return None
+
+
+class Recall(Known):
+    """Remember: one object is shown. FindImposter: all but one are shown, and that one is right.
+    All are on the table when the answer can be given.
+    """
+
+    has_twin = True
+
+    @property
+    def _things(self) -> Mapping[int, Any]:
+        """Key → object, in the order of the table's."""
+        things: Mapping[int, Any] = getattr(self._scene, "cubes", None) or self._scene.shape_actors
+        return things
+
+    @property
+    def _right(self) -> Any:
+        """The tensor that holds the key, or keys, of what is right [1, …]."""
+        for name in ("true_color_indices", "true_shape_indices", "imposter_key"):
+            if hasattr(self._scene, name):
+                return getattr(self._scene, name)
+        raise AttributeError(f"{type(self._scene).__name__} names no right object")
+
+    @property
+    def _answers(self) -> list[int]:
+        """Keys of what is right, in their order."""
+        keys: list[int] = self._right[0].reshape(-1).tolist()
+        return keys
+
+    def _name(self, key: int) -> str:
+        """What makes an object different from the others."""
+        scene = self._scene
+        if hasattr(scene, "shape_color_dict"):
+            about = scene.shape_color_dict[key]
+            return f"{_COLORS[about['color_id']]} {about['shape']}"
+        if hasattr(scene, "shape_dict"):
+            return str(scene.shape_dict[key])
+        return str(scene.COLOR_MAPPING[key][0]).lower()
+
+    def _shown(self, time: int) -> Sequence[int]:
+        """Keys of the objects that are shown."""
+        if time >= int(self._scene.cue_steps_per_env[0]):
+            return ()
+        if "Imposter" not in type(self._scene).__name__:
+            return self._answers
+        return [key for key in self._things if key not in self._answers]
+
+    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        visible = {}
+        for number, key in enumerate(self._shown(time), 1):
+            visible[f"object {number}"] = VisibleFact(self._name(key))
+        return visible, time == self._cue_end
+
+    def flip(self) -> None:
+        """The next object is the right one."""
+        scene = self._scene
+        self._right[:] = (self._answers[0] + 1) % len(self._things)
+        if hasattr(scene, "_apply_phase_layout"):
+            scene._apply_phase_layout(scene.elapsed_steps.long())
+
+    def candidates(self, time: int) -> Candidates | None:
+        if time < self._cue_end:
+            return None
+        return self._among(list(self._things), self._answers[0])
+
+    def _among(self, keys: Sequence[int], right: int) -> Candidates:
+        """These objects, of which one is right."""
+        places = [place_of(self._things[key])[:2].tolist() for key in keys]
+        return Candidates(places, [keys.index(right)])
+
+
+class Several(Recall):
+    """BunchOfColors and SeqOfColors: some cubes are shown together or one by one, and are to be
+    touched in any order. The hand leaves no trace on a cube, so that touches are facts as well.
+
+    Twins differ in the last cube, and the decision is the last one to touch.
+    """
+
+    _in_order: ClassVar[bool] = False
+
+    def __init__(self, scene: Any, cue_end: int) -> None:
+        super().__init__(scene, cue_end)
+        self._touched: list[int] = []
+
+    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        scene = self._scene
+        shown = list(self._shown(time))
+        duration = getattr(scene, "cue_step_duration_per_env", None)
+        if shown and duration is not None:
+            shown = [self._answers[time // int(duration[0])]]
+        visible = {}
+        for key in shown:
+            number = self._answers.index(key) + 1
+            visible[f"object {number}"] = VisibleFact(self._name(key))
+
+        new = []
+        for key in scene.touched_cubes[0].nonzero().reshape(-1).tolist():
+            if key not in self._touched:
+                new.append(key)
+        self._touched += new
+        if self._touched:
+            last = self._touched[-1]
+            gap = place_of(self._things[last]) - place_of(scene.agent.tcp)
+            if new or np.linalg.norm(gap) < _NEAR:
+                fact = VisibleFact(self._name(last), {"touches"}, replaces=self._in_order)
+                visible[f"touch {len(self._touched)}"] = fact
+        return visible, time == self._cue_end or bool(new)
+
+    def flip(self) -> None:
+        """A cube that was not among them stands for the last one."""
+        others = [key for key in self._things if key not in self._answers]
+        self._right[0, -1] = others[0]
+
+    def candidates(self, time: int) -> Candidates | None:
+        *former, last = self._answers
+        if time < self._cue_end or set(former) - set(self._touched):
+            return None
+        return self._among([key for key in self._things if key not in former], last)
+
+
+class InOrder(Several):
+    """ChainOfColors: the same, in the order in which they were shown. Each touch replaces the last
+    one, as the place in the order. Twins exchange the first two.
+    """
+
+    _in_order = True
+
+    def flip(self) -> None:
+        self._right[0, :2] = self._right[0, :2].flip(0)
+
+    def candidates(self, time: int) -> Candidates | None:
+        return Recall.candidates(self, time)
+
+
+class Origin(Known):
+    """TakeItBack: where the cube lay. Twins begin in another of the three columns."""
+
+    has_twin = True
+    _is_reached = False
+
+    def _column(self) -> int:
+        """Of the three columns, 0 to 2, that in which the cube began."""
+        return int(np.floor(place_of(self._scene.initial_region)[1] / _COLUMN + 0.25)) + 1
+
+    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        scene = self._scene
+        gap = place_of(scene.cube) - place_of(scene.initial_region)
+        reached = bool(scene.goal_reached_status[0])
+        decides = reached and not self._is_reached
+        self._is_reached = reached
+        if np.linalg.norm(gap[:2]) < _MOVED:
+            return {"origin": VisibleFact(_COLUMNS[self._column()])}, decides
+        return {}, decides
+
+    def flip(self) -> None:
+        scene = self._scene
+        column = self._column()
+        shift = ((column + 1) % 3 - column) * _COLUMN
+        for thing in (scene.cube, scene.initial_region):
+            pose = thing.pose.raw_pose.clone()
+            pose[:, 1] += shift
+            thing.pose = pose
+
+    def candidates(self, time: int) -> Candidates | None:
+        if not bool(self._scene.goal_reached_status[0]):
+            return None
+        x, y = place_of(self._scene.initial_region)[:2].tolist()
+        column = self._column()
+        places = [[x, y + (other - column) * _COLUMN] for other in range(3)]
+        return Candidates(places, [column])
+
+
+class Turned(Known):
+    """Rotate: how the peg lay, from which it is to be turned by an angle that the goal names."""
+
+    _is_turned = False
+
+    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        scene = self._scene
+        turned = abs(wrapped(float(scene.target_angle[0]) - float(scene.angle_diff[0]))) > _MOVED
+        decides = turned and not self._is_turned
+        self._is_turned |= turned
+        if self._is_turned:
+            return {}, decides
+        degrees = np.rad2deg(float(scene.initial_rotations[0])) % 180
+        return {"angle": VisibleFact(f"{degrees:.0f} degrees")}, decides
+
+
+class Rolling(Known):
+    """Intercept: the ball's velocity, which two frames show. It stays in view, so that no decision
+    depends on a fact that is gone.
+    """
+
+    def look(self, time: int) -> tuple[Mapping[str, VisibleFact], bool]:
+        ball = self._scene.ball
+        if np.linalg.norm(place_of(ball) - place_of(self._scene.agent.tcp)) < _NEAR:
+            return {}, False
+        speed = float(np.linalg.norm(self._scene.oracle_info[0].cpu().numpy()))
+        return {"velocity": VisibleFact(f"{speed:.2f} m/s")}, False
+
+
+_KINDS: Mapping[str, type[Known]] = {
+    "Remember": Recall,
+    "FindImposter": Recall,
+    "BunchOfColors": Several,
+    "SeqOfColors": Several,
+    "ChainOfColors": InOrder,
+    "TakeItBack": Origin,
+    "Rotate": Turned,
+    "Intercept": Rolling,
+}
+"""Beginning of a task's name → what its scenes show."""
+
+
+def kind_of(task: str) -> type[Known]:
+    """The class that knows what the scenes of a task show."""
+    for beginning, kind in _KINDS.items():
+        if task.startswith(beginning):
+            return kind
+    return Known
