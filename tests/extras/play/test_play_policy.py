@@ -145,7 +145,7 @@ def test_a_policy_plays_for_as_many_steps_as_its_evaluation(
     facts = facts_of(policy, None, str(checkpoint), settings, None)
     options = RunOptions(base=open_blocks, show_progress=False)
     jobs = [Job("VideoUnmask", "test", episode) for episode in range(2)]
-    evaluate(policy, jobs, tmp_path / "evaluated", facts, settings, options)
+    run_episodes(policy, jobs, tmp_path / "evaluated", facts, settings, options)
     evaluated = read_records(tmp_path / "evaluated" / "episodes.jsonl")
     assert [record.chunks for record in evaluated] == [
         len(record.extra["decisions"]) for record in played
