@@ -83,8 +83,8 @@ def test_images_on_demand_are_those_of_the_simulators_own_observations() -> None
 
 @pytest.mark.parametrize(
     "task",
-    ["RememberShape5", "FindImposterColor9", "TakeItBack", "RotateStrictPos", "RotateLenientPos", "InterceptFast",
-     "InterceptGrabSlow", "BunchOfColors3", "ChainOfColors3"],
+    ["RememberShape5", "FindImposterColor9", "TakeItBack", "RotateStrictPos", "RotateLenientPos",
+     "InterceptFast", "InterceptGrabSlow", "BunchOfColors3", "ChainOfColors3"],
 )  # fmt: skip
 def test_scripts_solve_tasks_of_all_kinds_of_memory_that_run(task: str) -> None:
     for episode in range(2):
