@@ -55,8 +55,6 @@ from mme_vla.utils.io import to_line
 LINES, FIGURES = "twins.jsonl", "twins.json"
 MEMORY_OFF = "drop:all"
 """The arm without memory: everything remembered is removed."""
-MAX_ACTIONS = 400
-"""Of the demonstrator before the decision."""
 NOTHING = RenderRequest({}, now=(), grounded=False)
 
 
@@ -233,7 +231,7 @@ class TwinScenes:
             candidates: Candidates | None = base.candidates
             while candidates is None:
                 action = next(script, None)
-                if action is None or len(actions) == MAX_ACTIONS:
+                if action is None:
                     raise NoPairError("the demonstrator reaches no decision that depends on a fact")
                 actions.append(action)
                 draw = self._plan.of_chunk(first, 1)

@@ -337,8 +337,9 @@ def test_only_what_knows_the_fact_is_right_in_both_scenes_of_mikasa(
         def rule(_: PlantedEpisode) -> np.ndarray:
             candidates, place = made[-1].candidates, made[-1].tool
             goal = candidates.places[candidates.correct[0] if number is None else number]
-            row = np.zeros(7, np.float32)
-            row[:2] = np.clip((np.asarray(goal) - place) / 0.1, -1, 1)
+            gap = np.asarray(goal) - place
+            row = np.zeros(7, np.float32)  # of four equal steps, of 0.038 m at most
+            row[:2] = gap / max(float(np.linalg.norm(gap)), 4 * 0.038)
             return np.tile(row, (4, 1))
 
         return rule

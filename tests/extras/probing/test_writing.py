@@ -11,6 +11,7 @@ import pytest
 
 from helpers.rollout_fakes import quick_policy
 from mme_vla import UserError
+from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes
 from mme_vla.envs.facts import Fact
 from mme_vla.envs.metadata import TASK_NAMES
@@ -32,6 +33,7 @@ from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.memory.ttt import TTT
 
+REPOSITORY = Path(__file__).parents[3]
 FACTS = {"a": np.arange(10), "b": np.arange(20, 30)}
 
 
@@ -207,6 +209,31 @@ def test_the_score_separates_evidence_from_chance_on_every_task(task: str) -> No
         score_writing(name, [episode]).to_dict()["mean"]["score"] for name in ("oracle", "random")
     )
     assert oracle >= 0.95 and chance < oracle - 0.1
+
+
+def test_an_environment_of_ones_own_has_scores_from_its_facts(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(REPOSITORY / "examples" / "blink")
+    words = (
+        "writing --plugins blink --env blink --tasks Blink --episodes 2 --memories tokendrop oracle"
+    )
+    main(words.split())
+    rows = capsys.readouterr().out.splitlines()
+    assert next(row for row in rows if "`oracle`" in row).split("|")[8].strip() == "1.00"
+
+    (spec,) = choose_episodes("Blink", 1, env="blink")
+    episode = record_evidence(spec, frozenset([0, 2]), env="blink")
+    assert episode is not None and episode.facts[0].needed == (4,)
+    assert (episode.exec_start, sorted(episode.images)) == (4, [0, 2])
+    assert episode.states.shape == (episode.length, 1) and episode.images[0].shape == (64, 64, 3)
+
+    # Frames that no policy sees: those after the last action.
+    late = [Fact("light", "left", (0, 99), (4, 99)), Fact("end", "x", (99, 99))]
+    monkeypatch.setattr(type(environment("blink")), "facts", lambda self, env: late)
+    episode = record_evidence(spec, env="blink")
+    assert episode is not None
+    assert episode.facts == [Fact("light", "left", (0, episode.length - 1), (4,))]
 
 
 @pytest.mark.nightly
