@@ -322,9 +322,7 @@ def summary_rows(policy: Policy, folder: Path) -> list[tuple[str, str]]:
         relative = f"{len(space.of_pose)} of them differences to the tool's pose"
     memory = "none"
     if policy.memory is not None:
-        budget = (
-            f"{counted(policy.memory.budget, 'token')}" if policy.memory.budget else "no tokens"
-        )
+        budget = counted(policy.memory.budget, "token") if policy.memory.budget else "no tokens"
         parts_of = [str(sections.memory.get("name", "memory")), budget]
         parts_of.append(f"of the camera {robot.memory_camera}")
         parts_of.append(f"integration {sections.integration.get('name', 'none')}")
@@ -333,7 +331,7 @@ def summary_rows(policy: Policy, folder: Path) -> list[tuple[str, str]]:
         ("model", f"{names[0]}, backbone {names[1]} ({type(policy).__name__})"),
         ("parameters", f"{sum(parts.values()):,}: {sizes}"),
         ("robot", f"{robot.name}: cameras {', '.join(robot.camera_names)}, {rate}"),
-        ("state", f"{counted(robot.state.width, 'number')}"),
+        ("state", counted(robot.state.width, "number")),
         ("action", f"{counted(space.width, 'number')}, {relative}"),
         ("chunk", f"{space.horizon} actions, of which {space.execute} are executed"),
         ("memory", memory),
@@ -355,9 +353,8 @@ def training_rows(folder: Path, sections: PolicySections) -> list[tuple[str, str
         steps = f"{state['step']:,} of {train.get('steps', 0):,} updates"
         steps += f", batches of {train.get('batch_size')}, learning rate {train.get('lr')}"
         steps += f", seed {state['config'].get('seed')}"
-    rows = [("data", known), ("training", steps)]
-    results = _summary(card.get("results") or {})
-    rows.append(("error", results or "not recorded"))
+    error = _summary(card.get("results") or "not recorded")
+    rows = [("data", known), ("training", steps), ("error", error)]
     check = _open_loop_of(folder)
     if check is not None:
         rows.append(("open loop", f"{check.get('episode', 'an episode')}. {check['verdict']}"))

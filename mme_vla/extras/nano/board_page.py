@@ -371,7 +371,7 @@ def page(board: Board) -> str:
     if board.published:
         beside = [published(board), agreements(board)]
         sections.append(Section("Beside the published ranking", published_figure(board), beside))
-    return html_page("nanoMME-16", sections, f"{counted(len(board.rows), 'row')}", sortable=True)
+    return html_page("nanoMME-16", sections, counted(len(board.rows), "row"), sortable=True)
 
 
 def _cell(value: float | None, spec: str) -> str:

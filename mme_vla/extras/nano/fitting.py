@@ -205,7 +205,7 @@ def train(job: Training) -> Path:
         if job.tower_seed != job.seed:
             copy_tower(build({**job.config, "seed": job.tower_seed}), policy)
         samples, val_set = prepared(policy, job)
-        card = {"data": f"{counted(len(job.files), 'demonstration')}", "recipe": dict(job.settings)}
+        card = {"data": counted(len(job.files), "demonstration"), "recipe": dict(job.settings)}
         validation = Validation(
             val_set,
             val_set.collate,
