@@ -48,7 +48,7 @@ NOT_RUN = {
     r"^pytest tests/": "these tests run by themselves",
     r"mme-vla audit checkpoint=": "evaluates for minutes",
     r"torchrun|accelerate launch|--multirun": "needs several GPUs or a cluster",
-    r"env[= ]mikasa|benchmarks/mikasa": "needs the extra `mikasa`; tests/extras/mikasa runs its code",
+    r"env[= ]mikasa|benchmarks/mikasa": "needs the extra `mikasa`, as tests/extras/mikasa does",
     r"<|…": "has a place for a file or folder of the reader's own",
     r"mme(_vla\.|-vla )train ": "trains for minutes or hours",
     r"mme(_vla\.|-vla )nano( |$)": "trains for minutes or hours",
