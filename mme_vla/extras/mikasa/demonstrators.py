@@ -109,7 +109,7 @@ def touch(hand: Hand) -> Actions:
 
 _OVER = 0.025  # metres over the middle of an object; a touch counts within 0.05
 _ABOVE_CUBE = 0.012  # metres over the point that counts, less than the radius of a touch
-_TRAVEL = 0.16  # height at which the hand passes over cubes and button
+TRAVEL = 0.16  # height at which the hand passes over cubes and button
 
 
 def touch_several(hand: Hand) -> Actions:
@@ -119,16 +119,16 @@ def touch_several(hand: Hand) -> Actions:
     for key in scene.true_color_indices[0].tolist():
         cube = scene.cubes[key]
         top = place_of(cube) + _up(scene.CUBE_HALFSIZE + 0.005 + _ABOVE_CUBE)
-        above = np.array([top[0], top[1], _TRAVEL])
-        yield from hand.go(hand.position * [1, 1, 0] + _up(_TRAVEL), 0.03, CLOSED)
+        above = np.array([top[0], top[1], TRAVEL])
+        yield from hand.go(hand.position * [1, 1, 0] + _up(TRAVEL), 0.03, CLOSED)
         yield from hand.go(above, 0.02, CLOSED)
         for _ in range(30):
             if bool(scene.touched_cubes[0, key]):
                 break
             yield hand.action(0.7 * (top - hand.position), gripper=CLOSED)
     button = np.array([*scene.button_xy[0].tolist(), float(scene.button_top_z[0])])
-    yield from hand.go(hand.position * [1, 1, 0] + _up(_TRAVEL), 0.03, CLOSED)
-    yield from hand.go(button * [1, 1, 0] + _up(_TRAVEL), 0.02, CLOSED)
+    yield from hand.go(hand.position * [1, 1, 0] + _up(TRAVEL), 0.03, CLOSED)
+    yield from hand.go(button * [1, 1, 0] + _up(TRAVEL), 0.02, CLOSED)
     for _ in range(30):
         if bool(scene.pending_press[0]):
             break

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mme_vla.envs.facts import Candidates, VisibleFact
-from mme_vla.extras.mikasa.demonstrators import place_of, wrapped
+from mme_vla.extras.mikasa.demonstrators import TRAVEL, place_of, wrapped
 
 _COLORS = ("red", "lime", "blue")  # of shapes in colours, by their `color_id`
 _NEAR = 0.1  # metres from the hand to a thing that it touches, or has just touched
@@ -121,7 +121,8 @@ class Several(Recall):
     """BunchOfColors and SeqOfColors: some cubes are shown together or one by one, and are to be
     touched in any order. The hand leaves no trace on a cube, so that touches are facts as well.
 
-    Twins differ in the last cube, and the decision is the last one to touch.
+    Twins differ in the last cube. The decision is the last one to touch, made where the hand has
+    been lifted: before, it moves to no cube.
     """
 
     _in_order: ClassVar[bool] = False
@@ -154,6 +155,11 @@ class Several(Recall):
                 visible[f"touch {len(self._touched)}"] = fact
         return visible, time == self._cue_end or bool(new)
 
+    def _is_lifted(self, time: int) -> bool:
+        """Whether the hand is at the height at which it passes over cubes, after the cue."""
+        height = float(place_of(self._scene.agent.tcp)[2])
+        return time >= self._cue_end and abs(height - TRAVEL) < 0.03
+
     def flip(self) -> None:
         """A cube that was not among them stands for the last one."""
         others = [key for key in self._things if key not in self._answers]
@@ -161,7 +167,7 @@ class Several(Recall):
 
     def candidates(self, time: int) -> Candidates | None:
         *former, last = self._answers
-        if time < self._cue_end or set(former) - set(self._touched):
+        if not self._is_lifted(time) or set(former) - set(self._touched):
             return None
         return self._among([key for key in self._things if key not in former], last)
 
@@ -177,7 +183,7 @@ class InOrder(Several):
         self._right[0, :2] = self._right[0, :2].flip(0)
 
     def candidates(self, time: int) -> Candidates | None:
-        return Recall.candidates(self, time)
+        return Recall.candidates(self, time) if self._is_lifted(time) else None
 
 
 class Origin(Known):

@@ -29,7 +29,7 @@ def cubes_scene(right: list[int], one_by_one: bool) -> SimpleNamespace:
         touched_cubes=torch.zeros((1, 5), dtype=torch.bool),
         cue_steps_per_env=torch.tensor([2 * len(right)]),
         COLOR_MAPPING={key: (f"Colour{key}", None) for key in range(5)},
-        agent=SimpleNamespace(tcp=thing(1, 1, 1)),
+        agent=SimpleNamespace(tcp=thing(1, 1, 0.16)),
     )
     if one_by_one:
         scene.cue_step_duration_per_env = torch.tensor([2])
@@ -40,7 +40,7 @@ def played(known: Several, scene: Any, touches: dict[int, int], steps: int = 30)
     """The facts of an episode in which cubes are touched at some steps, for two frames each."""
     log = FactLog()
     for time in range(steps):
-        scene.agent.tcp = thing(1, 1, 1)
+        scene.agent.tcp = thing(1, 1, 0.16)
         for begun, key in touches.items():
             if begun <= time < begun + 2:
                 scene.agent.tcp = scene.cubes[key]
@@ -90,6 +90,8 @@ def test_twins_of_several_cubes_decide_at_the_last_one() -> None:
     known.flip()
     assert scene.true_color_indices.tolist() == [[3, 0, 1]]
     assert list(known.candidates(24).correct) == [0]
+    scene.agent.tcp = thing(1, 1, 0.05)
+    assert known.candidates(24) is None, "the hand has yet to rise"
 
 
 def test_twins_of_a_chain_exchange_the_first_two_and_decide_at_once() -> None:
